@@ -16,12 +16,13 @@ mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 # ruff: noqa: E402
-from test_batch import ball_spec, make, shell
+from test_batch import ball_spec, make, read, shell
 
 from biotac_mj import batch as batches
 from biotac_mj.batch import kernels
 from biotac_mj.batch.batch import Batch
 from biotac_mj.batch.implicit import energy, integrator, rounds
+from biotac_mj.batch.marks import Marks
 
 SKINS, NV, WORLDS, H2 = 3, 8, 16, 1.6e-5
 
@@ -60,7 +61,7 @@ def corrected(steps):
             models[k].tangent0 = wp.array(tangent, dtype=wp.spatial_matrixd)
             models[k].wrench0 = wp.zeros((1, WORLDS), dtype=wp.spatial_vectord)
         again, square = wp.zeros(1, dtype=int), wp.full(WORLDS, H2, dtype=wp.float64)
-        wp.launch(integrator.begin_correction, WORLDS, [c])
+        wp.launch(integrator.begin_correction, WORLDS, [wp.ones(WORLDS, dtype=int), c])
         for left in range(steps, -1, -1):
             force = np.einsum("wkni,kwi->wn", jacobian, c.force.numpy())
             found = first + np.linalg.solve(held, force[:, :, None])[:, :, 0]
@@ -88,6 +89,7 @@ def test_skins_on_the_same_joints_are_corrected_together():
 def test_a_skin_that_does_not_act_lacks_nothing():
     with wp.ScopedDevice("cpu"):
         c = integrator.corrections(3, 2, 1)
+        c.going.fill_(1)
         for array in (c.force, c.amiss):
             array.fill_(1.0)
         wp.launch(integrator.leave_out, 2, [1, 1], [c])
@@ -118,17 +120,16 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
         model.wrench0 = wp.array(wrench, dtype=wp.spatial_vectord)
         model.tangent0 = wp.array(np.tile(np.eye(6), (1, n, 1, 1)), dtype=wp.spatial_matrixd)
         correction = wp.array(wrench, dtype=wp.spatial_vectord)
-        gains, some = wp.zeros(n, dtype=int), wp.zeros(1, dtype=int)
+        gains, going, every = Marks(n), Marks(n), wp.ones(n, dtype=int)
         model_before = model.tangent0.numpy()[0, 1]
         # one that gives too much only now, as another pushes less, is withheld too
-        wp.launch(energy.withhold, n, [model, pushes, r, some])
-        assert r.push.numpy().tolist() == [0, 1, 0] and some.numpy()[0] == 1
+        wp.launch(energy.withhold, n, [every, model, pushes, r], [going.struct])
+        assert r.push.numpy().tolist() == [0, 1, 0] and going.world.numpy().tolist() == [1, 0, 1]
         r.push.fill_(1.0)
-        some.zero_()
-        wp.launch(energy.find_gain, n, [model, pushes, r], [gains, some])
-        assert gains.numpy().tolist() == [1, 0, 1] and some.numpy()[0] == 1
+        wp.launch(energy.find_gain, n, [every, model, pushes, r], [gains.struct])
+        assert gains.world.numpy().tolist() == [1, 0, 1] and gains.any.numpy()[0] == 1
         start = wp.array(np.full((n, 4), np.nan), dtype=float)
-        wp.launch(energy.withdraw, n, [gains, model, r, correction, start])
+        wp.launch(energy.withdraw, n, [gains.world, model, r, correction, start])
     assert np.isnan(start.numpy()[1]).all() and not start.numpy()[[0, 2]].any()
     assert r.push.numpy().tolist() == [0, 1, 0] and r.settled.numpy().tolist() == [0, 1, 0]
     for array in (model.wrench0, model.tangent0, correction):
@@ -149,13 +150,15 @@ def test_a_skin_that_does_not_act_leaves_bodies_to_themselves(monkeypatch):
     with monkeypatch.context() as patch:
         restrain = Batch.restrain
 
-        def lets_go(self, greedy, again):
-            restrain(self, greedy, again)
-            again.fill_(1)
+        def lets_go(self, taking_part, going):
+            restrain(self, taking_part, going)
+            going.any.fill_(1)
 
         patch.setattr(Batch, "restrain", lets_go)
-        second = wp.array([0, 1], dtype=int)
-        patch.setattr(Batch, "find_gain", lambda self, gains, some: (wp.copy(gains, second), some.fill_(1)))
+        second = Marks(2)
+        second.world.assign([0, 1])
+        second.any.fill_(1)
+        patch.setattr(Batch, "find_gain", lambda self, taking_part, gains: gains.copy(second))
         mjw.step(m, d)
     read, speed = d.sensordata.numpy(), d.qvel.numpy()[:, 0]
     np.testing.assert_allclose(speed[1] - known[1], down, rtol=1e-4)
@@ -223,6 +226,56 @@ def test_a_world_that_is_lost_changes_no_bit_of_others():
     # both make it bounce, and each knows
     np.testing.assert_allclose(frequency, stiffest[0], rtol=0.1)
     np.testing.assert_array_equal(beside, sound)
+
+
+TUMBLING = [(0.1, [0.0, 0.0, 0.0]), (1.0, None), (0.4, [3.0, 50.0, -20.0]), (1.0, [20.0, -40.0, 30.0])]
+
+
+def tumbling(tier, throws):
+    """Positions, speeds and readings (step, number) of a light box in each world, thrown at a pad with speed
+    [m/s] and spin [rad/s], or far above it (no spin); and rounds (step, world)."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = 4e-3, [0, 9.81, 0]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    box = spec.worldbody.add_body(name="box", pos=[-0.009, -0.0107, 0.001])
+    box.add_freejoint()
+    box.add_geom(
+        name="box", type=mujoco.mjtGeom.mjGEOM_BOX, size=[4e-3, 3e-3, 3.5e-3], mass=2.4e-3, density=0
+    )
+    batches.add(spec, body="world", skin=shell())
+    mjm = spec.compile()
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+    m = mjw.put_model(mjm)
+    d = mjw.put_data(mjm, mjd, nworld=len(throws), nconmax=16, njmax=60)
+    batches.attach(mjm, m, d, skin=shell(), tier=tier, readings={"noise": False})
+    qpos, qvel = d.qpos.numpy(), d.qvel.numpy()
+    for w, (speed, spin) in enumerate(throws):
+        qvel[w, 1] = speed
+        if spin is None:
+            qpos[w, 1] -= 0.02
+        else:
+            qvel[w, 3:] = spin
+    d.qpos.assign(qpos)
+    d.qvel.assign(qvel)
+    out, rounds = [], []
+    for _ in range(12):
+        mjw.step(m, d)
+        out.append(np.concatenate([d.qpos.numpy(), d.qvel.numpy(), d.sensordata.numpy()], axis=1))
+        rounds.append(read(mjm, d, "status")[:, 5].copy())
+    return np.array(out), np.array(rounds)
+
+
+@pytest.mark.parametrize("tier, throws", [("condensed", TUMBLING), ("full", TUMBLING[:3])])
+def test_a_world_is_the_same_to_the_bit_beside_any_others(tier, throws):
+    """Whether its skin settles at once, sleeps until a box comes, or needs rounds of its own: what the others
+    of the batch still do changes nothing in it."""
+    found, rounds = tumbling(tier, throws)
+    assert (rounds[:, 0] == 1).all() and rounds[:, 2:].max() > 1  # the others need more
+    for w in (0, 1, 3):
+        if w < len(throws):
+            alone, _ = tumbling(tier, [throws[w]])
+            np.testing.assert_array_equal(found[:, w], alone[:, 0])
 
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"

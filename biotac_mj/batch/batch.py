@@ -30,6 +30,7 @@ from .implicit import dynamics, energy, integrator, rounds
 from .implicit.compliance import Response
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
+from .marks import Marks
 from .memory import Scratch
 from .release import Clearance
 from .senses import Senses
@@ -115,9 +116,9 @@ class Batch(Skins):
         r = self._of_step
         return [*last, r.end_pos, r.end_mat, r.left, r.frequency, r.open, r.passed], first
 
-    def predict(self, m: "mjw.Model", d: "mjw.Data", any_of_all: wp.array) -> None:
+    def predict(self, m: "mjw.Model", d: "mjw.Data", taking_part: Marks) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
-        who takes part; finds this step's rows."""
+        marks the worlds whose skin takes part; finds this step's rows."""
         r = self._of_step
         bodies = [self._core, self._body, d.xpos, d.xmat]
         self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
@@ -125,7 +126,7 @@ class Batch(Skins):
         self._advance(m, d, self._step)
         turning = [self._core, self._body, m.body_rootid, m.body_isdofancestor, *where, d.cdof, *start]
         self._launch(dynamics.relative_jacobians, self._jacobian.shape, turning, [self._jacobian])
-        self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, any_of_all)
+        self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, taking_part)
         if self.moving:
             inertial = int(self.skin.inertial)
             by = [self.dt, self._delay, inertial, self.model]
@@ -229,12 +230,12 @@ class Batch(Skins):
         clearance.measure(geoms, laws, skin.data.rest_vert)
         self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
 
-    def find_compliance(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array) -> None:
-        """Finds how the bodies give way, after mujoco_warp's constraint solver; inertia: see `Integrator`.
-        Launches only."""
-        self._response.find(m, d, inertia, self._row, self._jacobian)
-        self._response.write(self._jacobian, self._of_step.square, self.skin.bodies.compliance)
-        self._response.find(m, d, d.M, self._all_rows, self._jacobian)
+    def find_compliance(self, m: "mjw.Model", d: "mjw.Data", going: wp.array, inertia: wp.array) -> None:
+        """Finds how the bodies give way in worlds that are going (nworld,), after mujoco_warp's constraint
+        solver; inertia: see `Integrator`. Launches only."""
+        self._response.find(m, d, going, inertia, self._row, self._jacobian)
+        self._response.write(going, self._jacobian, self._of_step.square, self.skin.bodies.compliance)
+        self._response.find(m, d, going, d.M, self._all_rows, self._jacobian)
 
     def begin_solve(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Begins to solve the wanted skins where the bodies go; those that move no bodies it solves, where
@@ -291,37 +292,43 @@ class Batch(Skins):
         self.skin.keep()
         self.begin_solve(m, d)
 
-    def compare(self, again: wp.array) -> None:
-        """After it; sets again[0] where the bodies of a world may go elsewhere under its new model."""
-        self._launch(rounds.look, self.nworld, [self.rest.awake, self.model], [self._of_step, again])
+    def compare(self, going: Marks) -> None:
+        """After it; marks worlds whose bodies may go elsewhere under its new model."""
+        self._launch(rounds.look, self.nworld, [self.rest.awake, self.model], [self._of_step, going.struct])
 
-    def judge(self, again: wp.array) -> None:
-        """After `predict`: sets again[0] where a skin is to be solved again."""
+    def judge(self, going: Marks, still_going: Marks) -> None:
+        """After `evaluate`: marks those of the worlds that are going whose skin is to be solved again."""
         st = self.skin.data.worlds
-        self._launch(rounds.judge, self.nworld, [st.reason, self.model], [self._of_step, st.wanted, again])
+        known, changed = [going.world, st.reason, self.model], [self._of_step, st.wanted, still_going.struct]
+        self._launch(rounds.judge, self.nworld, known, changed)
 
     def solve_again(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Another round of the worlds that want one. Launches only."""
         self.skin.put_back()
         self.begin_solve(m, d)
 
-    def restrain(self, any_greedy: wp.array, again: wp.array) -> None:
-        """Takes the push of skins that have not the energy for it, after `evaluate`; sets again[0] where that
-        changes how bodies move, any_greedy[0] where a step of more damping is to be tried first."""
-        out = [self._greedy, any_greedy, again]
-        self._settle(energy.restrain, [self._last], [self._solid], out)
+    def find_energy(self, taking_part: Marks, damped: Marks) -> None:
+        """Finds the energy of skins in worlds that take part, after `evaluate`; marks those in which a step
+        of more damping is to be tried."""
+        out = [self._greedy, damped.struct]
+        self._settle(energy.find_energy, taking_part, [self._last], [self._solid], out)
+
+    def restrain(self, taking_part: Marks, going: Marks) -> None:
+        """Takes the push of skins that have not the energy for it, after `find_energy`, and marks their
+        worlds."""
+        self._settle(energy.restrain, taking_part, outputs=[going.struct])
 
     def scale_push(self) -> None:
         """Gives those as much push as they have energy for, after `evaluate` without any."""
         self._settle(energy.scale_push)
 
-    def withhold(self, again: wp.array) -> None:
+    def withhold(self, going: Marks, still_going: Marks) -> None:
         """Takes it again where it still is too much, as `restrain`."""
-        self._settle(energy.withhold, outputs=[again])
+        self._settle(energy.withhold, going, outputs=[still_going.struct])
 
-    def find_gain(self, gains: wp.array, any_gain: wp.array) -> None:
-        """Sets gains (nworld,) and any_gain[0] where withholding all does not help, after `evaluate`."""
-        self._settle(energy.find_gain, outputs=[gains, any_gain])
+    def find_gain(self, taking_part: Marks, gains: Marks) -> None:
+        """Marks worlds where withholding all does not help, after `evaluate`."""
+        self._settle(energy.find_gain, taking_part, outputs=[gains.struct])
 
     def withdraw(self, d: "mjw.Data", gains: wp.array) -> None:
         """Lets the skins of those worlds not act in this step."""
@@ -333,13 +340,13 @@ class Batch(Skins):
         dim = stiffness.shape[:2]
         self._launch(energy.add_stiffness, dim, [self._jacobian, self.model], [stiffness])
 
-    def conclude(self, stiffness: wp.array) -> None:
+    def conclude(self, taking_part: Marks, stiffness: wp.array) -> None:
         """Settles the account of energy, after `evaluate`; stiffness: of all skins."""
         found, driven = self._response, self._driven
         self._launch(energy.drive, self._power.shape, [stiffness, found.L, found.response], [driven])
         known = [stiffness, found.response, driven, self.model]
         self._launch(energy.add_powers, self._power.shape, known, [self._power])
-        self._settle(energy.conclude, how=[self.skin.reason, self._power])
+        self._settle(energy.conclude, taking_part, how=[self.skin.reason, self._power])
 
     def finish(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
@@ -411,15 +418,15 @@ class Batch(Skins):
         fraction[[k for k in self._skins if bodies[k] in cores]] = 0.5
         self.skin.fraction.assign(fraction)
 
-    def pass_by(self) -> None:
-        """Ends a step in which no skin takes part."""
-        self._launch(energy.pass_by, self.nworld, [self._solid.area], [self._of_step])
+    def pass_by(self, taking_part: Marks) -> None:
+        """Ends a step of the worlds in which no skin takes part."""
+        known = [taking_part.world, self._solid.area]
+        self._launch(energy.pass_by, self.nworld, known, [self._of_step])
 
-    def _settle(self, kernel, last=(), how=(), outputs=()):
-        r = self._of_step
+    def _settle(self, kernel, worlds=None, last=(), how=(), outputs=()):
         self._find_wrenches()
-        inputs = [self.model, *last, self._wrench, *how]
-        self._launch(kernel, self.nworld, inputs, [r, *outputs])
+        inputs = [*([worlds.world] if worlds else []), self.model, *last, self._wrench, *how]
+        self._launch(kernel, self.nworld, inputs, [self._of_step, *outputs])
 
     def _find_wrenches(self):
         self._launch(rounds.wrenches, self.groups, [self.model, self._of_step], [self._wrench])
@@ -436,7 +443,7 @@ class Hook:
         self._contact_force = None
         self._corrected = []  # whose forces are corrected together
         self._fork = Fork(m.qpos0.device)
-        self._any = wp.zeros(1, dtype=int, device=m.qpos0.device)
+        self._taking_part = self._going = self._next = None  # `Marks` of worlds: in the step, in a round
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
         m.callback.contactfilter = self.contactfilter
 
@@ -459,6 +466,8 @@ class Hook:
         if self._contact_force is None or len(self._contact_force) < d.naconmax:
             self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)
             self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
+        with wp.ScopedDevice(d.qpos.device):
+            self._taking_part, self._going, self._next = (Marks(d.nworld) for _ in range(3))
 
     def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
         """Of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
@@ -486,8 +495,8 @@ class Hook:
         if self._corrected != [b for b in self.batches if b.moving]:
             self._take_memory(m, d)
         batches = [b for b in self.batches if b.active]
-        self._any.zero_()
-        self._fork.run(*(functools.partial(batch.predict, m, d, self._any) for batch in batches))
+        self._taking_part.clear()
+        self._fork.run(*(functools.partial(batch.predict, m, d, self._taking_part) for batch in batches))
         moving = [b for b in batches if b.moving]
         for batch in batches:
             if batch not in moving:
@@ -495,11 +504,8 @@ class Hook:
         if moving:
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
-                wp.capture_if(
-                    self._any,
-                    lambda: self._find_balance(m, d, moving),
-                    lambda: [batch.pass_by() for batch in moving],
-                )
+                wp.capture_if(self._taking_part.any, lambda: self._find_balance(m, d, moving))
+            self._fork.run(*(functools.partial(batch.pass_by, self._taking_part) for batch in moving))
             self._act(m, d, moving)
         self._fork.run(*(batch.end_step for batch in batches))
 
@@ -518,8 +524,7 @@ class Hook:
         slots = np.cumsum([0, *(batch.nslot for batch in self._corrected)])
         with wp.ScopedDevice(device):
             self._outside = wp.empty_like(d.qfrc_passive)
-            self._again, self._amiss, self._greedy = (wp.zeros(1, dtype=int) for _ in range(3))
-            self._gains = wp.zeros(d.nworld, dtype=int)
+            self._amiss = wp.zeros(1, dtype=int)
             self._stiffness = wp.zeros((d.nworld, m.nv, m.nv), dtype=wp.float64)
             rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
             self._integrator, self._ends, self._loads = Integrator(m, d), Ends(d), Loads(m, d)
@@ -529,77 +534,80 @@ class Hook:
             batch.take_part(m, self._slope.correction, int(first), rows, int(row))
 
     def _find_balance(self, m, d, moving):
-        """Models of the skins that hold where they lead, and that give no energy which is not there."""
-        again = self._again
+        """Models of the skins that hold where they lead, and that give no energy which is not there.
 
-        def go_on():
-            self._accelerate(m, d, moving)
-            again.zero_()
-            for batch in moving:
-                batch.judge(again)
-            wp.capture_if(again, lambda: self._solve(moving, lambda batch: batch.solve_again(m, d)))
-
-        def restrain_all():
-            again.zero_()
-            self._greedy.zero_()
-            for batch in moving:
-                batch.restrain(self._greedy, again)
-
-        def damp():
-            for batch in moving:
-                batch.use_euler(m, d)
-            self._accelerate(m, d, moving)
-            find_compliance()
-            again.fill_(1)
-            wp.capture_while(again, go_on)
-            restrain_all()
-
-        def find_compliance():
-            inertia = self._integrator.inertia
-            self._fork.run(*(functools.partial(batch.find_compliance, m, d, inertia) for batch in moving))
-
-        def withhold():
-            self._accelerate(m, d, moving)
-            again.zero_()
-            for batch in moving:
-                batch.withhold(again)
-
-        def restrain():
-            self._accelerate(m, d, moving)
-            for batch in moving:
-                batch.scale_push()
-            wp.capture_while(again, withhold)
-            again.zero_()
-            self._gains.zero_()
-            for batch in moving:
-                batch.find_gain(self._gains, again)
-            wp.capture_if(again, withdraw)
-
-        def withdraw():
-            for batch in moving:
-                batch.withdraw(d, self._gains)
-            self._accelerate(m, d, moving)
-
+        A world is going until its skins are settled. From then on no launch changes it."""
+        going, taking_part = self._going, self._taking_part
+        going.copy(taking_part)
         _begin_dynamics(m, d)
         if self._integrator.differs:
             self._integrator.take_matrices(m, d)
         self._accelerate(m, d, moving, first=True)
-        find_compliance()
-        again.zero_()
+        self._find_compliance(m, d, moving)
         self._solve(moving, lambda batch: batch.solve_first(m, d))
-        for batch in moving:
-            batch.compare(again)
-        wp.capture_while(again, go_on)
-        restrain_all()
-        wp.capture_if(self._greedy, damp)
-        wp.capture_if(again, restrain)
+        self._choose(moving, lambda batch, found: batch.compare(found))
+        self._go_on(m, d, moving)
+        self._choose(moving, lambda batch, found: batch.find_energy(taking_part, found))
+        wp.capture_if(going.any, lambda: self._damp(m, d, moving))
+        self._choose(moving, lambda batch, found: batch.restrain(taking_part, found))
+        wp.capture_if(going.any, lambda: self._restrain(m, d, moving))
         self._stiffness.zero_()
         for batch in moving:
             batch.add_stiffness(self._stiffness)
         for batch in moving:
-            batch.conclude(self._stiffness)
+            batch.conclude(taking_part, self._stiffness)
         end = self._ends.find(m, d, self._integrator.qacc)
         self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
+
+    def _choose(self, moving, choose):
+        """Which worlds go on: those that any batch chooses."""
+        self._next.clear()
+        for batch in moving:
+            choose(batch, self._next)
+        self._going.copy(self._next)
+
+    def _go_on(self, m, d, moving):
+        """Rounds of the worlds that are going, until all are settled or cannot be."""
+
+        def go_on():
+            self._accelerate(m, d, moving)
+            self._choose(moving, lambda batch, found: batch.judge(self._going, found))
+            wp.capture_if(self._going.any, lambda: self._solve(moving, lambda batch: batch.solve_again(m, d)))
+
+        wp.capture_while(self._going.any, go_on)
+
+    def _damp(self, m, d, moving):
+        """Backward Euler's step in the worlds that are going."""
+        for batch in moving:
+            batch.use_euler(m, d)
+        self._accelerate(m, d, moving)
+        self._find_compliance(m, d, moving)
+        self._go_on(m, d, moving)
+        for batch in moving:
+            batch.find_energy(self._taking_part, self._next)
+
+    def _restrain(self, m, d, moving):
+        """Withholds push in the worlds that are going."""
+
+        def withhold():
+            self._accelerate(m, d, moving)
+            self._choose(moving, lambda batch, found: batch.withhold(self._going, found))
+
+        def withdraw():
+            for batch in moving:
+                batch.withdraw(d, self._going.world)
+            self._accelerate(m, d, moving)
+
+        self._accelerate(m, d, moving)
+        for batch in moving:
+            batch.scale_push()
+        wp.capture_while(self._going.any, withhold)
+        self._choose(moving, lambda batch, found: batch.find_gain(self._taking_part, found))
+        wp.capture_if(self._going.any, withdraw)
+
+    def _find_compliance(self, m, d, moving):
+        known = m, d, self._going.world, self._integrator.inertia
+        self._fork.run(*(functools.partial(batch.find_compliance, *known) for batch in moving))
 
     def _solve(self, moving, solve):
         """Solves the skins, those of the condensed tier side by side."""
@@ -626,36 +634,36 @@ class Hook:
             batch.add_forces(d)
 
     def _accelerate(self, m, d, moving, first=False):
-        """Where the bodies go under the present models."""
-        self._find_accelerations(m, d, moving, first)
+        """Where the bodies go under the present models, in the worlds that are going."""
+        going, correction, device = self._going.world, self._slope.correction, d.qacc.device
+        self._find_accelerations(m, d, moving, going, first)
         if self._integrator.differs:
-            found = {"inputs": [self._slope.correction], "dim": d.nworld, "device": d.qacc.device}
 
             def compare():
-                self._integrator.integrate(m, d)
+                self._integrator.integrate(m, d, correction.going)
                 self._amiss.zero_()
                 for batch in self._corrected:
                     batch.find_amiss(d, self._integrator.qacc)
-                wp.launch(integrator.judge, outputs=[self._amiss], **found)
+                wp.launch(integrator.judge, d.nworld, [correction], [self._amiss], device=device)
 
             def go_on():
                 self._slope.find(m, d, self._integrator.inertia, self._corrected)
-                self._find_accelerations(m, d, moving)
+                self._find_accelerations(m, d, moving, correction.going)
                 compare()
 
-            wp.launch(integrator.begin_correction, **found)
+            wp.launch(integrator.begin_correction, d.nworld, [going, correction], device=device)
             compare()
             wp.capture_while(self._amiss, go_on)
         self._fork.run(*(functools.partial(batch.evaluate, self._integrator.qacc) for batch in moving))
 
-    def _find_accelerations(self, m, d, moving, first=False):
-        """Those of the constraint solver."""
+    def _find_accelerations(self, m, d, moving, going, first=False):
+        """Those of the constraint solver, in worlds that are going."""
         import mujoco_warp as mjw
 
         self._act(m, d, moving)
         mjw.fwd_acceleration(m, d, factorize=first)
         mjw.solve(m, d)
-        wp.copy(d.qacc_warmstart, d.qacc)
+        integrator.accept(going, d.qacc, d.qacc_warmstart)
 
     def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
         import mujoco_warp as mjw

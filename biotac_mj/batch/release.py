@@ -168,6 +168,7 @@ def give_up(
     st: Worlds,
     gone: wp.array(dtype=bool),
     # Out:
+    at_rest_out: wp.array(dtype=int),
     anew_out: wp.array(dtype=bool),
     reset_out: wp.array(dtype=bool),
     any_out: wp.array(dtype=int),
@@ -184,6 +185,8 @@ def give_up(
             st.nonconverged[w] = st.nonconverged[w] - 1
         elif st.load_factor[w] == real(0.0) and stays[w] >= _PATIENCE:
             anew_out[w] = True
+    if st.wanted[w] == 1:
+        at_rest_out[w] = wp.where(gone[w], 1, 0)
     reset_out[w] = gone[w] or anew_out[w]
     if reset_out[w]:
         any_out[0] = 1
@@ -230,12 +233,18 @@ def rest_worlds(
 
 @wp.kernel
 def count_stays(
-    gone: wp.array(dtype=bool), st: Worlds, stays: wp.array(dtype=int), undeformed_out: wp.array(dtype=int)
+    awake: wp.array(dtype=int),
+    at_rest: wp.array(dtype=int),
+    st: Worlds,
+    # In and out:
+    stays: wp.array(dtype=int),
+    # Out:
+    undeformed_out: wp.array(dtype=int),
 ):
     """Ends a step: in how many the skins have stayed where they were; which have their form at rest."""
     w = wp.tid()
-    if st.wanted[w] == 1:
-        undeformed_out[w] = wp.where(gone[w], 1, 0)
+    if awake[w] == 1:
+        undeformed_out[w] = at_rest[w]
     if st.reason[w] != NOT_FINITE:
         stays[w] = _stayed(stays[w], st.load_factor[w])
 
@@ -290,7 +299,7 @@ class Release:
         n = data.nworld
         with wp.ScopedDevice(model.device):
             allocate("release", self, {"world": n})
-            self.near, self.undeformed = (wp.zeros(n, dtype=int) for _ in range(2))
+            self.near, self.undeformed, self._at_rest = (wp.zeros(n, dtype=int) for _ in range(3))
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
             self._own = wp.zeros(n, dtype=vec4)
@@ -315,13 +324,13 @@ class Release:
         if not self.possible:
             return
         self.any.zero_()
-        outputs = [self._data.worlds, self.gone, self._anew, self.reset, self.any]
+        outputs = [self._data.worlds, self.gone, self._at_rest, self._anew, self.reset, self.any]
         self._launch(give_up, self._data.nworld, [self.near, self.stays], outputs)
 
-    def count(self) -> None:
-        """Ends a step. Launches only."""
-        outputs = [self.stays, self.undeformed]
-        self._launch(count_stays, self._data.nworld, [self.gone, self._data.worlds], outputs)
+    def count(self, awake: wp.array) -> None:
+        """Ends a step; awake: (nworld,) 1 where the skin took part in it. Launches only."""
+        known, outputs = [awake, self._at_rest, self._data.worlds], [self.stays, self.undeformed]
+        self._launch(count_stays, self._data.nworld, known, outputs)
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._model.device)

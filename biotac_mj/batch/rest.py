@@ -10,6 +10,7 @@ from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
 from .kernels import Model
+from .marks import MarkedWorlds, Marks, mark
 from .release import NEAR, Clearance, constants_of, find_close, margin_of
 from .skin import BatchSkin
 
@@ -60,7 +61,7 @@ def leave(
     # Out:
     awake_out: wp.array(dtype=int),
     any_out: wp.array(dtype=int),
-    any_of_all_out: wp.array(dtype=int),
+    taking_part_out: MarkedWorlds,
 ):
     """Wakes skins that a geom comes close to, or whose core it is in. Of those that are left at rest, what a
     step writes: where the geoms were last, no iterations."""
@@ -70,7 +71,7 @@ def leave(
     awake_out[w] = st.wanted[w]
     if st.wanted[w] == 1:
         any_out[0] = 1
-        any_of_all_out[0] = 1
+        mark(taking_part_out, w)
         return
     st.iterations[w] = 0
     for g in range(geoms.count):
@@ -141,20 +142,20 @@ class Rest:
             self._constants = wp.zeros(n, dtype=vec4)
         self.lasting = [self._resting, self._constants]
 
-    def begin_step(self, any_of_all: wp.array) -> None:
+    def begin_step(self, taking_part: Marks) -> None:
         """Finds who takes part in the step, with the geoms where they go without acceleration; writes the
-        skins' `wanted`, and sets any_of_all[0] where one does. Launches only."""
+        skins' `wanted`, and marks their worlds. Launches only."""
         skin, st = self._skin, self._skin.data.worlds
         if not self.possible:
             st.wanted.fill_(1)
-            any_of_all.fill_(1)
+            taking_part.fill()
             return
         geoms, laws, clearance = skin.geoms.struct, skin.data.laws.struct, self._clearance
         self.any.zero_()
         known = [*clearance.ball, geoms, laws, self._constants, self._resting, st]
         self._launch(wake, skin.nworld, known, [clearance.close, clearance.found])
         clearance.measure(geoms, laws, skin.x)
-        known, written = [geoms, laws, clearance.found], [self.awake, self.any, any_of_all]
+        known, written = [geoms, laws, clearance.found], [self.awake, self.any, taking_part.struct]
         self._launch(leave, skin.nworld, known, [skin.motion, st, *written])
 
     def end_step(self, model: Model, settled: wp.array, rounds: wp.array) -> None:

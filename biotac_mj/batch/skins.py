@@ -12,6 +12,7 @@ from ..skin.program import compile_ahead, finish_compiling
 from ..skin.state import GUESS, MEMORY, OUTCOME
 from . import kernels
 from .ahead import launched_by
+from .marks import Marks
 from .rest import Rest
 from .senses import Senses
 from .skin import BatchSkin
@@ -125,12 +126,12 @@ class Skins:
         return self.skin.nbytes + (self.senses.nbytes if self.senses else 0)
 
     def begin_step(
-        self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array, any_of_all: wp.array
+        self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array, taking_part: Marks
     ) -> None:
-        """Before the first `solve_at` of a step, with the bodies where they go without acceleration; sets
-        any_of_all[0] where a skin takes part in it. Launches only."""
+        """Before the first `solve_at` of a step, with the bodies where they go without acceleration; marks
+        worlds whose skin takes part in it. Launches only."""
         self.place_geoms(pos, mat, geom_pos, geom_quat)
-        self.rest.begin_step(any_of_all)
+        self.rest.begin_step(taking_part)
         if self.senses:
             self.senses.begin_step()
 
@@ -144,7 +145,7 @@ class Skins:
         self.rest.end_step(self.model, self._settled, self._rounds)
         how = [self.skin.reason, self._settled]
         self._launch(kernels.count_failures, self.nworld, how, [self.failed, self.began])
-        self.skin.release.count()
+        self.skin.release.count(self.rest.awake)
 
     def solve_at(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
         """Solves the skins of the wanted worlds for touching bodies at pos, mat [group, world] in the BioTac
@@ -239,7 +240,7 @@ class PoseBatch(Skins):
             )  # (w, x, y, z), as mujoco_warp keeps it
             self._pos = wp.zeros(self.groups, dtype=wp.vec3d)
             self._mat = wp.zeros(self.groups, dtype=wp.mat33d)
-            self._any = wp.zeros(1, dtype=int)
+            self._taking_part = Marks(self.nworld)
             self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
             self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
 
@@ -275,7 +276,7 @@ class PoseBatch(Skins):
                 [data.frame_pos, data.frame_mat, skin.core_pos, skin.core_mat],
             )
         where = self._pos, self._mat, self._geom_pos, self._geom_quat
-        self.begin_step(*where, self._any)
+        self.begin_step(*where, self._taking_part)
         wp.capture_if(self.rest.any, lambda: (self.keep_models(), self.solve_at(*where)))
         self.end_step()
         bodies = [self._core, self._body, self.model.wrench0, xpos, xmat, xipos]

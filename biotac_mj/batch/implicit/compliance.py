@@ -30,6 +30,7 @@ _LEAST = wp.constant(wp.float64(1e-12))  # of a pivot, of the entry that it came
 @wp.kernel
 def factor(
     # In:
+    going: wp.array(dtype=int),
     inertia: wp.array2d(dtype=float),
     rownnz: wp.array(dtype=int),
     rowadr: wp.array(dtype=int),
@@ -47,8 +48,10 @@ def factor(
     L_out: wp.array3d(dtype=real),
 ):
     """Cholesky's factor of the inertia with what constraints now hold, but for a skin's own rows, of which
-    the first of six are `own`; by the threads of a block."""
+    the first of six are `own`; by the threads of a block. Of worlds that are going."""
     w, t = wp.tid()
+    if going[w] == 0:
+        return
     threads = wp.block_dim()
     n = L_out.shape[1]
     for i in range(t, n, threads):
@@ -120,6 +123,7 @@ def substitute(L: wp.array3d(dtype=real), w: int, c: int, x: wp.array3d(dtype=re
 @wp.kernel
 def give(
     # In:
+    going: wp.array(dtype=int),
     L: wp.array3d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     # Out:
@@ -127,6 +131,8 @@ def give(
 ):
     """Accelerations of the degrees of freedom by a unit of the wrench on one body."""
     w, c = wp.tid()
+    if going[w] == 0:
+        return
     for i in range(L.shape[1]):
         response_out[w, c, i] = jacobian[c / 6, w, i][c % 6]
     substitute(L, w, c, response_out)
@@ -135,6 +141,7 @@ def give(
 @wp.kernel
 def move(
     # In:
+    going: wp.array(dtype=int),
     square: wp.array(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     response: wp.array3d(dtype=real),
@@ -143,6 +150,8 @@ def move(
 ):
     """A column of the compliance: motions of all bodies by that."""
     w, c = wp.tid()
+    if going[w] == 0:
+        return
     groups = jacobian.shape[0]
     for g in range(groups):
         m = vec6()
@@ -172,6 +181,7 @@ class Factor:
         self,
         m: "mjw.Model",
         d: "mjw.Data",
+        going: wp.array,
         inertia: wp.array,
         springs: bool = True,
         own: wp.array | None = None,
@@ -179,6 +189,7 @@ class Factor:
         """Factors the inertias. Launches only.
 
         Args:
+          going: (nworld,) of int, 1 where it is to be done.
           inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
           springs: whether constraints hold, as its solver left them. own: (slot, nworld) the first of six
             rows each that do not.
@@ -186,7 +197,7 @@ class Factor:
         efc, (none, no_slot) = d.efc, self._none
         held = [no_slot if own is None else own, d.nefc if springs else none]
         held += [efc.state, efc.J, efc.D, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
-        known = [inertia, *self._inertia_rows, *held]
+        known = [going, inertia, *self._inertia_rows, *held]
         launcher, n = Launcher(self.L.device), len(self.L)
         if self.L.device.is_cuda:
             launcher.launch_blocks(factor, [n], known, [self.L], block_dim=_BLOCK)
@@ -215,22 +226,30 @@ class Response:
         return self._factor.L
 
     def find(
-        self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, own: wp.array, jacobian: wp.array
+        self,
+        m: "mjw.Model",
+        d: "mjw.Data",
+        going: wp.array,
+        inertia: wp.array,
+        own: wp.array,
+        jacobian: wp.array,
     ) -> None:
         """Finds the response of bodies whose Jacobians are (group, world, dof). Launches only.
 
         Args:
+          going: (nworld,) of int, 1 where it is to be done.
           inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
           own: (slot, nworld) the first of six rows each that do not hold.
         """
-        self._factor.find(m, d, inertia, own=own)
+        self._factor.find(m, d, going, inertia, own=own)
         dim, device = self.response.shape[:2], self.response.device
-        wp.launch(give, dim, [self._factor.L, jacobian], [self.response], device=device)
+        wp.launch(give, dim, [going, self._factor.L, jacobian], [self.response], device=device)
 
-    def write(self, jacobian: wp.array, square: wp.array, compliance: wp.array) -> None:
+    def write(self, going: wp.array, jacobian: wp.array, square: wp.array, compliance: wp.array) -> None:
         """Writes the compliance [group, group, world] of what was found. Launches only.
 
         Args:
+          going: (nworld,) of int, 1 where it is to be done.
           square: (nworld,) by which an acceleration moves bodies to where the skin is solved [m per m/s^2].
         """
         groups, n, device = jacobian.shape[0], len(self.response), self.response.device
@@ -241,5 +260,5 @@ class Response:
             device=device,
             copy=False,
         )
-        known = [square, jacobian, self.response]
+        known = [going, square, jacobian, self.response]
         wp.launch(move, (n, 6 * groups), known, [entries], device=device)

@@ -8,10 +8,20 @@ from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, with
 from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
+from ..marks import MarkedWorlds, mark
 from .compliance import substitute
 from .rounds import Rounds, Solid, force_of
 
-__all__ = ["conclude", "find_gain", "withdraw", "pass_by", "restrain", "scale_push", "withhold"]
+__all__ = [
+    "conclude",
+    "find_energy",
+    "find_gain",
+    "pass_by",
+    "restrain",
+    "scale_push",
+    "withdraw",
+    "withhold",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,25 +74,26 @@ def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
 
 
 @wp.kernel
-def restrain(
+def find_energy(
     # In:
+    taking_part: wp.array(dtype=int),
     model: Model,
     last: Model,
     wrench: wp.array2d(dtype=vec6),
     solid: Solid,
     # In and out:
     r: Rounds,
-    greedy: wp.array(dtype=int),
-    any_greedy: wp.array(dtype=int),
-    again: wp.array(dtype=int),
+    # Out:
+    greedy_out: wp.array(dtype=int),
+    damped: MarkedWorlds,
 ):
-    """Finds the energy in the skins. Of those that would give more some are greedy: they have not yet made
-    backward Euler's step, which gives less. The others' push is taken.
-
-    What remains without it is the skin's tangent about the present pose: a damper. The energy is that of the
-    last step, and what those have put in who have moved bodies since.
-    """
+    """Finds the energy in the skins: that of the last step, and what those have put in who have moved bodies
+    since. Those that would give more are greedy while they have not yet made backward Euler's step, which
+    gives less: their worlds are marked."""
     w = wp.tid()
+    greedy_out[w] = 0
+    if taking_part[w] == 0:
+        return
     before = real(0.0)
     now = real(0.0)
     pushed = real(0.0)
@@ -102,14 +113,27 @@ def restrain(
     if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with, and elsewhere nothing
         store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
     r.store[w] = store
-    greedy[w] = 0
-    if overdraws(r, model, wrench, w):
-        if r.gamma[w] < real(EULER):
-            greedy[w] = 1
-            any_greedy[0] = 1
-        else:
-            r.push[w] = real(0.0)
-            again[0] = 1
+    if r.gamma[w] < real(EULER) and overdraws(r, model, wrench, w):
+        greedy_out[w] = 1
+        mark(damped, w)
+
+
+@wp.kernel
+def restrain(
+    # In:
+    taking_part: wp.array(dtype=int),
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    # In and out:
+    r: Rounds,
+    going: MarkedWorlds,
+):
+    """Takes the push of skins that would give more energy than they have, and marks their worlds. What
+    remains without it is the skin's tangent about the present pose: a damper."""
+    w = wp.tid()
+    if taking_part[w] == 1 and overdraws(r, model, wrench, w):
+        r.push[w] = real(0.0)
+        mark(going, w)
 
 
 @wp.kernel
@@ -141,43 +165,43 @@ def scale_push(
 @wp.kernel
 def withhold(
     # In:
+    going: wp.array(dtype=int),
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     # In and out:
     r: Rounds,
-    again: wp.array(dtype=int),
+    still_going: MarkedWorlds,
 ):
     """Withholds more where a share of the push still gives too much, at last all: also of a skin that gives
     too much only now that another one of its world pushes less."""
     w = wp.tid()
-    if r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
+    if going[w] == 0 or r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
         return
+    mark(still_going, w)
     if r.push[w] == real(1.0):
         r.push[w] = real(0.0)
-        again[0] = 1
         return
     r.push[w] = _withheld_further(r.push[w], r.store[w], r.without[w], given(r, model, wrench, w))
     r.trial[w] = r.trial[w] + 1
     if r.trial[w] == _TRIALS:
         r.push[w] = real(0.0)
-    again[0] = 1
 
 
 @wp.kernel
 def find_gain(
     # In:
+    taking_part: wp.array(dtype=int),
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     r: Rounds,
     # Out:
-    gains: wp.array(dtype=int),
-    any_gain: wp.array(dtype=int),
+    gains: MarkedWorlds,
 ):
-    """Worlds where a skin gives more than it has whatever is withheld, or what acts is no number."""
+    """Marks worlds where a skin gives more than it has whatever is withheld, or what acts is no number."""
     w = wp.tid()
-    if not given(r, model, wrench, w) <= wp.max(r.store[w], real(0.0)) + _ROUNDING * r.most[w]:
-        gains[w] = 1
-        any_gain[0] = 1
+    store = wp.max(r.store[w], real(0.0)) + _ROUNDING * r.most[w]
+    if taking_part[w] == 1 and not given(r, model, wrench, w) <= store:
+        mark(gains, w)
 
 
 @wp.kernel
@@ -285,6 +309,7 @@ def _frequency(power: wp.array2d(dtype=wp.vec2d), w: int):
 @wp.kernel
 def conclude(
     # In:
+    taking_part: wp.array(dtype=int),
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     reason: wp.array(dtype=int),
@@ -294,6 +319,8 @@ def conclude(
 ):
     """Keeps the energy that is left, and how fast bodies bounce."""
     w = wp.tid()
+    if taking_part[w] == 0:
+        return
     r.frequency[w] = _frequency(power, w)
     # what is withheld is in the skin all the same
     store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
@@ -305,10 +332,12 @@ def conclude(
 
 
 @wp.kernel
-def pass_by(area: real, r: Rounds):
-    """Instead of all rounds where no skin takes part: bodies go where they go, a skin has the energy of its
-    adhesion."""
+def pass_by(taking_part: wp.array(dtype=int), area: real, r: Rounds):
+    """Instead of all rounds in worlds where no skin takes part: bodies go where they go, a skin has the
+    energy of its adhesion."""
     w = wp.tid()
+    if taking_part[w] == 1:
+        return
     r.left[w] = real(0.0)
     if r.surface.shape[0] > 0:
         r.left[w] = r.surface[w] * area

@@ -21,7 +21,16 @@ from .compliance import Factor, substitute
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Correction", "Integrator", "Slope", "begin_correction", "corrections", "find_amiss", "judge"]
+__all__ = [
+    "Correction",
+    "Integrator",
+    "Slope",
+    "accept",
+    "begin_correction",
+    "corrections",
+    "find_amiss",
+    "judge",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,9 +96,11 @@ def _largest(m: vec6):
 
 
 @wp.kernel
-def begin_correction(c: Correction):
+def begin_correction(going: wp.array(dtype=int), c: Correction):
+    """Begins one in the worlds that are going."""
     w = wp.tid()
     c.rounds[w] = 0
+    c.going[w] = going[w]
     c.wrong[w] = real(0.0)
     c.most[w] = real(0.0)
     c.largest[w] = real(0.0)
@@ -110,6 +121,8 @@ def find_amiss(
     """After mujoco_warp's answer a, a' [world, dof]: what the correction of one skin lacks, whose bodies
     begin at `first`."""
     w = wp.tid()
+    if c.going[w] == 0:
+        return
     for g in range(jacobian.shape[0]):
         k = first + g
         motion = vec6()
@@ -127,6 +140,8 @@ def find_amiss(
 def leave_out(first: int, count: int, c: Correction):
     """A skin that takes no part, in the place of `find_amiss`."""
     w = wp.tid()
+    if c.going[w] == 0:
+        return
     for k in range(first, first + count):
         c.force[k, w] = vec6()
         c.amiss[k, w] = vec6()
@@ -142,6 +157,8 @@ def judge(c: Correction, again: wp.array(dtype=int)):
     c.wrong[w] = real(0.0)
     c.most[w] = real(0.0)
     c.largest[w] = real(0.0)
+    if c.going[w] == 0:
+        return
     c.going[w] = 0
     if c.rounds[w] < _MAX_CORRECTIONS and _poorly_corrected(wrong, most, largest, _CORRECTED):
         c.rounds[w] = c.rounds[w] + 1
@@ -252,8 +269,8 @@ class Slope:
         """Corrects the forces of `batches` (a Batch each), after mujoco_warp's constraint solver and
         `judge`; inertia: see `Integrator`. Launches only."""
         c, device = self.correction, d.qpos.device
-        self._held.find(m, d, d.M)
-        self._damped.find(m, d, inertia, springs=False)
+        self._held.find(m, d, c.going, d.M)
+        self._damped.find(m, d, c.going, inertia, springs=False)
         factors = [self._held.L, self._damped.L, d.M, m.M_rownnz, m.M_rowadr, m.M_colind]
         worlds, columns = c.found.shape[:2]
         for batch in batches:
@@ -273,6 +290,26 @@ def _damping_inputs() -> list[str]:
     from mujoco_warp._src import forward
 
     return [arg.label for arg in forward._compute_damping_deriv.adj.args if arg.label != "deriv_out"]
+
+
+@wp.kernel
+def accept_accelerations(
+    going: wp.array(dtype=int),
+    # In and out:
+    found: wp.array2d(dtype=float),
+    accepted: wp.array2d(dtype=float),
+):
+    w, i = wp.tid()
+    if going[w] == 1:
+        accepted[w, i] = found[w, i]
+    else:
+        found[w, i] = accepted[w, i]
+
+
+def accept(going: wp.array, found: wp.array, accepted: wp.array) -> None:
+    """Takes accelerations (nworld, nv) that were found in worlds that are going (nworld,), and puts back
+    those of the others. Launches only."""
+    wp.launch(accept_accelerations, found.shape, [going], [found, accepted], device=found.device)
 
 
 class Integrator:
@@ -295,7 +332,7 @@ class Integrator:
         self.qacc, self.inertia = d.qacc, d.M
         if not self.differs:
             return
-        self.qacc = wp.zeros_like(d.qacc)
+        self.qacc, self._found = wp.zeros_like(d.qacc), wp.zeros_like(d.qacc)
         self._matrix, self._now = wp.zeros_like(d.M), wp.zeros_like(d.M)
         self._factor, self._diagonal = wp.zeros_like(d.qLD), wp.zeros_like(d.qLDiagInv)
         self.inertia = self._matrix
@@ -329,17 +366,19 @@ class Integrator:
             rows = [m.opt.timestep, m.M_rownnz, m.M_rowadr, self._damping]
             self._launch(forward._euler_damp_qfrc, self._damping.shape, rows)
 
-    def integrate(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Finds `qacc` after mujoco_warp's constraint solver. Launches only."""
+    def integrate(self, m: "mjw.Model", d: "mjw.Data", going: wp.array) -> None:
+        """Finds `qacc` of the worlds that are going (nworld,), after mujoco_warp's constraint solver.
+        Launches only."""
         from mujoco_warp._src import forward, smooth
 
         if self._kind == _IMPLICIT:
             wp.copy(self._now, self._matrix)  # is factored in place
-            smooth.factor_solve_lu(m, d, self._now, self.qacc, d.efc.Ma)
+            smooth.factor_solve_lu(m, d, self._now, self._found, d.efc.Ma)
         else:
-            smooth.factor_solve_i(m, d, self._matrix, self._factor, self._diagonal, self.qacc, d.efc.Ma)
+            smooth.factor_solve_i(m, d, self._matrix, self._factor, self._diagonal, self._found, d.efc.Ma)
         if self._kind in (_FAST, _IMPLICIT):
-            forward.implicit_free_body(m, d, d.efc.Ma, self.qacc, solve=True)
+            forward.implicit_free_body(m, d, d.efc.Ma, self._found, solve=True)
+        accept(going, self._found, self.qacc)
 
     def _launch(self, kernel, dim, inputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self._matrix], device=self.qacc.device)

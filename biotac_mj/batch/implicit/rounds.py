@@ -13,6 +13,7 @@ from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
+from ..marks import MarkedWorlds, mark
 
 __all__ = [
     "Rounds",
@@ -185,10 +186,8 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
 
 @wp.kernel
 def use_euler(step: real, greedy: wp.array(dtype=int), r: Rounds):
-    """Makes the step that of backward Euler in greedy worlds, whose skins are to be solved again; all push
-    again."""
+    """Makes the step that of backward Euler in greedy worlds, whose skins are to be solved again."""
     w = wp.tid()
-    r.push[w] = real(1.0)
     if greedy[w] == 1:
         r.settled[w] = 0
         _set_gamma(r, w, step, real(EULER))
@@ -269,10 +268,10 @@ def look(
     model: Model,
     # In and out:
     r: Rounds,
-    again: wp.array(dtype=int),
+    going: MarkedWorlds,
 ):
-    """After the first solve: counts it; which worlds need no second look, since the bodies go where they were
-    thought to go. What else holds them leaves less of a change than their inertia."""
+    """After the first solve: counts it; marks worlds that need a second look, since the bodies do not go
+    where they were thought to go. What else holds them leaves less of a change than their inertia."""
     w = wp.tid()
     if awake[w] == 0:
         return
@@ -281,28 +280,29 @@ def look(
     if _distance_off(model, r, w) < _TOLERANCE:
         r.settled[w] = 1
     else:
-        again[0] = 1
+        mark(going, w)
 
 
 @wp.kernel
 def judge(
     # In:
+    going: wp.array(dtype=int),
     reason: wp.array(dtype=int),
     model: Model,
     # In and out:
     r: Rounds,
     wanted: wp.array(dtype=int),
-    again: wp.array(dtype=int),
+    still_going: MarkedWorlds,
 ):
-    """After MuJoCo's answer to the models: which worlds go again. Not those whose last solve found no
-    balance: another one is not worth its cost."""
+    """After MuJoCo's answer to the models: which of the worlds that are going go again. Not those whose last
+    solve found no balance: another one is not worth its cost."""
     w = wp.tid()
     wanted[w] = 0
-    if r.settled[w] == 1:
+    if going[w] == 0 or r.settled[w] == 1:
         return
     if _distance_off(model, r, w) < _TOLERANCE:
         r.settled[w] = 1
     elif reason[w] == CONVERGED and r.rounds[w] < r.limit:
         r.rounds[w] = r.rounds[w] + 1
         wanted[w] = 1
-        again[0] = 1
+        mark(still_going, w)
