@@ -5,7 +5,7 @@ skin and another sensor.
         [--observe electrodes none ...] [--seeds 0 1 2 3 4] [--worlds 512] [--minutes 10] [--policies DIR]
         [--hand DIR/shadow_hand/right_hand.xml] [--transfer 64]
     python benchmarks/touch_pays.py --score out/policies --transfer 16 --json OUT     # of policies that are
-    python benchmarks/touch_pays.py --table OUT
+    python benchmarks/touch_pays.py --table OUT [OUT ...] [--draw FILE.png]
 
 The policies of a task learn side by side, in shares of one batch, for --minutes in all; those that feel
 learned electrodes in a batch of their own. Success is that of one more episode in each world, from beginnings
@@ -25,7 +25,7 @@ import time
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-__all__ = ["UNSEEN", "main", "table", "transfer"]
+__all__ = ["UNSEEN", "draw", "main", "table", "transfer"]
 
 UNSEEN = {"dead": 1.0, "crosstalk": 1.0, "pdc_gain": 1.0}
 OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": UNSEEN}
@@ -91,6 +91,32 @@ def table(found: dict) -> str:
     return "\n".join(lines)
 
 
+def draw(found: dict, path: pathlib.Path) -> None:
+    """A picture of success by task and kind of touch: all seeds with their interval, each seed, and what is
+    left on the other skin and sensor."""
+    from matplotlib.figure import Figure
+
+    kinds, tasks = (list(dict.fromkeys(c[name] for c in found["policies"])) for name in ("observe", "task"))
+    groups = {"policies": found["policies"], "transfer": found.get("transfer", [])}
+    figure = Figure(figsize=(2.6 * len(tasks) + 1.0, 3.2), layout="constrained")
+    for axis, task in zip(figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0], tasks, strict=True):
+        for row, kind in enumerate(kinds):
+            for part, color, shift in (("policies", "C0", 0.0), ("transfer", "C1", 0.25)):
+                some = [s for s in groups[part] if (s["task"], s["observe"]) == (task, kind)]
+                score = _pooled(some)
+                if not score:
+                    continue
+                axis.barh(row + shift, score["success"], 0.22, color=color, alpha=0.5)
+                axis.plot([score["low"], score["high"]], 2 * [row + shift], color=color, lw=2)
+                seeds = [s["success"] for s in some if "success" in s]
+                axis.plot(seeds, len(seeds) * [row + shift], "k.", ms=4)
+        axis.set(title=task, xlim=(0, 1), ylim=(len(kinds) - 0.5, -0.5), xlabel="success")
+        axis.set_yticks(range(len(kinds)), kinds)
+    told = "as it learned" + (" (blue), other skin and sensor (orange)" if groups["transfer"] else "")
+    figure.suptitle(f"Synthetic sensors, {found['device']}; {told}", fontsize=9)
+    figure.savefig(path, dpi=120)
+
+
 def _rate(score):
     if "success" not in score:
         return "not played"
@@ -143,12 +169,22 @@ def _learn(options, tasks, own, written):
     return cards
 
 
+def _joined(files):
+    """What several files have, each policy once."""
+    found = dict(files[0])
+    for part in ("policies", "transfer"):
+        every = {(r["task"], r["observe"], r["seed"]): r for file in files for r in file.get(part, [])}
+        found[part] = list(every.values())
+    return found
+
+
 def main(arguments=None) -> int:
     from biotac_mj.cli.names import TASKS
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--json", type=pathlib.Path, help="file to write")
-    parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file, and end")
+    parser.add_argument("--table", type=pathlib.Path, nargs="+", help="print the table of files, and end")
+    parser.add_argument("--draw", type=pathlib.Path, help="with --table, a picture to write")
     parser.add_argument("--score", type=pathlib.Path, help="folder of policies that are scored, not trained")
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--observe", nargs="+", default=["electrodes", "none"], help="kinds of touch")
@@ -163,7 +199,10 @@ def main(arguments=None) -> int:
     parser.add_argument("--transfer", type=int, default=0, help="worlds of another skin and sensor")
     options = parser.parse_args(arguments)
     if options.table:
-        print(table(json.loads(options.table.read_text(encoding="utf-8"))))
+        found = _joined([json.loads(path.read_text(encoding="utf-8")) for path in options.table])
+        print(table(found))
+        if options.draw:
+            draw(found, options.draw)
         return 0
     if options.json is None:
         parser.error("--json FILE to write, or --table FILE to print")
