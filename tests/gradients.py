@@ -95,8 +95,8 @@ def balanced(skin, record):
     """The record at a balance to rounding, by Newton's method with the consistent tangent; the step there."""
     for _ in range(8):
         step = LinearStep(skin, record)
-        force = skin.data.force.numpy()[:, 0] * skin.model.free_mask.numpy()[:, None]
-        if np.linalg.norm(force) < 1e-10:
+        force = torch.from_numpy(skin.data.force.numpy() * skin.model.free_mask.numpy()[:, None, None])
+        if force.norm() < 1e-10:
             break
-        record = dataclasses.replace(record, x=record.x + step.solve(force.ravel()).reshape(-1, 3))
+        record = dataclasses.replace(record, x=record.x + step.solve(force))
     return record, step

@@ -51,25 +51,29 @@ def test_one_step_to_rounding(element, liquid):
     before and rest positions."""
     skin = ball(0.18, element=element, liquid=liquid)
     pos, _ = path(13)
-    mat = np.tile(np.eye(3), (13, 1, 1, 1))
+    mat = np.tile(np.eye(3), (1, 13, 1, 1, 1))
     rest = another_shape(skin)
-    steps = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False, rest.numpy()).steps
+    steps = follow(skin, pos.numpy()[None], mat, skin.friction, skin.own, rest.numpy()).steps
     mixed = [r for r in steps if 0 < len(r.slips) < len(r.touches) and len(r.held.sample)]
     record, step = balanced(skin, mixed[-1])
     assert (skin.data.core.trial_geom.numpy() >= 0).any()
     draw = np.random.default_rng(5)
     free = skin.model.free_mask.numpy()[:, None]
     nodes, anchors = (
-        1e3 * free * draw.normal(size=record.x.shape),
+        1e3 * free * draw.normal(size=record.x[:, 0].shape),
         draw.normal(size=step.touching.stick.shape),
     )
-    slopes = step.pull(nodes, np.zeros((1, 6)), 0.0, 1e3 * anchors, shape=True)
+    anchors_of_all = step.none()["anchor"]
+    anchors_of_all[step.touching.sample] = torch.from_numpy(1e3 * anchors)
+    none = torch.zeros(1, 1, 6).double(), torch.zeros(1).double()
+    slopes = step.pull(torch.from_numpy(nodes)[:, None], *none, anchors_of_all, shape=True)
     rest.requires_grad_()
     areas = [areas_at(rest, surface.surface.face_np) for surface in (skin.data.outer, skin.data.core)]
-    felt = [torch.from_numpy(slopes[name]) for name in ("area", "core_area")]
+    felt = [slopes[name][:, 0] for name in ("area", "core_area")]
     assert all(slope.any() for slope in felt)
     by_area = torch.autograd.grad(areas, rest, felt)[0].numpy()
-    slopes["rest"] = slopes["vert"] + by_area
+    slopes["rest"] = torch.from_numpy(slopes["vert"] + by_area)
+    slopes["anchor"] = slopes["anchor"][record.held.sample]
 
     def moved(h, name, way):
         shape = rest.detach().numpy()
@@ -78,16 +82,21 @@ def test_one_step_to_rounding(element, liquid):
         elif name == "pose":
             change = {"poses": record.poses | {"pos": record.poses["pos"] + h * way}}
         else:
-            shape, change = shape + h * way, {"x": record.x + h * (1 - free) * way}
+            moved = torch.from_numpy(h * (1 - free) * way)[:, None]
+            shape, change = shape + h * way, {"x": record.x + moved}
         skin.rest_at(shape)
         there, step = balanced(skin, dataclasses.replace(record, **change))
         after = skin.data.outer.trial_anchor.numpy()[step.touching.sample, 0]
-        return (nodes * there.x).sum() + 1e3 * (anchors * after).sum()
+        return (nodes * there.x[:, 0].numpy()).sum() + 1e3 * (anchors * after).sum()
 
-    sizes = {"pose": ((1, 3), 1e-8), "anchor": (record.held.anchor.shape, 1e-8), "rest": (rest.shape, 1e-8)}
+    sizes = {
+        "pose": ((1, 1, 3), 1e-8),
+        "anchor": (record.held.anchor.shape, 1e-8),
+        "rest": (rest.shape, 1e-8),
+    }
     for name, (shape, size) in sizes.items():
         way = draw.normal(size=shape)
-        expected = (slopes[name][..., :3] * way).sum()
+        expected = float((slopes[name][..., :3] * way).sum())
         found = differences(functools.partial(moved, name=name, way=way), size)
         assert found == pytest.approx(expected, rel=1e-6), name
 
@@ -118,7 +127,7 @@ def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, fric
     touch = np.array([x, (point[:, 1] - lift)[lift > 0].min(), z])
     pos = touch + np.array([0, depth, 0]) + np.linspace(0, 1e-3, 6)[:, None] * along
     mat = np.tile(np.eye(3), (6, 1, 1, 1))
-    before = follow(skin, pos[:5, None], mat[:5], skin.friction, skin.own, False).steps[-1]
+    before = follow(skin, pos[None, :5, None], mat[None, :5], skin.friction, skin.own).steps[-1]
     geoms, outer, force = skin.geoms, skin.data.outer, []
     begun, held = skin.state(geoms).save(), Held.of(outer)
     poses = {name: getattr(geoms.struct, name).numpy().copy() for name in ("pos_last", "mat_last")}
@@ -129,8 +138,8 @@ def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, fric
             getattr(geoms.struct, name).numpy()[:] = value
         geoms.set_pose(pos[5:] + far * along, mat[5])
         record = advance(skin, geoms, before, 1.0, skin.constants)
-        assert not record.changes.lost and record.on_core
-        force.append(record.wrench[0, :3])
+        assert not record.changes[0].lost and record.on_core
+        force.append(record.wrench[0, 0, :3].numpy())
     change = np.linalg.norm(np.diff(force, axis=0), axis=1)
     assert change.max() < 3 * np.median(change)
 
@@ -182,36 +191,38 @@ SHAPES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", SHAPES)
-def test_samples_on_every_shape(kind):
+@pytest.mark.parametrize("shape", SHAPES)
+def test_samples_on_every_shape(shape):
     """Force and anchor by place, anchor, friction and stiffness; some points lie at a kink."""
     draw, n = np.random.default_rng(3), 200
     hull = trimesh.creation.icosphere(subdivisions=1, radius=4e-3)
-    grids = [bake_distance_grid(hull.vertices, hull.faces)] if kind == "mesh" else ()
-    rounding = 5e-4 * (kind in ("box", "cylinder"))
-    geoms = GeomSet([kind], [SHAPES[kind]], rounding=[rounding], grids=grids)
+    grids = [bake_distance_grid(hull.vertices, hull.faces)] if shape == "mesh" else ()
+    rounding = 5e-4 * (shape in ("box", "cylinder"))
+    geoms = GeomSet([shape], [SHAPES[shape]], rounding=[rounding], grids=grids)
     way = draw.normal(size=(n, 3))
     local = way / np.linalg.norm(way, axis=1, keepdims=True) * draw.uniform(2e-3, 3.7e-3, (n, 1))
-    if kind == "plane":
+    if shape == "plane":
         local[:, 2] = -0.01 * abs(local[:, 2])
-    if kind == "mesh":
+    if shape == "mesh":
         points, face = trimesh.sample.sample_surface(hull, n, seed=4)
         local = points - 5e-5 * hull.face_normals[face]
-    given = [local, local + 2e-5 * draw.normal(size=(n, 3)), np.full(n, 0.5), np.full(n, 2e3)]
+    stick, ones = local + 2e-5 * draw.normal(size=(n, 3)), np.ones(n)
+    given = [torch.from_numpy(a) for a in (local, stick, 0.5 * ones, 2e3 * ones)]
+    kind, plane = torch.zeros(n, dtype=int), torch.zeros(n, 4).double()
     units = np.array([1e-2] * 3 + [1e-5] * 3)
 
     def felt(*given):
-        return differentiate_samples(geoms.struct, np.zeros(n, int), np.zeros((n, 4)), *given, 0.1)
+        return differentiate_samples(geoms.struct, kind, plane, *given, 0.1)
 
     own = felt(*given)
-    assert own.slips.any() or kind in ("sphere", "mesh")
+    assert (own.anchor != given[1]).any() or shape in ("sphere", "mesh")
     slopes = own.by_local, own.by_stick, own.by_friction[..., None], own.by_stiffness[..., None]
     for at, (slope, size) in enumerate(zip(slopes, (1e-9, 1e-9, 1e-5, 1e-2))):
-        way = draw.normal(size=given[at].shape)
+        way = torch.from_numpy(draw.normal(size=given[at].shape))
         ends = []
         for h in (size, -size):
             one = felt(*given[:at], given[at] + h * way, *given[at + 1 :])
-            ends.append(np.concatenate([one.force, one.anchor], 1))
+            ends.append(torch.cat([one.force, one.anchor], 1).numpy())
         found = (ends[0] - ends[1]) / (2 * size) / units
         expected = np.einsum("noi,ni->no", slope, way.reshape(n, -1)) / units
         error = np.abs(found - expected).max(1) / (np.abs(expected).max(1) + 1e-3)
@@ -221,16 +232,16 @@ def test_samples_on_every_shape(kind):
 def test_tangents_and_cotangents_are_of_one_jacobian():
     skin = ball(element="linear", liquid=True, bulk_modulus=1e5)  # others' slopes drown in that of water
     pos, _ = path(9)
-    mat = np.tile(np.eye(3), (9, 1, 1, 1))
-    trajectory = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False)
+    mat = np.tile(np.eye(3), (1, 9, 1, 1, 1))
+    trajectory = follow(skin, pos.numpy()[None], mat, skin.friction, skin.own)
     draw = np.random.default_rng(2)
     out = Outputs.of(trajectory)
     out = Outputs(*(draw.normal(size=a.shape) for a in (1e2 * out.nodes, out.wrench, 1e-4 * out.pressure)))
     areas = [surface.surface.area.numpy() for surface in (skin.data.outer, skin.data.core)]
     ahead = Inputs(
-        1e-4 * draw.normal(size=(2, 9, 1, 6)),
-        draw.normal(size=(2, 1)),
-        {name: skin.own[name] * draw.normal(size=2) for name in NUMBERS},
+        1e-4 * draw.normal(size=(2, 1, 9, 1, 6)),
+        draw.normal(size=(2, 1, 1)),
+        {name: skin.own[name] * draw.normal(size=(2, 1)) for name in NUMBERS},
         1e-5 * draw.normal(size=(2, skin.model.nvert, 3)),
         *(area * draw.normal(size=(2, len(area))) for area in areas),
     )
@@ -239,7 +250,7 @@ def test_tangents_and_cotangents_are_of_one_jacobian():
         one = (there.nodes[i] * out.nodes).sum() + (there.wrench[i] * out.wrench).sum()
         one += (there.pressure[i] * out.pressure).sum()
         other = (ahead.pose[i] * back.pose).sum() + (ahead.friction[i] * back.friction).sum()
-        other += sum(ahead.numbers[name][i] * back.numbers[name] for name in NUMBERS)
+        other += sum((ahead.numbers[name][i] * back.numbers[name]).sum() for name in NUMBERS)
         shape = [
             (getattr(ahead, name)[i] * getattr(back, name)).sum() for name in ("vert", "area", "core_area")
         ]

@@ -68,10 +68,11 @@ def press(estimator, along, around, share, gain=1.0):
     trajectory, steps = table.simulate(along, around, share)
     record, nodes = trajectory.steps[-1], len(estimator.geometry.vert)
     film = FilmConduction(estimator.geometry)
-    ratio = film.impedance(record.x[:nodes]) / film.impedance(trajectory.rest.x[:nodes])
+    pressed, rest = (of.x[:nodes, 0].numpy() for of in (record, trajectory.rest))
+    ratio = film.impedance(pressed) / film.impedance(rest)
     counts = counts_from_impedance(impedance_from_counts(REST) * ratio**gain)
-    pdc = float(counts_from_pressure(record.pressure - trajectory.rest.pressure))
-    wrench, middle = torch.from_numpy(record.wrench[0]), torch.from_numpy(table.middle(record.touches))
+    pdc = float(counts_from_pressure(float(record.pressure - trajectory.rest.pressure)))
+    wrench, middle = record.wrench[0, 0], torch.from_numpy(table.middle(record.touches))
     truth = outcome_of(wrench, middle).numpy()
     force, pressure = float(np.exp(truth[0])), pressure_change(pdc, PDC)
     return counts, pdc, Touch(change_of(counts, REST), pressure, force, truth[1:4])
@@ -140,16 +141,17 @@ def test_a_tilts_slope_is_that_of_tilted_presses(estimator):
     around = np.radians(-25.0)
     straight, steps = table.simulate(-0.0085, around)
     middle = torch.from_numpy(table.middle(straight.steps[-1].touches))
-    tilt, size = table._tangents(steps, around).pose[0], 0.02
+    tilt, size = table._tangents(steps, around).pose[0, 0], 0.02
     ends = []
     for h in (size, -size):
         pos = steps.pos + h * tilt[:, :, :3]
         mat = Rotation.from_rotvec(h * tilt[0, 0, 3:]).as_matrix() @ steps.mat
-        trajectory = follow(skin, pos, mat, skin.friction, skin.own, False)
+        trajectory = follow(skin, pos[None], mat[None], skin.friction, skin.own)
         record, nodes = trajectory.steps[-1], len(estimator.geometry.vert)
         film = FilmConduction(estimator.geometry)
-        signal = np.append(np.log(film.impedance(record.x[:nodes])), 1e-3 * record.pressure)
-        ends.append(np.append(signal, outcome_of(torch.from_numpy(record.wrench[0]), middle)[:4]))
+        x, pressure = record.x[:nodes, 0].numpy(), float(record.pressure)
+        signal = np.append(np.log(film.impedance(x)), 1e-3 * pressure)
+        ends.append(np.append(signal, outcome_of(record.wrench[0, 0], middle)[:4]))
     point = (4 * 7 + 0) * 9 + 8  # third place along, first around, deepest; at others slopes jump more
     slopes = np.append(table.by_press[point, 0], table.outcome_by[point, 0, :4])
     found = (ends[0] - ends[1]) / (2 * size)

@@ -10,10 +10,12 @@ from gradients import STEPS, assert_slopes, ball, loss_of, path
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import press
-from biotac_mj.differentiable.together.solve import Gmres, refuse_unsolved
+from biotac_mj.differentiable.linear.inverse import StepInverse, solve_by_gmres
+from biotac_mj.differentiable.linear.step import LinearStep
+from biotac_mj.differentiable.record import follow
+from biotac_mj.differentiable.skin import NUMBERS as OF_SKIN
+from biotac_mj.differentiable.skin import SkinWorlds
 from biotac_mj.skin import Material
-from biotac_mj.skin.program import Program
-from biotac_mj.skin.types import DOUBLE, SINGLE
 
 CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")
 OFF = [[0, 0, 0], [5e-5, 0, 2e-5], [-3e-4, -1e-4, 0]]
@@ -57,7 +59,7 @@ def test_every_input_against_differences(element):
     skin = ball(element=element, liquid=False)
     given = worlds(2)
     pressed = press(skin, **given, together="cpu")
-    assert (skin.together[1].data.core_force != 0).any((1, 2)).all()
+    assert (skin.together(2, "cpu").data.core_force != 0).any((1, 2)).all()
     loss_of(pressed).backward()
     draw = np.random.default_rng(1)
     ways = {name: draw.normal(size=value.shape) for name, value in given.items()}
@@ -102,8 +104,39 @@ def test_what_is_not_there_is_refused():
         press(dry, pos, quat, smoothing=1e-6, together="cpu")
     with pytest.raises(ValueError, match="together is 'gpu': give 'cpu', or a CUDA device"):
         press(dry, pos, quat, together="gpu")
-    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="no gradients forwards: leave"):
-        press(dry, forward_ad.make_dual(pos, pos), quat, together="cpu")
+
+
+def test_forwards_is_backwards():
+    skin, given = ball(element="linear", liquid=False), worlds(2, 9)
+    draw = torch.Generator().manual_seed(3)
+    ways = {n: torch.randn(v.shape, generator=draw, dtype=torch.float64) for n, v in given.items()}
+    ways = {name: STEPS[name] * way for name, way in ways.items()}
+    with forward_ad.dual_level():
+        dual = {name: forward_ad.make_dual(value.detach(), ways[name]) for name, value in given.items()}
+        ahead = forward_ad.unpack_dual(loss_of(press(skin, **dual, together="cpu"))).tangent.item()
+    back = sum((g * ways[n]).sum().item() for n, g in zip(given, gradients(skin, given, together="cpu")[1]))
+    assert ahead == pytest.approx(back, rel=1e-6)
+
+
+@pytest.mark.parametrize("transpose", [False, True])
+@pytest.mark.parametrize("preconditioner", ["sparse", "dense"])
+def test_inverse_of_steps_solves_as_the_factor_does(preconditioner, transpose):
+    """What CUDA takes, here on the CPU, in double and in single precision, where skin lies on the core."""
+    skin, given = ball(element="linear", liquid=False), worlds(2)
+    both = SkinWorlds(skin.model, skin.made_with, 2, skin.precision, preconditioner)
+    pos, mat = given["pos"].detach().numpy(), np.tile(np.eye(3), (2, 13, 1, 1, 1))
+    numbers = {name: skin.own[name] for name in OF_SKIN}
+    record = follow(both, pos, mat, given["friction"].detach().numpy(), numbers).steps[-1]
+    assert record.on_core and len(record.slips) and not any(change.lost for change in record.changes)
+    step = LinearStep(both, record)
+    right = torch.randn(record.x.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = step.solve(right, transpose)
+    step._inverses[transpose] = inverse = StepInverse(both, *step._blocks, transpose)
+    assert inverse(right).dtype is (torch.float32 if preconditioner == "dense" else torch.float64)
+    before = both.products
+    found = step.solve(right, transpose)
+    assert both.products - before < 60
+    assert (found - expected).abs().max() < 1e-6 * expected.abs().max()
 
 
 @pytest.mark.parametrize("single", [False, True])
@@ -116,42 +149,28 @@ def test_systems_of_worlds(single):
     right = torch.randn(n, w, 3, generator=draw, dtype=torch.float64)
     right[:, 1] = 0
 
-    precision = SINGLE if single else DOUBLE
-    p, q, r, z = (wp.zeros((n, w), dtype=precision.vec, device="cpu") for _ in range(4))
-    part = wp.zeros((1, n // 8, w), dtype=wp.float64, device="cpu")
-    mask, on = wp.ones(n, dtype=wp.float64, device="cpu"), wp.zeros(w, dtype=int, device="cpu")
+    def rows(v):
+        return v.permute(1, 0, 2).reshape(w, -1)
 
-    def solve(error, most):
-        gmres = Gmres(precision, 8, mask, p, q, r, z, part, on, error, most)
-        wp.to_torch(gmres.right).copy_(right)
+    def product(v):
+        return torch.einsum("wij,wj->wi", A, rows(v)).view(w, n, 3).permute(1, 0, 2)
 
-        def product(v, out):
-            v, flags = wp.to_torch(v).double().permute(1, 0, 2).reshape(w, -1), wp.to_torch(on).bool()
-            found = torch.einsum("wij,wj->wi", A, v).view(w, n, 3).permute(1, 0, 2)
-            wp.to_torch(out)[:, flags] = found[:, flags].to(wp.to_torch(out))
+    def inverse(v):
+        found = (rows(v) / near).view(w, n, 3).permute(1, 0, 2)
+        return found.float() if single else found
 
-        def inverse(v):
-            v = wp.to_torch(v)
-            wp.to_torch(z).copy_(
-                (v.permute(1, 0, 2).reshape(w, -1) / near.to(v)).view(w, n, 3).permute(1, 0, 2)
-            )
+    def solve(error, most, start=None):
+        how = {"digits": 1e-4, "restart": 40} if single else {}
+        return solve_by_gmres(product, inverse, right, error, start, most, **how)
 
-        def record(program):
-            products = (p, q), (gmres.x, gmres.product)
-            calls = [lambda own=own: program.call(lambda: product(*own)) for own in products]
-            gmres.put(program, *calls, lambda v: program.call(lambda: inverse(v)))
-
-        Program("cpu", record).run()
-        return wp.to_torch(gmres.x), gmres
-
-    x, gmres = solve(1e-9, 400)
-    exact = torch.linalg.solve(A, right.permute(1, 0, 2).reshape(w, -1))
-    assert (x.permute(1, 0, 2).reshape(w, -1) - exact).abs().max() < 1e-7 * exact.abs().max()
-    assert gmres.taken.numpy()[1] > 10 and not x[:, 1].any() and not gmres.failed.numpy().any()
-    failed = solve(1e-9, 3)[1].failed.numpy()
-    assert failed[0] == failed[2] == 4 and failed[1] == 0
+    x, count = solve(1e-9, 400)
+    exact = torch.linalg.solve(A, rows(right))
+    assert (rows(x) - exact).abs().max() < 1e-7 * exact.abs().max()
+    assert count > 10 and not x[:, 1].any()
+    again, fewer = solve(1e-9, 400, start=x * (1 + 1e-5))
+    assert fewer < count and (again - x).abs().max() < 1e-7 * x.abs().max()
     with pytest.raises(ValueError, match="of world 0 was not solved with 3 products"):
-        refuse_unsolved(failed)
+        solve(1e-9, 3)
 
 
 @CUDA

@@ -28,7 +28,7 @@ class _Press:
 
     Attributes:
       skin, indentation, parameters: of what.
-      scaled: (p,) parameters. steps: records. slopes: (p, nstep, nvert, 3) of their nodes.
+      scaled: (p,) parameters. steps: records. slopes: (p, 1, nstep, nvert, 3) of their nodes.
     """
 
     skin: Skin
@@ -42,12 +42,12 @@ class _Press:
         """Whether it is one of these."""
         return self.skin is skin and self.indentation is indentation and self.parameters == parameters
 
-    def ahead(self, scaled: np.ndarray) -> list[np.ndarray | None]:
-        """Where other parameters have the nodes (nvert, 3) of each step, to first order; None where none was
-        found, or a step may have several balances: which one is found there is to hang on the press alone,
+    def ahead(self, scaled: np.ndarray) -> list[torch.Tensor | None]:
+        """Where other parameters have the nodes (nvert, 1, 3) of each step, to first order; None where none
+        was found, or a step may have several balances: which one is found there is to hang on the press alone,
         and not on what was tried before."""
-        moved = np.tensordot(scaled - self.scaled, self.slopes, 1)
-        unsure = [step.on_core or step.changes.sharp or step.changes.lost for step in self.steps]
+        moved = np.tensordot(scaled - self.scaled, self.slopes, 1)[0, :, :, None]
+        unsure = [step.on_core or step.changes[0].sharp or step.changes[0].lost for step in self.steps]
         return [None if no else step.x + dx for step, dx, no in zip(self.steps, moved, unsure)]
 
 
@@ -87,29 +87,28 @@ class Forces:
         press = functools.partial(
             follow,
             skin,
-            steps.pos,
-            steps.mat,
+            steps.pos[None],
+            steps.mat[None],
             np.array([friction]),
-            dict(zip(NUMBERS, numbers(values).tolist())),
-            np.isinf(configuration.options.bulk_modulus),
+            dict(zip(NUMBERS, numbers(values))),
             dt=steps.dt,
         )
         scaled = np.array([p.scaled(float(v)) for p, v in zip(parameters, values)])
         last = self._last if self._last and self._last.of(skin, indentation, parameters) else None
         trajectory = press(near=last and last.ahead(scaled))
-        if last and trajectory.steps[-1].changes.lost:
+        if last and trajectory.steps[-1].changes[0].lost:
             trajectory = press()
         by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
         ahead = Inputs(
-            np.zeros((len(parameters), len(steps.pos), 1, 6)),
-            np.array(by_friction),
-            dict(zip(NUMBERS, slopes)),
+            np.zeros((len(parameters), 1, len(steps.pos), 1, 6)),
+            np.array(by_friction)[:, None],
+            dict(zip(NUMBERS, slopes[..., None])),
         )
         found = push_forward(skin, trajectory, ahead, last and last.slopes)
         self._last = _Press(skin, indentation, list(parameters), scaled, trajectory.steps, found.nodes)
-        change = found.wrench[:, steps.ends, 0, :3]
-        force = np.array([trajectory.steps[i].wrench[0, :3] for i in steps.ends])
-        return force, np.moveaxis(change, 0, -1), sum(r.changes.lost for r in trajectory.steps)
+        change = found.wrench[:, 0, steps.ends, 0, :3]
+        force = np.array([trajectory.steps[i].wrench[0, 0, :3].numpy() for i in steps.ends])
+        return force, np.moveaxis(change, 0, -1), sum(r.changes[0].lost for r in trajectory.steps)
 
     def prepare(
         self,

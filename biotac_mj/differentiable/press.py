@@ -7,6 +7,7 @@ import types
 
 import numpy as np
 import torch
+import warp as wp
 
 from ..geometry.edge_nodes import EDGES
 from ..geometry.rigid import matrix_entries
@@ -18,9 +19,7 @@ from .linear.rest import areas_at, cavity_at
 from .record import Changes, follow
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, Outputs, pull_back, push_forward
-from .tensors import real_tensor
-from .together.press import press_together
-from .together.skin import refuse_together
+from .tensors import real_tensor, skew
 
 __all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
 
@@ -96,7 +95,7 @@ def press(
         a quarter of it, and friction gives way earlier by as much. Contact with the core keeps its kinks. 0:
         Coulomb's law.
       together: "cpu" or a CUDA device, as "cuda:0", where all worlds are solved at once and what comes out
-        lies; backwards alone. None: one after another. Refused: liquid, rubber that remembers, rest_nodes,
+        lies. None: one after another. Refused: liquid, rubber that remembers, rest_nodes,
         smoothing.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
         (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
@@ -108,7 +107,7 @@ def press(
         tetrahedron is inverted, or what worlds that go together cannot have.
     """
     if together is not None:
-        refuse_together(skin, together, rest_nodes, smoothing)
+        _refuse_together(skin, together, rest_nodes, smoothing)
     pos, quat = real_tensor("pos", pos).cpu(), real_tensor("quat", quat).cpu()
     if (core_pos is None) != (core_quat is None):
         raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
@@ -141,27 +140,21 @@ def press(
     rest = _rest_of(skin, rest_nodes, nworld)
     times = _times_of(skin, dt, pos.shape[1])
     constants = _constants_of(skin, {"prony": prony, "mullins": mullins, "hysteresis": hysteresis}, nworld)
+    made = [numbers_of(skin, {name: v[w] for name, v in given.items()}, rest[w]) for w in range(nworld)]
+    made = torch.stack([torch.stack([own[name] for name in NUMBERS]) for own in made])
+    changes, mat, parts = [], _matrix(quat), []
     if together is not None:
-        stacked = [numbers_of(skin, {name: v[w] for name, v in given.items()}) for w in range(nworld)]
-        stacked = torch.stack([torch.stack([own[name] for name in NUMBERS]) for own in stacked])
-        path = pos, _matrix(quat), friction, stacked
-        nodes, wrench, changes = press_together(skin, together, *path)
-        pressure = nodes.new_zeros(nodes.shape[:2])
-        if alone:
-            nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
-        return Pressed(nodes, wrench, pressure, changes)
-    worlds, changes = [], []
-    for w in range(nworld):
-        numbers = numbers_of(skin, {name: value[w] for name, value in given.items()}, rest[w])
-        stacked = torch.stack([numbers[name] for name in NUMBERS])
-        changes.append([])
-        path = pos[w], _matrix(quat[w]), friction[w]
-        own = stacked, constants[w], *_shape_of(skin, rest[w])
-        worlds.append(_Press.apply(skin, changes[-1], times, smoothing, *path, *own))
-    nodes, wrench, pressure = (torch.stack(parts) for parts in zip(*worlds))
+        worlds, own = skin.together(nworld, together), (pos, mat, friction, made, constants[0])
+        found = _Press.apply(worlds, changes, times, 0.0, *own, None, None, None)
+    else:
+        for w, shape in enumerate(rest):
+            one = slice(w, w + 1)
+            own = pos[one], mat[one], friction[one], made[one], constants[w], *_shape_of(skin, shape)
+            parts.append(_Press.apply(skin, changes, times, smoothing, *own))
+        found = [torch.cat(of) for of in zip(*parts)]
     if alone:
-        nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
-    return Pressed(nodes, wrench, pressure, changes)
+        found = [one[0] for one in found]
+    return Pressed(*found, changes)
 
 
 def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -> dict:
@@ -259,6 +252,23 @@ def _rest_of(skin, nodes, nworld):
     return list(nodes)
 
 
+def _refuse_together(skin, device, rest_nodes, smoothing):
+    """What only worlds that go one after another can have, or a device that is not there."""
+    alone = "is not there for worlds that go together: leave `together` out"
+    if skin.model.has_liquid:
+        raise ValueError(f"liquid {alone}, or take liquid=False")
+    if skin.model.material.remembers:
+        raise ValueError(f"rubber with prony, mullins or hysteresis {alone}")
+    if rest_nodes is not None:
+        raise ValueError(f"rest_nodes {alone}")
+    if smoothing:
+        raise ValueError(f"smoothing {alone}")
+    try:
+        wp.get_device(device)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"together is {device!r}: give 'cpu', or a CUDA device that is there") from error
+
+
 def _refuse_smoothing(skin, width):
     """Of a mesh the distance is exact near its surface alone."""
     spacing = skin.geoms.struct.grids.spacing.numpy()
@@ -319,59 +329,57 @@ def _of_worlds(name, value, nworld, shape):
 
 
 class _Press(torch.autograd.Function):
-    """One world. Rotations are matrices here: their cotangents are those that lie along rotations."""
+    """All worlds of a skin. Rotations are matrices here: their cotangents lie along rotations."""
 
     @staticmethod
     def forward(context, skin, changes, dt, smoothing, pos, mat, friction, numbers, constants, *shape):
         context.skin, rest = skin, shape[0]
-        values = {name: float(value) for name, value in zip(NUMBERS, numbers)}
         path = (a.detach().numpy() for a in (pos, mat, friction))
-        incompressible = math.isinf(skin.model.options.bulk_modulus)
+        numbers = dict(zip(NUMBERS, numbers.detach().T))
         # a copy: who moves the nodes in place afterwards moves no checkpoint
         vert = None if rest is None else rest.detach().numpy().copy()
-        with skin.lock:
+        with skin.lock, skin.stream():
             context.trajectory = trajectory = follow(
-                skin, *path, values, incompressible, vert, dt, constants.detach().numpy().copy(), smoothing
+                skin, *path, numbers, vert, dt, constants.detach().numpy().copy(), smoothing
             )
             out = Outputs.of(trajectory)
-        changes += [record.changes for record in trajectory.steps]
+        changes += [list(of) for of in zip(*(record.changes for record in trajectory.steps))]
         context.mat = mat.detach()
-        return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
+        return out.nodes, out.wrench, out.pressure
 
     @staticmethod
     def jvp(context, _skin, _changes, _dt, _smoothing, pos, mat, friction, numbers, constants, *shape):
         rest, area, core_area = shape
-        count, zero = len(NUMBERS), torch.zeros(())
+        skin, zero = context.skin, torch.zeros((), dtype=torch.float64)
         pos, mat, friction, numbers = (zero if t is None else t for t in (pos, mat, friction, numbers))
         turn = (mat + torch.zeros_like(context.mat)) @ context.mat.transpose(-1, -2)
         turn = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1)
         pose = torch.cat([pos + torch.zeros_like(turn), turn], -1)
-        friction, numbers = friction.expand(context.mat.shape[1]), numbers.expand(count)
+        friction = friction.expand(skin.nworld, skin.geoms.count)
+        numbers = numbers.expand(skin.nworld, len(NUMBERS)).numpy()
         shape = (None, None, None)
         if rest is not None:
-            core_area = torch.zeros(context.skin.surfaces[1]) if core_area is None else core_area
+            core_area = torch.zeros(skin.surfaces[1]) if core_area is None else core_area
             shape = (t.numpy()[None] for t in (rest, area, core_area))
         ahead = Inputs(
-            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None])), *shape,
+            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.T[:, None])), *shape,
             None if constants is None else constants.numpy()[None],
         )  # fmt: skip
-        with context.skin.lock:
-            out = push_forward(context.skin, context.trajectory, ahead)
-        return tuple(torch.from_numpy(a[0]) for a in (out.nodes, out.wrench, out.pressure))
+        with skin.lock, skin.stream():
+            out = push_forward(skin, context.trajectory, ahead)
+        return tuple(skin.tensor(a[0]) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(context, nodes, wrench, pressure):
-        given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
-        with context.skin.lock:
-            found = pull_back(context.skin, context.trajectory, given, context.needs_input_grad[9])
-        mat = context.mat
+        skin, mat = context.skin, context.mat
+        with skin.lock, skin.stream():
+            found = pull_back(
+                skin, context.trajectory, Outputs(nodes, wrench, pressure), context.needs_input_grad[9]
+            )
         move, turn = torch.from_numpy(found.pose).split(3, -1)
-        x, y, z = turn.unbind(-1)
-        zero = torch.zeros_like(x)
-        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(mat.shape)
-        numbers = torch.tensor([found.numbers[name] for name in NUMBERS], dtype=torch.float64)
+        numbers = torch.from_numpy(np.stack([found.numbers[name] for name in NUMBERS], 1))
         shape = found.vert, found.area, found.core_area
         shape = (None if a is None else torch.from_numpy(a) for a in shape)
         own = numbers, torch.from_numpy(found.constants), *shape
-        return None, None, None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), *own
+        return None, None, None, None, move, 0.5 * skew(turn) @ mat, torch.from_numpy(found.friction), *own

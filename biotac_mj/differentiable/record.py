@@ -1,19 +1,22 @@
-"""A press step by step, with all that its gradient needs: the state in which every step began, and where it
-ended. No step is solved a second time."""
+"""A press of all worlds of a skin step by step, with all that its gradient needs: the state in which every
+step began, and where it ended. No step is solved a second time."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
+import torch
+import warp as wp
 
 from ..skin import GeomSet, step
 from ..skin.program import Launcher
 from ..skin.state import SavedState
 from .memory_constants import relaxed, write_constants
-from .skin import NUMBERS, Skin
-from .touching import Held, at_sharp_edges, look
+from .skin import NUMBERS, SkinWorlds
+from .touching import Held, at_sharp_edges, find_touching, rows, touching_samples
 
-__all__ = ["Changes", "Record", "Trajectory", "advance", "follow", "restore"]
+__all__ = ["Changes", "Record", "Trajectory", "advance", "follow", "hold_pressure", "restore"]
 
 _NOTHING = 1e-15  # of the largest energy density that rubber has borne
 _WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds`, as a step had them
@@ -45,39 +48,41 @@ class Changes:
 
 @dataclasses.dataclass
 class Record:
-    """One step.
+    """One step of all worlds; tensors lie where the skin does.
 
     Attributes:
       geoms: what touched: the skin's, or nothing.
-      x: (nvert, 3) nodes when it ended [m].
-      begun: state when it began; with a largest energy below any in the step in which a filling comes to
-        rest, which leaves rubber that has borne no more than that.
+      x, x_last: (nvert, nworld, 3) nodes when it ended and began [m].
+      begun: state of a single world on the CPU when it began; with a largest energy below any in the step in
+        which a filling comes to rest, which leaves rubber that has borne no more than that. Else None.
       held: what stuck then.
-      poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, ...).
-      numbers: of the world.
-      wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
+      poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, nworld, ...).
+      numbers: of the worlds, (nworld,).
+      wrench: (nworld, ngroup, 6) of the skin on the geoms. pressure: (nworld,) of the liquid above the
+        surroundings [Pa].
       touches, slips: samples that touch, that slip, when it ends.
       yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped in it, (n,) points
         that bore more than ever; empty without memory.
       on_core: samples that touch the core, when it ends.
-      changes: against the step before. smoothing: half width of first touch [m].
+      changes: of each world, against the step before. smoothing: half width of first touch [m].
       dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`.
     """
 
     geoms: GeomSet
-    x: np.ndarray
-    begun: SavedState
+    x: torch.Tensor
+    x_last: torch.Tensor
+    begun: SavedState | None
     held: Held
     poses: dict
     numbers: dict
-    wrench: np.ndarray
-    pressure: float
-    touches: np.ndarray
-    slips: np.ndarray
+    wrench: torch.Tensor
+    pressure: torch.Tensor
+    touches: torch.Tensor
+    slips: torch.Tensor
     yields: np.ndarray
     loads: np.ndarray
     on_core: int
-    changes: Changes
+    changes: list[Changes]
     dt: float
     constants: np.ndarray
     smoothing: float
@@ -94,35 +99,33 @@ class Trajectory:
 
 
 def follow(
-    skin: Skin,
+    skin: SkinWorlds,
     pos: np.ndarray,
     mat: np.ndarray,
     friction: np.ndarray,
     numbers: dict,
-    incompressible: bool,
     vert: np.ndarray | None = None,
     dt: np.ndarray | None = None,
     constants: np.ndarray | None = None,
     smoothing: float = 0.0,
-    near: Sequence[np.ndarray | None] | None = None,
+    near: Sequence[torch.Tensor | None] | None = None,
 ) -> Trajectory:
-    """Takes the geoms along a path, from a skin at rest.
+    """Takes the geoms along paths, from skins at rest.
 
     Args:
-      skin: the skin.
-      pos, mat: (nstep, ngeom, 3) [m], (nstep, ngeom, 3, 3) in the BioTac frame.
-      friction: (ngeom,). numbers: of NUMBERS.
-      incompressible: whether the liquid's pressure is an unknown of its own.
+      skin: the worlds.
+      pos, mat: (nworld, nstep, ngeom, 3) [m], (nworld, nstep, ngeom, 3, 3) in the BioTac frame.
+      friction: (ngeom,) or (nworld, ngeom). numbers: of NUMBERS, each of all worlds or (nworld,).
       vert: (nvert, 3) rest positions of the nodes [m]; None: the skin's.
       dt: (nstep,) times of the steps [s]; needed by a Prony series.
       constants: of the rubber's memory; None: the skin's.
       smoothing: half width of first touch, see `press` [m].
-      near: for each step nodes (nvert, 3) at which it begins to look for its balance [m], None: where the
-        step before leads. Then the press ends with the first step that is lost.
+      near: for each step nodes (nvert, nworld, 3) at which it begins to look for its balance [m], None: where
+        the step before leads. Then the press ends with the first step that is lost.
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
-    dt = np.ones(len(pos)) if dt is None else dt
+    dt = np.ones(pos.shape[1]) if dt is None else dt
     vert = skin.rest if vert is None else vert
     skin.rest_at(vert)
     data.reset()
@@ -131,67 +134,81 @@ def follow(
     geoms.set_friction(friction)
     rest = None
     if skin.model.has_liquid:
-        data.worlds.holds.fill_(int(incompressible or numbers["kappa"] == 0))
+        hold_pressure(skin)
         # filled slowly, as `skin.fill` does: after any time, and virgin
-        calm = relaxed(skin.model.material, constants)
-        write_constants(data, calm)
-        rest = advance(skin, skin.nothing, None, 1.0, calm)
+        settled = relaxed(skin.model.material, constants)
+        write_constants(data, settled)
+        rest = advance(skin, skin.nothing, None, 1.0, settled)
         if hasattr(rest.begun, "worst"):
             rest.begun.worst[:] = -np.inf
     if data.memory:
         write_constants(data, constants)
         data.memory.forget(data.x)
-    geoms.set_pose(pos[0], mat[0])
+    geoms.set_pose(pos[:, 0], mat[:, 0])
     geoms.advance()
     steps, before = [], None
-    for t, (p, m, h) in enumerate(zip(pos, mat, dt)):
-        geoms.set_pose(p, m)
+    for t in range(pos.shape[1]):
+        geoms.set_pose(pos[:, t], mat[:, t])
         if near and near[t] is not None:
-            data.increment.numpy()[:, 0] = near[t] - data.x.numpy()[:, 0]
+            wp.to_torch(data.increment).copy_(near[t] - wp.to_torch(data.x))
             data.worlds.guessed.fill_(1)
-        before = advance(skin, geoms, before, float(h), constants)
+        before = advance(skin, geoms, before, float(dt[t]), constants)
         steps.append(before)
-        if near and before.changes.lost:
+        if near and any(changes.lost for changes in before.changes):
             break
     return Trajectory(rest, steps, vert)
 
 
-def advance(skin: Skin, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray) -> Record:
+def hold_pressure(skin: SkinWorlds) -> None:
+    """The pressure of a liquid that keeps its volume is an unknown of its own."""
+    incompressible = math.isinf(skin.model.options.bulk_modulus)
+    kappa, holds = (wp.to_torch(getattr(skin.data.worlds, name)) for name in ("kappa", "holds"))
+    holds.copy_((kappa == 0) | incompressible)
+
+
+def advance(
+    skin: SkinWorlds, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray
+) -> Record:
     """Makes a step of dt [s] from the state that the skin has, to where the geoms are now. before: the step
     before, None: there is none. constants: of the rubber's memory."""
     data, outer, struct = skin.data, skin.data.outer, geoms.struct
-    begun, held = skin.state(geoms).save(), Held.of(outer)
+    begun = skin.state(geoms).save() if skin.model.has_liquid or data.memory else None
+    held, x_last = Held.of(outer), wp.to_torch(data.x).clone()
     names = ("pos", "mat", "pos_last", "mat_last", "friction")
-    poses = {name: getattr(struct, name).numpy()[:, 0].copy() for name in names}
+    poses = {name: wp.to_torch(getattr(struct, name)).clone() for name in names}
     step(skin.model, data, geoms, dt)
-    x = data.x.numpy()[:, 0].copy()
-    for name, value in poses.items():  # the step makes the last poses these
-        getattr(struct, name).numpy()[:, 0] = value
-    seen = look(outer, skin.weights, struct, x, begun.x, held)
+    x = wp.to_torch(data.x).clone()
+    _put_poses(geoms, poses)  # the step makes the last poses these
+    seen = find_touching(outer, skin.sample_weights, struct, x, x_last, held)
+    sharp = seen.sample[at_sharp_edges(struct, seen)]
     geoms.advance()
-    slips = (outer.trial_anchor.numpy()[seen.sample, 0] != seen.stick).any(1)
-    touches, slips = seen.sample, seen.sample[slips & (poses["friction"][seen.geom] > 0)]
-    yields, loads = _sides(skin, geoms, begun, before, bool((x != begun.x).any()))
-    changes = Changes(
-        lost=int(not data.converged[0] or data.worlds.increment.numpy()[0] > 0),
-        sharp=int(at_sharp_edges(struct, seen).sum()),
-    )
+    slips = (rows(outer.trial_anchor)[seen.sample] != seen.stick).any(1)
+    slips &= rows(struct.friction)[seen.geom] > 0 if geoms.count else slips
+    touches, slips = seen.sample, seen.sample[slips]
+    yields, loads = _sides(skin, geoms, begun, before, bool((x != x_last).any()))
+    counts = {"lost": torch.as_tensor(~data.converged | (data.worlds.increment.numpy() > 0)).long()}
+    of_worlds = {"sharp": sharp}
     if before is not None:
-        both = np.intersect1d(touches, before.touches)
-        changes = dataclasses.replace(
-            changes,
-            touched=len(touches) - len(both),
-            parted=len(before.touches) - len(both),
-            slipped=len(np.setdiff1d(np.intersect1d(slips, both), before.slips)),
-            stuck=len(np.setdiff1d(np.intersect1d(before.slips, both), slips)),
-            yielded=int((yields != before.yields).sum()),
-            softened=int((loads != before.loads).sum()),
-        )
-    pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
-    end = skin.read(*_WORLD), data.wrench[0], pressure
-    on_core = int((data.core.trial_geom.numpy() >= 0).sum()) if data.core else 0
-    past = dt, constants, skin.smoothing
-    return Record(geoms, x, begun, held, poses, *end, touches, slips, yields, loads, on_core, changes, *past)
+        stay, stayed = torch.isin(touches, before.touches), torch.isin(before.touches, touches)
+        both = touches[stay]
+        now, then = slips[torch.isin(slips, both)], before.slips[torch.isin(before.slips, both)]
+        of_worlds |= {
+            "touched": touches[~stay],
+            "parted": before.touches[~stayed],
+            "slipped": now[~torch.isin(now, before.slips)],
+            "stuck": then[~torch.isin(then, slips)],
+        }
+        counts |= {"yielded": torch.tensor([(yields != before.yields).sum()])}
+        counts |= {"softened": torch.tensor([(loads != before.loads).sum()])}
+    counts |= {name: torch.bincount(s % skin.nworld, minlength=skin.nworld) for name, s in of_worlds.items()}
+    counts = {name: count.expand(skin.nworld).tolist() for name, count in counts.items()}
+    changes = [Changes(**{name: of[w] for name, of in counts.items()}) for w in range(skin.nworld)]
+    pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else x.new_zeros(skin.nworld)
+    on_core = len(touching_samples(data.core.trial_geom)[0]) if data.core else 0
+    return Record(
+        geoms, x, x_last, begun, held, poses, skin.read(*_WORLD), skin.tensor(data.wrench).clone(), pressure,
+        touches, slips, yields, loads, on_core, changes, dt, constants, skin.smoothing,
+    )  # fmt: skip
 
 
 def _sides(skin, geoms, begun, before, moved):
@@ -213,20 +230,26 @@ def _sides(skin, geoms, begun, before, moved):
     return slipped, loads
 
 
-def restore(skin: Skin, record: Record) -> None:
+def restore(skin: SkinWorlds, record: Record) -> None:
     """Puts the skin where a step ended, with the contact and the liquid of there."""
-    data, struct = skin.data, record.geoms.struct
+    data = skin.data
     skin.write(record.numbers)
     skin.smooth(record.smoothing)
     if data.memory:
         write_constants(data, record.constants)
-    skin.state(record.geoms).load(record.begun)
+    if record.begun is not None:
+        skin.state(record.geoms).load(record.begun)
     if data.memory:
         data.dt.fill_(record.dt)
         data.memory.begin_step(Launcher("cpu"), data.dt, data.worlds.softness)
         skin.write({"softness": record.numbers["softness"]})
     record.held.give(data.outer)
-    data.x.numpy()[:, 0] = record.x
-    for name, value in record.poses.items():
-        getattr(struct, name).numpy()[:, 0] = value
+    wp.to_torch(data.x).copy_(record.x)
+    _put_poses(record.geoms, record.poses)
     skin.solver(record.geoms).evaluate_forces()
+
+
+def _put_poses(geoms: GeomSet, poses: dict) -> None:
+    """Gives geoms what a record's `poses` has."""
+    for name, value in poses.items():
+        wp.to_torch(getattr(geoms.struct, name)).copy_(value)

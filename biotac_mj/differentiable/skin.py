@@ -1,4 +1,4 @@
-"""A skin and its geoms that gradients can pass through: one world on the CPU, steps solved tightly."""
+"""Skins and their geoms that gradients can pass through, steps solved tightly."""
 
 import contextlib
 import dataclasses
@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import ArrayLike
 
@@ -13,13 +14,14 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.meshes import DistanceGrid
 from ..skin.program import Program
+from ..skin.rubber.element_forces import ElementForces
 from ..skin.state_arrays import StateArrays
 from ..skin.step import SkinStep, prepare_step
-from ..skin.types import real, vec3
-from .linear.inverse import FaceBlocks, Factors
+from ..skin.types import DOUBLE, real, vec3
+from .linear.inverse import Factors
 from .memory_constants import constants_of
 
-__all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond", "sum_corners"]
+__all__ = ["NUMBERS", "TOLERANCE", "Skin", "SkinWorlds", "refuse_beyond"]
 
 # of a step: the gradient is that of a balance, and wrong by as much as that is missed
 TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
@@ -31,7 +33,7 @@ NUMBERS = ("mu", "lam", "contact_stiffness", "natural", "kappa")
 
 
 @wp.kernel(module=f"{__name__}.sums", enable_backward=False)
-def sum_corners(
+def _sum_corners(
     # In:
     start: wp.array(dtype=int),
     slot: wp.array(dtype=int),
@@ -47,110 +49,129 @@ def sum_corners(
     sum_out[i, w] = total
 
 
-class Skin:
-    """A skin and what may touch it.
+class _Replayed:
+    """A program that is a CUDA graph from its second run on: the first compiles its kernels and makes
+    PyTorch's workspaces, which no capture may."""
+
+    def __init__(self, device, record):
+        self._program, self._device, self._runs, self._graph = Program(device, record), device, 0, None
+
+    def run(self):
+        self._runs += 1
+        if not self._device.is_cuda or self._runs == 1:
+            self._program.run()
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(self._device) as capture:
+                self._program.run()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+
+class SkinWorlds:
+    """A skin in several worlds on one device, and what may touch it.
 
     Args:
-      geometry: of the skin.
-      material: a preset's name or a Material.
-      options: SkinOptions; tolerance and limits are made at least as good as TOLERANCE, MAX_NEWTON and
-        MAX_WORK.
-      types, sizes, friction, groups, rounding, grids: of the geoms, as `skin.GeomSet` has them.
-      modulus: factors on Young's modulus, as `skin.SkinModel` has them.
-      precision: of the linear solves of a gradient; None: a hundredth of the steps' tolerance, which bounds
-        what a gradient is worth, and FINEST at least.
+      model: of the skin. made_with: arguments of `skin.GeomSet`. nworld: number of worlds.
+      precision: of the linear solves of a gradient.
+      preconditioner: of the steps, see `SkinData`.
+      smooths: whether first touch can be smooth.
+      owner: of the model, where it is another skin's, which moves its rest positions.
 
     Attributes:
-      model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
-      weights: (s, 3) barycentric, of the samples of a face.
+      model, data, geoms: SkinModel, SkinData, GeomSet. nothing: a GeomSet of none. nworld, device: of them.
+      weights: (s, 3) barycentric, of the samples of a face; sample_weights: the same, a tensor of the device.
       surfaces: numbers of outer faces, and of those that can meet the core.
-      of_inner_faces: matrices of blocks of the faces that the liquid wets; None of a solid.
-      factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
+      factors: of its stiffness, for linear solves on the CPU. products: that these took since
+        `begin_solves`.
       constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
-      rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
-        others lie on its edges.
+      rest: (nvert, 3) rest positions of all nodes that are solved [m].
       smoothing: half width of first touch of what is pressed now [m].
-      friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
-      made_of: geometry and modulus that it was given. made_with: what its GeomSet was.
       lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
-
-    Raises:
-      ValueError: an option whose gradient is not there, see `refuse_beyond`, or what the parts raise.
     """
 
     def __init__(
         self,
-        geometry: SkinGeometry,
-        material: str | Material = "default",
-        options: SkinOptions | None = None,
-        types: Sequence[str] = (),
-        sizes: Sequence = (),
-        friction: ArrayLike | None = None,
-        groups: ArrayLike | None = None,
-        rounding: ArrayLike | None = None,
-        grids: Sequence[DistanceGrid] = (),
-        modulus: ArrayLike | Callable | None = None,
-        precision: float | None = None,
+        model: SkinModel,
+        made_with: dict,
+        nworld: int,
+        precision: float,
+        preconditioner: str | None = None,
+        smooths: bool = False,
+        owner: "SkinWorlds | None" = None,
     ):
-        given = options or SkinOptions()
-        tight = dataclasses.replace(
-            given,
-            tolerance=min(given.tolerance, TOLERANCE),
-            max_newton=max(given.max_newton, MAX_NEWTON),
-            max_work=max(given.max_work, MAX_WORK),
-        )
-        self.precision = max(FINEST, 1e-2 * tight.tolerance) if precision is None else precision
-        self.model = SkinModel(geometry, material, tight, modulus=modulus)
-        self.rest, self.given = self.model.geometry.vert.copy(), geometry.nvert
-        self._lies = self.rest
-        refuse_beyond(self.model)
-        if "ellipsoid" in types:
-            raise ValueError("gradients of an ellipsoid are not there: take a mesh, or spheres and capsules")
-        self.data = SkinData(self.model)
-        # before a step is recorded, which takes the kernels that know of it
-        self.smoothing = 0.0
-        self.data.laws.struct.smoothing = self._smoothing = wp.zeros(1, dtype=real, device="cpu")
-        friction = np.full(len(types), self.model.material.friction) if friction is None else friction
-        names = "types", "sizes", "friction", "groups", "rounding", "grids"
-        self.made_of = geometry, modulus
-        self.made_with = dict(zip(names, (types, sizes, friction, groups, rounding, grids)))
-        self.geoms = GeomSet(**self.made_with)
-        self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
-        self.lock = threading.RLock()
-        self.together = None, None, None  # what its worlds at once were made for, they, what goes back there
-        self.nothing, self._states = GeomSet([], []), {}
-        # one for its own use; the other is that of the steps, and knows the shape in which these left it
-        self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
-        self._stepped = self.solver(self.geoms).k.elements
-        self._direction = wp.zeros_like(self.data.x)
+        self.model, self.made_with, self.nworld, self.precision = model, made_with, nworld, precision
+        self.device, self.lock = model.device, threading.RLock()
+        self.rest = model.geometry.vert.copy()
+        self._lies, self._owner = self.rest, owner
+        self.data = data = SkinData(model, nworld, preconditioner=preconditioner)
+        self.smoothing, self._smoothing = 0.0, None
+        if smooths:  # before a step is recorded, which takes the kernels that know of it
+            self._smoothing = wp.zeros(nworld, dtype=real, device=self.device)
+            data.laws.struct.smoothing = self._smoothing
+        self.geoms = GeomSet(**made_with, nworld=nworld, device=self.device)
+        self.nothing, self._states = GeomSet([], [], nworld=nworld, device=self.device), {}
+        core = data.core
+        self.surfaces = len(model.outer.face), len(core.surface.face) if core else 0
+        self.weights = model.sample.numpy()
+        self.constants = constants_of(model.material)
+        self.factors, self.products = None if self.device.is_cuda else Factors(model), 0
+        with wp.ScopedDevice(self.device):
+            self._on = wp.ones(nworld, dtype=int)
+            direction, at_nodes = (wp.zeros_like(data.x) for _ in range(2))
+        self._direction, self._at_nodes = (wp.to_torch(array) for array in (direction, at_nodes))
+        self.sample_weights = torch.as_tensor(self.weights, device=self.torch_device).double()
+        # one for its own use; the other is that of the steps, where these are in double, and knows the shape
+        # in which they left it
+        parts = model.elements, data.rubber, data.options, DOUBLE
+        self._elements, steps = ElementForces(*parts), self.solver(self.geoms)
+        self._stepped = steps.k.elements if data.precision is DOUBLE else self._elements
         # recorded: packing their arguments takes as long as what they do
-        self._at_nodes = wp.zeros_like(self.data.x)
-        x, on, p, total = self.data.x, self._on, self._direction, self._at_nodes
-        elements, stepped, inverted = self._elements, self._stepped, self.data.worlds.inverted
+        x, on, p, total = data.x, self._on, direction, at_nodes
+        elements, stepped, inverted = self._elements, self._stepped, data.worlds.inverted
         lists = [elements.start, elements.slot]
 
         def push(program):
             elements.push_corners(program, x, on, inverted)
-            program.launch(sum_corners, total.shape, [*lists, elements.corner_force], [total])
+            program.launch(_sum_corners, total.shape, [*lists, elements.corner_force], [total])
 
         def collect(program):
-            program.launch(sum_corners, total.shape, [*lists, stepped.corner_force], [total])
+            program.launch(_sum_corners, total.shape, [*lists, stepped.corner_force], [total])
 
         def multiply(program):
             stepped.multiply_corners(program, x, p, on)
-            program.launch(sum_corners, total.shape, [*lists, stepped.corner], [total])
+            program.launch(_sum_corners, total.shape, [*lists, stepped.corner], [total])
 
         self._push, self._collect, self._multiply = (
-            Program("cpu", record) for record in (push, collect, multiply)
+            _Replayed(self.device, record) for record in (push, collect, multiply)
         )
-        core = self.data.core
-        self.surfaces = len(self.model.outer.face), len(core.surface.face) if core else 0
-        self.weights = self.model.sample.numpy()
-        inner = self.model.inner  # None of a solid, which holds no liquid
-        self.of_inner_faces = FaceBlocks(inner.face_np, self.model.nvert) if inner else None
-        self.factors = Factors(self.model)
-        self.own = self.read(*NUMBERS)
-        self.constants = constants_of(self.model.material)
+        # of steps: into the preconditioner what is in `touching` and `block` of the surfaces; k.z of k.r
+        self.precondition = _Replayed(self.device, steps.put_preconditioner)
+        self.invert = _Replayed(self.device, lambda program: steps.put_inverse(program, steps.k.r))
+
+    # --- tensors ---
+
+    @property
+    def torch_device(self) -> torch.device:
+        """As PyTorch names it."""
+        return torch.device(str(self.device))
+
+    def tensor(self, array: np.ndarray) -> torch.Tensor:
+        """On the device."""
+        return torch.as_tensor(np.ascontiguousarray(array), device=self.torch_device)
+
+    @contextlib.contextmanager
+    def stream(self) -> Iterator[None]:
+        """PyTorch launches where Warp does."""
+        if not self.device.is_cuda:
+            yield
+            return
+        torch.cuda.synchronize(self.torch_device)
+        with torch.cuda.stream(wp.stream_to_torch(self.device)):
+            yield
+        torch.cuda.synchronize(self.torch_device)
+
+    # --- the skin ---
 
     def rest_at(self, vert: np.ndarray) -> None:
         """Lies at other rest positions (nvert, 3) [m], until it is told otherwise; a filled skin begins a
@@ -159,6 +180,9 @@ class Skin:
         Raises:
           ValueError: a tetrahedron would be inverted, degenerate or folded; then nothing has changed.
         """
+        if self._owner:
+            self._owner.rest_at(vert)
+            return
         if np.array_equal(vert, self._lies):
             return
         self.model.elements.rest_at(vert)
@@ -185,32 +209,73 @@ class Skin:
             self._states[id(geoms)] = StateArrays(self.data, geoms)
         return self._states[id(geoms)]
 
-    def multiply_rubber(self, p: np.ndarray) -> np.ndarray:
-        """(3 nvert,) tangent of the rubber where forces were evaluated last (`record.restore`), times p
-        (3 nvert,)."""
-        self._direction.numpy()[:, 0] = p.reshape(-1, 3)
+    def read(self, *names: str) -> dict:
+        """Numbers of `newton.worlds.Worlds` by name, (nworld,)."""
+        return {name: wp.to_torch(getattr(self.data.worlds, name)).clone() for name in names}
+
+    def write(self, numbers: dict) -> None:
+        """The inverse of `read`; numbers are of all worlds."""
+        for name, value in numbers.items():
+            wp.to_torch(getattr(self.data.worlds, name)).copy_(torch.as_tensor(value))
+
+    # --- linear algebra ---
+
+    def begin_solves(self) -> None:
+        """Before a gradient, which does not depend on those before."""
+        self.products = 0
+        if self.factors:
+            self.factors.begin()
+
+    def count_products(self, count: int, x: torch.Tensor) -> None:
+        """After a solve that took so many products with the tangent at x (nvert, nworld, 3) [m]."""
+        self.products += count
+        if self.factors and self.nworld == 1:
+            self.factors.watch(count, x[:, 0].numpy())
+
+    def multiply_rubber(self, p: torch.Tensor) -> torch.Tensor:
+        """Tangent of the rubber where forces were evaluated last (`record.restore`), times p (nvert, nworld,
+        3)."""
+        self._direction.copy_(p)
         return self._found(self._multiply)
 
     def _found(self, program):
         program.run()
-        return self._at_nodes.numpy().ravel().copy()
+        return self._at_nodes.clone()
 
     @contextlib.contextmanager
-    def another_lam(self, mu: float, lam: float) -> Iterator[float]:
-        """With another second constant of the law, which is told, on the same side of `Tetrahedra.cap`."""
-        other = 2 * lam if lam > self.model.elements.cap * mu else 0.5 * (lam or mu)
-        self.data.rubber.lam.fill_(other)
+    def another_lam(self) -> Iterator[torch.Tensor]:
+        """With another second constant of the law (nworld,), which is told, on the same side of
+        `Tetrahedra.cap`."""
+        mu, array = wp.to_torch(self.data.rubber.mu), wp.to_torch(self.data.rubber.lam)
+        lam = array.clone()
+        half = 0.5 * torch.where(lam == 0, mu, lam)
+        other = torch.where(lam > self.model.elements.cap * mu, 2 * lam, half)
+        array.copy_(other)
         yield other
-        self.data.rubber.lam.fill_(lam)
+        array.copy_(lam)
 
-    def virgin_rubber(self) -> np.ndarray:
-        """`push_virgin_rubber` where forces were evaluated last."""
-        return self.push_virgin_rubber() if self.data.memory else self._found(self._collect)
+    def rubber_slopes(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Slopes of the rubber's forces (nvert, nworld, 3) by both its constants, where they were evaluated
+        last.
 
-    def push_virgin_rubber(self) -> np.ndarray:
-        """(3 nvert,) forces at the nodes of rubber whose points have no past stress and do not soften [N]."""
+        They are homogeneous in both, and linear in the second on either side of where points feel no more of
+        it (`Tetrahedra.cap`): two evaluations are exact. What is not, its past and its softening, is left to
+        `linear.memory`."""
+        mu, lam = (wp.to_torch(getattr(self.data.rubber, name)).clone() for name in ("mu", "lam"))
+        with self.another_lam() as other:
+            there = self._push_virgin()
+        here = self._found(self._collect) if self._is_at_hand() else self._push_virgin()
+        by_lam = (there - here) / (other - lam)[:, None]
+        return (here - lam[:, None] * by_lam) / mu[:, None], by_lam
+
+    def _is_at_hand(self):
+        return self._stepped is not self._elements and not self.data.memory
+
+    def _push_virgin(self):
+        """Forces of rubber whose points have no past stress and do not soften [N]."""
         rubber = self.data.rubber
-        kept = [(a, wp.clone(a)) for a in (getattr(rubber, "past", None), rubber.mullins) if a is not None]
+        past = [getattr(rubber, "past", None), rubber.mullins] if self.data.memory else []
+        kept = [(a, wp.clone(a)) for a in past if a is not None]
         for array, _ in kept:
             array.zero_()
         force = self._found(self._push)
@@ -222,14 +287,77 @@ class Skin:
         """See `ElementForces.point_slopes`, where the nodes are."""
         return self._elements.point_slopes(self.data.x, change)
 
-    def read(self, *names: str) -> dict:
-        """Numbers of `newton.worlds.Worlds` by name."""
-        return {name: float(getattr(self.data.worlds, name).numpy()[0]) for name in names}
 
-    def write(self, numbers: dict) -> None:
-        """The inverse of `read`."""
-        for name, value in numbers.items():
-            getattr(self.data.worlds, name).fill_(value)
+class Skin(SkinWorlds):
+    """A skin and what may touch it, in a single world on the CPU.
+
+    Args:
+      geometry: of the skin.
+      material: a preset's name or a Material.
+      options: SkinOptions; tolerance and limits are made at least as good as TOLERANCE, MAX_NEWTON and
+        MAX_WORK.
+      types, sizes, friction, groups, rounding, grids: of the geoms, as `skin.GeomSet` has them.
+      modulus: factors on Young's modulus, as `skin.SkinModel` has them.
+      precision: of the linear solves of a gradient; None: a hundredth of the steps' tolerance, which bounds
+        what a gradient is worth, and FINEST at least.
+
+    Attributes:
+      own: NUMBERS of its material and filling. friction: (ngeom,) Coulomb's coefficients that a press has
+        unless it is given others.
+      given: how many of its nodes are the geometry's; others lie on its edges.
+
+    Raises:
+      ValueError: an option whose gradient is not there, see `refuse_beyond`, or what the parts raise.
+    """
+
+    def __init__(
+        self,
+        geometry: SkinGeometry,
+        material: str | Material = "default",
+        options: SkinOptions | None = None,
+        types: Sequence[str] = (),
+        sizes: Sequence = (),
+        friction: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+        rounding: ArrayLike | None = None,
+        grids: Sequence[DistanceGrid] = (),
+        modulus: ArrayLike | Callable | None = None,
+        precision: float | None = None,
+    ):
+        given = options or SkinOptions()
+        tight = dataclasses.replace(
+            given,
+            tolerance=min(given.tolerance, TOLERANCE),
+            max_newton=max(given.max_newton, MAX_NEWTON),
+            max_work=max(given.max_work, MAX_WORK),
+        )
+        model = SkinModel(geometry, material, tight, modulus=modulus)
+        refuse_beyond(model)
+        if "ellipsoid" in types:
+            raise ValueError("gradients of an ellipsoid are not there: take a mesh, or spheres and capsules")
+        friction = np.full(len(types), model.material.friction) if friction is None else friction
+        names = "types", "sizes", "friction", "groups", "rounding", "grids"
+        made_with = dict(zip(names, (types, sizes, friction, groups, rounding, grids)))
+        precision = max(FINEST, 1e-2 * tight.tolerance) if precision is None else precision
+        super().__init__(model, made_with, 1, precision, smooths=True)
+        self._made_of, self.given = (geometry, modulus), geometry.nvert
+        self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
+        self.own = {name: float(value) for name, value in self.read(*NUMBERS).items()}
+        self._together = None, None
+
+    def together(self, nworld: int, device: str) -> SkinWorlds:
+        """The same skin in several worlds on "cpu" or a CUDA device; the last ones are kept."""
+        with self.lock:
+            if self._together[0] != (nworld, device):
+                model, owner = self.model, self
+                if wp.get_device(device).is_cuda:
+                    geometry, modulus = self._made_of
+                    model = SkinModel(geometry, model.material, model.options, device, modulus=modulus)
+                    owner = None
+                made = SkinWorlds(model, self.made_with, nworld, self.precision, owner=owner)
+                made.lock = self.lock  # it may share the model
+                self._together = (nworld, device), made
+            return self._together[1]
 
 
 def refuse_beyond(model: SkinModel) -> None:

@@ -7,13 +7,14 @@ again when it is its turn."""
 import dataclasses
 
 import numpy as np
+import torch
 
 from .linear.memory import Memory
 from .linear.step import LinearStep
 from .record import Record, Trajectory
-from .skin import NUMBERS, Skin
+from .skin import NUMBERS, SkinWorlds
 
-__all__ = ["Anchors", "Inputs", "Outputs", "no_memory", "pull_back", "push_forward", "slope_of_reference"]
+__all__ = ["Inputs", "Outputs", "no_memory", "pull_back", "pull_pressure", "push_forward"]
 
 
 @dataclasses.dataclass
@@ -21,34 +22,35 @@ class Outputs:
     """What a press gives, or cotangents or tangents of it.
 
     Attributes:
-      nodes: (nstep, nvert, 3) [m]. wrench: (nstep, ngroup, 6) of the skin on the geoms [N, N m].
-      pressure: (nstep,) of the liquid above rest [Pa].
+      nodes: (nworld, nstep, nvert, 3) [m]. wrench: (nworld, nstep, ngroup, 6) of the skin on the geoms
+        [N, N m].
+      pressure: (nworld, nstep) of the liquid above rest [Pa].
     """
 
-    nodes: np.ndarray
-    wrench: np.ndarray
-    pressure: np.ndarray
+    nodes: torch.Tensor
+    wrench: torch.Tensor
+    pressure: torch.Tensor
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> "Outputs":
-        """What a press gave out."""
+        """What a press gave out, on the skin's device."""
         steps, rest = trajectory.steps, trajectory.rest
         begin = rest.pressure if rest else 0.0
         return cls(
-            np.array([r.x for r in steps]),
-            np.array([r.wrench for r in steps]),
-            np.array([r.pressure - begin for r in steps]),
+            torch.stack([r.x for r in steps]).permute(2, 0, 1, 3).contiguous(),
+            torch.stack([r.wrench for r in steps], 1),
+            torch.stack([r.pressure - begin for r in steps], 1),
         )
 
 
 @dataclasses.dataclass
 class Inputs:
-    """Cotangents or tangents of the inputs of a press.
+    """Cotangents or tangents of the inputs of a press, arrays of the host.
 
     Attributes:
-      pose: (nstep, ngeom, 6) translations [m] and rotation vectors about the geoms' origins [rad], in the
-        BioTac frame.
-      friction: (ngeom,). numbers: of `skin.NUMBERS`.
+      pose: (nworld, nstep, ngeom, 6) translations [m] and rotation vectors about the geoms' origins [rad], in
+        the BioTac frame.
+      friction: (nworld, ngeom). numbers: of `skin.NUMBERS`, (nworld,).
       vert: (nvert, 3) rest positions [m], which move rubber and fixed nodes; area, core_area: (nface,) of
         outer faces and of those that can meet the core, which move contact [m^2]. None: they stay.
       constants: (c,) of the rubber's memory, see `memory_constants.constants_of`. None: they stay.
@@ -63,125 +65,138 @@ class Inputs:
     constants: np.ndarray | None = None
 
 
-def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool = False) -> Inputs:
+def pull_back(skin: SkinWorlds, trajectory: Trajectory, outputs: Outputs, shape: bool = False) -> Inputs:
     """Cotangents of the inputs from those of the outputs; shape: of rest positions and areas too."""
     skin.rest_at(trajectory.vert)
-    steps, holds = trajectory.steps, bool(skin.data.worlds.holds.numpy()[0])
-    pose = np.zeros((len(steps), skin.geoms.count, 6))
-    friction, numbers = np.zeros(skin.geoms.count), dict.fromkeys(NUMBERS, 0.0)
-    x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, Anchors()
-    vert, area, core_area = np.zeros_like(x), *(np.zeros(n) for n in skin.surfaces)
+    steps, w, ngeom = trajectory.steps, skin.nworld, skin.geoms.count
+    nodes, wrench, pressures = (
+        torch.as_tensor(getattr(outputs, name), device=skin.torch_device)
+        for name in ("nodes", "wrench", "pressure")
+    )
+    nodes, wrench, pressures = nodes.permute(1, 2, 0, 3), wrench.permute(1, 2, 0, 3), pressures.T
+    like = steps[0].x
+    pose, friction = like.new_zeros((len(steps), ngeom, w, 6)), like.new_zeros((ngeom, w))
+    numbers = {name: like.new_zeros(w) for name in NUMBERS}
+    x, pressure, anchor = torch.zeros_like(like), like.new_zeros(w), None
+    vert, area, core_area = np.zeros(like[:, 0].shape), 0.0, 0.0
     memory, constants = no_memory(skin), np.zeros(len(skin.constants))
-    skin.factors.begin()
+    skin.begin_solves()
 
     def back(record, x, wrench, pressure):
-        nonlocal anchors, vert, area, core_area, memory
+        nonlocal anchor, vert, area, core_area, memory
         step = LinearStep(skin, record)
-        given = step.pull(x, wrench, pressure, anchors.of(step.touching.sample), shape, memory)
+        anchor = step.none()["anchor"] if anchor is None else anchor
+        given = step.pull(x, wrench, pressure, anchor, shape, memory)
         if memory:
             memory = given["memory"]
         if shape:
             vert, area, core_area = vert + given["vert"], area + given["area"], core_area + given["core_area"]
-        anchors = Anchors(record.held.sample, given["anchor"])
+        anchor = given["anchor"]
         for name in NUMBERS:
-            numbers[name] += float(given[name])
-        last = given["reference"] * slope_of_reference(record) + (given["offset"] if holds else 0.0)
-        return given, given["x_last"], float(last)
+            numbers[name] += given[name]
+        return given, given["x_last"], pull_pressure(skin, record, given)
 
     for t in reversed(range(len(steps))):
-        own = float(outputs.pressure[t])
-        given, x, pressure = back(steps[t], x + outputs.nodes[t], outputs.wrench[t], pressure + own)
+        given, x, pressure = back(steps[t], x + nodes[t], wrench[t], pressure + pressures[t])
         pose[t] += given["pose"]
         pose[max(t - 1, 0)] += given["pose_last"]
         friction += given["friction"]
         constants += given.get("constants", 0.0)
     if trajectory.rest:
-        x = back(trajectory.rest, x, np.zeros((0, 6)), pressure - float(outputs.pressure.sum()))[1]
-    if not shape:
-        return Inputs(pose, friction, numbers, constants=constants)
-    return Inputs(pose, friction, numbers, vert + x, area, core_area, constants)  # a press begins at rest
+        none = like.new_zeros((0, w, 6))
+        x = back(trajectory.rest, x, none, pressure - pressures.sum(0))[1]
+    numbers = {name: value.cpu().numpy() for name, value in numbers.items()}
+    found = Inputs(
+        pose.permute(2, 0, 1, 3).cpu().numpy(), friction.T.cpu().numpy(), numbers, constants=constants
+    )
+    if shape:  # a press begins at rest
+        found.vert = vert + x[:, 0].numpy()
+        found.area, found.core_area = area[:, 0].numpy(), core_area[:, 0].numpy()
+    return found
 
 
 def push_forward(
-    skin: Skin, trajectory: Trajectory, inputs: Inputs, near: np.ndarray | None = None
+    skin: SkinWorlds, trajectory: Trajectory, inputs: Inputs, near: np.ndarray | None = None
 ) -> Outputs:
     """Tangents of the outputs from those of the inputs, k of them at once.
 
     Args:
-      inputs: with arrays of a leading k: pose (k, nstep, ngeom, 6), friction (k, ngeom), numbers (k,), ...
-      near: (k, nstep, nvert, 3) nodes' tangents of nearly the same press, from which less is left to find.
+      inputs: with arrays of a leading k: pose (k, nworld, nstep, ngeom, 6), friction (k, nworld, ngeom),
+        numbers (k, nworld), ...
+      near: (k, nworld, nstep, nvert, 3) nodes' tangents of nearly the same press, from which less is left to
+        find.
 
     Returns:
-      Outputs with a leading k.
+      Outputs with a leading k, arrays of the host.
     """
     skin.rest_at(trajectory.vert)
-    steps, k, holds = trajectory.steps, len(inputs.pose), bool(skin.data.worlds.holds.numpy()[0])
-    n, ngroup = skin.model.nvert, skin.geoms.ngroup
-    shape = k, len(steps)
-    out = Outputs(np.zeros((*shape, n, 3)), np.zeros((*shape, ngroup, 6)), np.zeros(shape))
-    x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [Anchors()] * k
-    begin, moves, memory = np.zeros(k), inputs.vert is not None, [no_memory(skin)] * k
+    steps, k, like = trajectory.steps, len(inputs.pose), trajectory.steps[0].x
+    pose, friction = skin.tensor(inputs.pose).permute(0, 2, 3, 1, 4), skin.tensor(inputs.friction).mT
+    numbers = {name: skin.tensor(inputs.numbers[name]) for name in NUMBERS}
+    near = None if near is None else skin.tensor(near).permute(2, 0, 3, 1, 4)
+    moves, none = inputs.vert is not None, like.new_zeros(skin.nworld)
+    x, pressure, anchors = [torch.zeros_like(like)] * k, [none] * k, [None] * k
+    memory, out = [no_memory(skin)] * k, []
     constants = np.zeros((k, len(skin.constants))) if inputs.constants is None else inputs.constants
+    constants = torch.as_tensor(constants)
     if moves:
-        x = x + inputs.vert
-    skin.factors.begin()
+        vert, area, core_area = map(skin.tensor, (inputs.vert, inputs.area, inputs.core_area))
+        x = [own + vert[i][:, None] for i, own in enumerate(x)]
+    skin.begin_solves()
 
     def ahead(record, t):
-        step = LinearStep(skin, record)
-        wrench = np.zeros((k, record.geoms.ngroup, 6))
+        step, wrench = LinearStep(skin, record), []
         for i in range(k):
-            given = {name: inputs.numbers[name][i] for name in NUMBERS}
-            given |= {"x_last": x[i], "anchor": anchors[i].of(record.held.sample)}
-            given["reference"] = pressure[i] * slope_of_reference(record)
-            given["offset"] = pressure[i] if holds else 0.0
+            given = {name: value[i] for name, value in numbers.items()} | {"x_last": x[i]}
+            if anchors[i] is not None:
+                given["anchor"] = anchors[i]
+            given |= _push_pressure(skin, record, pressure[i])
             if t is not None:
-                given |= {"pose": inputs.pose[i, t], "pose_last": inputs.pose[i, max(t - 1, 0)]}
-                given["friction"] = inputs.friction[i]
+                given |= {"pose": pose[i, t], "pose_last": pose[i, max(t - 1, 0)], "friction": friction[i]}
             if moves:
-                given |= {"area": inputs.area[i], "core_area": inputs.core_area[i]}
-            own = constants[i] if t is not None else 0 * constants[i]
-            x[i], wrench[i], pressure[i], held, memory[i] = step.push(
+                given |= {"area": area[i][:, None], "core_area": core_area[i][:, None]}
+            x[i], six, pressure[i], anchors[i], memory[i] = step.push(
                 given,
-                inputs.vert[i] if moves else None,
+                vert[i] if moves else None,
                 memory[i],
-                own,
-                None if near is None or t is None else near[i, t],
+                constants[i] if t is not None else 0 * constants[i],
+                None if near is None or t is None else near[t, i],
             )
-            anchors[i] = Anchors(step.touching.sample, held)
-        return wrench
+            wrench.append(six)
+        return torch.stack(wrench)
 
+    begin = none
     if trajectory.rest:
         ahead(trajectory.rest, None)
-        begin = pressure.copy()
+        begin = torch.stack(pressure)
     for t, record in enumerate(steps):
-        out.wrench[:, t] = ahead(record, t)
-        out.nodes[:, t], out.pressure[:, t] = x, pressure - begin
-    return out
+        wrench = ahead(record, t)
+        out.append((torch.stack(x), wrench, torch.stack(pressure) - begin))
+    nodes, wrench, pressures = (torch.stack(parts, 1) for parts in zip(*out))
+    found = nodes.permute(0, 3, 1, 2, 4), wrench.permute(0, 3, 1, 2, 4), pressures.mT
+    return Outputs(*(a.cpu().numpy() for a in found))
 
 
-def slope_of_reference(record: Record) -> float:
+def pull_pressure(skin: SkinWorlds, record: Record, given: dict) -> torch.Tensor:
+    """(nworld,) cotangent of the pressure when a step began, from those of what the step was given."""
+    holds = torch.as_tensor(skin.data.worlds.holds.numpy(), device=skin.torch_device)
+    return given["reference"] * _slope_of_reference(record) + holds * given["offset"]
+
+
+def _push_pressure(skin: SkinWorlds, record: Record, pressure: torch.Tensor) -> dict:
+    """Tangents of what a step was given by the pressure (nworld,) when it began."""
+    holds = torch.as_tensor(skin.data.worlds.holds.numpy(), device=skin.torch_device)
+    return {"reference": pressure * _slope_of_reference(record), "offset": pressure * holds}
+
+
+def _slope_of_reference(record: Record) -> float:
     """Of `newton.worlds.Worlds.reference` by the last pressure: its size, but for a least one."""
-    reference = record.numbers["reference"]
+    if record.begun is None:
+        return 0.0
     pressure = record.begun.last_pressure
-    return float(np.sign(pressure)) if abs(pressure) == reference else 0.0
+    return float(np.sign(pressure)) if abs(pressure) == float(record.numbers["reference"]) else 0.0
 
 
-def no_memory(skin: Skin) -> Memory | None:
+def no_memory(skin: SkinWorlds) -> Memory | None:
     """A press begins at a state without any, and what that remembers stays as it is."""
     return Memory.none(skin.model.material, skin.data.memory.npoint) if skin.data.memory else None
-
-
-class Anchors:
-    """Vectors of samples by number; of others they are zero."""
-
-    def __init__(self, sample: np.ndarray | None = None, value: np.ndarray | None = None):
-        if sample is None:
-            sample, value = np.zeros(0, int), np.zeros((0, 3))
-        self._sample, self._value = sample, value
-
-    def of(self, sample: np.ndarray) -> np.ndarray:
-        """(m, 3) of samples (m,)."""
-        out = np.zeros((len(sample), 3))
-        both, here, there = np.intersect1d(sample, self._sample, return_indices=True)
-        out[here] = self._value[there]
-        return out

@@ -8,7 +8,7 @@ import torch
 
 from ..short_repr import short_repr
 
-__all__ = ["TORCH", "real_tensor"]
+__all__ = ["TORCH", "add_rows", "real_tensor", "skew"]
 
 # names that `sensor.formulas` ask of numpy
 TORCH = types.SimpleNamespace(
@@ -16,6 +16,18 @@ TORCH = types.SimpleNamespace(
 )
 
 _ARRAYS = torch.Tensor, np.ndarray, np.generic
+
+
+def skew(v: torch.Tensor) -> torch.Tensor:
+    """`geometry.rigid.skew` of tensors: (..., 3) to (..., 3, 3)."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape, 3)
+
+
+def add_rows(into: torch.Tensor, at: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    """Adds value (m, ...) to the rows `at` (m,) of `into`, some of them more than once; returns that."""
+    return into.index_add_(0, at.reshape(-1), value.reshape(-1, *into.shape[1:]))
 
 
 def real_tensor(

@@ -1,11 +1,11 @@
 """Which samples of a surface touch, where they are in their geom's frame, and where they stick.
 
-All worlds of a skin are looked at together: samples, geoms and nodes have the numbers that they have in
-arrays [item, world] read row by row, item * nworld + world."""
+Samples, geoms and nodes of all worlds have the numbers that they have in arrays [item, world] read row by
+row, item * nworld + world. All tensors lie where the skin does."""
 
 import dataclasses
+import typing
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -14,7 +14,7 @@ from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
 
-__all__ = ["Held", "Touching", "at_sharp_edges", "flat", "look", "numbers_of_touching", "rows"]
+__all__ = ["Held", "Touching", "at_sharp_edges", "find_touching", "rows", "touching_samples"]
 
 _NEARER = (
     0.25  # of a sample's spacing, by which another side of a geom is nearer: 90 degrees, no tessellation
@@ -29,61 +29,40 @@ class Held:
       sample, geom: (n,) samples and the geoms they touched. anchor: (n, 3) in those geoms' frames [m].
     """
 
-    sample: np.ndarray
-    geom: np.ndarray
-    anchor: np.ndarray
+    sample: torch.Tensor
+    geom: torch.Tensor
+    anchor: torch.Tensor
 
     @classmethod
-    def none(cls) -> "Held":
+    def none(cls, device: torch.device | str = "cpu") -> typing.Self:
         """Nothing."""
-        return cls(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
+        number = torch.zeros(0, dtype=torch.int64, device=device)
+        return cls(number, number, torch.zeros((0, 3), dtype=torch.float64, device=device))
 
     @classmethod
-    def of(cls, state: ContactState) -> "Held":
+    def of(cls, state: ContactState) -> typing.Self:
         """What the surface remembers now."""
-        sample, geom = numbers_of_touching(state.anchor_geom)
-        return cls(sample, geom, rows(state.anchor, sample))
+        sample, geom = touching_samples(state.anchor_geom)
+        return cls(sample, geom, rows(state.anchor)[sample])
 
     def give(self, state: ContactState) -> None:
         """The inverse of `of`."""
-        state.anchor_geom.fill_(-1)
-        set_rows(state.anchor_geom, self.sample, self.geom // state.anchor_geom.shape[1])
-        set_rows(state.anchor, self.sample, self.anchor)
+        geoms = rows(state.anchor_geom)
+        geoms.fill_(-1)
+        geoms[self.sample] = (self.geom // state.anchor_geom.shape[1]).int()
+        rows(state.anchor)[self.sample] = self.anchor
 
 
-def numbers_of_touching(geom: wp.array) -> tuple[np.ndarray, np.ndarray]:
+def rows(array: wp.array) -> torch.Tensor:
+    """An array [item, world] row by row: a view."""
+    return wp.to_torch(array, requires_grad=False).flatten(0, 1)
+
+
+def touching_samples(geom: wp.array) -> tuple[torch.Tensor, torch.Tensor]:
     """Samples (n,) that have a geom in an array [sample, world], which has -1 for none, and these geoms."""
-    if geom.device.is_cuda:  # no more than these are copied
-        found = wp.to_torch(geom).ravel()
-        sample = torch.nonzero(found >= 0).ravel()
-        sample, found = (a.cpu().numpy() for a in (sample, found[sample]))
-    else:
-        found = geom.numpy().ravel()
-        sample = np.flatnonzero(found >= 0)
-        found = found[sample]
-    return sample, found.astype(int) * geom.shape[1] + sample % geom.shape[1]
-
-
-def rows(array: wp.array, number: np.ndarray) -> np.ndarray:
-    """(n, ...) of an array [item, world] by number; of CUDA no more than these are copied."""
-    if not array.device.is_cuda:
-        return flat(array)[number]
-    return wp.to_torch(array).flatten(0, 1)[torch.from_numpy(number).to(str(array.device))].cpu().numpy()
-
-
-def set_rows(array: wp.array, number: np.ndarray, value: np.ndarray) -> None:
-    """The inverse of `rows`."""
-    if not array.device.is_cuda:
-        flat(array)[number] = value
-        return
-    at = wp.to_torch(array).flatten(0, 1)
-    at[torch.from_numpy(number).to(at.device)] = torch.from_numpy(value).to(at.device, at.dtype)
-
-
-def flat(array: wp.array) -> np.ndarray:
-    """An array [item, world] row by row; on the CPU its own memory."""
-    found = array.numpy()
-    return found.reshape(-1, *found.shape[2:])
+    found, nworld = rows(geom), geom.shape[1]
+    sample = torch.nonzero(found >= 0).ravel()
+    return sample, found[sample].long() * nworld + sample % nworld
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,8 +70,8 @@ class Touching:
     """m samples that touch, as the last evaluation of the forces found them.
 
     Attributes:
-      sample, geom: (m,). nworld: of the skin. node: (m, 3) of their faces. weight: (m, 3) barycentric, of
-        where they push. area: (m,) that each stands for [m^2].
+      sample, geom: (m,). nworld: of the skin. face: (m,) that each is on. node: (m, 3) of it. weight: (m, 3)
+        barycentric, of where they push. area: (m,) that each stands for [m^2].
       plane: (m, 4) normal and offset [m], in the geom's frame, of what they meet of an edge; else zeros.
       point, last: (m, 3) where they push, and where they were when the step began [m].
       local: (m, 3) in the geom's frame.
@@ -100,57 +79,68 @@ class Touching:
       stick: (m, 3) where they stick if they do, in the geom's frame.
     """
 
-    sample: np.ndarray
-    geom: np.ndarray
-    node: np.ndarray
-    weight: np.ndarray
-    area: np.ndarray
-    plane: np.ndarray
-    point: np.ndarray
-    last: np.ndarray
-    local: np.ndarray
-    old: np.ndarray
-    stick: np.ndarray
-    nworld: int = 1
+    sample: torch.Tensor
+    geom: torch.Tensor
+    face: torch.Tensor
+    node: torch.Tensor
+    weight: torch.Tensor
+    area: torch.Tensor
+    plane: torch.Tensor
+    point: torch.Tensor
+    last: torch.Tensor
+    local: torch.Tensor
+    old: torch.Tensor
+    stick: torch.Tensor
+    nworld: int
 
     @property
-    def world(self) -> np.ndarray:
+    def world(self) -> torch.Tensor:
         """(m,) of each sample."""
         return self.sample % self.nworld
 
     @property
-    def kind(self) -> np.ndarray:
+    def kind(self) -> torch.Tensor:
         """(m,) numbers of the geoms, whatever the world."""
         return self.geom // self.nworld
 
 
-def look(
-    state: ContactState, weights: np.ndarray, geoms: Geoms, x: np.ndarray, x_last: np.ndarray, held: Held
+def find_touching(
+    state: ContactState,
+    weights: torch.Tensor,
+    geoms: Geoms,
+    x: torch.Tensor,
+    x_last: torch.Tensor,
+    held: Held,
 ) -> Touching:
     """Finds them.
 
     Args:
       state: of the surface, after an evaluation. weights: (s, 3) of the samples of a face.
       geoms: with poses of the end and of the beginning of the step.
-      x, x_last: (nvert nworld, 3) nodes then [m]. held: when the step began.
+      x, x_last: (nvert, nworld, 3) nodes then [m]. held: when the step began.
     """
-    nworld, count = state.trial_geom.shape[1], state.trial_geom.size
-    sample, geom = numbers_of_touching(state.trial_geom)
-    face, weight = sample // nworld // len(weights), weights[sample // nworld % len(weights)]
-    node = state.surface.face_np[face] * nworld + (sample % nworld)[:, None]
-    point, last = (np.einsum("ma,mak->mk", weight, at[node]) for at in (x, x_last))
-    number = np.full(count, -1)
-    number[held.sample] = np.arange(len(held.sample))
+    nworld, s = state.trial_geom.shape[1], len(weights)
+    sample, geom = touching_samples(state.trial_geom)
+    world, of_surface = sample % nworld, sample // nworld
+    kind, weight = of_surface // s, weights[of_surface % s]
+    node = wp.to_torch(state.surface.face)[kind].long() * nworld + world[:, None]
+    corner = x.reshape(-1, 3)[node]
+    point, last = (torch.einsum("ma,mak->mk", weight, at) for at in (corner, x_last.reshape(-1, 3)[node]))
+    number = torch.full((state.trial_geom.size,), -1, device=sample.device)
+    number[held.sample] = torch.arange(len(held.sample), device=sample.device)
     old = number[sample]
-    old[old >= 0] = np.where(held.geom[old[old >= 0]] == geom[old >= 0], old[old >= 0], -1)
-    pos, mat, pos_last, mat_last = (flat(a) for a in (geoms.pos, geoms.mat, geoms.pos_last, geoms.mat_last))
-    stick = _inside(last, pos_last[geom], mat_last[geom])
-    stick[old >= 0] = held.anchor[old[old >= 0]]
-    local = _inside(point, pos[geom], mat[geom])
-    at, plane, part = _met(geoms, geom, local, weight, x[node])
-    area = state.surface.area.numpy()[face] / len(weights) * part
-    point = np.einsum("ma,mak->mk", at, x[node])
-    return Touching(sample, geom, node, at, area, plane, point, last, local, old, stick, nworld)
+    known = torch.nonzero(old >= 0).ravel()
+    old[known[held.geom[old[known]] != geom[known]]] = -1
+    known = old >= 0
+    poses = (rows(getattr(geoms, name))[geom] for name in ("pos", "mat", "pos_last", "mat_last"))
+    pos, mat, pos_last, mat_last = poses
+    stick, local = _in_frame(last, pos_last, mat_last), _in_frame(point, pos, mat)
+    stick[known] = held.anchor[old[known]]
+    at, plane, fraction = _meet_edges(geoms, geom, local, weight, corner)
+    area = wp.to_torch(state.surface.area).double()[kind] / s * fraction
+    point = torch.einsum("ma,mak->mk", at, corner)
+    face = kind * nworld + world
+    return Touching(sample, geom, face, node, at, area, plane, point, last, local, old, stick, nworld)
 
 
 @wp.kernel(module=f"{__name__}.met", enable_backward=False)
@@ -182,22 +172,28 @@ def _meet(
         plane_out[i] = wp.vec4d(n[0], n[1], n[2], met.gap - wp.dot(n, y))
 
 
-def _met(geoms, geom, local, weight, corner):
-    """Where samples push (m, 3), the planes (m, 4) of edges that they meet, and their part in it (m,)."""
-    m, edged = len(geom), geoms.window.numpy().any()
-    at, plane, part = weight.copy(), np.zeros((m, 4)), np.ones(m)
-    if not (m and edged):
-        return at, plane, part
-    with wp.ScopedDevice(geoms.size.device):
-        given = [wp.array(geom, dtype=int), geoms, *(wp.array(a, dtype=vec3) for a in (local, weight))]
-        given += [wp.array(corner, dtype=vec3, ndim=2)]
-        out = [wp.array(a, dtype=kind) for a, kind in ((at, vec3), (plane, wp.vec4d), (part, real))]
-        wp.launch(_meet, m, given, out)
-    return tuple(a.numpy() for a in out)
+def _meet_edges(geoms, geom, local, weight, corner):
+    """Where samples push (m, 3), the planes (m, 4) of edges that they meet, and the fraction of their area
+    that does (m,)."""
+    m = len(geom)
+    at, plane, fraction = weight.clone(), weight.new_zeros((m, 4)), weight.new_ones(m)
+    if m and geoms.window.numpy().any():
+        arrays = (
+            (local, vec3),
+            (weight, vec3),
+            (corner, vec3),
+            (at, vec3),
+            (plane, wp.vec4d),
+            (fraction, real),
+        )
+        made = [wp.from_torch(a.contiguous(), dtype=kind) for a, kind in arrays]
+        given = [wp.from_torch(geom.int(), dtype=wp.int32), geoms, *made[:3]]
+        wp.launch(_meet, m, given, made[3:], device=geoms.size.device)
+    return at, plane, fraction
 
 
-def _inside(point, pos, mat):
-    return np.einsum("mki,mk->mi", mat, point - pos)
+def _in_frame(point, pos, mat):
+    return torch.einsum("mki,mk->mi", mat, point - pos)
 
 
 @wp.kernel(module=f"{__name__}.behind", enable_backward=False)
@@ -223,17 +219,13 @@ def _look_behind(
     sharp_out[i] = wp.where(there[3] > here[3] - real(1.0 - _NEARER) * reach, 1, 0)
 
 
-def at_sharp_edges(geoms: Geoms, at: Touching) -> np.ndarray:
+def at_sharp_edges(geoms: Geoms, at: Touching) -> torch.Tensor:
     """(m,) whether samples touch where their geom is finer than they lie apart: at an edge that is not
     rounded. There the push jumps from one of its sides to another, and a step may have several balances."""
-    m = len(at.sample)
-    if not m:
-        return np.zeros(0, bool)
-    with wp.ScopedDevice(geoms.size.device):
-        sharp = wp.zeros(m, dtype=int)
-        inputs = [
-            wp.array(at.kind, dtype=int), geoms, wp.array(at.local, dtype=vec3),
-            wp.array(np.sqrt(at.area), dtype=real),
-        ]  # fmt: skip
-        wp.launch(_look_behind, m, inputs, [sharp])
-    return sharp.numpy() > 0
+    sharp = torch.zeros(len(at.sample), dtype=torch.int32, device=at.sample.device)
+    if len(sharp):
+        arrays = (at.local, vec3), (at.area.sqrt(), real)
+        local, spacing = (wp.from_torch(a.contiguous(), dtype=kind) for a, kind in arrays)
+        inputs = [wp.from_torch(at.kind.int(), dtype=wp.int32), geoms, local, spacing]
+        wp.launch(_look_behind, len(sharp), inputs, [wp.from_torch(sharp)], device=geoms.size.device)
+    return sharp > 0

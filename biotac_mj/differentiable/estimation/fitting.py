@@ -147,25 +147,26 @@ class _Search:
         turn = Rotation.from_rotvec(at[3:] @ self._axes).as_matrix()
         pos = start + (self._steps.pos - start) @ turn.T + 1e-3 * at[:3]
         steps = Steps(pos, turn @ self._steps.mat, self._steps.dt, self._steps.ends)
-        pose = np.zeros((5, len(pos), 1, 6))
-        pose[:3, :, 0, :3] = 1e-3 * np.eye(3)[:, None]
+        pose = np.zeros((5, 1, len(pos), 1, 6))
+        pose[:3, 0, :, 0, :3] = 1e-3 * np.eye(3)[:, None]
         for k, axis in enumerate(self._axes):
-            pose[3 + k, :, 0] = np.column_stack(
+            pose[3 + k, 0, :, 0] = np.column_stack(
                 [np.cross(axis, pos[:, 0] - pos[0, 0]), np.tile(axis, (len(pos), 1))]
             )
         with skin.lock:
-            incompressible = np.isinf(skin.model.options.bulk_modulus)
-            trajectory = follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible)
-            still = {name: np.zeros(5) for name in skin.own}
-            ahead = push_forward(skin, trajectory, Inputs(pose, np.zeros((5, 1)), still))
+            trajectory = follow(skin, steps.pos[None], steps.mat[None], skin.friction, skin.own)
+            still = {name: np.zeros((5, 1)) for name in skin.own}
+            ahead = push_forward(skin, trajectory, Inputs(pose, np.zeros((5, 1, 1)), still))
         record, rest, n = trajectory.steps[-1], trajectory.rest, presses.geometry.nvert
-        before = np.log(self._film.impedance(rest.x[:n] if rest else presses.geometry.vert))
-        value, slopes = slopes_of_film(self._film, record.x[:n], ahead.nodes[:, -1, :n])
-        read = np.append(value - before, 1e-3 * (record.pressure - (rest.pressure if rest else 0.0)))
-        read_by = np.column_stack([slopes, 1e-3 * ahead.pressure[:, -1]])
-        wrench = torch.from_numpy(record.wrench[0].copy())
+        lies = rest.x[:n, 0].numpy() if rest else presses.geometry.vert
+        before = np.log(self._film.impedance(lies))
+        value, slopes = slopes_of_film(self._film, record.x[:n, 0].numpy(), ahead.nodes[:, 0, -1, :n])
+        pressure = float(record.pressure - (rest.pressure if rest else 0.0))
+        read = np.append(value - before, 1e-3 * pressure)
+        read_by = np.column_stack([slopes, 1e-3 * ahead.pressure[:, 0, -1]])
+        wrench = record.wrench[0, 0]
         outcome = functools.partial(outcome_of, middle=torch.from_numpy(presses.middle(record.touches)))
-        by = torch.autograd.functional.jacobian(outcome, wrench).numpy() @ ahead.wrench[:, -1, 0].T
+        by = torch.autograd.functional.jacobian(outcome, wrench).numpy() @ ahead.wrench[:, 0, -1, 0].T
         used = slice(len(self._signal))
         missed = (read[used] - self._signal) / self._noise[used]
         scale = max(1.0, missed @ missed / len(missed))

@@ -170,8 +170,7 @@ class Presses:
     def simulate(self, along: float, around: float, share: float = 1.0) -> tuple[Trajectory, Steps]:
         """A press at a place [m], [rad]: its steps, and their way."""
         steps, skin = self.way(along, around, share), self.skin
-        incompressible = np.isinf(skin.model.options.bulk_modulus)
-        return follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible), steps
+        return follow(skin, steps.pos[None], steps.mat[None], skin.friction, skin.own), steps
 
     def way(self, along: float, around: float, share: float = 1.0) -> Steps:
         """The steps of a press at a place [m], [rad]."""
@@ -183,9 +182,9 @@ class Presses:
 
         return steps_of(plan(share * deepest(plan(_DEEPEST), self._core_samples)))[0]
 
-    def middle(self, touches: np.ndarray) -> np.ndarray:
+    def middle(self, touches: torch.Tensor) -> np.ndarray:
         """(3,) of samples by number, on the resting skin [m]."""
-        skin = self.skin
+        skin, touches = self.skin, touches.numpy()
         face, weight = touches // len(skin.weights), skin.weights[touches % len(skin.weights)]
         corner = self.geometry.vert[skin.data.outer.surface.face_np[face]]
         return np.einsum("ma,mak->mk", weight, corner).mean(0)
@@ -207,43 +206,42 @@ class Presses:
                     trajectory, steps = self.simulate(along, around)
                     ahead = push_forward(self.skin, trajectory, self._tangents(steps, around))
                 rest = trajectory.rest
-                films = films or _Films(self.geometry, rest.x[:n] if rest else self.geometry.vert)
-                begin = rest.pressure if rest else 0.0
+                lies = rest.x[:n, 0].numpy() if rest else self.geometry.vert
+                films = films or _Films(self.geometry, lies)
+                begin = float(rest.pressure) if rest else 0.0
                 for k, end in enumerate(steps.ends[1:], start=1):
                     record, here = trajectory.steps[end], (i, j, k)
                     try:
-                        read = films.read(record.x[:n], ahead.nodes[:, end, :n])
+                        read = films.read(record.x[:n, 0].numpy(), ahead.nodes[:, 0, end, :n])
                     except NoFilmError:  # beyond what can be read, as deep as it can
                         read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
                     for name, value in zip(widths, read):
                         table[name][here][..., :-1] = value
-                    table["signal"][here][-1] = 1e-3 * (record.pressure - begin)
-                    table["by_press"][here][:, -1] = 1e-3 * ahead.pressure[:, end]
-                    wrench, middle = (
-                        torch.from_numpy(a.copy()) for a in (record.wrench[0], self.middle(record.touches))
-                    )
+                    table["signal"][here][-1] = 1e-3 * (float(record.pressure) - begin)
+                    table["by_press"][here][:, -1] = 1e-3 * ahead.pressure[:, 0, end]
+                    wrench, middle = record.wrench[0, 0], torch.from_numpy(self.middle(record.touches))
                     slopes = torch.autograd.functional.jacobian(
                         functools.partial(outcome_of, middle=middle), wrench
                     )
                     table["outcome"][here] = outcome_of(wrench, middle).numpy()
                     table["outcome"][here][0] -= np.log(_SHARES[k])
-                    table["outcome_by"][here] = ahead.wrench[:, end, 0] @ slopes.numpy().T
+                    table["outcome_by"][here] = ahead.wrench[:, 0, end, 0] @ slopes.numpy().T
         for name in ("outcome", "outcome_by"):
             table[name][:, :, 0] = table[name][:, :, 1]
         return table
 
     def _tangents(self, steps, around):
         """Two tilts of the way about its beginning, and the fill."""
-        pose = np.zeros((3, len(steps.pos), 1, 6))
+        pose = np.zeros((3, 1, len(steps.pos), 1, 6))
         for k, axis in enumerate(frame_of(steps, around)):
-            pose[k, :, 0] = np.concatenate(
+            pose[k, 0, :, 0] = np.concatenate(
                 [np.cross(axis, steps.pos[:, 0] - steps.pos[0, 0]), np.tile(axis, (len(steps.pos), 1))], 1
             )
         own = self.skin.own
-        numbers = {name: np.zeros(3) for name in own}
+        numbers = {name: np.zeros((3, 1)) for name in own}
         if self.skin.model.has_liquid:
             numbers["natural"][2], numbers["kappa"][2] = _FILL, -own["kappa"] / own["natural"] * _FILL
-        return Inputs(pose, np.zeros((3, 1)), numbers)
+        return Inputs(pose, np.zeros((3, 1, 1)), numbers)
 
 
 class _Films:

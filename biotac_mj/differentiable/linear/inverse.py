@@ -1,20 +1,59 @@
-"""Linear systems with the consistent tangent: GMRES, made short by the skin's sparse factor, corrected for
-contact and liquid as they are, unsymmetric."""
+"""Linear systems with the consistent tangent, of all worlds of a skin at once: GMRES, made short by an
+approximate inverse that knows contact and liquid as they are, unsymmetric."""
 
+import typing
 from collections.abc import Callable
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.linalg import solve_triangular
+import torch
+import warp as wp
 
 from ...skin.model import SkinModel
+from ..tensors import add_rows
 
-__all__ = ["FaceBlocks", "Factors", "RoughInverse", "solve_by_gmres"]
+if typing.TYPE_CHECKING:
+    from ..skin import SkinWorlds
+
+__all__ = ["FaceBlocks", "FactorInverse", "Factors", "StepInverse", "solve_by_gmres"]
 
 # products too many after which a factor, which costs 75 and saves two to four a step, is made
 _FACTOR = 150
 _FEW = 16
 _CANCELLED = 0.1  # of a vector's length: less is left of it beside the basis, and rounding is felt
+_MOST = 400  # products of a solve
+# what products with a single-precision inverse reduce a residual by, before it is measured anew; vectors of
+# the basis then, after which it begins anew
+_DIGITS, _BASIS = 1e-4, 40
+# blocks that the skin's surfaces keep of a face's nine: of two of its corners
+_PAIRS = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
+
+
+class FaceBlocks:
+    """A matrix over the nodes of all worlds: a sum of dense blocks of faces.
+
+    Args:
+      face: (m,) numbers of the faces. node: (m, 3) of their nodes, row by row of [node, world].
+      block: (m, 9, 9).
+    """
+
+    def __init__(self, face: torch.Tensor, node: torch.Tensor, block: torch.Tensor):
+        self.face, self.node, self.block = face, node, block
+
+    @classmethod
+    def of(cls, face: torch.Tensor, node: torch.Tensor, block: torch.Tensor) -> typing.Self:
+        """Blocks of samples, several of one face (m,), summed up."""
+        which, place = torch.unique(face, return_inverse=True)
+        nodes = node.new_zeros((len(which), 3))
+        nodes[place] = node
+        return cls(which, nodes, add_rows(block.new_zeros((len(which), 9, 9)), place, block))
+
+    def multiply(self, v: torch.Tensor, transpose: bool = False) -> torch.Tensor:
+        """The matrix, or its transpose, times v (nvert, nworld, 3)."""
+        felt = v.reshape(-1, 3)[self.node].reshape(-1, 9)
+        felt = torch.einsum("mij,mi->mj" if transpose else "mij,mj->mi", self.block, felt)
+        out = v.new_zeros(v.shape)
+        add_rows(out.view(-1, 3), self.node, felt)
+        return out
 
 
 class Factors:
@@ -41,127 +80,249 @@ class Factors:
             self.now, self._products = self._model.factor_at(x), 0
 
 
-class FaceBlocks:
-    """Sparse sums of dense blocks of the same faces, whose pattern is found once.
+class FactorInverse:
+    """(A - B + a b')^-1 of each world by Woodbury's identity, on the CPU; A is the stiffness of the factor
+    over `softness`.
 
     Args:
-      face: (nface, 3) nodes. n: number of nodes.
+      factors: of the skin. softness: (nworld,), see `newton.worlds.Worlds`.
+      blocks: B, of faces that touch. free: (nvert,) bool, of nodes.
+      a, b: (nvert, nworld, 3), zero at fixed nodes; None: there are none.
+      transpose: of the matrix with B' and b a'.
     """
 
-    def __init__(self, face: np.ndarray, n: int):
-        at = (3 * face[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(face), 9)
-        entry = 3 * n * at[:, :, None] + at[:, None, :]
-        entry, self._place = np.unique(entry, return_inverse=True)
-        self._place, self._shape = self._place.ravel(), (3 * n, 3 * n)
-        self._column = (entry % (3 * n)).astype(np.int32)
-        self._start = np.searchsorted(entry, 3 * n * np.arange(3 * n + 1)).astype(np.int32)
-
-    def sum(self, block: np.ndarray) -> sp.csr_matrix:
-        """(3n, 3n) of blocks (nface, 9, 9)."""
-        value = np.bincount(self._place, block.ravel(), len(self._column))
-        return sp.csr_matrix((value, self._column, self._start), shape=self._shape)
-
-
-class RoughInverse:
-    """(A + N D N' + a b')^-1 by Woodbury's identity, A the stiffness of the factor over `softness`.
-
-    Args:
-      factors: of the skin. softness: see `newton.worlds.Worlds`.
-      nodes: (m,) free nodes in contact; N takes their coordinates. stiffness: (3m, 3m) D.
-      a, b: (3 nvert,), zero at fixed nodes.
-    """
+    digits, restart = 0.0, _MOST
 
     def __init__(
         self,
         factors: Factors,
-        softness: float,
-        nodes: np.ndarray,
-        stiffness: np.ndarray,
-        a: np.ndarray,
-        b: np.ndarray,
+        softness: torch.Tensor,
+        blocks: list[FaceBlocks],
+        free: np.ndarray,
+        a: torch.Tensor | None,
+        b: torch.Tensor | None,
+        transpose: bool,
     ):
-        self._factor, self._soft, self._b = factors.now, softness, b
-        m = 3 * len(nodes)
-        self._dof = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self._columns = np.zeros((m + 1, len(a)))
-        # the factor keeps its inverse's rows, and nodes touch for many steps
-        self._columns[:m, factors.dof] = softness * self._factor.rows(nodes)
-        if a.any():
-            self._columns[m] = self._plain(a)
-        felt = np.concatenate([self._columns[:, self._dof], self._columns @ b[:, None]], 1).T
-        stiff = np.zeros((m + 1, m + 1))
-        stiff[:m, :m], stiff[m, m] = stiffness, 1.0
-        self._small = np.linalg.solve(np.eye(m + 1) + stiff @ felt, stiff)
+        self._factor, self._soft, nworld = factors.now, softness.numpy(), len(softness)
+        node, block = (
+            torch.cat([getattr(own, name) for own in blocks]).numpy() for name in ("node", "block")
+        )
+        if transpose:
+            block, a, b = np.swapaxes(block, 1, 2), b, a
+        self._worlds, size = [], 3 * len(free)
+        for w, soft in enumerate(self._soft):
+            mine = node[:, 0] % nworld == w
+            corner = node[mine] // nworld
+            nodes = np.unique(corner)
+            nodes = nodes[free[nodes]]
+            m = 3 * len(nodes)
+            place = np.full(len(free), -1)
+            place[nodes] = np.arange(len(nodes))
+            at = np.where(place[corner] < 0, -m, 3 * place[corner])
+            at = (at[:, :, None] + np.arange(3)).reshape(-1, 9)
+            entry = m * at[:, :, None] + at[:, None, :]
+            known = (at[:, :, None] >= 0) & (at[:, None, :] >= 0)
+            stiff = np.zeros((m + 1, m + 1))
+            stiff[:m, :m] = -np.bincount(entry[known], block[mine][known], m * m).reshape(m, m)
+            stiff[m, m] = 1.0
+            dof = (3 * nodes[:, None] + np.arange(3)).ravel()
+            columns, along = np.zeros((m + 1, size)), np.zeros(size)
+            # the factor keeps its inverse's rows, and nodes touch for many steps
+            columns[:m, factors.dof] = soft * self._factor.rows(nodes)
+            if a is not None:
+                columns[m] = soft * self._factor.solve(a[:, w : w + 1].numpy()).ravel()
+                along = b[:, w].numpy().ravel()
+            felt = np.concatenate([columns[:, dof], columns @ along[:, None]], 1).T
+            self._worlds.append((dof, along, columns, np.linalg.solve(np.eye(m + 1) + stiff @ felt, stiff)))
 
-    def __call__(self, v: np.ndarray) -> np.ndarray:
-        """Times v (3 nvert,), zero at fixed nodes."""
-        y = self._plain(v)
-        return y - (self._small @ np.append(y[self._dof], self._b @ y)) @ self._columns
+    def __call__(self, v: torch.Tensor) -> torch.Tensor:
+        """Times v (nvert, nworld, 3), zero at fixed nodes."""
+        out = self._soft[:, None] * self._factor.solve(v.numpy())
+        for w, (dof, along, columns, small) in enumerate(self._worlds):
+            y = out[:, w].ravel()
+            y = y - (small @ np.append(y[dof], along @ y)) @ columns
+            out[:, w] = y.reshape(-1, 3)
+        return torch.from_numpy(out)
 
-    def _plain(self, v):
-        return self._soft * self._factor.solve(v.reshape(-1, 1, 3)).ravel()
+
+class StepInverse:
+    """The approximate inverse that steps on the skin's device have, with contact as it is in a gradient. The
+    skin has no liquid, and lies where a step ended (`record.restore`).
+
+    Args:
+      skin: the worlds. outer, core: blocks of the faces of both surfaces that touch. transpose: of the
+        transposed matrix.
+    """
+
+    def __init__(self, skin: "SkinWorlds", outer: FaceBlocks, core: FaceBlocks | None, transpose: bool):
+        self._skin, k = skin, skin.solver(skin.geoms).k
+        st = skin.data.worlds
+        for flag in (st.active, st.running):
+            flag.fill_(1)
+        st.viscosity.zero_()
+        k.worth.fill_(1.0)  # of no account: an update has no residual here
+        k.r.zero_()
+        for state, blocks in ((skin.data.outer, outer), (skin.data.core, core)):
+            if state is None:
+                continue
+            touching, block = wp.to_torch(state.touching), wp.to_torch(state.block)
+            touching.zero_()
+            if blocks is None:
+                continue
+            touching.view(-1)[blocks.face] = 1
+            # the same of both orders of two corners: contact is felt at points between them
+            own = blocks.block.transpose(1, 2) if transpose else blocks.block
+            own = own.reshape(-1, 3, 3, 3, 3)
+            face, world = blocks.face // skin.nworld, blocks.face % skin.nworld
+            for i, (a, b) in enumerate(_PAIRS):
+                block[6 * face + i, world] = -own[:, a, :, b]
+        skin.precondition.run()
+        self._r, self._z, self._part = (wp.to_torch(array) for array in (k.r, k.z, k.part))
+        self._chunk = torch.arange(len(self._r), device=self._r.device) // k.chunk
+        single = self._r.dtype == torch.float32
+        self.digits, self.restart = (_DIGITS, _BASIS) if single else (0.0, _MOST)
+
+    def __call__(self, v: torch.Tensor) -> torch.Tensor:
+        """Times v (nvert, nworld, 3), zero at fixed nodes, in the precision of the step's directions."""
+        self._r.copy_(v)
+        squares = self._part[0].zero_()  # of a right-hand side by chunks of nodes, by which it is scaled
+        add_rows(squares, self._chunk, (self._r.double() ** 2).sum(2))
+        self._skin.invert.run()
+        return self._z.clone()
 
 
 def solve_by_gmres(
-    product: Callable,
-    inverse: Callable,
-    right: np.ndarray,
+    product: Callable[[torch.Tensor], torch.Tensor],
+    inverse: Callable[[torch.Tensor], torch.Tensor],
+    right: torch.Tensor,
     precision: float,
-    start: np.ndarray | None = None,
-    most: int = 400,
-) -> tuple[np.ndarray, int]:
-    """Solution of A x = right, and how many products it took.
+    start: torch.Tensor | None = None,
+    most: int = _MOST,
+    digits: float = 0.0,
+    restart: int = _MOST,
+) -> tuple[torch.Tensor, int]:
+    """Solutions of A x = right of all worlds, each with its own A, and how many products they took.
 
     The residual is measured after the inverse, so that `precision` is of x: a skin is a million times stiffer
-    against some motions than against others, and a small residual would say little.
+    against some motions than against others, and a small residual would say little. The basis has the
+    precision of what the inverse gives.
 
     Args:
-      product, inverse: A and its approximate inverse times a vector (n,).
-      precision: error of x to end at, of its size.
-      start: a solution of nearly the same system, from which less is left to find.
+      product, inverse: A and its approximate inverse times a tensor (n, nworld, 3).
+      right: (n, nworld, 3).
+      precision: error of x to end at, of its size in each world.
+      start: solutions of nearly the same systems, from which less is left to find.
       most: products.
+      digits: how far a residual is reduced before it is measured anew; 0: all the way.
+      restart: vectors of the basis, after which it begins anew.
 
     Raises:
-      ValueError: not solved with so many: the matrix is next to singular.
+      ValueError: not solved with so many: a matrix is next to singular.
     """
-    if start is None or not start.any():
-        z = inverse(right)
-        wanted = precision * np.linalg.norm(z)
-        start = np.zeros_like(z)
-    else:
-        z = inverse(right - product(start))
-        wanted = precision * np.linalg.norm(start)
-    size = np.linalg.norm(z)
-    if size <= wanted:
-        return start + z, 0
-    basis, along = np.empty((most + 1, len(right))), np.zeros((most + 1, most))
-    basis[0], missed = z / size, np.zeros(most + 1)
-    turns, missed[0] = np.zeros((most, 2)), size
+    x, left = torch.zeros_like(right), right
+    if start is not None and start.any():
+        x, left = start.clone(), right - product(start)
+    z = inverse(left)
+    size = _lengths(_rows(z if left is right else x))
+    wanted, count = precision * size, 0
+    while True:
+        beta = _lengths(_rows(z))
+        going = ~(beta <= wanted)
+        if not going.any():
+            return x, count
+        if count >= most or not np.isfinite(beta).all():
+            raise _unsolved(going, count)
+        change, more, missed = _cycle(
+            product, inverse, z, beta, going, np.maximum(wanted, digits * beta), min(restart, most - count)
+        )
+        x, count = x + change, count + more
+        if digits == 0 and (np.abs(missed) <= wanted)[going].all():
+            return x, count
+        z = inverse(right - product(x))
+
+
+def _cycle(product, inverse, z, beta, going, goal, most):
+    """One basis, begun with z (n, nworld, 3) of lengths beta: the changes of x, the products that it took,
+    and what the worlds still miss."""
+    nworld = len(beta)
+    v = _rows(z)
+    basis = v.new_empty((nworld, most + 1, v.shape[1]))
+    basis[:, 0] = v * _over(beta, v)
+    turns, columns, heads, missed = [], [], [], beta.copy()
+    used, on = np.zeros(nworld, int), going.copy()
     for j in range(most):
-        w = inverse(product(basis[j]))
-        length = np.linalg.norm(w)
-        for _ in range(2):
-            before, part = length, basis[: j + 1] @ w
-            along[: j + 1, j] += part
-            w -= part @ basis[: j + 1]
-            length = np.linalg.norm(w)
-            if length > _CANCELLED * before:
-                break  # else once more for what rounding left
+        w = _rows(inverse(product(_nodes(basis[:, j], z).to(torch.float64))))
+        column, length = _project(w, basis[:, : j + 1])
         # Givens' rotations keep what is along the basis triangular
-        column = along[: j + 1, j]
-        for i, (c, s) in enumerate(turns[:j].tolist()):
-            column[i], column[i + 1] = c * column[i] + s * column[i + 1], c * column[i + 1] - s * column[i]
-        diagonal = float(np.hypot(column[j], length))
-        if diagonal == 0:
+        for i, (c, s) in enumerate(turns):
+            above, below = column[:, i].copy(), column[:, i + 1].copy()
+            column[:, i], column[:, i + 1] = c * above + s * below, c * below - s * above
+        diagonal = np.hypot(column[:, j], length)
+        if (on & ~(diagonal > 0)).any():
+            raise _unsolved(on & ~(diagonal > 0), j + 1)
+        diagonal = np.where(diagonal > 0, diagonal, 1.0)
+        c, s = column[:, j] / diagonal, length / diagonal
+        column[:, j] = diagonal
+        turns.append((c, s))
+        columns.append(column)
+        heads.append(c * missed)
+        used[on] = j + 1
+        missed = np.where(on, -s * missed, missed)
+        on = on & ~(np.abs(missed) <= goal) & np.isfinite(missed)
+        if not on.any():
             break
-        c, s = turns[j] = column[j] / diagonal, length / diagonal
-        column[j] = diagonal
-        missed[j], missed[j + 1] = c * missed[j], -s * missed[j]
-        if abs(missed[j + 1]) <= wanted:
-            y = solve_triangular(along[: j + 1, : j + 1], missed[: j + 1])
-            return start + y @ basis[: j + 1], j + 1
-        basis[j + 1] = w / length
-    raise ValueError(
-        f"a step's adjoint was not solved with {most} products: its tangent is next to singular, as of skin "
-        "that slides freely; look at the step's changes and shorten it"
+        basis[:, j + 1] = w * _over(length, w)
+    k = len(columns)
+    triangle, head = np.tile(np.eye(k), (nworld, 1, 1)), np.zeros((nworld, k))
+    for j, (column, value) in enumerate(zip(columns, heads)):
+        mine = used > j
+        triangle[mine, : j + 1, j], head[mine, j] = column[mine], value[mine]
+    y = torch.from_numpy(np.linalg.solve(triangle, head[..., None])).to(basis)
+    found = (y.transpose(1, 2) @ basis[:, :k])[:, 0]
+    return _nodes(found, z).to(torch.float64), k, missed
+
+
+def _project(w, basis):
+    """Takes what w (nworld, n) has of a basis (nworld, k, n) from it: how much that is (nworld, k), and the
+    lengths of what is left."""
+    along = torch.zeros_like(basis[:, :, 0])
+    double = w.dtype == torch.float64
+    length = w.norm(dim=1) if double else None
+    for _ in range(2 if double else 1):
+        part = (basis @ w[:, :, None])[..., 0]
+        along += part
+        w -= (part[:, None] @ basis)[:, 0]
+        before, length = length, w.norm(dim=1)
+        if not double or (length > _CANCELLED * before).all():
+            break  # else once more for what rounding left
+    felt = torch.cat([along, length[:, None]], 1).double().cpu().numpy()
+    return felt[:, :-1], felt[:, -1]
+
+
+def _rows(v):
+    """(nworld, 3 n) of (n, nworld, 3)."""
+    return v.transpose(0, 1).reshape(v.shape[1], -1)
+
+
+def _nodes(v, like):
+    """The inverse of `_rows`."""
+    n, nworld, _ = like.shape
+    return v.reshape(nworld, n, 3).transpose(0, 1).contiguous()
+
+
+def _lengths(v):
+    return v.norm(dim=1).double().cpu().numpy()
+
+
+def _over(length, like):
+    """(nworld, 1) one over lengths; of nothing, nothing."""
+    safe = np.where(length > 0, length, 1.0)
+    return torch.from_numpy(np.where(length > 0, 1 / safe, 0.0)).to(like)[:, None]
+
+
+def _unsolved(worlds, products):
+    world = int(np.argmax(worlds))
+    return ValueError(
+        f"the adjoint of a step of world {world} was not solved with {products} products: its tangent is next "
+        "to singular, as of skin that slides freely; look at the step's changes and shorten it"
     )

@@ -16,7 +16,7 @@ from ...skin.rubber.law import LAWS
 from ...skin.rubber.material import Material
 from ..memory_constants import split_constants
 from ..record import Record
-from ..skin import Skin
+from ..skin import SkinWorlds
 
 __all__ = ["LinearMemory", "Memory"]
 
@@ -50,11 +50,11 @@ class LinearMemory:
     """The points of a skin that lies where a step ended (`record.restore`).
 
     Args:
-      skin: a `skin.Skin` with memory.
+      skin: of one world, with memory.
       record: of the step.
     """
 
-    def __init__(self, skin: Skin, record: Record):
+    def __init__(self, skin: SkinWorlds, record: Record):
         elements, rubber, material = skin.model.elements, skin.data.rubber, skin.model.material
         self._skin, self._elem, self._gradient = skin, elements.elem, elements.gradient
         self._linear, self._isochoric = (rubber.law == LAWS[name] for name in ("linear", "neo_hookean"))
@@ -63,7 +63,7 @@ class LinearMemory:
         modulus = np.ones(len(self._elem)) if elements.modulus is None else elements.modulus
         self._modulus = np.repeat(modulus, self._shape[1])
         self._volume = self._modulus * elements.weight.ravel()
-        self._F = self._gradient_of(record.x)
+        self._F = self._gradient_of(record.x[:, 0].numpy())
         self._inverse = np.linalg.inv(self._F)
         overstress, last, slip = (
             getattr(rubber, name).numpy()[..., 0, :, :].reshape(-1, n, 3, 3)
@@ -99,12 +99,13 @@ class LinearMemory:
     def _moduli(self, numbers):
         """Stress and energy density of what remembers, and how they depend on the law's constants: linearly,
         see `LinearStep`."""
-        skin, mu, lam = self._skin, numbers["mu"], numbers["lam"]
+        skin, mu, lam = self._skin, float(numbers["mu"]), float(numbers["lam"])
         memory, x, none = skin.data.memory, skin.data.x, np.zeros_like(self._F)
-        with skin.another_lam(mu, lam) as other:
+        with skin.another_lam() as other:
             P, _, W = memory.point_slopes(x, none)
         self._P, _, self._W = memory.point_slopes(x, none)
-        lams = (P - self._P) / (other - lam), (W - self._W) / (other - lam)
+        apart = float(other) - lam
+        lams = (P - self._P) / apart, (W - self._W) / apart
         mus = (self._P - lam * lams[0]) / mu, (self._W - lam * lams[1]) / mu
         self._mu, self._by = mu, {"mu": mus, "lam": lams}
 

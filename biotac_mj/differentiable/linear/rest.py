@@ -13,12 +13,12 @@ derivative are the elements' own (`skin.rubber.element_kernels`)."""
 import numpy as np
 import torch
 
-from ..skin import Skin
+from ..skin import SkinWorlds
 
 __all__ = ["areas_at", "cavity_at", "pull_rest", "push_rest"]
 
 
-def pull_rest(skin: Skin, x: np.ndarray, balance: np.ndarray) -> np.ndarray:
+def pull_rest(skin: SkinWorlds, x: np.ndarray, balance: np.ndarray) -> np.ndarray:
     """(nvert, 3) slopes of balance . f by rest positions, f the forces of the rubber.
 
     Args:
@@ -39,7 +39,7 @@ def pull_rest(skin: Skin, x: np.ndarray, balance: np.ndarray) -> np.ndarray:
     return out
 
 
-def push_rest(skin: Skin, x: np.ndarray, change: np.ndarray) -> np.ndarray:
+def push_rest(skin: SkinWorlds, x: np.ndarray, change: np.ndarray) -> np.ndarray:
     """(nvert, 3) by which the forces of the rubber change when rest positions do by change (nvert, 3) [m]."""
     points = _Points(skin, x)
     G = np.einsum("eai,eqaj->eqij", change[points.elem], points.gradient)
@@ -70,7 +70,7 @@ class _Points:
         if elements.modulus is not None:
             self.share = self.share * elements.modulus[:, None]
         self.volume = self._weight.sum(1)
-        self.averaged = max(numbers["lam"] - elements.cap * numbers["mu"], 0.0)
+        self.averaged = max(float(numbers["lam"] - elements.cap * numbers["mu"]), 0.0)
         self.F = np.einsum("eai,eqaj->eqij", x[self.elem], self.gradient)
 
     def slopes(self, change):

@@ -1,34 +1,25 @@
-"""What a touching sample feels, as a function of what it depends on: Warp's adjoint of the contact's own
-functions.
+"""What the samples of a surface feel, as a function of what it depends on, linear.
 
 In the geom's frame a sample's force and its new anchor depend on where it is and on where it sticks, on the
-coefficient of friction and on the stiffness of its springs; turning and moving the geom is left to `linear`.
-All six numbers of a sample have copies of these side by side, so that one backward pass gives all slopes."""
+coefficient of friction and on the stiffness of its springs: Warp's adjoint of the contact's own functions.
+All six numbers of a sample have copies of these side by side, so that one backward pass gives all slopes.
+Turning and moving the geom is written out."""
 
 import dataclasses
-import types
-from collections.abc import Callable
 
-import numpy as np
 import torch
 import warp as wp
 
-from ...geometry.rigid import skew
 from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
 from ...skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
+from ...skin.data import ContactState
 from ...skin.types import real, vec3
-from ..touching import Touching, flat
+from ..tensors import add_rows, skew
+from ..touching import Touching, rows
+from .inverse import FaceBlocks
 
-__all__ = [
-    "SampleJacobians",
-    "SampleSlopes",
-    "combine_slopes",
-    "differentiate_on_device",
-    "differentiate_samples",
-    "of_corners",
-    "slopes_of_samples",
-]
+__all__ = ["LinearSurface", "SampleJacobians", "SampleSlopes", "differentiate_samples", "slopes_of_samples"]
 
 _OUTPUTS = 6  # force, anchor
 
@@ -84,97 +75,55 @@ class SampleJacobians:
     Attributes:
       force: (m, 3) [N]. anchor: (m, 3) [m].
       by_local, by_stick: (m, 6, 3). by_friction, by_stiffness: (m, 6), the latter by the sample's springs.
-      slips: (m,) whether it slips.
     """
 
-    force: np.ndarray
-    anchor: np.ndarray
-    by_local: np.ndarray
-    by_stick: np.ndarray
-    by_friction: np.ndarray
-    by_stiffness: np.ndarray
-    slips: np.ndarray
+    force: torch.Tensor
+    anchor: torch.Tensor
+    by_local: torch.Tensor
+    by_stick: torch.Tensor
+    by_friction: torch.Tensor
+    by_stiffness: torch.Tensor
 
 
 def differentiate_samples(
     geoms: Geoms,
-    geom: np.ndarray,
-    plane: np.ndarray,
-    local: np.ndarray,
-    stick: np.ndarray,
-    friction: np.ndarray,
-    stiffness: np.ndarray,
-    stick_ratio: float,
-    smoothing: float = 0.0,
-) -> SampleJacobians:
-    """Force and anchor of samples that touch, with their derivatives.
-
-    Args:
-      geoms: struct of the geoms.
-      geom: (m,) which one each sample touches, whatever the world. plane: (m, 4), see `Touching`.
-      local: (m, 3) where it is, stick: (m, 3) where it sticks, in the geom's frame [m].
-      friction: (m,). stiffness: (m,) of its springs [N/m].
-      stick_ratio: `SkinOptions.stick_ratio`. smoothing: half width of first touch, see `press` [m].
-    """
-    m = len(geom)
-
-    device = geoms.size.device
-
-    def copies(value, dtype):
-        value = np.repeat(np.asarray(value, float)[:, None], _OUTPUTS, 1)
-        return wp.array(np.ascontiguousarray(value), dtype=dtype, device=device, requires_grad=True)
-
-    inputs = [copies(local, vec3), copies(stick, vec3), copies(friction, real), copies(stiffness, real)]
-    felt = wp.zeros((m, _OUTPUTS), dtype=real, device=device, requires_grad=True)
-    which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device=device)
-    felt.grad.fill_(1.0)
-    met = wp.array(np.asarray(plane, float), dtype=wp.vec4d, device=device)
-    _central_differences(
-        stick_ratio, smoothing, which, geoms, met, inputs, [a.grad for a in inputs], felt, felt.grad
-    )
-    value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
-    slips = (np.asarray(friction) > 0) & (value[:, 3:] != stick).any(1)
-    return SampleJacobians(value[:, :3].copy(), value[:, 3:].copy(), *slopes, slips)
-
-
-def differentiate_on_device(
-    geoms: Geoms,
-    geom: torch.Tensor,
+    kind: torch.Tensor,
     plane: torch.Tensor,
     local: torch.Tensor,
     stick: torch.Tensor,
     friction: torch.Tensor,
     stiffness: torch.Tensor,
     stick_ratio: float,
+    smoothing: float = 0.0,
 ) -> SampleJacobians:
-    """`differentiate_samples` of tensors that lie where the geoms do, in tensors."""
-    m = len(geom)
+    """Force and anchor of samples that touch, with their derivatives.
+
+    Args:
+      geoms: struct of the geoms; tensors lie on its device.
+      kind: (m,) which one each sample touches, whatever the world. plane: (m, 4), see `Touching`.
+      local: (m, 3) where it is, stick: (m, 3) where it sticks, in the geom's frame [m].
+      friction: (m,). stiffness: (m,) of its springs [N/m].
+      stick_ratio: `SkinOptions.stick_ratio`. smoothing: half width of first touch, see `press` [m].
+    """
+    m, types = len(kind), (vec3, vec3, real, real)
     given = [
         a[:, None].expand(m, _OUTPUTS, *a.shape[1:]).contiguous() for a in (local, stick, friction, stiffness)
     ]
     slopes = [torch.zeros_like(a) for a in given]
     felt = torch.zeros((m, _OUTPUTS), dtype=torch.float64, device=local.device)
-    kinds = vec3, vec3, real, real
-    inputs, grads = ([wp.from_torch(a, dtype=t) for a, t in zip(arrays, kinds)] for arrays in (given, slopes))
-    ends = [wp.from_torch(a, dtype=real) for a in (felt, torch.ones_like(felt))]
-    which = wp.from_torch(geom.int(), dtype=wp.int32)
-    met = wp.from_torch(plane.contiguous(), dtype=wp.vec4d)
-    _central_differences(stick_ratio, 0.0, which, geoms, met, inputs, grads, *ends)
-    slips = (friction > 0) & (felt[:, 3:] != stick).any(1)
-    return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes, slips)
-
-
-def _central_differences(stick_ratio, width, which, geoms, plane, inputs, grads, felt, felt_grad):
-    """Forwards, then backwards: as a tape would, which takes longer to find out what to do than this
-    takes."""
-    if not len(which):
-        return
-    given, device = [stick_ratio, width, which, geoms, plane, *inputs], geoms.size.device
-    wp.launch(_feel, felt.shape, given, [felt], device=device)
-    wp.launch(
-        _feel, felt.shape, given, [felt], device=device,
-        adj_inputs=[stick_ratio, width, None, geoms, None, *grads], adj_outputs=[felt_grad], adjoint=True,
-    )  # fmt: skip
+    if m:
+        inputs, grads = ([wp.from_torch(a, dtype=t) for a, t in zip(of, types)] for of in (given, slopes))
+        ends = [wp.from_torch(a, dtype=real) for a in (felt, torch.ones_like(felt))]
+        which = wp.from_torch(kind.int(), dtype=wp.int32)
+        met = wp.from_torch(plane.contiguous(), dtype=wp.vec4d)
+        constants, device = [stick_ratio, smoothing, which, geoms, met], geoms.size.device
+        # forwards, then backwards: as a tape would, which takes longer to find out what to do than this takes
+        wp.launch(_feel, felt.shape, [*constants, *inputs], ends[:1], device=device)
+        wp.launch(
+            _feel, felt.shape, [*constants, *inputs], ends[:1], device=device, adjoint=True,
+            adj_inputs=[stick_ratio, smoothing, None, geoms, None, *grads], adj_outputs=ends[1:],
+        )  # fmt: skip
+    return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,78 +132,147 @@ class SampleSlopes:
     what moves there. Blocks of six rows: force, anchor.
 
     Attributes:
-      own: in the geoms' frames.
-      by_point: (m, 6, 3) by where the sample is. by_springs: (m, 6, 1) by the stiffness of its springs.
+      by_point: (m, 6, 3) by where the sample is. by_springs: (m, 6) by the stiffness of its springs.
       by_pose: (m, 6, 6) by the geom's translation and rotation vector about its origin. by_friction:
-        (m, 6, 1). by_stick: (m, 6, 3) by where it sticks, in the geom's frame.
+        (m, 6). by_stick: (m, 6, 3) by where it sticks, in the geom's frame.
       old, new: numbers of samples that touched the same geom when the step began, and of the k others, which
         stick to where they were then. by_last: (k, 6, 3), by_pose_last: (k, 6, 6) of these.
       collect: (m, 6, 3) wrench on the geom by force. wrench_by_node: (m, 6, 9) by the corners of its face.
     """
 
-    own: SampleJacobians
-    by_point: np.ndarray
-    by_springs: np.ndarray
-    by_pose: np.ndarray
-    by_friction: np.ndarray
-    by_stick: np.ndarray
-    old: np.ndarray
-    new: np.ndarray
-    by_last: np.ndarray
-    by_pose_last: np.ndarray
-    collect: np.ndarray
-    wrench_by_node: np.ndarray
+    by_point: torch.Tensor
+    by_springs: torch.Tensor
+    by_pose: torch.Tensor
+    by_friction: torch.Tensor
+    by_stick: torch.Tensor
+    old: torch.Tensor
+    new: torch.Tensor
+    by_last: torch.Tensor
+    by_pose_last: torch.Tensor
+    collect: torch.Tensor
+    wrench_by_node: torch.Tensor
 
 
 def slopes_of_samples(
-    at: Touching, geoms: Geoms, springs: np.ndarray, stick_ratio: float, smoothing: float = 0.0
+    at: Touching, geoms: Geoms, springs: torch.Tensor, stick_ratio: float, smoothing: float = 0.0
 ) -> SampleSlopes:
     """Of samples that touch, with springs (m,) [N/m]."""
-    pos, mat, pos_last, mat_last, friction = (
-        flat(getattr(geoms, name))[at.geom] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
+    pos, R, pos_last, R_last, friction = (
+        rows(getattr(geoms, name))[at.geom] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
     )
     given = at.kind, at.plane, at.local, at.stick, friction, springs
-    own = differentiate_samples(geoms, *given, stick_ratio, smoothing)
-    return combine_slopes(np, skew, at, own, (pos, mat, pos_last, mat_last))
-
-
-def combine_slopes(
-    xp: types.ModuleType, skew: Callable, at: Touching, own: SampleJacobians, poses: tuple
-) -> SampleSlopes:
-    """From the geoms' frames to the BioTac's.
-
-    Args:
-      xp, skew: numpy and `geometry.rigid.skew`, or torch and the same of tensors; the others are its arrays.
-      poses: pos (m, 3) and mat (m, 3, 3) of each sample's geom, the same when the step began.
-    """
-    pos, R, pos_last, R_last = poses
-    RT = R.swapaxes(1, 2)
+    own, RT = differentiate_samples(geoms, *given, stick_ratio, smoothing), R.transpose(1, 2)
 
     def outward(J):  # forces into the BioTac frame
-        return xp.concatenate([R @ J[:, :3], J[:, 3:]], 1)
+        return torch.cat([R @ J[:, :3], J[:, 3:]], 1)
 
-    by_local = outward(own.by_local)
-    by_point, by_springs = by_local @ RT, outward(own.by_stiffness[..., None])
+    by_local, by_stick = outward(own.by_local), outward(own.by_stick)
+    by_point = by_local @ RT
     # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
-    moved = by_local @ xp.concatenate([-RT, RT @ skew(at.point - pos)], 2)
-    force = xp.einsum("mij,mj->mi", R, own.force)
-    moved[:, :3, 3:] -= skew(force)
-    by_stick = outward(own.by_stick)
-    old, new = (xp.argwhere(side).ravel() for side in (at.old >= 0, at.old < 0))
-    then = R_last[new].swapaxes(1, 2)
-    last = xp.concatenate([-then, then @ skew(at.last[new] - pos_last[new])], 2)
+    by_pose = by_local @ torch.cat([-RT, RT @ skew(at.point - pos)], 2)
+    force = torch.einsum("mij,mj->mi", R, own.force)
+    by_pose[:, :3, 3:] -= skew(force)
+    old, new = (torch.nonzero(side).ravel() for side in (at.old >= 0, at.old < 0))
+    then = R_last[new].transpose(1, 2)
+    last = torch.cat([-then, then @ skew(at.last[new] - pos_last[new])], 2)
     # wrench: -sum F, -sum p x F
-    one = xp.zeros_like(R)
-    one[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    collect = xp.concatenate([-one, -skew(at.point)], 1)
-    turn = xp.concatenate([xp.zeros_like(R), skew(force)], 1)
-    wrench = collect @ of_corners(at.weight, by_point)[:, :3] + of_corners(at.weight, turn)
+    one = torch.eye(3, dtype=R.dtype, device=R.device).expand_as(R)
+    collect = torch.cat([-one, -skew(at.point)], 1)
+    turn = torch.cat([torch.zeros_like(R), skew(force)], 1)
+    wrench_by_node = _of_corners(at.weight, collect @ by_point[:, :3] + turn)
+    by_springs, by_friction = (outward(J[..., None])[..., 0] for J in (own.by_stiffness, own.by_friction))
     return SampleSlopes(
-        own, by_point, by_springs, moved, outward(own.by_friction[..., None]), by_stick, old, new,
-        by_stick[new] @ then, by_stick[new] @ last, collect, wrench,
+        by_point, by_springs, by_pose, by_friction, by_stick, old, new,
+        by_stick[new] @ then, by_stick[new] @ last, collect, wrench_by_node,
     )  # fmt: skip
 
 
-def of_corners(weight: np.ndarray, block: np.ndarray) -> np.ndarray:
+def _of_corners(weight, block):
     """(m, r, 9) by the corners of faces, of blocks (m, r, 3) by a point that has weights (m, 3) on them."""
     return (block[:, :, None, :] * weight[:, None, :, None]).reshape(*block.shape[:2], 9)
+
+
+class LinearSurface:
+    """The samples of a surface that touch when a step ends, linear in all that they depend on.
+
+    Args:
+      at: them. geoms: what they touch. state: of the surface.
+      stiffness: (nworld,) of contact [Pa/m].
+      stick_ratio, smoothing: see `differentiate_samples`.
+      core: whether it is the inner surface, whose geom is the core: that is no input, and has no friction.
+
+    Attributes:
+      slopes: of the samples. by_node: (m, 6, 9) what they feel by the nodes of their faces.
+      spread: (m, 9, 3) forces on these nodes by the samples' forces.
+    """
+
+    def __init__(
+        self,
+        at: Touching,
+        geoms: Geoms,
+        state: ContactState,
+        stiffness: torch.Tensor,
+        stick_ratio: float,
+        smoothing: float = 0.0,
+        core: bool = False,
+    ):
+        self.at, self._core, self._area = at, core, "core_area" if core else "area"
+        springs = stiffness[at.world] * at.area
+        self.slopes = slopes_of_samples(at, geoms, springs, stick_ratio, smoothing)
+        self._by_area = springs / wp.to_torch(state.surface.area).double()[at.face // at.nworld]
+        self.by_node = _of_corners(at.weight, self.slopes.by_point)
+        one = torch.eye(3, dtype=springs.dtype, device=springs.device)
+        self.spread = (at.weight[:, :, None, None] * one).reshape(-1, 9, 3)
+
+    def blocks(self) -> FaceBlocks:
+        """Forces on nodes by nodes, summed up by faces."""
+        return FaceBlocks.of(self.at.face, self.at.node, self.spread @ self.by_node[:, :3])
+
+    def at_samples(self, nodal: torch.Tensor) -> torch.Tensor:
+        """(m, 3) cotangents of the samples' forces from those of forces on nodes (nvert, nworld, 3)."""
+        felt = nodal.reshape(-1, 3)[self.at.node].reshape(-1, 9)
+        return torch.einsum("mij,mi->mj", self.spread, felt)
+
+    def at_nodes(self, force: torch.Tensor, nodal: torch.Tensor) -> None:
+        """Adds forces of the samples (m, 3) to those on nodes (nvert, nworld, 3)."""
+        add_rows(nodal.view(-1, 3), self.at.node, torch.einsum("mij,mj->mi", self.spread, force))
+
+    def pull(self, force: torch.Tensor, anchor: torch.Tensor | None, given: dict) -> None:
+        """Adds to cotangents of what a step was given, see `step.GIVEN`, those by forces and anchors of the
+        samples (m, 3)."""
+        s, at = self.slopes, self.at
+        rows = 3 if anchor is None else 6
+        felt = force if anchor is None else torch.cat([force, anchor], 1)
+        by_springs = (s.by_springs[:, :rows] * felt).sum(1)
+        add_rows(given["contact_stiffness"], at.world, at.area * by_springs)
+        add_rows(given[self._area].view(-1), at.face, self._by_area * by_springs)
+        if self._core:
+            return
+        add_rows(given["pose"].view(-1, 6), at.geom, torch.einsum("mij,mi->mj", s.by_pose, felt))
+        add_rows(given["friction"].view(-1), at.geom, (s.by_friction * felt).sum(1))
+        anchors = torch.einsum("mij,mi->mj", s.by_stick[s.old], felt[s.old])
+        add_rows(given["anchor"], at.sample[s.old], anchors)
+        felt = felt[s.new]
+        last = torch.einsum("mij,mi->mj", s.by_pose_last, felt)
+        add_rows(given["pose_last"].view(-1, 6), at.geom[s.new], last)
+        last = torch.einsum("mij,mi->mj", _of_corners(at.weight[s.new], s.by_last), felt)
+        add_rows(given["x_last"].view(-1, 3), at.node[s.new], last)
+
+    def push(self, given: dict) -> tuple[torch.Tensor, torch.Tensor]:
+        """Tangents of the samples' forces and anchors (m, 3) by those of what a step was given; its nodes
+        stay."""
+        s, at = self.slopes, self.at
+        springs = at.area * given["contact_stiffness"][at.world]
+        springs = springs + self._by_area * given[self._area].reshape(-1)[at.face]
+        felt = s.by_springs * springs[:, None]
+        if not self._core:
+            felt = felt + torch.einsum("mij,mj->mi", s.by_pose, given["pose"].reshape(-1, 6)[at.geom])
+            felt = felt + s.by_friction * given["friction"].reshape(-1)[at.geom][:, None]
+            anchors = given["anchor"][at.sample[s.old]]
+            felt[s.old] += torch.einsum("mij,mj->mi", s.by_stick[s.old], anchors)
+            last = given["pose_last"].reshape(-1, 6)[at.geom[s.new]]
+            felt[s.new] += torch.einsum("mij,mj->mi", s.by_pose_last, last)
+            last = given["x_last"].reshape(-1, 3)[at.node[s.new]].reshape(-1, 9)
+            by_last = _of_corners(at.weight[s.new], s.by_last)
+            felt[s.new] += torch.einsum("mij,mj->mi", by_last, last)
+        return felt[:, :3], felt[:, 3:]

@@ -233,13 +233,13 @@ class _Run:
         skins = [Cotangent.none(s.skin) for s in self.skins]
         driven = {n: np.zeros((self.nstep, *np.shape(getattr(self.data, n)))) for n in names if n in _DRIVEN}
         for s in self.skins:
-            s.skin.factors.begin()
+            s.skin.begin_solves()
         for t in reversed(range(self.nstep)):
             y[:nv] += _along(model, self.ends[t], qpos[t])
             y[nv : 2 * nv] += qvel[t]
             y[2 * nv :] += act[t]
             for i, s in enumerate(self.skins):
-                skins[i].x[: s.nvert] += own[3 * i][t]
+                skins[i].x[: s.nvert, 0] += torch.from_numpy(own[3 * i][t])
                 skins[i].pressure += float(own[3 * i + 2][t])
             wrenches = [own[3 * i + 1][t] for i in range(len(self.skins))]
             y, more, skins = self._back(t, np.concatenate([y, sensors[t]]), wrenches, skins, tuple(driven))
@@ -267,7 +267,12 @@ class _Run:
         linear, base, units, bases = [], [], [], []
         for i, (s, k) in enumerate(zip(self.skins, kept)):
             if k.resting:
-                linear.append(None), base.append(skins[i].pose.ravel()), units.append([]), bases.append(None)
+                (
+                    linear.append(None),
+                    base.append(skins[i].pose.numpy().ravel()),
+                    units.append([]),
+                    bases.append(None),
+                )
                 continue
             one = s.linear(before[i], k, s.instance.horizon)
             pushed = wrenches[i].ravel() + by_wrench[i].T @ end

@@ -2,12 +2,12 @@
 and from where it ended, and made linear there."""
 
 import dataclasses
-import math
 import typing
 import weakref
 from collections.abc import Iterable
 
 import numpy as np
+import torch
 
 from ...coupling.instance import Instance
 from ...coupling.setup import OUT_OF_REACH, STARTED
@@ -16,9 +16,9 @@ from ...skin.state import SavedState
 from ..linear.memory import Memory
 from ..linear.step import LinearStep
 from ..memory_constants import write_constants
-from ..record import Record, advance
+from ..record import Record, advance, hold_pressure
 from ..skin import Skin
-from ..sweep import Anchors, no_memory, slope_of_reference
+from ..sweep import no_memory, pull_pressure
 
 __all__ = ["Cotangent", "Kept", "LoopSkin", "Pulled"]
 
@@ -45,20 +45,21 @@ class Kept:
 
 @dataclasses.dataclass
 class Cotangent:
-    """Of a skin's state between two steps: nodes (nvert, 3), pressure, poses of the geoms (ngeom, 6), anchors
-    and what its rubber remembers."""
+    """Of a skin's state between two steps: nodes (nvert, 1, 3), pressure (1,), poses of the geoms
+    (ngeom, 1, 6), anchors of all samples (nsample, 3) and what its rubber remembers."""
 
-    x: np.ndarray
-    pressure: float
-    pose: np.ndarray
-    anchors: Anchors
+    x: torch.Tensor
+    pressure: torch.Tensor
+    pose: torch.Tensor
+    anchors: torch.Tensor
     memory: Memory | None
 
     @classmethod
     def none(cls, skin: Skin) -> "Cotangent":
         """Zeros."""
-        x, pose = np.zeros((skin.model.nvert, 3)), np.zeros((skin.geoms.count, 6))
-        return cls(x, 0.0, pose, Anchors(), no_memory(skin))
+        nsample = skin.surfaces[0] * len(skin.weights)
+        shapes = (skin.model.nvert, 1, 3), (1,), (skin.geoms.count, 1, 6), (nsample, 3)
+        return cls(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes), no_memory(skin))
 
 
 class Pulled:
@@ -72,11 +73,11 @@ class Pulled:
 
     def __init__(
         self,
-        pose: np.ndarray,
-        pose_last: np.ndarray,
-        x: np.ndarray,
-        pressure: np.ndarray | float,
-        anchor: np.ndarray,
+        pose: torch.Tensor,
+        pose_last: torch.Tensor,
+        x: torch.Tensor,
+        pressure: torch.Tensor,
+        anchor: torch.Tensor,
         memory: typing.Any | None,
     ):
         self.parts = [pose, pose_last, x, pressure, anchor]
@@ -85,7 +86,7 @@ class Pulled:
 
     @property
     def pose(self) -> np.ndarray:
-        return self.parts[0].ravel()
+        return self.parts[0].numpy().ravel()
 
     def plus(self, others: Iterable["Pulled"], weights: Iterable[float]) -> "Pulled":
         """Adds shares of others."""
@@ -167,7 +168,7 @@ class LoopSkin:
     def record(self, before: SavedState, kept: Kept, dt: float) -> Record:
         """Solves a step of dt [s] again."""
         skin, geoms = self.skin, self.skin.geoms
-        data, options = skin.data, skin.model.options
+        data = skin.data
         skin.rest_at(skin.rest)
         skin.write(skin.own)
         skin.smooth(0.0)
@@ -178,7 +179,7 @@ class LoopSkin:
         skin.state(geoms).load(before.replace(increment=increment, motion=np.zeros((geoms.count, 3))))
         data.worlds.guessed.fill_(1)
         if skin.model.has_liquid:
-            data.worlds.holds.fill_(int(math.isinf(options.bulk_modulus)))
+            hold_pressure(skin)
         ends = kept.state.geom_pos, kept.state.geom_mat
         geoms.set_pose(*(ends if kept.begun is None else kept.begun))
         geoms.advance()
@@ -198,11 +199,9 @@ class LinearLoopStep:
 
     def pull(self, after: Cotangent, wrench: np.ndarray) -> Pulled:
         """From cotangents of the state and of the wrenches (ngroup, 6)."""
-        anchors = after.anchors.of(self.step.touching.sample)
-        given = self.step.pull(after.x, wrench, after.pressure, anchors, memory=after.memory)
-        pressure = float(given["reference"] * slope_of_reference(self.record))
-        if self.skin.data.worlds.holds.numpy()[0]:
-            pressure += float(given["offset"])
+        wrench = torch.from_numpy(wrench)[:, None]
+        given = self.step.pull(after.x, wrench, after.pressure, after.anchors, memory=after.memory)
+        pressure = pull_pressure(self.skin, self.record, given)
         pose, last = given["pose"] + after.pose, given["pose_last"]
         if (
             not self.kept.whole
@@ -212,9 +211,8 @@ class LinearLoopStep:
 
     def before(self, pulled: Pulled) -> Cotangent:
         """Of the state when the step began."""
-        _, last, x, pressure, anchor, *memory = pulled.parts
-        memory = Memory(*memory) if memory else None
-        return Cotangent(x, pressure, last, Anchors(self.record.held.sample, anchor), memory)
+        _, last, x, pressure, anchors, *memory = pulled.parts
+        return Cotangent(x, pressure, last, anchors, Memory(*memory) if memory else None)
 
 
 _skins = weakref.WeakKeyDictionary()

@@ -1,1 +1,0 @@
-"""Presses of many worlds at once, on one device, and their gradients."""
