@@ -412,8 +412,8 @@ _GRADIENTS = [
      "yes, of what touches the skin; contact with the core keeps its kinks"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
     ("several worlds at once, on the CPU or CUDA", "`press(together=)`",
-     "dry and elastic, by poses, friction and the law's constants, backwards; refused by name: liquid, "
-     "prony, mullins and hysteresis, rest_nodes, smoothing, gradients forwards"),
+     "dry and elastic, by poses, friction and the law's constants, backwards and forwards; refused by name: "
+     "liquid, prony, mullins and hysteresis, rest_nodes, smoothing"),
     ("rubber with prony, mullins or hysteresis", "`press(dt=, prony=, mullins=, hysteresis=)`, `calibrate`",
      "yes; fits have the law's constants alone; by time steps no gradient"),
     ("contact_law; implicit dynamics", "`Skin`", "refused by name"),

@@ -43,9 +43,9 @@ class _Press:
         return self.skin is skin and self.indentation is indentation and self.parameters == parameters
 
     def ahead(self, scaled: np.ndarray) -> list[torch.Tensor | None]:
-        """Where other parameters have the nodes (nvert, 1, 3) of each step, to first order; None where none
-        was found, or a step may have several balances: which one is found there is to hang on the press alone,
-        and not on what was tried before."""
+        """Nodes (nvert, 1, 3) of each step with other parameters, to first order; None where none was found,
+        or a step may have several balances: which one is found there depends on the press alone, and not on
+        those before."""
         moved = np.tensordot(scaled - self.scaled, self.slopes, 1)[0, :, :, None]
         unsure = [step.on_core or step.changes[0].sharp or step.changes[0].lost for step in self.steps]
         return [None if no else step.x + dx for step, dx, no in zip(self.steps, moved, unsure)]

@@ -323,6 +323,6 @@ def _over(length, like):
 def _unsolved(worlds, products):
     world = int(np.argmax(worlds))
     return ValueError(
-        f"the adjoint of a step of world {world} was not solved with {products} products: its tangent is next "
-        "to singular, as of skin that slides freely; look at the step's changes and shorten it"
+        f"the adjoint of a step of world {world} was not solved with {products} products: its tangent is "
+        "next to singular, as of skin that slides freely; look at the step's changes and shorten it"
     )

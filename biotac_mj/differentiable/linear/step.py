@@ -27,7 +27,7 @@ __all__ = ["GIVEN", "LinearStep"]
 
 # what a step is given, besides rest positions and what the rubber remembers: nodes when it began (nvert,
 # nworld, 3); anchors of all samples then (nsample nworld, 3); poses of the geoms when it ended and began
-# (ngeom, nworld, 6), a translation and a rotation vector about the geom's own origin, both in the BioTac frame;
+# (ngeom, nworld, 6), a translation and a rotation vector about the geom's own origin, in the BioTac frame;
 # frictions (ngeom, nworld); areas at rest of outer faces and of those that can meet the core (nface, nworld);
 # and (nworld,) `skin.NUMBERS` and the pressures `offset` and `reference` of `newton.worlds.Worlds`
 _SCALARS = (*NUMBERS, "offset", "reference")
