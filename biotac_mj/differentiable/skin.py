@@ -18,7 +18,7 @@ from ..skin.rubber.element_forces import ElementForces
 from ..skin.state_arrays import StateArrays
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import DOUBLE, real, vec3
-from .linear.inverse import Factors
+from .linear.factors import Factors
 from .memory_constants import constants_of
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "SkinWorlds", "refuse_beyond"]
@@ -302,9 +302,11 @@ class Skin(SkinWorlds):
         what a gradient is worth, and FINEST at least.
 
     Attributes:
+      model, data, geoms: SkinModel, SkinData of one world, GeomSet; others see `SkinWorlds`.
+      rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
+        others lie on its edges.
       own: NUMBERS of its material and filling. friction: (ngeom,) Coulomb's coefficients that a press has
         unless it is given others.
-      given: how many of its nodes are the geometry's; others lie on its edges.
 
     Raises:
       ValueError: an option whose gradient is not there, see `refuse_beyond`, or what the parts raise.

@@ -8,17 +8,12 @@ import numpy as np
 import torch
 import warp as wp
 
-from ...skin.model import SkinModel
+from ..skin import SkinWorlds
 from ..tensors import add_rows
+from .factors import Factors
 
-if typing.TYPE_CHECKING:
-    from ..skin import SkinWorlds
+__all__ = ["FaceBlocks", "FactorInverse", "StepInverse", "solve_by_gmres"]
 
-__all__ = ["FaceBlocks", "FactorInverse", "Factors", "StepInverse", "solve_by_gmres"]
-
-# products too many after which a factor, which costs 75 and saves two to four a step, is made
-_FACTOR = 150
-_FEW = 16
 _CANCELLED = 0.1  # of a vector's length: less is left of it beside the basis, and rounding is felt
 _MOST = 400  # products of a solve
 # what products with a single-precision inverse reduce a residual by, before it is measured anew; vectors of
@@ -54,30 +49,6 @@ class FaceBlocks:
         out = v.new_zeros(v.shape)
         add_rows(out.view(-1, 3), self.node, felt)
         return out
-
-
-class Factors:
-    """The factor of a skin's stiffness, made anew in the present shape where solves take too long: the steps
-    of a press have much the same shape.
-
-    Attributes:
-      now: a `skin.precondition.sparse.SparseFactor`. dof: free coordinates, in the order of its rows.
-    """
-
-    def __init__(self, model: SkinModel):
-        self._model = model
-        self.dof = (3 * model.free[:, None] + np.arange(3)).ravel()
-        self.begin()
-
-    def begin(self) -> None:
-        """Begins with the factor at rest: a gradient does not depend on those before."""
-        self.now, self._products = self._model.factor, 0
-
-    def watch(self, products: int, x: np.ndarray) -> None:
-        """After solves that took so many products with the tangent at x (nvert, 3) [m]."""
-        self._products += max(products - _FEW, 0)
-        if self._products > _FACTOR:
-            self.now, self._products = self._model.factor_at(x), 0
 
 
 class FactorInverse:
@@ -154,7 +125,7 @@ class StepInverse:
         transposed matrix.
     """
 
-    def __init__(self, skin: "SkinWorlds", outer: FaceBlocks, core: FaceBlocks | None, transpose: bool):
+    def __init__(self, skin: SkinWorlds, outer: FaceBlocks, core: FaceBlocks | None, transpose: bool):
         self._skin, k = skin, skin.solver(skin.geoms).k
         st = skin.data.worlds
         for flag in (st.active, st.running):
