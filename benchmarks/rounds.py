@@ -5,12 +5,13 @@
 
 Round 1 is random and the same for all; each further round takes as many contacts from one pool within the
 same bounds, by design or at random, each at most twice, unless one explanation is decided. A name is right
-where a hidden effect's id is among `poses_blind.MEANT`; that of a modulus is where the laboratory's is
-another one. Run again, it goes on where it stopped; what is not done after --minutes is counted as far as it
-came."""
+where a hidden effect's id is among _MEANT; that of a modulus is where the laboratory's is another one. After
+the last round the gap is measured with a tool and at a place that no round has touched. Run again, it goes on
+where it stopped; what is not done after --minutes is counted as far as it came."""
 
 import argparse
 import concurrent.futures
+import dataclasses
 import functools
 import json
 import multiprocessing
@@ -23,6 +24,10 @@ from poses_blind import MEANT, gap
 from records import read_json, write_json
 
 ARMS = "designed", "random"
+# The generator's drifts are those of all electrodes within a trajectory.
+_MEANT = MEANT | {"drift": {"drift"}}
+_OTHER_TOOL, _UNTOUCHED, _UNSEEN = "geom:sphere:0.005", (-3.5e-3, -1e-3), 4  # [m] along; contacts there
+_BIN = 15  # names whose stated confidence is set beside how many are right
 _OTHER_MODULUS = 0.15  # of its logarithm, from which on it is another one
 
 
@@ -74,81 +79,91 @@ def _record(report, seconds):
 
 
 def _contacts(args):
-    """The simulator, bounds, and contacts of round 1 and of the pool."""
+    """The simulator, bounds, and contacts of round 1, of the pool, and of the tool and place that no round
+    touches."""
     from biotac_mj.discrepancy import Simulator
     from biotac_mj.discrepancy.trajectories.contacts import Bounds, drawn
 
     sim = Simulator(skin="coarse", tier="condensed", cache=str(args.cache))
     bounds = Bounds(force=2.0, depth=1.3e-3, tools=("sphere_7mm", "sphere_14mm"))
-    return (
-        sim,
-        bounds,
-        *(drawn(sim, bounds, count, seed) for count, seed in ((args.first, 1), (args.pool, 2))),
-    )
+    other = dataclasses.replace(bounds, tools=(_OTHER_TOOL,), reach=_UNTOUCHED)
+    asked = (bounds, args.first, 1), (bounds, args.pool, 2), (other, _UNSEEN, 3)
+    return sim, bounds, *(drawn(sim, *one) for one in asked)
 
 
 def solved(number, args):
     """Solves the skin of one contact of all, which the cache keeps."""
-    sim, _, begin, pool = _contacts(args)
-    sim.fields([_plan([(begin + pool)[number]], 0.0).contacts[0].trajectory], progress=False)
+    sim, _, begin, pool, unseen = _contacts(args)
+    sim.fields([_plan([(begin + pool + unseen)[number]], 0.0).contacts[0].trajectory], progress=False)
     return number
 
 
-def run(path, args):
-    """Rounds of one laboratory, both arms; as far as they have come they lie in the cache."""
+def run(task, args):
+    """Rounds of (a laboratory, an arm); as far as they have come they lie in the cache."""
+    path, arm = task
     from biotac_mj.discrepancy import diagnose
     from biotac_mj.discrepancy.trajectories.design import planned
     from biotac_mj.discrepancy.trajectories.plan_files import write_plan
 
     sensor = opened(path.read_bytes())
     lab = generator_of(sensor, "coarse", "condensed")
-    sim, bounds, begin, pool = _contacts(args)
+    sim, bounds, begin, pool, unseen = _contacts(args)
     number, clean = int(path.stem.split("_")[1]), {}
 
-    def measured(plan, turn, arm):
-        file = args.cache / f"{path.stem}_{arm}_{turn}.csv"
+    def measured(plan, turn, kind=arm):
+        file = args.cache / f"{path.stem}_{kind}_{turn}.csv"
         write_plan(plan, file)
         contacts = read_plan(file)
         free = _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), turn)
-        clean.update(((arm, t.id), t) for t in free)
+        clean.update((t.id, t) for t in free)
         return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), turn)
 
-    def judged(data, arm):
+    def judged(data):
         began = time.process_time()
         report = diagnose(sim, data, progress=False)
         record = _record(report, time.process_time() - began)
         if report.effects:
             aside = {data[i].id for i in report.locked}
-            without = [clean.get((arm, t.id)) or clean["first", t.id] for t in data]
-            record["true"] = gap(data, without, report.apply(sim), aside)  # the base is the sensor's own
+            # the base is the sensor's own
+            record["true"] = gap(data, [clean[t.id] for t in data], report.apply(sim), aside)
         return report, record
 
-    first = measured(_plan(begin, 0.0), 1, "first")
-    report, record = judged(first, "first")
-    out = {arm: [record] for arm in ARMS}
-    row = {"lab": path.stem, "truth": sensor, "arms": out}
-    write_json(args.cache / f"{path.stem}.json", row)
-    data, now = dict.fromkeys(ARMS, first), dict.fromkeys(ARMS, report)
+    data = measured(_plan(begin, 0.0), 1, "first")
+    report, record = judged(data)
+    row = {"lab": path.stem, "arm": arm, "truth": sensor, "rounds": [record]}
     for turn in range(2, args.rounds + 1):
-        for arm in ARMS:
-            if now[arm].beliefs.decided:
-                out[arm].append(out[arm][-1])
-                continue
-            end = max(t.clock + t.time[-1] for t in data[arm]) + 60.0
-            began = time.process_time()
-            if arm == "designed":
-                plan = planned(now[arm].beliefs, sim, bounds, args.more, pool, progress=False)
-            else:
-                picked = np.random.default_rng([number, turn]).choice(2 * len(pool), args.more, replace=False)
-                plan = _plan([pool[k % len(pool)] for k in picked], end)
-            design = time.process_time() - began
-            if plan.contacts:
-                data[arm] = data[arm] + measured(plan, turn, arm)
-            now[arm], record = judged(data[arm], arm)
-            out[arm].append(record | {"design_seconds": design, "alike": plan.alike})
-            print(path.stem, arm, turn, record["verdict"][:80], flush=True)
-            write_json(args.cache / f"{path.stem}.json", row)
+        write_json(_part(args, path, arm), row)
+        if report.beliefs.decided:
+            row["rounds"].append(row["rounds"][-1])
+            continue
+        began = time.process_time()
+        if arm == ARMS[0]:
+            plan = planned(report.beliefs, sim, bounds, args.more, pool, progress=False)
+        else:
+            picked = np.random.default_rng([number, turn]).choice(2 * len(pool), args.more, replace=False)
+            plan = _plan([pool[k % len(pool)] for k in picked], _end(data))
+        design = time.process_time() - began
+        if plan.contacts:
+            data = data + measured(plan, turn)
+        report, record = judged(data)
+        row["rounds"].append(record | {"design_seconds": design, "alike": plan.alike})
+        print(path.stem, arm, turn, record["verdict"][:80], flush=True)
+    write_json(_part(args, path, arm), row)
+    if report.effects:
+        other = measured(_plan(unseen, _end(data)), args.rounds + 1, "unseen")
+        without = [clean[t.id] for t in other]
+        row["unseen"] = gap(other, without, report.apply(sim), {t.id for t in other})
     return row
+
+
+def _part(args, path, arm):
+    """Where a laboratory's rounds lie as far as they have come."""
+    return args.cache / f"{path.stem}_{arm}.json"
+
+
+def _end(data):
+    """When a further round may begin [s]."""
+    return max(t.clock + t.time[-1] for t in data) + 60.0
 
 
 def counted(rows):
@@ -156,10 +171,39 @@ def counted(rows):
     false names, and unknown outside the catalogue."""
     table = {}
     for arm in ARMS:
-        for turn in range(max((len(r["arms"][arm]) for r in rows), default=0)):
-            some = [(r["arms"][arm][turn], r["truth"]) for r in rows if len(r["arms"][arm]) > turn]
+        own = [r for r in rows if r["arm"] == arm]
+        for turn in range(max((len(r["rounds"]) for r in own), default=0)):
+            some = [(r["rounds"][turn], r["truth"]) for r in own if len(r["rounds"]) > turn]
             table[f"{arm}, round {turn + 1}"] = _counted(some)
+        last = [(r["rounds"][-1], r["truth"]) for r in own]
+        table[f"{arm}, as far as it came"] = _counted(last) | _stated(last)
+        unseen = [r["unseen"] for r in own if isinstance(r.get("unseen"), float)]
+        if unseen:
+            median = float(np.median(unseen))
+            table[f"{arm}, where nothing was measured"] = {"closed": median, "of": len(unseen)}
     return table
+
+
+def _judged(record, truth):
+    """Names [(ids, confidence)] that count, what is hidden, whether each name is right, and whether each
+    hidden effect is named."""
+    want = [] if truth["kind"] == "outside" else [_MEANT.get(e[0], {e[0]}) for e in truth["effects"]]
+    other = abs(np.log(truth["base"]["modulus"])) > _OTHER_MODULUS
+    named = [(set(ids), sure) for ids, sure in zip(record["named"], record["confidence"])]
+    named = [(ids, sure) for ids, sure in named if not (other and "modulus" in ids)]
+    right = [any(ids & w for w in want) for ids, _ in named]
+    return named, want, right, [any(ids & w for ids, _ in named) for w in want]
+
+
+def _stated(some):
+    """Of bins of names, the least sure first: mean confidence that is stated, and share that is right."""
+    names = []
+    for record, truth in some:
+        named, _, right, _ = _judged(record, truth)
+        names += [(sure, ok) for (_, sure), ok in zip(named, right) if sure is not None]
+    names.sort()
+    bins = [names[k : k + _BIN] for k in range(0, len(names), _BIN)]
+    return {"stated": [[round(float(v), 3) for v in np.mean(one, axis=0)] for one in bins]}
 
 
 def _counted(some):
@@ -168,11 +212,7 @@ def _counted(some):
     closed = []
     for record, truth in some:
         kind = truth["kind"]
-        want = [] if kind == "outside" else [MEANT.get(e[0], {e[0]}) for e in truth["effects"]]
-        other = abs(np.log(truth["base"]["modulus"])) > _OTHER_MODULUS
-        named = [set(ids) for ids in record["named"] if not (other and "modulus" in ids)]
-        right = [any(ids & w for w in want) for ids in named]
-        found = [any(ids & w for ids in named) for w in want]
+        named, want, right, found = _judged(record, truth)
         best = set(record["explanations"][0][0])
         true = len(best) == len(want) and all(best & w for w in want) and kind != "outside"
         c["labs"] += 1
@@ -194,23 +234,23 @@ def _counted(some):
     return c | {"closed": float(np.median(closed)) if closed else None}
 
 
-def done(paths, args, rows):
-    """Runs laboratories in so many processes, and adds their rows as they come."""
+def done(tasks, args, rows):
+    """Runs (laboratory, arm) in so many processes, and adds their rows as they come."""
     if args.jobs == 1:
-        for path in paths:
-            rows.append(run(path, args))
+        for task in tasks:
+            rows.append(run(task, args))
             write_json(args.json, rows)
         return
     until = time.monotonic() + 60 * args.minutes
     context = multiprocessing.get_context("spawn")
     solved(0, args)  # compiles what all need
-    _, _, begin, more = _contacts(args)
+    _, _, begin, more, unseen = _contacts(args)
     with concurrent.futures.ProcessPoolExecutor(args.jobs, context) as pool:
-        rest = range(1, len(begin) + len(more))
+        rest = range(1, len(begin) + len(more) + len(unseen))
         for _ in pool.map(functools.partial(_tried, solved, args=args), rest):
             pass
         print(f"skins solved, {until - time.monotonic():.0f} s are left", flush=True)
-        work = [pool.submit(_tried, run, path, args=args) for path in paths]
+        work = [pool.submit(_tried, run, task, args=args) for task in tasks]
         try:
             for one in concurrent.futures.as_completed(work, max(until - time.monotonic(), 1.0)):
                 if one.result() is not None:
@@ -220,10 +260,10 @@ def done(paths, args, rows):
             for process in list(pool._processes.values()):
                 process.kill()
             pool.shutdown(wait=False, cancel_futures=True)
-    there = {row["lab"] for row in rows}
-    for path in paths:
-        part = args.cache / f"{path.stem}.json"
-        if path.stem not in there and part.exists():
+    there = {(row["lab"], row["arm"]) for row in rows}
+    for path, arm in tasks:
+        part = _part(args, path, arm)
+        if (path.stem, arm) not in there and part.exists():
             rows.append(json.loads(part.read_text()))
     write_json(args.json, rows)
 
@@ -254,7 +294,9 @@ def main(argv=None):
     rows = read_json(args.json, [])
     i, n = map(int, args.share.split("/"))
     paths = sorted(args.labs.glob("lab_*.sealed"))[i::n]
-    done([path for path in paths if all(row["lab"] != path.stem for row in rows)], args, rows)
+    there = {(row["lab"], row["arm"]) for row in rows}
+    tasks = [(path, arm) for arm in ARMS for path in paths]  # design first
+    done([(path, arm) for path, arm in tasks if (path.stem, arm) not in there], args, rows)
     for name, counts in counted(rows).items():
         print(name, counts)
 

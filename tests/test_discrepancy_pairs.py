@@ -31,7 +31,6 @@ def bent(counts, clock, rng):
 
 
 @pytest.mark.slow  # quick: which electrodes are singled out, and how their gains bend
-@pytest.mark.xfail(reason="a gain that bends is found at 0.27 where 0.42 is hidden", strict=True)
 def test_two_gains_that_bend_are_those_of_two_electrodes(tmp_path):
     report = diagnose(Springs(), changed(bent, n=10), progress=False)
     assert [e.id for e in report.effects] == ["gain"], report.verdict

@@ -403,7 +403,6 @@ def test_who_is_astray(fitted, aside, off):
 
 
 @pytest.mark.slow  # quick: a modulus of another rest, and gains that give back what it took
-@pytest.mark.xfail(reason="a rocking of 34 nats is named where the modulus alone is another one", strict=True)
 def test_a_base_of_another_modulus_is_calibrated_and_named():
     """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from . import likelihood
-from .base.nuisance import HIGH, KNOWN, LOW, PRIOR, Nuisance
+from .base.nuisance import BETWEEN, HIGH, KNOWN, LOW, PRIOR, Nuisance
 from .settings import SETTINGS
 
 if typing.TYPE_CHECKING:
@@ -131,7 +131,8 @@ class _Model:
         if not np.any(comparison.sim.log_rest):
             absent.add("stands_off")
         slopes = comparison.fields.slopes
-        absent |= {name for name in ("mesh", "tier", "log_film") if name not in slopes}
+        absent |= {name for name in BETWEEN if name not in slopes}
+        absent |= {"log_film"} if comparison.fields.film is None else set()
         self.free = [n for n in _NUISANCE if n not in absent]
         known_of = dict(zip(_NUISANCE, zip(PRIOR, _MOVES)))
         self.parameters = [(None, n, *known_of[n]) for n in self.free]

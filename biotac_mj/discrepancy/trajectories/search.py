@@ -98,13 +98,25 @@ def found(
         # where the likeliest adds what another's law lacks, so do those that are less likely
         if not able or _shared(comparison, able[0], out, chosen):
             break
+        best = able[0] = _other_shapes(comparison, able[0], out.fit, chosen)
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
-        best = able[0]
         best.ties = [c.effect.id for c in able[1:] if _tied(best, c)]
         out.found.append(best)
         out.fit = best.fit
     _without_needless(comparison, out, usable, chosen)
     return out
+
+
+def _other_shapes(comparison, one, current, chosen) -> Candidate:
+    """A Candidate at the likeliest of its shapes: a fit ends at the one that lies nearest to its start."""
+    effect, theta = one.fit.effects[-1]
+    best = one.fit
+    for shape in effect.grid if len(effect.grid) > 1 else ():
+        begin = [*current.effects, (effect, theta | shape)]
+        fit = fit_effects(comparison, begin, chosen, current)
+        if fit.score > best.score and not effect.rejection_reason(fit.effects[-1][1]):
+            best = fit
+    return dataclasses.replace(one, fit=best, gain=float(best.score - current.score))
 
 
 def _asked(usable):
@@ -165,10 +177,8 @@ def _round(comparison, search, usable, chosen, seed, bar):
     short += [r for r in ranked if r not in short and r[1].id in beside]
     bar.total += len(short)
     out = []
-    for _, effect, start in short:
-        # what moves the object takes back what errors of poses had to explain without it
-        begin = dataclasses.replace(current, offsets=0 * current.offsets) if effect.moves_object else current
-        fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, begin)
+    for expected, effect, start in short:
+        fit = _fitted(comparison, effect, start, expected, current, chosen)
         fit = _solved(comparison, fit, effect, current, chosen)
         out.append(_candidate(comparison, effect, fit, current, chance, usable))
         bar.update()
@@ -179,17 +189,52 @@ def _round(comparison, search, usable, chosen, seed, bar):
     return sorted(out, key=lambda c: -c.gain)
 
 
+def _fitted(comparison, effect, start, expected, current, chosen):
+    """Fit of an effect beside others, from where straight lines lead; expected: evidence by these.
+
+    What moves the object takes back what errors of poses have to explain without it: from no effect, step by
+    step, or from poses as they are said to be where that leads to less than is expected."""
+    if not effect.moves_object:
+        return fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
+    none = {n: v if effect.params[n].shape else effect.params[n].start for n, v in start.items()}
+    fit = fit_effects(comparison, [*current.effects, (effect, none)], chosen, current)
+    if fit.score - current.score >= expected:
+        return fit
+    begin = dataclasses.replace(current, offsets=0 * current.offsets)
+    other = fit_effects(comparison, [*current.effects, (effect, start)], chosen, begin)
+    return max(fit, other, key=lambda one: one.score)
+
+
 def _candidate(comparison, effect, fit, current, chance, usable):
     """Candidate of a fit with one effect more than `current`."""
     gain, theta = fit.score - current.score, fit.effects[-1][1]
     p = float((1 + (chance >= gain).sum()) / (1 + len(chance)))
     # as much again of every further effect: laws of other forms leave something
-    refused = ["evidence"] if gain < len(fit.effects) * _asked(usable) else []
+    asked = len(fit.effects) * _asked(usable)
+    refused = ["evidence"] if gain < asked else []
+    refused += ["resolution"] if gain >= asked > _beside_alike(comparison, fit, current, gain) else []
     refused += ["chance"] if p > SETTINGS.rate else []
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
     refused += ["little"] if _little(comparison, effect, theta) else []
     return Candidate(effect, fit, float(gain), p, refused)
+
+
+def _beside_alike(comparison, fit, current, gain) -> float:
+    """Evidence [nats] of the last effect of a fit over a model that is off by the same pattern.
+
+    By as much as is expected of the model without it (`Fit.size`) that may be off in any way, in all channels
+    together: of this effect by a share of prior N(0, e^2), as large as that where the effect is largest. With
+    a likelihood that is quadratic
+    in the effect's size, and has `gain` at it, that leaves gain / (1 + 2 gain e^2) and an Occam factor."""
+    effect, theta = fit.effects[-1]
+    if effect.wiring:  # electrodes are read in another's place, or are not
+        return gain
+    models = fit.effects, fit.effects[:-1]
+    raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in models]
+    change = np.quantile(np.abs(np.concatenate([a - b for a, b in zip(*raw)])), 0.98, axis=0)
+    alike = 2 * max(gain, 0.0) * float(np.min(current.size / np.maximum(change, 1e-12))) ** 2
+    return gain / (1 + alike) + 0.5 * float(np.log1p(alike))
 
 
 def _little(comparison, effect, theta) -> bool:

@@ -105,14 +105,11 @@ class Comparison:
 
     def moved(self, i: int, offset: np.ndarray | float = 0.0) -> list[np.ndarray]:
         """What poses do to trajectory i, (n, width) per metre along x, y and z, about an offset (3,) [m]."""
-        slopes, scale = self.fields.stacked, self.modulus * self.sim.modulus
+        scale = self.modulus * self.sim.modulus
         z = np.exp(self.fields.base[i]["log_z"]) / 1e4
         counts_per_log = -4095 * z / (z + 1) ** 2
-        out, along = [], self.trajectories[i].heading @ np.broadcast_to(offset, 3)
-        for axis, heading in zip("xyz", self.trajectories[i].heading):
-            slope = slopes[axis][i]
-            if "press" in slopes:
-                slope = slope + heading * (slopes["press"][i] + 2 * along * slopes["bend"][i])
+        out = []
+        for slope in self.fields.shifting(i, np.broadcast_to(offset, 3)):
             counts, pdc = counts_per_log * slope[:, 4:], scale * slope[:, 3] / 36.5
             out.append(self._stack(counts, pdc, scale * slope[:, :3]))
         return out

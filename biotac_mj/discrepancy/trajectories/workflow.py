@@ -34,7 +34,7 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
-_SURE = 0.99  # that laws of another form leave of any confidence
+_SURE = 1 - SETTINGS.rate  # the most that is stated: so many of all names are false
 
 __all__ = ["TrajectoryDiagnosis", "about_rests", "diagnose"]
 

@@ -23,7 +23,7 @@ __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance",
 PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5, 0.5, 0.5])
 LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2, -1.0, -0.2])
 HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2, 1.0, 1.2])
-BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `fields.Fields`
+BETWEEN = "mesh", "tier"  # differences of solved skins, see `fields.Fields`
 # measured on the condensed tier, whose price is seconds
 OTHER_MESH = {
     shipped_skin(design, mesh): shipped_skin(design, other)

@@ -17,7 +17,7 @@ from ....geometry.skins import load_skin
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import OTHER_MESH
-from .fields import MAPS, Fields
+from .fields import MAPS, Curve, Fields, stack
 
 if typing.TYPE_CHECKING:
     from ..trajectory import Trajectory
@@ -25,10 +25,10 @@ if typing.TYPE_CHECKING:
 __all__ = ["Solver", "filled", "inflated", "softer", "solved_fields", "spots", "sunk", "tacky"]
 
 _SHIFT = 40e-6  # [m] of the poses for differences
-_DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
+_DEEPER = np.array([-0.12e-3, 0.0, _SHIFT, 0.12e-3])  # [m] along the press
 _FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
 _RADIUS, _BUBBLE = 0.15, 8e-9
-_FILM = 0.5  # of the logarithm of its least thickness
+_FILM = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])  # logarithms of its least thickness
 _SOFTER = -0.25  # of the logarithm of the modulus
 _UNEVEN = 0.2  # [1/cm] of the modulus
 _SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
@@ -58,13 +58,13 @@ class Solver(typing.Protocol):
 
 
 def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
-    """The skin along the trajectories and its differences: 15 solutions of the data set by the condensed
+    """The skin along the trajectories and its differences: 18 solutions of the data set by the condensed
     tier, beside one of the simulator's own; kept in `cache`."""
     spheres = any("sphere" in t.tool for t in trajectories)
     # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
     with tqdm.tqdm(
-        total=(15 + len(spots(trajectories)) + spheres + inflated(sim) + 4 * (quick is not sim))
+        total=(18 + len(spots(trajectories)) + spheres + inflated(sim) + 4 * (quick is not sim))
         * len(trajectories),
         desc="skin",
         disable=not progress or None,
@@ -84,10 +84,7 @@ def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool 
         if sim.skin in OTHER_MESH:
             there = quick.but(skin=OTHER_MESH[sim.skin]).solve(trajectories, progress=tick)
             slopes["mesh"] = _about_rest(_difference(there, here))
-        film = read_dict(sim.options, "options").get("film") or {}
-        thicker = {"residual_film": np.exp(_FILM) * sim.skin_and_film(0.0, 0.0)[1].residual_film}
-        thicker = quick.but(options=sim.options | {"film": {**film, **thicker}})
-        slopes["log_film"] = _about_rest(_difference(thicker.solve(trajectories, progress=tick), here, _FILM))
+        film = _films(quick, trajectories, here, tick)
         slopes |= _uneven(quick, trajectories, here, tick)
         slopes |= filled(quick, trajectories, here, tick)
         slopes |= sunk(quick, trajectories, here, tick)
@@ -101,7 +98,7 @@ def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool 
                 progress=tick,
             )
             slopes["xyz"[axis]] = _difference(moved, here, _SHIFT)
-        slopes |= _bending(quick, trajectories, here, slopes, tick)
+        deeper = _deeper(quick, trajectories, here, slopes, tick)
         if spheres:
             slopes["radius"] = _difference(
                 quick.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
@@ -113,24 +110,43 @@ def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool 
         slopes["bubble"] = _difference(
             quick.solve(trajectories, bubble=_BUBBLE, progress=tick), here, _BUBBLE
         )
-    return Fields(base, slopes, trajectories, here)
+    return Fields(base, slopes, trajectories, here, deeper=deeper, film=film)
 
 
-def _bending(sim, trajectories, base, slopes, tick):
-    """What linear differences miss along the press: "press" per m, "bend" per m^2."""
-    deeper, shallower = (
+def _deeper(sim, trajectories, base, slopes, tick):
+    """What shifts along the press change: load rises faster than depth, and begins where the object
+    touches. A short one is what those in x, y and z together say."""
+    less, more = (
         sim.solve(
             trajectories,
             offset=[np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories],
             progress=tick,
         )
-        for by in (_DEEPER, -_DEEPER)
+        for by in (_DEEPER[0], _DEEPER[-1])
     )
-    press, bend = _parabola(shallower, base, deeper, -_DEEPER, _DEEPER)
-    for i, t in enumerate(trajectories):  # beyond what differences in x, y and z already say of it
-        for k, slope in press[i].items():
-            press[i][k] = slope - sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz"))
-    return {"press": press, "bend": bend}
+    changes = []
+    for i, t in enumerate(trajectories):
+        straight = sum(h * stack(slopes[x][i]) for h, x in zip(t.heading, "xyz"))
+        none = np.zeros_like(straight)
+        changes.append(
+            np.array(
+                [stack(less[i]) - stack(base[i]), none, _SHIFT * straight, stack(more[i]) - stack(base[i])]
+            )
+        )
+    return Curve(_DEEPER, changes)
+
+
+def _films(sim, trajectories, base, tick):
+    """What another least thickness of the film changes, about rest."""
+    given = read_dict(sim.options, "options").get("film") or {}
+    own = sim.skin_and_film(0.0, 0.0)[1].residual_film
+    changes = []
+    for log in _FILM:
+        film = {**given, "residual_film": float(np.exp(log) * own)}
+        other = sim.but(options=sim.options | {"film": film})
+        solved = other.solve(trajectories, progress=tick) if log else base
+        changes.append([stack(one) for one in _about_rest(_difference(solved, base))])
+    return Curve(_FILM, [np.array(of) for of in zip(*changes)])
 
 
 def _uneven(sim, trajectories, base, tick):

@@ -22,11 +22,12 @@ _ANSWERS = {name for effect in CATALOGUE for name in effect.answers}  # that eff
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
     (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across), per metre that
-    the skin has sunk (sink); "tacky_" and a work of joining: by all of it; "press" per metre
-    and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of the
-    condensed tier, "log_film": per log of the film's least thickness, "modulus": per log of the modulus,
-    beyond a factor on force and pressure (where the liquid stands under pressure at rest).
+    the skin has sunk (sink); "tacky_" and a work of joining: by all of it; about rest "mesh": of another
+    mesh, "tier": of the condensed tier, "modulus": per log of the modulus, beyond a factor on force and
+    pressure (where the liquid stands under pressure at rest).
 
+    deeper: what shifts along the heading change [m], None where x, y and z say that too. film: what the
+    logarithm of the film's least thickness changes, about rest.
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: what slopes miss there of all of them together}, {parameter: the same of how that changes
     with it})], see `Simulator.bend`: of a share s of these parameters they miss s^2 of it, and s of the
@@ -40,6 +41,8 @@ class Fields:
     quick: list | None = None
     curves: dict[frozenset, list] = dataclasses.field(default_factory=dict)
     remembered: dict[str, list] = dataclasses.field(default_factory=dict)
+    deeper: "Curve | None" = None
+    film: "Curve | None" = None
 
     def __post_init__(self):
         self.quick = self.base if self.quick is None else self.quick
@@ -58,7 +61,30 @@ class Fields:
         """Fields of some trajectories (indices), as the condensed tier solves them, without what was solved
         with effects."""
         slopes = {k: [v[i] for i in which] for k, v in self.slopes.items()}
-        return Fields([self.quick[i] for i in which], slopes, [self.trajectories[i] for i in which])
+        deeper, film = (None if one is None else one.part(which) for one in (self.deeper, self.film))
+        some = [self.trajectories[i] for i in which]
+        return Fields([self.quick[i] for i in which], slopes, some, deeper=deeper, film=film)
+
+    def shifted(self, i: int, offset: np.ndarray) -> np.ndarray:
+        """(n, 23) what an offset (n, 3) of the poses changes of trajectory i [m]."""
+        heading, change = self.trajectories[i].heading, 0.0
+        if self.deeper is not None:
+            along = offset @ heading
+            change, offset = self.deeper.at(i, along), offset - np.outer(along, heading)
+        for name, by in zip("xyz", offset.T):
+            if name in self.stacked and by.any():
+                change = change + self.stacked[name][i] * by[:, None]
+        return change
+
+    def shifting(self, i: int, offset: np.ndarray) -> list[np.ndarray]:
+        """(n, 23) per metre along x, y and z, about an offset (3,) of trajectory i [m]."""
+        slopes = [self.stacked[name][i] for name in "xyz"]
+        if self.deeper is None:
+            return slopes
+        heading = self.trajectories[i].heading
+        straight = sum(h * slope for h, slope in zip(heading, slopes))
+        press = self.deeper.slope(i, offset @ heading) - straight
+        return [slope + h * press for h, slope in zip(heading, slopes)]
 
     def bent(self, moving: list) -> list:
         """(of what was solved, how much of it) of effects [(Effect, theta)]: of the most of them that were
@@ -83,6 +109,59 @@ class Fields:
         there, missed = min(self.remembered[effect.id], key=lambda one: unlike(effect, theta, one[0]))
         share = next(iter(effect.params))
         return theta[share] / there[share] * missed[i]
+
+
+class Curve:
+    """What one number of the base changes: a cubic between the values that were solved, straight beyond them.
+    It has no more turns than they have (Fritsch and Carlson 1980): an object that does not touch yet changes
+    nothing, and a film matters only where the skin lies on the core."""
+
+    def __init__(self, at: np.ndarray, changes: list[np.ndarray]):
+        """at: (m,) that were solved, rising, one of them 0. changes: per trajectory (m, n, 23)."""
+        self.solved, self.changes = at, changes
+        self.tangents = [_tangents(at, one) for one in changes]
+
+    def part(self, which: np.ndarray) -> "Curve":
+        return Curve(self.solved, [self.changes[i] for i in which])
+
+    def at(self, i: int, value: np.ndarray | float) -> np.ndarray:
+        """(n, 23) change of trajectory i by values (n,), or one of all rows."""
+        wide, share, low, high, left, right = self._interval(i, value)
+        inside = np.clip(share, 0, 1)
+        back = 1 - inside
+        change = (1 + 2 * inside) * back**2 * low + inside**2 * (3 - 2 * inside) * high
+        change += wide * inside * back * (back * left - inside * right)
+        return change + (share - inside) * wide * np.where(share < 0, left, right)
+
+    def slope(self, i: int, value: np.ndarray | float) -> np.ndarray:
+        """(n, 23) of the change at values (n,), or one of all rows."""
+        wide, share, low, high, left, right = self._interval(i, value)
+        inside = np.clip(share, 0, 1)
+        by = 6 * inside * (1 - inside) * (high - low) / wide
+        return by + (1 - inside) * (1 - 3 * inside) * left - inside * (2 - 3 * inside) * right
+
+    def _interval(self, i, value):
+        changes, tangents = self.changes[i], self.tangents[i]
+        row = np.arange(changes.shape[1])
+        value = np.broadcast_to(value, row.shape)
+        k = np.clip(np.searchsorted(self.solved, value, "right") - 1, 0, len(self.solved) - 2)
+        wide = (self.solved[k + 1] - self.solved[k])[:, None]
+        share = (value - self.solved[k])[:, None] / wide
+        return wide, share, changes[k, row], changes[k + 1, row], tangents[k, row], tangents[k + 1, row]
+
+
+def _tangents(at, changes):
+    """(m, n, 23) slopes of changes at (m,): parabolas', within three times that to either side."""
+    wide = np.diff(at)[:, None, None]
+    secant = np.diff(changes, axis=0) / wide
+    out = np.empty_like(changes)
+    out[1:-1] = (secant[1:] * wide[:-1] + secant[:-1] * wide[1:]) / (wide[1:] + wide[:-1])
+    limit = 3 * np.minimum(np.abs(secant[1:]), np.abs(secant[:-1]))
+    out[1:-1] = np.clip(out[1:-1], -limit, limit)
+    for end, beside in ((0, 1), (-1, -2)):
+        limit = 3 * np.abs(secant[end])
+        out[end] = np.clip(2 * secant[end] - out[beside], -limit, limit)
+    return out
 
 
 def unlike(effect: Effect, theta: dict, there: dict) -> float:

@@ -262,7 +262,7 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
-        """The skin along the trajectories and its differences: 15 solutions of the data set by the condensed
+        """The skin along the trajectories and its differences: 18 solutions of the data set by the condensed
         tier, beside one of the simulator's own; kept in `cache`."""
         return solved_fields(self, trajectories, progress)
 
@@ -343,6 +343,8 @@ class Simulator:
             shares.append((np.log(modulus), "modulus"))
         for i, run in enumerate(runs):
             between = sum(share * fields.stacked[name][i] for share, name in shares if share)
+            if nuisance.log_film and fields.film is not None:
+                between = between + fields.film.at(i, nuisance.log_film)
             if np.ndim(between):
                 run.force = run.force + modulus * between[:, :3]
                 run.pressure = run.pressure + modulus * between[:, 3]
@@ -445,18 +447,13 @@ class Simulator:
         curves = fields.bent(moving)
         for i in sorted(set(changed) - set(anew)):
             run = runs[i]
-            along = run.offset @ run.heading
-            shift = (
-                [("press", along), ("bend", along**2), *zip("xyz", run.offset.T)] if run.offset.any() else []
-            )
             parts = [
-                *shift,
                 ("radius", run.log_radius),
                 ("friction", run.log_friction),
                 ("friction2", run.log_friction**2),
                 ("bubble", run.bubble),
             ]
-            change = 0.0
+            change = fields.shifted(i, run.offset) if run.offset.any() else 0.0
             for name, amount in parts:
                 several = np.ndim(amount) > 0
                 if name in fields.stacked and (amount.any() if several else amount):
