@@ -28,11 +28,10 @@ from biotac_mj.learning.predictor import PointsModel
 from biotac_mj.learning.protocol import interaction_errors, paired_test, quartiles
 from biotac_mj.learning.training.arrays import join, load_arrays
 from biotac_mj.learning.training.config import LearningConfig
-from biotac_mj.learning.training.inverse import contact_centre, field_errors, patch_of_push, patch_overlap
-from biotac_mj.learning.training.local import counts_change
+from biotac_mj.learning.training.inverse import inverse_errors, patch_of_push
+from biotac_mj.learning.training.local import counts_change, film_with_gains
 from biotac_mj.learning.training.paper import train_latent_projection, train_pointnet
 from biotac_mj.learning.weights import save_points_model
-from biotac_mj.sensor.channels import log_impedance
 
 OUT = pathlib.Path(__file__).parents[1] / "biotac_mj" / "assets" / "weights"
 # What differs from the paper's: d ln Z, no dropout and a projection that is trained through the decoder, all
@@ -59,16 +58,6 @@ def divide(arrays, seed=0):
     return np.r_[train, np.flatnonzero(~arrays.labelled)], choose, judge
 
 
-def gained(arrays, fit, rows):
-    """Change of counts of the simulated film, with a gain for each electrode from rows `fit`."""
-    z = torch.as_tensor(
-        log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device
-    )
-    z = z - z[arrays.first]
-    gain = (z[fit] * arrays.log_change(fit)).sum(0) / z[fit].square().sum(0).clamp(min=1e-9)
-    return counts_change(gain * z[rows], arrays.tare[rows])
-
-
 @torch.no_grad()
 def judged(arrays, rows, predictions):
     """{name: RMS of each interaction [counts]}; predictions: change of counts of the rows."""
@@ -83,30 +72,12 @@ def forward(arrays, nets, rows, config, fit=None):
     film = arrays.simulated[rows] - arrays.simulated[arrays.first[rows]]
     out = {"no change": torch.zeros_like(film), "film": film}
     if fit is not None:
-        out["film with gains"] = gained(arrays, fit, rows)
+        out["film with gains"] = film_with_gains(arrays, fit, rows)
     for name, net in nets.items():
         rest = net(torch.zeros_like(arrays.field[:1].float()))
         u = [unit * arrays.field[r].float() for r in rows.split(256)]
         out[name] = counts_change(torch.cat([net(x) - rest for x in u]), arrays.tare[rows])
     return out
-
-
-@torch.no_grad()
-def backward(arrays, model, rows, patch):
-    """Errors of the inverse projection on rows of one set."""
-    place, found = arrays.geometry.vert[arrays.outer], []
-    for r in rows.split(256):
-        field, push = model(arrays.log_change(r))
-        truth, push = arrays.force[r].float().cpu().numpy(), push.cpu().numpy()
-        centre = contact_centre(push, place, patch) - contact_centre(truth, place)
-        found.append(
-            field_errors(field, arrays.field[r].float())
-            | {
-                "centre": np.where(truth.sum(1) > 0.1, 1e3 * np.linalg.norm(centre, axis=1), np.nan),
-                "overlap": np.where(truth.sum(1) > 0.1, patch_overlap(push, truth, patch), np.nan),
-            }
-        )
-    return {k: np.concatenate([f[k] for f in found]) for k in found[0]}
 
 
 def speed(model, config, device, repeats=20):
@@ -180,7 +151,8 @@ def main():
     patch = float(np.median(patches))
     for a, model, (_, mine) in zip(sets, served, parts):
         if len(mine):
-            inverse.append(backward(a, model, a.rows(mine, labelled=True), patch))
+            rows_of = a.rows(mine, labelled=True)
+            inverse.append(inverse_errors(a, lambda r: model(a.log_change(r)), rows_of, patch))  # noqa: B023
     inverse = {k: np.concatenate([f[k] for f in inverse]) for k in inverse[0]}
     with torch.no_grad():
         u = arrays.field[rows].float() * (1e-3 / config.mesh_scale)

@@ -21,13 +21,14 @@ from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
 from ..instants.linear import ridges
 from ..predictor import PointsModel
+from ..protocol import interaction_errors
 from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays
 from .config import LearningConfig, without_gone
 from .features import Pod
 from .fitting import Watch
-from .inverse import PATCH, contact_centre, field_errors, patch_of_push, patch_overlap, train_inverse
-from .local import Features, train_head
+from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_inverse
+from .local import Features, film_with_gains, train_head
 from .paper import train_latent_projection, train_pointnet
 
 __all__ = ["FORWARD", "division_of", "train_all", "train_split"]
@@ -250,7 +251,7 @@ def train_split(
     predictions["linear"] = timed("linear", lambda: _linear(arrays, now, fit, check, both))
     physics = arrays.simulated[both] - arrays.simulated[arrays.first[both]]
     predictions["physics"] = physics
-    predictions["physics_gain"] = _physics_gain(arrays, fit, both)
+    predictions["physics_gain"] = film_with_gains(arrays, fit, both)
 
     models = {}
     for name in names:
@@ -341,7 +342,8 @@ def train_split(
         )
     report["mesh"] = {name: _mesh_errors(arrays, code, every) for name, code in codes.items()}
     report["inverse"] = {
-        name: _inverse_errors(arrays, model, rows, shares[name]) for name, model in back.items()
+        name: _inverse_summary(inverse_errors(arrays, model, rows, shares[name]))
+        for name, model in back.items()
     }
     report["seconds"] = seconds
     if names:
@@ -386,28 +388,14 @@ def _linear(arrays, now, fit, check, both):
     )
 
 
-def _physics_gain(arrays, fit, both):
-    """The simulation's own d ln Z, times one gain for each electrode."""
-    from ...sensor.channels import log_impedance
-    from .local import counts_change
-
-    z = torch.as_tensor(
-        log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device
-    )
-    z = z - z[arrays.first]
-    y = arrays.log_change(fit)
-    gain = (z[fit] * y).sum(0) / z[fit].square().sum(0).clamp(min=1e-9)
-    return counts_change(gain * z[both], arrays.tare[both])
-
-
 @torch.no_grad()
 def _in_parts(work, rows):
     return torch.cat([work(r) for r in rows.split(512)])
 
 
 def _median(got, truth, owner):
-    rms = (got - truth).square().mean(1).sqrt()
-    return float(np.median([float(rms[owner == k].mean()) for k in torch.unique(owner)]))
+    got, truth, owner = (x.cpu().numpy() for x in (got, truth, owner))
+    return float(np.median(interaction_errors(got, truth, owner)[1]))
 
 
 @torch.no_grad()
@@ -423,30 +411,17 @@ def _mesh_errors(arrays, code, rows, most=3000):
     return {"all": {k: float(v.mean()) for k, v in errors.items()}, "objects": table}
 
 
-@torch.no_grad()
-def _inverse_errors(arrays, model, rows, patch):
-    """Errors of the field [mm], of the patch's centre [mm] and its overlap, where at least 0.1 N touch.
-    patch: see `contact_centre`."""
-    place = arrays.geometry.vert[arrays.outer]
-    fields, centres, overlaps, touching = [], [], [], []
-    for r in rows.split(512):
-        field, force = model(r)
-        fields.append(field_errors(field, arrays.field[r].float()))
-        truth = arrays.force[r].float().cpu().numpy()
-        touching.append(truth.sum(1) > 0.1)
-        force = force.cpu().numpy()
-        found = contact_centre(force, place, patch)
-        centres.append(np.linalg.norm(found - contact_centre(truth, place), axis=1))
-        overlaps.append(patch_overlap(force, truth, patch))
-    out = {k: float(np.mean(np.concatenate([f[k] for f in fields]))) for k in fields[0]}
-    touching, centres, overlaps = (np.concatenate(x) for x in (touching, centres, overlaps))
-    known = touching & np.isfinite(centres)
+def _inverse_summary(errors):
+    """Means of the field's errors [mm], median of the patch's centre [mm] and its overlap, of
+    `inverse_errors`."""
+    out = {k: float(np.mean(errors[k])) for k in ("mean", "moved", "largest")}
+    known = np.isfinite(errors["centre"])
     if known.any():
-        q25, q50, q75 = np.percentile(1e3 * centres[known], [25, 50, 75])
+        q25, q50, q75 = np.percentile(errors["centre"][known], [25, 50, 75])
         out |= {
             "centre_median": float(q50),
             "centre_quartiles": [float(q25), float(q75)],
-            "overlap_mean": float(overlaps[known].mean()),
+            "overlap_mean": float(errors["overlap"][known].mean()),
         }
     return out
 

@@ -1,6 +1,7 @@
 """From electrodes back to the skin: displacements, contact forces and the patch that touches."""
 
 import typing
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ __all__ = [
     "InverseHead",
     "contact_centre",
     "field_errors",
+    "inverse_errors",
     "log_change_of",
     "patch_of_push",
     "patch_overlap",
@@ -186,6 +188,27 @@ def patch_of_push(push: np.ndarray, force: np.ndarray) -> float:
     """
     shares = np.arange(0.1, 0.96, 0.05)
     return float(max(shares, key=lambda share: np.nanmean(patch_overlap(push, force, share))))
+
+
+@torch.no_grad()
+def inverse_errors(arrays: "Arrays", model: Callable, rows: torch.Tensor, patch: float = PATCH) -> dict:
+    """Errors of an inverse model, each (n,): of the field as `field_errors`, of the patch's centre [mm] and
+    its overlap, NaN where less than 0.1 N touch.
+
+    Args:
+      model: function of rows (k,) -> field (k, nvert, 3) [mm] and force or push (k, nouter).
+      rows: (n,) of the set. patch: see `contact_centre`.
+    """
+    place, found = arrays.geometry.vert[arrays.outer], []
+    for r in rows.split(512):
+        field, push = model(r)
+        truth, push = arrays.force[r].float().cpu().numpy(), push.cpu().numpy()
+        off = 1e3 * np.linalg.norm(contact_centre(push, place, patch) - contact_centre(truth, place), axis=1)
+        touching = truth.sum(1) > 0.1
+        own = {"centre": np.where(touching, off, np.nan)}
+        own["overlap"] = np.where(touching, patch_overlap(push, truth, patch), np.nan)
+        found.append(field_errors(field, arrays.field[r].float()) | own)
+    return {k: np.concatenate([f[k] for f in found]) for k in found[0]}
 
 
 def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:

@@ -20,7 +20,17 @@ if typing.TYPE_CHECKING:
     from .config import LearningConfig
     from .features import Pod
 
-__all__ = ["Features", "counts_change", "train_head"]
+__all__ = ["Features", "counts_change", "film_with_gains", "train_head"]
+
+
+def film_with_gains(arrays: "Arrays", fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    """Change of counts (n, 19) of the simulation's own film in rows (n,), with one gain of d ln Z for each
+    electrode from labelled rows `fit`."""
+    counts = arrays.simulated.cpu().numpy()
+    z = torch.as_tensor(log_impedance(counts), dtype=torch.float32, device=arrays.device)
+    z = z - z[arrays.first]
+    gain = (z[fit] * arrays.log_change(fit)).sum(0) / z[fit].square().sum(0).clamp(min=1e-9)
+    return counts_change(gain * z[rows], arrays.tare[rows])
 
 
 def counts_change(log_change: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
