@@ -444,10 +444,9 @@ _SKIN_ON_SKIN = (
     "Skins of two BioTacs meet (`tests/test_skin_on_skin.py`) in attach, condensed and batch, where neither "
     "names its `geoms`.\nThe other paths have one BioTac; `skin.step` takes geoms of type skin with "
     "`GeomSet(own=)`, and gradients refuse them.\n\n"
-    "MuJoCo's own `<force>`, `<torque>`, `<touch>`, `cfrc_ext` and `cfrc_int` feel a two-way skin in attach, "
-    "condensed and batch ([how](lab/coupling.md#mujocos-own-force-sensors)).\n"
-    "`<contact>` sensors that would have to feel it are refused when the model is compiled, as are flexes "
-    "that collide with a BioTac\n(`tests/test_true_contact.py`)."
+    "MuJoCo's own `<force>`, `<torque>`, `<touch>`, `<contact>`, `cfrc_ext` and `cfrc_int` feel a two-way "
+    "skin in attach, condensed and batch ([how](lab/coupling.md#mujocos-own-force-sensors)).\n"
+    "Flexes that collide with a BioTac are refused when the model is compiled (`tests/test_true_contact.py`)."
 )
 
 

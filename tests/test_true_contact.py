@@ -208,39 +208,73 @@ def test_a_flex_that_would_pass_through_the_skin_is_refused():
             spec.compile()
 
 
-CONTACTS = """<mujoco><worldbody><site name="mount" quat="1 -1 0 0"/><site name="zone" size=".1"/>
-<body name="tray" pos="0 0 .1"><freejoint/><geom name="tray" size=".01" mass=".1"/>
-<body name="ball" pos="0 0 .1"><geom name="ball" size=".005" mass=".1"/></body></body>
-<geom name="table" type="plane" size="1 1 1" pos="0 0 -.1" contype="2" conaffinity="2"/></worldbody>
-<sensor><contact name="seen" {}/></sensor></mujoco>"""
+EVERYTHING = "found force torque dist pos normal tangent"
+CONTACTS = f"""<mujoco><option timestep=".002" integrator="implicitfast" cone="{{cone}}"/><worldbody>
+<body name="arm"><joint type="slide" axis="0 0 1" stiffness="2e4" damping="100"/>
+<inertial mass=".2" pos="0 0 -.02" diaginertia="1e-4 1e-4 1e-4"/>
+<site name="mount" quat="1 -1 0 0"/><site name="zone" size=".03"/>
+<site name="far" pos="0 0 .1" size=".03"/></body>
+<body name="plate" pos="-.009 0 .0134"><joint type="slide" axis="0 0 1" damping="4"/>
+<geom name="left" size=".005" pos="-.003 0 0" mass=".05"/>
+<geom name="right" size=".005" pos=".003 0 0" mass=".05"/>
+<geom name="clear" size=".005" pos="0 0 .1" mass="1e-6"/></body>
+</worldbody><sensor>
+<contact name="left" geom1="left" data="{EVERYTHING}"/>
+<contact name="right" geom2="right" data="{EVERYTHING}"/>
+<contact name="net" site="zone" reduce="netforce" data="{EVERYTHING}"/>
+<contact name="ordered" subtree1="arm" body2="plate" num="3" reduce="maxforce" data="force normal"/>
+<contact name="clear" geom1="clear"/><contact name="far" site="far"/><force site="zone"/></sensor></mujoco>"""
 
 
-def with_a_contact_sensor(what, core=None):
-    """Compiles a model with a `<contact>` sensor; core: kind of object by which it names the BioTac."""
-    spec = mujoco.MjSpec.from_string(CONTACTS.format(what))
-    biotac_mj.attach(spec, site="mount", skin="coarse", readings=False)
-    if core is not None:
-        spec.sensor("seen").objtype, spec.sensor("seen").objname = core, "biotac_core"
-    with biotac_mj.plugin.explained():
-        return mujoco.MjData(spec.compile())
+def check_contacts(read, external):
+    """What `<contact>` sensors read of two balls on one body, 100 g, that lie on a skin; external: the
+    cfrc_ext (6,) of that body."""
+    both = [
+        dict(zip(("found", "force", "torque", "dist", "pos", "normal", "tangent"), part))
+        for part in (np.split(read(name), [1, 4, 7, 8, 11, 14]) for name in ("left", "right"))
+    ]
+    total = np.zeros(3)
+    for one, sign in zip(both, (-1.0, 1.0)):
+        assert one["found"][0] == 1 and one["dist"][0] == 0.0
+        # a normal points from the sensor's first object to its second: here out of the ball, and into it
+        assert sign * one["normal"][2] > 0.9
+        frame = np.stack([one["normal"], one["tangent"], np.cross(one["normal"], one["tangent"])])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-6)
+        total += sign * one["force"] @ frame
+        assert one["force"][0] > 0.2
+    assert both[0]["pos"][0] < both[1]["pos"][0] - 0.004
+    np.testing.assert_allclose(total, external[3:], atol=1e-5)
+    assert total[2] == pytest.approx(WEIGHT, rel=5e-3)
+    net = read("net")
+    assert net[0] == 2
+    np.testing.assert_allclose(np.abs(net[1:4]), np.abs(total), atol=1e-5)
+    ordered = read("ordered").reshape(3, 6)
+    assert ordered[0, 0] >= ordered[1, 0] > 0.2 and not ordered[2].any()
+    assert (ordered[:2, 5] > 0.9).all()  # from arm to plate
+    assert read("clear")[0] == read("far")[0] == 0
 
 
-@pytest.mark.parametrize(
-    "what",
-    ["", 'site="zone"', 'geom1="ball"', 'geom2="ball"', 'body1="ball"', 'subtree1="tray"', "core", "below"],
-)
-def test_a_contact_sensor_that_would_miss_the_skin_is_refused(what):
-    core = {"core": mujoco.mjtObj.mjOBJ_BODY, "below": mujoco.mjtObj.mjOBJ_XBODY}.get(what)
-    what = 'geom2="ball"' if core else what
-    said = "<contact> sensor 'seen' would not feel the skin of 'biotac_core'"
-    with pytest.warns(RuntimeWarning, match=said), pytest.raises(ValueError, match=said):
-        with_a_contact_sensor(what, core)
+@pytest.mark.parametrize(("tier", "cone"), [("condensed", "pyramidal"), ("full", "elliptic")])
+def test_contact_sensors_feel_the_skin(tier, cone):
+    spec = mujoco.MjSpec.from_string(CONTACTS.format(cone=cone))
+    biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 150)
+    assert data.ncon == 0  # as MuJoCo leaves them
+    check_contacts(lambda name: data.sensor(name).data, data.cfrc_ext[model.body("plate").id])
 
 
-def test_a_contact_sensor_of_what_touches_no_skin_works():
-    with_a_contact_sensor('geom1="table"')
-    with_a_contact_sensor('body1="ball" geom2="table"')
-    with_a_contact_sensor('geom2="ball"', mujoco.mjtObj.mjOBJ_GEOM)  # of the core alone, which is rigid
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_in_a_batch_contact_sensors_feel_the_skin(cone):
+    d, _ = batch_of(CONTACTS.format(cone=cone), 150)
+    model = mujoco.MjModel.from_xml_string(CONTACTS.format(cone=cone))  # sensors that come first
+    for data, external in zip(d.sensordata.numpy(), d.cfrc_ext.numpy()):
+        read = {
+            model.sensor(i).name: data[model.sensor_adr[i] :][: model.sensor_dim[i]]
+            for i in range(model.nsensor)
+        }
+        check_contacts(read.get, external[-1])  # the plate's
 
 
 def on_a_static_link():

@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 
 from ..coupling.implicit.rules import LOSS_FREQUENCY
+from ..coupling.loads import core_geom
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
@@ -50,6 +51,7 @@ class Batch(Skins):
 
     Attributes besides those of `Skins`:
       active: False leaves the skins out of `mjw.step` and `mjw.forward`: nothing is solved, nothing acts.
+      ngeom: number of geoms that can touch.
     """
 
     def __init__(
@@ -78,11 +80,8 @@ class Batch(Skins):
             self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._acting = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
-            self._geom_group = wp.array(touching.group.astype(np.int32), dtype=int)
-            self._resultants = (
-                *(wp.zeros(self.groups, dtype=wp.vec3d) for _ in range(2)),
-                wp.zeros(self.groups, dtype=wp.float64),
-            )
+            kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.spatial_vectord)
+            self._touches = [wp.zeros((len(touching.geom), self.nworld), dtype=kind) for kind in kinds]
             self._of_step = r = rounds.Rounds()
             r.limit = limit
             for name in ("here", "start", "", "asked", "free", "end"):
@@ -97,7 +96,9 @@ class Batch(Skins):
             self._step = wp.full(self.nworld, self.dt, dtype=wp.float64)
             self._power = wp.zeros((self.nworld, 6 * skin.ngroup), dtype=wp.vec2d)
             self._greedy = wp.zeros(self.nworld, dtype=int)
-        pairs = SolidPairs(ModelView(mjm._address), touching)
+        view = ModelView(mjm._address)
+        self._core_geom, self.ngeom = core_geom(view, touching.core), len(touching.geom)
+        pairs = SolidPairs(view, touching)
         self.solid_contacts = SolidContacts(pairs, self.nworld, self.device)
         self._delay = loss / (2 * math.pi * LOSS_FREQUENCY * self.dt)
         self._clearance = Clearance(skin.model, self.nworld)
@@ -392,20 +393,36 @@ class Batch(Skins):
         self._launch(loads.apply_wrenches, self.nworld, where, [d.xfrc_applied])
         self._launch(loads.clear_rows, self._row.shape, [self._row], [d.efc.force])
 
-    def add_touch(self, m: "mjw.Model", d: "mjw.Data", sensor: wp.array) -> None:
-        """Adds its contacts to the touch sensors of these numbers."""
+    def find_touches(self) -> None:
+        """Parts what acts among the geoms."""
         from . import loads
 
-        skin, pos, normal, force = self.skin, *self._resultants
-        outer, model = skin.data.outer, skin.model
-        samples = [len(model.sample), model.outer.face, self._geom_group, outer.kept, outer.anchor_geom]
+        skin, outer, model = self.skin, self.skin.data.outer, self.skin.model
+        samples = [len(model.sample), model.outer.face, self._group, outer.kept, outer.anchor_geom]
         samples += [outer.sample_force, skin.x, self._acting]
-        self._launch(loads.find_resultants, self.groups, samples, [pos, normal, force])
+        self._launch(loads.find_touches, self.groups, samples, [*self._touches])
+
+    def add_touch(self, m: "mjw.Model", d: "mjw.Data", sensor: wp.array) -> None:
+        """Adds its touches to the touch sensors of these numbers."""
+        from . import loads
+
         sensors = [sensor, m.sensor_objid, m.sensor_adr, m.sensor_cutoff]
-        sensors += [m.body_weldid, m.body_rootid, m.site_bodyid]
+        sensors += [m.body_weldid, m.body_rootid, m.geom_bodyid, m.site_bodyid]
         sites = [m.site_type, m.site_size, d.site_xpos, d.site_xmat, d.xpos, d.xmat]
-        known = [self._core, self._body, *sensors, *sites, pos, normal, force]
+        pos, normal, _, wrench = self._touches
+        known = [self._core, self._geom, *sensors, *sites, pos, normal, wrench]
         self._launch(loads.add_touch, (len(sensor), self.nworld), known, [d.sensordata])
+
+    def list_touches(self, m: "mjw.Model", d: "mjw.Data", row: int, listed: list) -> None:
+        """Adds its touches to the contacts, with rows from `row` on."""
+        from mujoco_warp import ConeType
+
+        from . import loads
+
+        pos, normal, _, wrench = self._touches
+        pyramidal = m.opt.cone == ConeType.PYRAMIDAL
+        known = [self._core, self._core_geom, self._geom, pyramidal, row, d.xpos, d.xmat, pos, normal, wrench]
+        self._launch(loads.list_touches, (self.ngeom, self.nworld), known, listed)
 
     def meet(self, others: list["Batch"]) -> None:
         """Shares what skins do to each other between two that both move bodies."""
@@ -527,7 +544,11 @@ class Hook:
             self._amiss = wp.zeros(1, dtype=int)
             self._stiffness = wp.zeros((d.nworld, m.nv, m.nv), dtype=wp.float64)
             rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
-            self._integrator, self._ends, self._loads = Integrator(m, d), Ends(d), Loads(m, d)
+            self._integrator, self._ends, self._loads = (
+                Integrator(m, d),
+                Ends(d),
+                Loads(m, d, self._corrected),
+            )
             self._slope = integrator.Slope(m, sum(groups), d.nworld)
         self._scratch = Scratch(device)
         for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):

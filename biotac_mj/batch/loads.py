@@ -1,14 +1,17 @@
 """What mujoco_warp's own force quantities have of the skins, for all worlds at once (`coupling/loads.py` for
-one): `cfrc_ext` and `cfrc_int` where mujoco_warp computes them, and the sensors `<force>`, `<torque>` and
-`<touch>`."""
+one): `cfrc_ext` and `cfrc_int` where mujoco_warp computes them, and the sensors `<force>`, `<torque>`,
+`<touch>` and `<contact>`."""
 
+import copy
 import typing
 
 import mujoco
 import numpy as np
 import warp as wp
 from mujoco_warp._src.ray import ray_geom
+from mujoco_warp._src.types import ContactType, vec5
 
+from ..coupling.loads import PYRAMID
 from ..skin.types import double, widen
 
 if typing.TYPE_CHECKING:
@@ -21,9 +24,10 @@ wp.set_module_options({"enable_backward": False})
 real = wp.float64
 vec3 = wp.vec3d
 vec6 = wp.spatial_vectord
-_FORCE, _TORQUE, _TOUCH = (
-    int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH")
+_FORCE, _TORQUE, _TOUCH, _CONTACT = (
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH", "CONTACT")
 )
+_CONSTRAINT, _PYRAMID = wp.constant(int(ContactType.CONSTRAINT)), wp.constant(PYRAMID)
 _TINY = wp.constant(wp.float64(1e-12))  # [N]
 
 
@@ -107,7 +111,7 @@ def write_wrench_sensors(
 
 
 @wp.kernel
-def find_resultants(
+def find_touches(
     # In:
     nsample: int,
     face: wp.array(dtype=wp.vec3i),
@@ -120,14 +124,22 @@ def find_resultants(
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     normal_out: wp.array2d(dtype=vec3),
-    force_out: wp.array2d(dtype=real),
+    share_out: wp.array2d(dtype=real),
+    wrench_out: wp.array2d(dtype=vec6),
 ):
-    """Of each body on a skin: centre of pressure, mean normal out of the skin there, and the force along
-    it."""
+    """What each geom gets of what acts on its body (`Instance.touches`): centre of pressure, mean normal out
+    of the skin there, share of the body's wrench, force and torque about the centre."""
     g, w = wp.tid()
-    load = real(0.0)
-    pos = vec3()
-    normal = vec3()
+    first = int(-1)
+    for k in range(group.shape[0]):
+        if group[k] == g:
+            if first < 0:
+                first = k
+            pos_out[k, w] = vec3()
+            normal_out[k, w] = vec3()
+            share_out[k, w] = real(0.0)
+            wrench_out[k, w] = vec6()
+    total = real(0.0)
     for f in range(kept.shape[0]):
         if kept[f, w] == 1:
             t = face[f]
@@ -140,29 +152,47 @@ def find_resultants(
                 if k >= 0:
                     if group[k] == g:
                         push = wp.max(-wp.dot(force[f * nsample + s, w], n), real(0.0))
-                        load += push
-                        pos += push / real(3.0) * (a + b + c)
-                        normal += push * n
-    size = real(0.0)
-    if load > _TINY:
-        pos_out[g, w] = pos / load
-        normal = wp.normalize(normal)
-        size = wp.max(wp.dot(wp.spatial_top(acting[g, w]), normal), real(0.0))
-    normal_out[g, w] = normal
-    force_out[g, w] = size
+                        total += push
+                        share_out[k, w] += push
+                        pos_out[k, w] += push / real(3.0) * (a + b + c)
+                        normal_out[k, w] += push * n
+    pushed = wp.spatial_top(acting[g, w])
+    square = wp.dot(pushed, pushed)
+    if first < 0 or square < _TINY * _TINY:
+        return
+    if total < _TINY:
+        pos_out[first, w] = wp.cross(pushed, wp.spatial_bottom(acting[g, w])) / square
+        normal_out[first, w] = pushed
+        share_out[first, w] = real(1.0)
+        total = real(1.0)
+    centre = vec3()
+    for k in range(group.shape[0]):
+        if group[k] == g and share_out[k, w] > real(0.0):
+            centre += pos_out[k, w] / total
+            pos_out[k, w] = pos_out[k, w] / share_out[k, w]
+            normal_out[k, w] = wp.normalize(normal_out[k, w])
+            share_out[k, w] = share_out[k, w] / total
+    turn = wp.spatial_bottom(acting[g, w]) - wp.cross(centre, pushed)
+    for k in range(group.shape[0]):
+        if group[k] == g:
+            share = share_out[k, w]
+            for i in range(3):
+                wrench_out[k, w][i] = share * pushed[i]
+                wrench_out[k, w][i + 3] = share * turn[i]
 
 
 @wp.kernel
 def add_touch(
     # In:
     core: int,
-    body: wp.array(dtype=int),
+    geom: wp.array(dtype=int),
     sensor: wp.array(dtype=int),
     sensor_objid: wp.array(dtype=int),
     sensor_adr: wp.array(dtype=int),
     sensor_cutoff: wp.array(dtype=float),
     body_weldid: wp.array(dtype=int),
     body_rootid: wp.array(dtype=int),
+    geom_bodyid: wp.array(dtype=int),
     site_bodyid: wp.array(dtype=int),
     site_type: wp.array(dtype=int),
     site_size: wp.array(dtype=wp.vec3),
@@ -172,45 +202,169 @@ def add_touch(
     xmat: wp.array2d(dtype=wp.mat33),
     pos: wp.array2d(dtype=vec3),
     normal: wp.array2d(dtype=vec3),
-    force: wp.array2d(dtype=real),
+    wrench: wp.array2d(dtype=vec6),
     # In and out:
     sensordata: wp.array2d(dtype=float),
 ):
-    """Adds the contacts whose ray out of the sensor's body meets its site."""
-    k, w = wp.tid()
-    i = sensor[k]
-    site = sensor_objid[i]
+    """Adds the touches whose ray out of the sensor's body meets its site."""
+    i, w = wp.tid()
+    s = sensor[i]
+    site = sensor_objid[s]
     b = site_bodyid[site]
     turn = widen(xmat[w, core])
-    for g in range(body.shape[0]):
+    for k in range(geom.shape[0]):
         sign = real(0.0)
-        if b == body[g]:
+        if b == geom_bodyid[geom[k]]:
             sign = real(-1.0)
         elif body_weldid[b] == body_weldid[core] and body_rootid[b] == body_rootid[core]:
             sign = real(1.0)
-        if sign != real(0.0) and force[g, w] > real(0.0):
-            at = wp.vec3(turn * pos[g, w] + double(xpos[w, core]))
-            ray = wp.vec3(sign * (turn * normal[g, w]))
+        push = wp.dot(wp.spatial_top(wrench[k, w]), normal[k, w])
+        if sign != real(0.0) and push > real(0.0):
+            at = wp.vec3(turn * pos[k, w] + double(xpos[w, core]))
+            ray = wp.vec3(sign * (turn * normal[k, w]))
             frame = site_xmat[w, site]
             away, _normal = ray_geom(site_xpos[w, site], frame, site_size[site], at, ray, site_type[site])
             if away >= 0.0:
-                sensordata[w, sensor_adr[i]] = sensordata[w, sensor_adr[i]] + float(force[g, w])
-    if sensor_cutoff[i] > 0.0:
-        sensordata[w, sensor_adr[i]] = wp.min(sensordata[w, sensor_adr[i]], sensor_cutoff[i])
+                sensordata[w, sensor_adr[s]] = sensordata[w, sensor_adr[s]] + float(push)
+    if sensor_cutoff[s] > 0.0:
+        sensordata[w, sensor_adr[s]] = wp.min(sensordata[w, sensor_adr[s]], sensor_cutoff[s])
+
+
+@wp.struct
+class Contacts:
+    """Of mujoco_warp's contacts what its `<contact>` sensors read; `force` is of the constraint rows."""
+
+    dist: wp.array(dtype=float)
+    pos: wp.array(dtype=wp.vec3)
+    frame: wp.array(dtype=wp.mat33)
+    friction: wp.array(dtype=vec5)
+    dim: wp.array(dtype=int)
+    geom: wp.array(dtype=wp.vec2i)
+    efc_address: wp.array2d(dtype=int)
+    worldid: wp.array(dtype=int)
+    type: wp.array(dtype=int)
+    adhesion: wp.array(dtype=float)
+
+
+@wp.kernel
+def copy_contacts(
+    # In:
+    contact: Contacts,
+    count: wp.array(dtype=int),
+    # Out:
+    contact_out: Contacts,
+    count_out: wp.array(dtype=int),
+):
+    i = wp.tid()
+    n = wp.min(count[0], contact.dist.shape[0])
+    if i == 0:
+        count_out[0] = n
+    if i < n:
+        contact_out.dist[i] = contact.dist[i]
+        contact_out.pos[i] = contact.pos[i]
+        contact_out.frame[i] = contact.frame[i]
+        contact_out.friction[i] = contact.friction[i]
+        contact_out.dim[i] = contact.dim[i]
+        contact_out.geom[i] = contact.geom[i]
+        contact_out.worldid[i] = contact.worldid[i]
+        contact_out.type[i] = contact.type[i]
+        contact_out.adhesion[i] = contact.adhesion[i]
+        for k in range(contact.efc_address.shape[1]):
+            contact_out.efc_address[i, k] = contact.efc_address[i, k]
+
+
+@wp.kernel
+def list_touches(
+    # In:
+    core: int,
+    core_geom: int,
+    geom: wp.array(dtype=int),
+    pyramidal: bool,
+    row: int,
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    pos: wp.array2d(dtype=vec3),
+    normal: wp.array2d(dtype=vec3),
+    wrench: wp.array2d(dtype=vec6),
+    # In and out:
+    contact: Contacts,
+    count: wp.array(dtype=int),
+    row_force: wp.array2d(dtype=float),
+):
+    """Adds the touches of a skin to the contacts, each with six components; rows from `row` on are theirs."""
+    k, w = wp.tid()
+    force = wp.spatial_top(wrench[k, w])
+    if wp.dot(force, force) == real(0.0):
+        return
+    i = wp.atomic_add(count, 0, 1)
+    turn = widen(xmat[w, core])
+    n = turn * normal[k, w]
+    least = wp.min(wp.abs(n[0]), wp.min(wp.abs(n[1]), wp.abs(n[2])))
+    axis = vec3(real(0.0), real(0.0), real(1.0))
+    if wp.abs(n[0]) == least:
+        axis = vec3(real(1.0), real(0.0), real(0.0))
+    elif wp.abs(n[1]) == least:
+        axis = vec3(real(0.0), real(1.0), real(0.0))
+    t = wp.normalize(wp.cross(n, axis))
+    frame = wp.matrix_from_rows(n, t, wp.cross(n, t))
+    force = frame * (turn * force)
+    torque = frame * (turn * wp.spatial_bottom(wrench[k, w]))
+    contact.dist[i] = 0.0
+    contact.pos[i] = wp.vec3(turn * pos[k, w] + double(xpos[w, core]))
+    contact.frame[i] = wp.mat33(frame)
+    contact.friction[i] = vec5(1.0, 1.0, 1.0, 1.0, 1.0)
+    contact.dim[i] = 6
+    contact.geom[i] = wp.vec2i(core_geom, geom[k])
+    contact.worldid[i] = w
+    contact.type[i] = _CONSTRAINT
+    contact.adhesion[i] = 0.0
+    first = row + _PYRAMID * k
+    for c in range(_PYRAMID):
+        contact.efc_address[i, c] = first + c
+    if pyramidal:  # the mean of two edges' sum is the normal force's part, their difference a component
+        for c in range(5):
+            value = torque[wp.max(c - 2, 0)]
+            if c < 2:
+                value = force[c + 1]
+            row_force[w, first + 2 * c] = float(force[0] / real(10.0) + value / real(2.0))
+            row_force[w, first + 2 * c + 1] = float(force[0] / real(10.0) - value / real(2.0))
+    else:
+        for c in range(3):
+            row_force[w, first + c] = float(force[c])
+            row_force[w, first + 3 + c] = float(torque[c])
 
 
 class Loads:
     """Of a mujoco_warp Model with batches; made before a capture begins. Delayed sensors lack the skins."""
 
-    def __init__(self, m: "mjw.Model", d: "mjw.Data"):
+    def __init__(self, m: "mjw.Model", d: "mjw.Data", batches: list):
         kind, late = m.sensor_type.numpy(), m.sensor_delay.numpy().max(axis=0, initial=0.0) > 0.0
 
         def those(kinds):
             return wp.array(np.flatnonzero(np.isin(kind, kinds) & ~late).astype(np.int32), dtype=int)
 
         with wp.ScopedDevice(d.qpos.device):
-            self._wrench, self._touch = those((_FORCE, _TORQUE)), those((_TOUCH,))
+            self._wrench, self._touch, self._contact = map(those, ((_FORCE, _TORQUE), (_TOUCH,), (_CONTACT,)))
             self._applied, self._rows = wp.empty_like(d.xfrc_applied), wp.empty_like(d.efc.force)
+            if len(self._contact):
+                self._prepare_contacts(d, batches)
+
+    def _prepare_contacts(self, d, batches):
+        """A Data like `d` whose contacts have room for the skins'."""
+        ngeom = sum(batch.ngeom for batch in batches)
+        room, rows = d.naconmax + d.nworld * ngeom, d.njmax + _PYRAMID * ngeom
+        self._mujocos, self._listed, self._data = Contacts(), Contacts(), copy.copy(d)
+        self._data.contact, self._data.efc = copy.copy(d.contact), copy.copy(d.efc)
+        for name in Contacts.vars:
+            given = getattr(d.contact, name)
+            shape = (room, max(_PYRAMID, given.shape[1])) if given.ndim == 2 else (room,)
+            array = wp.zeros(shape, dtype=given.dtype)
+            setattr(self._mujocos, name, given)
+            setattr(self._listed, name, array)
+            setattr(self._data.contact, name, array)
+        self._data.efc.force = wp.zeros((d.nworld, rows), dtype=float)
+        self._data.nacon = wp.zeros(1, dtype=int)
+        self._data.naconmax, self._data.njmax = room, rows
 
     def write(self, m: "mjw.Model", d: "mjw.Data", batches: list) -> None:
         """Writes them, when each `Batch` has found what acts; of those that move bodies. Launches only."""
@@ -228,6 +382,25 @@ class Loads:
             frames = [m.site_bodyid, m.body_rootid, d.site_xpos, d.site_xmat, d.subtree_com, d.cfrc_int]
             shape = len(self._wrench), d.nworld
             wp.launch(write_wrench_sensors, shape, [*sensors, *frames], [d.sensordata], device=d.qpos.device)
+        if len(self._touch) or len(self._contact):
+            for batch in batches:
+                batch.find_touches()
         if len(self._touch):
             for batch in batches:
                 batch.add_touch(m, d, self._touch)
+        if len(self._contact):
+            self._write_contacts(m, d, batches)
+
+    def _write_contacts(self, m, d, batches):
+        """<contact> by mujoco_warp's own kernels, of its contacts and the skins' touches."""
+        from mujoco_warp._src.sensor import _eval_sensor_contact
+
+        inputs = [self._mujocos, d.nacon]
+        listed = [self._listed, self._data.nacon]
+        wp.launch(copy_contacts, d.naconmax, inputs, listed, device=d.qpos.device)
+        wp.copy(self._data.efc.force[:, : d.njmax], d.efc.force)
+        row = d.njmax
+        for batch in batches:
+            batch.list_touches(m, d, row, [*listed, self._data.efc.force])
+            row += _PYRAMID * batch.ngeom
+        _eval_sensor_contact(m, self._data, self._contact)

@@ -426,34 +426,50 @@ class Instance:
         acting = self._outcome[5]
         return self._result.wrench if acting is None else acting
 
-    def resultants(self, wrench: np.ndarray) -> list:
-        """Of wrenches (ngroup, 6) on the touching bodies: [(centre of pressure (3,) [m], normal (3,) out of
-        the skin there, force along it [N])]. Nodes of the skin belong to the body whose force acts nearest to
-        them."""
-        skin, force, torque = self.setup.skin, wrench[:, :3], wrench[:, 3:]
-        square = np.maximum((force * force).sum(axis=1), np.finfo(float).tiny)[:, None]
-        along, axis = force / np.sqrt(square), np.cross(force, torque) / square
-        pos, normal = axis.copy(), along.copy()
-        if self._result.state is not None and hasattr(skin.stepper, "contact_force"):
-            with skin.lock:
-                push = skin.stepper.contact_force(self._result.state)
-            x, face = self._result.vert_xpos, skin.geometry.outer_face
-            face = face[push.any(axis=1)[face].any(axis=1)]
-            node, corner = np.unique(face, return_inverse=True)
-            of_face = np.cross(x[face[:, 1]] - x[face[:, 0]], x[face[:, 2]] - x[face[:, 0]])
-            outward = np.zeros((len(node), 3))
-            np.add.at(outward, corner.reshape(-1, 3), of_face[:, None])
-            outward /= np.maximum(np.linalg.norm(outward, axis=1), np.finfo(float).tiny)[:, None]
-            load = np.maximum(-(push[node] * outward).sum(axis=1), 0.0)
-            away = np.cross(x[node, None] - axis, along)
-            pushed = wrench.any(axis=1)
-            nearest = np.where(pushed, (away * away).sum(axis=2), np.inf).argmin(axis=1)
-            for k in np.flatnonzero(pushed):
-                mine = load * (nearest == k)
-                if mine.any():
-                    pos[k], mean = mine @ x[node] / mine.sum(), mine @ outward
-                    normal[k] = mean / np.linalg.norm(mean)
-        return list(zip(pos, normal, np.maximum((force * normal).sum(axis=1), 0.0)))
+    def touches(self, wrench: np.ndarray) -> list:
+        """What the geoms get of wrenches (ngroup, 6) on the touching bodies: [(number of the geom, centre of
+        pressure (3,) [m], normal (3,) out of the skin there, force (3,), torque (3,) about the centre)].
+
+        A body's wrench is shared by its geoms as the skin pushes on them. Where no push is known, the first
+        gets all, on the axis of the wrench."""
+        load, moment, outward = self._pushes()
+        out = []
+        for k in np.flatnonzero(wrench.any(axis=1)):
+            force, torque = wrench[k, :3], wrench[k, 3:]
+            geoms = np.flatnonzero(self.touching.group == k)
+            pushed = geoms[load[geoms] > 0.0]
+            if len(pushed):
+                part, pos = load[pushed] / load[pushed].sum(), moment[pushed] / load[pushed, None]
+                normal = outward[pushed]
+            else:
+                square = max(force @ force, np.finfo(float).tiny)
+                pushed, part, pos = geoms[:1], np.ones(1), np.cross(force, torque)[None] / square
+                normal = force[None]
+            normal = normal / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
+            turn = torque - np.cross(part @ pos, force)
+            out += [(int(g), x, n, a * force, a * turn) for g, x, n, a in zip(pushed, pos, normal, part)]
+        return out
+
+    def _pushes(self):
+        """Of the skin's normal push on each geom: its size (ngeom,) [N], size times place and size times
+        normal (ngeom, 3)."""
+        skin, ngeom = self.setup.skin, len(self.touching.geoms)
+        load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
+        if self._result.state is None or not hasattr(skin.stepper, "contact_push"):
+            return load, moment, outward
+        with skin.lock:
+            rows = skin.stepper.contact_rows(self._result.state)
+            push = skin.stepper.contact_push(self._result.state)
+        sample, geom = rows[:, :2].T.astype(int)
+        face, first = np.unique(sample // skin.stepper.sample_area[1], return_index=True)
+        corner = self._result.vert_xpos[skin.geometry.outer_face[face]]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        push = push[face]
+        np.add.at(load, geom[first], push)
+        np.add.at(moment, geom[first], push[:, None] * corner.mean(axis=1))
+        np.add.at(outward, geom[first], push[:, None] * normal)
+        return load, moment, outward
 
     def _push_on(self, other, group):
         """(6,) of this skin on another BioTac, its touching body `group`, in the frame of that one."""

@@ -1,119 +1,144 @@
-"""What MuJoCo's own force quantities have of the skins: `cfrc_ext`, `cfrc_int`, `<force>`, `<torque>` and
-`<touch>`.
+"""What MuJoCo's own force quantities have of the skins: `cfrc_ext`, `cfrc_int`, `<force>`, `<torque>`,
+`<touch>` and `<contact>`.
 
 A skin acts through `qfrc_passive` and through rows of constraints, which are no forces on bodies for MuJoCo.
-So after its constraint solver `mj_rnePostConstraint` runs once more, with the skins' wrenches in
-`xfrc_applied` while it does; then the sensors that read its results are written again. For `<touch>` each
-body that a skin touches is one contact, at the centre of pressure.
+So after its constraint solver MuJoCo's own functions run once more while `mjData.contact` lists the skins
+besides: each geom that a skin pushes is one contact, at the centre of pressure, with all six components of
+what acts.
 
 The rows of a skin lie where MuJoCo expects those of welds: what they push is left out there and counted
 here."""
 
+import contextlib
 import ctypes
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import cross
-from .structs import LIBRARY, DataView, ModelView
+from ..geometry.rigid import across
+from .solid_contacts import CONTACT, contacts_of
+from .structs import LIBRARY, DataView, ModelView, c_structs
 
-__all__ = ["Loads"]
+__all__ = ["PYRAMID", "Loads", "core_geom"]
 
-LIBRARY.mj_rnePostConstraint.argtypes = (ctypes.c_void_p,) * 2
-_SENSORS = {
-    int(getattr(mujoco.mjtSensor, f"mjSENS_{name.upper()}")): name for name in ("force", "torque", "touch")
-}
+LIBRARY.mj_rnePostConstraint.argtypes = LIBRARY.mj_sensorAcc.argtypes = (ctypes.c_void_p,) * 2
+_FORCE, _TORQUE, _TOUCH, _CONTACT = (
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH", "CONTACT")
+)
+_ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
+_PYRAMIDAL = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+PYRAMID = 10  # edges of a contact's friction pyramid with six components
 
 
-class _Contact(NamedTuple):
-    """One body on one skin, in the world: the bodies, centre of pressure [m], normal from core to body, and
-    the normal force [N]."""
+class _Touch(NamedTuple):
+    """A geom on a skin, in the world: the BioTac's body, the geom, centre of pressure [m], normal from core
+    to geom, and force [N] and torque [N m] on the geom about the centre."""
 
     core: int
-    body: int
+    geom: int
     pos: np.ndarray
     normal: np.ndarray
-    force: float
+    force: np.ndarray
+    torque: np.ndarray
 
 
 class Loads:
-    """Of all two-way skins of one mjData."""
+    """Of all two-way skins of one mjData. Sensors with a delay have MuJoCo's contacts alone."""
 
     def __init__(self, model: ModelView, data: DataView, coupled: list):
         self.model, self.data, self.coupled = model, data, coupled
-        kinds = [(i, _SENSORS.get(int(kind))) for i, kind in enumerate(model.sensor_type)]
-        now = [(i, kind) for i, kind in kinds if kind and not model.sensor_delay[i] > 0.0]
-        self._wrenches = [(i, kind) for i, kind in now if kind != "touch"]
-        self._touches = [i for i, kind in now if kind == "touch"]
+        kind, now = model.sensor_type, ~(model.sensor_delay > 0.0)
+        self._again, self._arrays = _with_sensors(
+            model, np.flatnonzero(now & np.isin(kind, (_FORCE, _TORQUE, _CONTACT)))
+        )
+        self._touch_sensors = np.flatnonzero(now & (kind == _TOUCH)).tolist()
+        self._core_geom = {t.touching.core: core_geom(model, t.touching.core) for t in coupled}
 
     def write(self, acting: dict) -> None:
         """Writes cfrc_ext, cfrc_int and the sensors. acting: {instance: wrenches (ngroup, 6) that its bodies
         get}, in the BioTac's frame."""
-        loaded = {instance: wrench for instance, wrench in acting.items() if wrench.any()}
-        if not loaded:
+        touches = [t for instance, wrench in acting.items() for t in self._touches(instance, wrench)]
+        if not touches:
             return
-        self._find_internal(loaded)
-        for i, kind in self._wrenches:
-            self._write_sensor(i, self._at_site(i)[3 if kind == "force" else 0 :][:3])
-        if self._touches:
-            contacts = [c for instance, wrench in loaded.items() for c in self._contacts(instance, wrench)]
-            for i in self._touches:
-                self._add_touch(i, contacts)
+        with self._listed(touches):
+            LIBRARY.mj_rnePostConstraint(self.model.address, self.data.address)
+            self._again.opt = self.model.struct.opt
+            LIBRARY.mj_sensorAcc(ctypes.addressof(self._again), self.data.address)
+        for i in self._touch_sensors:
+            self._add_touch(i, touches)
 
-    def _find_internal(self, loaded):
-        data = self.data
-        rows = np.concatenate([np.zeros(0, int), *(i.metric.numbers() for i in self.coupled)])
-        applied, pushed = data.xfrc_applied, data.efc_force
-        kept = applied.copy(), pushed[rows].copy()
-        pushed[rows] = 0.0
-        for instance, wrench in loaded.items():
-            core = instance.touching.core
-            frame, body = data.xmat[core].reshape(3, 3), [*instance.touching.body, core]
-            both = np.concatenate([wrench, -wrench.sum(axis=0)[None]])
-            force, torque = both[:, :3] @ frame.T, both[:, 3:] @ frame.T
-            applied[body, :3] += force
-            applied[body, 3:] += torque + cross(data.xpos[core] - data.xipos[body], force)
-        LIBRARY.mj_rnePostConstraint(self.model.address, data.address)
-        applied[:], pushed[rows] = kept
+    def _touches(self, instance, wrench):
+        core = instance.touching.core
+        frame, origin = self.data.xmat[core].reshape(3, 3), self.data.xpos[core]
+        for k, pos, *vectors in instance.touches(wrench):
+            geom = int(instance.touching.geom[k])
+            yield _Touch(core, geom, origin + frame @ pos, *(frame @ v for v in vectors))
 
-    def _at_site(self, sensor):
-        """Torque and force (6,) that a site's body gets from its parent, in the site's frame and about it."""
-        model, data, site = self.model, self.data, int(self.model.sensor_objid[sensor])
-        body = int(model.site_bodyid[site])
-        turn, wrench = data.site_xmat[site].reshape(3, 3), data.cfrc_int[body]
-        lever = data.site_xpos[site] - data.subtree_com[model.body_rootid[body]]
-        return np.concatenate([(wrench[:3] - np.cross(lever, wrench[3:])) @ turn, wrench[3:] @ turn])
+    @contextlib.contextmanager
+    def _listed(self, touches):
+        """Lets MuJoCo see the touches as contacts, and the skins' rows without their forces."""
+        data = self.data.struct
+        kept = data.contact, data.ncon, data.efc_force
+        contact = np.zeros(data.ncon + len(touches), CONTACT)
+        contact[: data.ncon] = contacts_of(self.data)
+        force = np.zeros(data.nefc + PYRAMID * len(touches))
+        force[: data.nefc] = self.data.efc_force
+        force[np.concatenate([np.zeros(0, int), *(i.metric.numbers() for i in self.coupled)])] = 0.0
+        pyramidal = self.model.opt.cone == _PYRAMIDAL
+        for k, t in enumerate(touches):
+            row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]
+            frame = np.concatenate([t.normal[None], *across(t.normal[None])])
+            one["pos"], one["frame"], one["friction"], one["dim"] = t.pos, frame.ravel(), 1.0, 6
+            one["geom"] = one["geom1"], one["geom2"] = self._core_geom[t.core], t.geom
+            one["flex"] = one["elem"] = one["vert"] = -1
+            one["efc_address"] = row
+            value = np.concatenate([frame @ t.force, frame @ t.torque])
+            if (
+                pyramidal
+            ):  # the mean of two edges' sum is the normal force's part, their difference a component
+                value = (value[0] / 5 + value[1:, None] * np.array([1.0, -1.0])).ravel() / 2
+            force[row : row + len(value)] = value
+        data.contact, data.efc_force = contact.ctypes.data, force.ctypes.data
+        data.ncon = len(contact)
+        try:
+            yield
+        finally:
+            data.contact, data.ncon, data.efc_force = kept
 
-    def _write_sensor(self, sensor, value):
-        model = self.model
-        cutoff, start = model.sensor_cutoff[sensor], int(model.sensor_adr[sensor])
-        if cutoff > 0.0:
-            value = np.clip(value, -cutoff, cutoff)
-        self.data.sensordata[start : start + len(value)] = value
-
-    def _add_touch(self, sensor, contacts):
-        """Adds the contacts whose ray out of the sensor's body meets the site, as MuJoCo does with its own.
+    def _add_touch(self, sensor, touches):
+        """Adds the touches whose ray out of the sensor's body meets the site, as MuJoCo does with its own.
         What a BioTac is welded to is one with it, but for the world."""
         model, data, site = self.model, self.data, int(self.model.sensor_objid[sensor])
         body, weld, root = int(model.site_bodyid[site]), model.body_weldid, model.body_rootid
-        total = float(data.sensordata[model.sensor_adr[sensor]])
-        for c in contacts:
-            if body == c.body:
-                ray = -c.normal
-            elif weld[body] == weld[c.core] and root[body] == root[c.core]:
-                ray = c.normal
+        adr, cutoff = int(model.sensor_adr[sensor]), model.sensor_cutoff[sensor]
+        for t in touches:
+            if body == model.geom_bodyid[t.geom]:
+                ray = -t.normal
+            elif weld[body] == weld[t.core] and root[body] == root[t.core]:
+                ray = t.normal
             else:
                 continue
             zone = data.site_xpos[site], data.site_xmat[site], model.site_size[site]
-            if mujoco.mju_rayGeom(*zone, c.pos, ray, int(model.site_type[site]), None) >= 0.0:
-                total += c.force
-        self._write_sensor(sensor, np.array([total]))
+            if mujoco.mju_rayGeom(*zone, t.pos, ray, int(model.site_type[site]), None) >= 0.0:
+                data.sensordata[adr] += max(float(t.force @ t.normal), 0.0)
+        if cutoff > 0.0:
+            data.sensordata[adr] = min(data.sensordata[adr], cutoff)
 
-    def _contacts(self, instance, wrench):
-        """One contact for each body that a skin pushes."""
-        core = instance.touching.core
-        frame, origin = self.data.xmat[core].reshape(3, 3), self.data.xpos[core]
-        for body, (pos, normal, force) in zip(instance.touching.body, instance.resultants(wrench)):
-            if force > 0.0:
-                yield _Contact(core, int(body), origin + frame @ pos, frame @ normal, force)
+
+def core_geom(model: ModelView, core: int) -> int:
+    """Number of the geom that stands for the skin of BioTac `core`: the one that has the body's name."""
+    mine, name = np.flatnonzero(model.geom_bodyid == core).tolist(), model.name("body", core)
+    return next((g for g in mine if model.name("geom", g) == name), mine[0])
+
+
+def _with_sensors(model, chosen):
+    """The model as it is, but with these sensors alone, which MuJoCo computes at its last stage."""
+    struct = c_structs("mjModel").from_buffer_copy(model.struct)
+    struct.nsensor, struct.nplugin = len(chosen), 0
+    arrays = {}  # which keep the memory
+    for name in (name for name, *_ in struct._fields_ if name.startswith("sensor_")):
+        arrays[name] = np.ascontiguousarray(getattr(model, name)[chosen])
+        setattr(struct, name, arrays[name].ctypes.data)
+    arrays["sensor_needstage"][:] = _ACC
+    return struct, arrays

@@ -16,19 +16,19 @@ from ..geometry.solid import fills_hull
 from .structs import LIBRARY, DataView, ModelView, c_structs
 from .touching import Touching, mesh_of
 
-__all__ = ["SolidContacts", "SolidPairs", "contacts_of"]
+__all__ = ["CONTACT", "SolidContacts", "SolidPairs", "contacts_of"]
 
 LIBRARY.mj_addContact.argtypes = (ctypes.c_void_p,) * 3
-_CONTACT = np.dtype(c_structs("mjContact"))
+CONTACT = np.dtype(c_structs("mjContact"))
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
 def contacts_of(data: DataView) -> np.ndarray:
     """MuJoCo's contacts (ncon,), a structured view that writes through."""
     if not data.ncon:
-        return np.zeros(0, _CONTACT)
-    memory = (ctypes.c_char * (data.ncon * _CONTACT.itemsize)).from_address(data.struct.contact)
-    return np.frombuffer(memory, _CONTACT)
+        return np.zeros(0, CONTACT)
+    memory = (ctypes.c_char * (data.ncon * CONTACT.itemsize)).from_address(data.struct.contact)
+    return np.frombuffer(memory, CONTACT)
 
 
 class SolidPairs:

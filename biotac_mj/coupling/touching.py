@@ -49,7 +49,7 @@ class Touching:
 
     Raises:
       ValueError: a named geom is missing or ambiguous, or lies on the BioTac's own link; a rounding of one
-        that is not named; a flex that collides with the BioTac, a `<contact>` sensor of what it touches.
+        that is not named; a flex that collides with the BioTac.
     """
 
     def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
@@ -67,8 +67,6 @@ class Touching:
             ids = np.array([i for i in ids if meshes.get(int(i), True) is not None], dtype=np.int64)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
-        if not (compiling and model.nexclude):
-            _refuse_contact_sensors(model, core, ids)
         self.body, group = np.unique(bodies, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
         for i in rounding:
@@ -239,38 +237,6 @@ def deformable(names: Iterable[str]) -> str:
         f"flex {', '.join(names)} collides with the BioTac, whose skin meets rigid geoms alone: set its "
         "contype and conaffinity to 0, or name the geoms that may touch with geoms=[...]"
     )
-
-
-def _refuse_contact_sensors(model, core, geoms):
-    """Raises ValueError for a `<contact>` sensor of a BioTac and a geom that it may touch: the skin is no
-    contact of MuJoCo's, so that it would read nothing of it."""
-    kinds = mujoco.mjtObj
-
-    def matches(kind, number, body, geom):
-        """Whether one side of a sensor has a body, of whose geoms `geom` would touch; -1: none that has a
-        name."""
-        if kind == kinds.mjOBJ_GEOM:
-            return number == geom
-        if kind == kinds.mjOBJ_BODY:
-            return number == body
-        if kind == kinds.mjOBJ_XBODY:  # a subtree
-            while body > number:
-                body = int(model.body_parentid[body])
-            return body == number
-        return True  # whatever there is, or lies at a site
-
-    for i in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).tolist():
-        one = int(model.sensor_objtype[i]), int(model.sensor_objid[i])
-        other = int(model.sensor_reftype[i]), int(model.sensor_refid[i])
-        for geom in geoms.tolist():
-            touching = int(model.geom_bodyid[geom]), geom
-            if any(matches(*a, core, -1) and matches(*b, *touching) for a, b in ((one, other), (other, one))):
-                sensor, skin = model.name("sensor", i) or f"#{i}", model.name("body", core)
-                raise ValueError(
-                    f"<contact> sensor {sensor!r} would not feel the skin of {skin!r}, which is no contact "
-                    "of MuJoCo's: take <touch>, <force> or the sensor contact_force, or name geoms that "
-                    "do not touch the skin"
-                )
 
 
 def _has_skin(model, core, geom):
