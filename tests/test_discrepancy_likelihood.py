@@ -1,12 +1,15 @@
 """The likelihood of data under a model that is nearly right, against densities that are computed whole."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.likelihood import kernel, of
-from biotac_mj.discrepancy.trajectories.search import found, screened
+from biotac_mj.discrepancy.trajectories.model.fields import Curve
+from biotac_mj.discrepancy.trajectories.search import _beside_alike, found, screened
 from biotac_mj.discrepancy.trajectories.settings import SETTINGS
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
@@ -65,8 +68,6 @@ def test_the_kernel_is_a_covariance():
 
 def test_what_a_model_misses_is_as_much_as_was_hidden(plain):
     """Synthetic: a bump of 40 counts on one electrode that goes with place and depth."""
-    import dataclasses
-
     comparison, null, _ = plain
     assert np.exp(np.log(null.amplitude).mean()) < SETTINGS.beyond
     data = [
@@ -98,3 +99,44 @@ def test_a_second_law_of_the_same_is_no_second_effect():
     assert [c.effect.id for c in search.found] == ["relax"]
     assert search.fit.effects[0][1]["g"] == pytest.approx(0.3, abs=0.05)
     assert search.fit.missed < 0.3 * null.missed
+
+
+def curve(function, at=(-2.0, 0.0, 1.0, 3.0)):
+    at = np.array(at)
+    return Curve(at, [np.tile(function(at)[:, None, None], (1, 5, 2))])
+
+
+def test_a_curve_is_right_where_it_was_solved_and_bends_no_more_than_that():
+    at = np.linspace(-3.0, 4.0, 71)
+    straight = curve(lambda x: 2 * x)
+    for one in (straight, curve(lambda x: np.maximum(x - 0.5, 0.0)), curve(lambda x: np.exp(0.3 * x) - 1)):
+        values, slopes = (np.array([f(0, x)[0, 0] for x in at]) for f in (one.at, one.slope))
+        np.testing.assert_allclose(
+            [one.at(0, x)[0, 0] for x in one.solved], one.changes[0][:, 0, 0], atol=1e-12
+        )
+        assert (np.diff(values) > -1e-12).all()  # what rises where it was solved rises between
+        by = [(one.at(0, x + 1e-6) - one.at(0, x - 1e-6))[0, 0] / 2e-6 for x in at]
+        np.testing.assert_allclose(slopes, by, atol=1e-5)
+    np.testing.assert_allclose([straight.at(0, x)[3, 1] for x in at], 2 * at, atol=1e-12)
+    hinge = curve(lambda x: np.maximum(x, 0.0))
+    assert hinge.at(0, -1.0).max() == 0 and hinge.slope(0, -0.5).max() == 0  # what does not touch yet
+    rows = straight.at(0, np.arange(5.0))
+    np.testing.assert_allclose(rows, np.tile(2 * np.arange(5.0)[:, None], (1, 2)))
+
+
+def test_evidence_beside_what_looks_alike_is_that_of_a_wider_prior(plain):
+    """Of one number with a likelihood that is quadratic, against the integral."""
+    comparison, null, chosen = plain
+    latency = by_id("latency")
+    fit = fit_effects(comparison, [(latency, {**latency.default(), "delay": 0.05})], chosen, null)
+    fit = dataclasses.replace(fit, effects=[(latency, {**latency.default(), "delay": 0.05})])
+    raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in (fit.effects, [])]
+    change = np.quantile(np.abs(np.concatenate([a - b for a, b in zip(*raw)])), 0.98, axis=0)
+    share = np.min(null.size / np.maximum(change, 1e-12))
+    for gain in (5.0, 50.0, 5000.0):
+        t = np.linspace(-12, 12, 200001)
+        log = -gain * ((1 - t) ** 2 - 1) - 0.5 * (t / share) ** 2  # likelihood over that at none, and prior
+        top = log.max()
+        mass = np.exp(log - top).sum() * (t[1] - t[0]) / np.sqrt(2 * np.pi) / share
+        alike = top + np.log(mass)
+        assert _beside_alike(comparison, fit, null, gain) == pytest.approx(gain - alike, abs=0.02 * gain**0.5)
