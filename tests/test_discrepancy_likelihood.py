@@ -106,7 +106,7 @@ def curve(function, at=(-2.0, 0.0, 1.0, 3.0)):
     return Curve(at, [np.tile(function(at)[:, None, None], (1, 5, 2))])
 
 
-def test_a_curve_is_right_where_it_was_solved_and_bends_no_more_than_that():
+def test_a_curve_has_no_turns_that_what_was_solved_lacks():
     at = np.linspace(-3.0, 4.0, 71)
     straight = curve(lambda x: 2 * x)
     for one in (straight, curve(lambda x: np.maximum(x - 0.5, 0.0)), curve(lambda x: np.exp(0.3 * x) - 1)):
@@ -124,7 +124,7 @@ def test_a_curve_is_right_where_it_was_solved_and_bends_no_more_than_that():
     np.testing.assert_allclose(rows, np.tile(2 * np.arange(5.0)[:, None], (1, 2)))
 
 
-def test_evidence_beside_what_looks_alike_is_that_of_a_wider_prior(plain):
+def test_evidence_beside_what_looks_alike_is_an_integral(plain):
     """Of one number with a likelihood that is quadratic, against the integral."""
     comparison, null, chosen = plain
     latency = by_id("latency")
