@@ -137,16 +137,19 @@ def _hits(score):
 
 
 def _against(cards, none):
-    """Fisher's test on the episodes of all seeds."""
-    from scipy.stats import fisher_exact
+    """Of seeds, where there are several (Welch's test of their rates), else of the episodes (Fisher's)."""
+    from scipy.stats import fisher_exact, ttest_ind
 
     if not none or cards is none:
         return ""
+    if min(len(cards), len(none)) > 1:
+        rates = [[card["success"] for card in group if "success" in card] for group in (cards, none)]
+        return f"{ttest_ind(*rates, equal_var=False, alternative='greater').pvalue:.2g}"
     pairs = [_pooled(group) for group in (cards, none)]
     if not all(pairs):
         return ""
-    table = [[_hits(score), score["episodes"] - _hits(score)] for score in pairs]
-    return f"{fisher_exact(table, 'greater').pvalue:.2g}"
+    counts = [[_hits(score), score["episodes"] - _hits(score)] for score in pairs]
+    return f"{fisher_exact(counts, 'greater').pvalue:.2g}"
 
 
 def _learn(options, tasks, own, written):

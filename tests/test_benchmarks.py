@@ -538,13 +538,39 @@ def test_touch_is_weighed_against_none(repo, accuracy):
     lines = touch_pays.table(found).splitlines()
     assert "| insert_peg | electrodes | 0 | 4.0 | 9 | 0.80 (0.10 to 0.90) | 0.60 (0.46 to 0.72) |" in lines
     p = scipy.stats.fisher_exact([[40, 10], [10, 40]], "greater").pvalue
-    assert (
-        f"| insert_peg | electrodes | 0.80 | {p:.2g} |" in lines
-        and "| insert_peg | none | 0.20 |  |" in lines
+    low, high = scipy.stats.binomtest(40, 50).proportion_ci(method="wilson")
+    there = "0.60 (0.46 to 0.72)"
+    pooled = f"0.80 ({low:.2f} to {high:.2f}) | 0.80, 0.80 | {p:.2g} | {there} |"
+    assert f"| insert_peg | electrodes | {pooled}" in lines
+    assert any(
+        line.startswith("| insert_peg | none | 0.20") and "|  | not played |" in line for line in lines
     )
     several = [card(name, 5 * k + more, k) for name, more in (("force", 30), ("none", 0)) for k in range(4)]
     lines = touch_pays.table({"device": "made up", "policies": several}).splitlines()
-    assert "| insert_peg | force | 0.75 | 0.014 |" in lines  # 1 of 70 orders
+    rates = [[(5 * k + more) / 50 for k in range(4)] for more in (30, 0)]
+    p = scipy.stats.ttest_ind(*rates, equal_var=False, alternative="greater").pvalue
+    (line,) = [line for line in lines if line.startswith("| insert_peg | force | 0.75 (")]
+    assert f"| 0.60, 0.90 | {p:.2g} |" in line
+
+
+def test_files_of_touch_are_read_and_drawn_as_one(tmp_path, accuracy, capsys):
+    import touch_pays
+    from PIL import Image
+
+    def card(observe, success):
+        of = {"task": "insert_peg", "observe": observe, "seed": 0, "minutes": 4.0, "decisions": 9}
+        return of | {"success": success, "low": 0.1, "high": 0.9, "episodes": 50}
+
+    files = [tmp_path / f"{name}.json" for name in "ab"]
+    for file, some in zip(files, ([card("none", 0.2)], [card("none", 0.4), card("force", 0.6)]), strict=True):
+        file.write_text(json.dumps({"device": "made up", "policies": some}))
+    picture = tmp_path / "picture.png"
+    assert touch_pays.main(["--table", *map(str, files), "--draw", str(picture)]) == 0
+    told = capsys.readouterr().out
+    assert "| insert_peg | none | 0 | 4.0 | 9 | 0.40" in told and "| force | 0 | 4.0 | 9 | 0.60" in told
+    assert "0.20 (0.10" not in told  # the later file counts
+    with Image.open(picture) as image:
+        assert min(image.size) > 200
 
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
