@@ -42,10 +42,17 @@ class FaceBlocks:
         nodes[place] = node
         return cls(which, nodes, add_rows(block.new_zeros((len(which), 9, 9)), place, block))
 
+    @classmethod
+    def together(cls, parts: list[typing.Self]) -> typing.Self:
+        """The sum of several."""
+        return cls(
+            *(torch.cat([getattr(part, name) for part in parts]) for name in ("face", "node", "block"))
+        )
+
     def multiply(self, v: torch.Tensor, transpose: bool = False) -> torch.Tensor:
         """The matrix, or its transpose, times v (nvert, nworld, 3)."""
-        felt = v.reshape(-1, 3)[self.node].reshape(-1, 9)
-        felt = torch.einsum("mij,mi->mj" if transpose else "mij,mj->mi", self.block, felt)
+        felt = v.reshape(-1, 3)[self.node].reshape(-1, 9, 1)
+        felt = torch.bmm(self.block.mT if transpose else self.block, felt)
         out = v.new_zeros(v.shape)
         add_rows(out.view(-1, 3), self.node, felt)
         return out
@@ -68,16 +75,14 @@ class FactorInverse:
         self,
         factors: Factors,
         softness: torch.Tensor,
-        blocks: list[FaceBlocks],
+        blocks: FaceBlocks,
         free: np.ndarray,
         a: torch.Tensor | None,
         b: torch.Tensor | None,
         transpose: bool,
     ):
         self._factor, self._soft, nworld = factors.now, softness.numpy(), len(softness)
-        node, block = (
-            torch.cat([getattr(own, name) for own in blocks]).numpy() for name in ("node", "block")
-        )
+        node, block = blocks.node.numpy(), blocks.block.numpy()
         if transpose:
             block, a, b = np.swapaxes(block, 1, 2), b, a
         self._worlds, size = [], 3 * len(free)
@@ -258,12 +263,12 @@ def _project(w, basis):
     lengths of what is left."""
     along = torch.zeros_like(basis[:, :, 0])
     double = w.dtype == torch.float64
-    length = w.norm(dim=1) if double else None
+    length = torch.linalg.vector_norm(w, dim=1) if double else None
     for _ in range(2 if double else 1):
         part = (basis @ w[:, :, None])[..., 0]
         along += part
         w -= (part[:, None] @ basis)[:, 0]
-        before, length = length, w.norm(dim=1)
+        before, length = length, torch.linalg.vector_norm(w, dim=1)
         if not double or (length > _CANCELLED * before).all():
             break  # else once more for what rounding left
     felt = torch.cat([along, length[:, None]], 1).double().cpu().numpy()

@@ -17,7 +17,7 @@ from ...threads import single_thread
 from ..record import Record, restore
 from ..skin import NUMBERS, SkinWorlds
 from ..touching import Held, find_touching, rows
-from .inverse import FactorInverse, StepInverse, solve_by_gmres
+from .inverse import FaceBlocks, FactorInverse, StepInverse, solve_by_gmres
 from .liquid import LinearLiquid
 from .memory import LinearMemory, Memory
 from .rest import pull_rest, push_rest
@@ -57,6 +57,8 @@ class LinearStep:
             self._liquid = LinearLiquid(skin, record, self._core) if skin.model.has_liquid else None
         surfaces = [surface for surface in (self._outer, self._core) if surface]
         self._blocks = [surface.blocks() for surface in surfaces]
+        turn = [self._liquid.turn] if self._liquid else []
+        self._all_blocks = FaceBlocks.together(self._blocks + turn)
 
     def _contact(self):
         skin, record = self._skin, self.record
@@ -81,11 +83,8 @@ class LinearStep:
 
     def _whole_tangent(self, v, transpose=False):
         """The same with the fixed nodes."""
-        found = self._skin.multiply_rubber(v)
-        for blocks in self._blocks:
-            found -= blocks.multiply(v, transpose)
+        found = self._skin.multiply_rubber(v) - self._all_blocks.multiply(v, transpose)
         if self._liquid:
-            found -= self._liquid.turn.multiply(v, transpose)
             left, right = self._liquid.push, self._liquid.by_node
             if transpose:
                 left, right = right, left
@@ -103,7 +102,8 @@ class LinearStep:
                 ends = (-liquid.push * self._free, liquid.by_node * self._free) if liquid else (None, None)
                 free = self._free[:, 0, 0].numpy() > 0
                 soft = self.record.numbers["softness"]
-                made = FactorInverse(skin.factors, soft, self._blocks, free, *ends, transpose)
+                blocks = FaceBlocks.together(self._blocks)
+                made = FactorInverse(skin.factors, soft, blocks, free, *ends, transpose)
             self._inverses[transpose] = made
         return self._inverses[transpose]
 
