@@ -306,10 +306,6 @@ class SkinStep:
         residual = Residual(k.worth, k.r, self._forces.gradient)
         self.M.update(program, self.st, residual, k.z, k.part, self._forces.beside)
 
-    def put_product(self, program: Launcher) -> None:
-        """k.q becomes the tangent of the elements and of what is in `touching` and `block` times k.p."""
-        self._forces.multiply(program)
-
     def put_inverse(self, program: Launcher, r: wp.array) -> None:
         """k.z becomes the approximate inverse of that times r, zero at fixed nodes; k.part holds the square
         of r by chunks."""

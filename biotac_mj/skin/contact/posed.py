@@ -18,7 +18,6 @@ from .shapes import (
     distance_to_edge,
     lower_bound,
     primitive_distance,
-    rough_bound,
 )
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
     "least_to",
     "meet",
     "place_on",
-    "rough_bound_to",
     "touch_bound",
 ]
 
@@ -137,14 +135,6 @@ def bound_to(geoms: Geoms, g: int, p: vec3, y: vec3):
     if geoms.kind[g] == SKIN:
         return _bound_between(geoms, g, p, y)
     return distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-
-
-@wp.func
-def rough_bound_to(geoms: Geoms, g: int, p: vec3, y: vec3):
-    """`bound_to` that asks no mesh: of one, by its grid alone."""
-    if geoms.kind[g] == SKIN:
-        return _bound_between(geoms, g, p, y)
-    return rough_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
 
 
 @wp.func
