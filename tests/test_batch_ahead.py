@@ -11,7 +11,7 @@ import warp as wp
 
 from biotac_mj import batch
 from biotac_mj.batch.ahead import _noted, kernels_of_step, launched_by
-from biotac_mj.batch.batch import Hook
+from biotac_mj.batch.hook import Hook
 
 SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
 <body><freejoint/><geom type="cylinder" size=".1 .1"/></body>

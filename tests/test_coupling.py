@@ -651,7 +651,6 @@ def test_a_dual_solver_that_stops_early_is_reported_as_it_acts(iterations, integ
     assert iterations == 3 or settled.all()  # with 3 the rows would lack up to 8 % of the skin's force
 
 
-@pytest.mark.xfail(strict=True, reason="steps in which rows are replaced by forces do not all settle")
 def test_a_dual_solver_that_stops_early_settles():
     _, _, settled = stack("PGS", 3, "Euler")
     assert settled.all()

@@ -40,7 +40,8 @@ from ..skin.settings import read_material
 from ..skin.step import kernels_for_cuda
 from . import kernels, release, rest, skin_kernels
 from .ahead import kernels_of_step, launched_by
-from .batch import Batch, Hook
+from .batch import Batch
+from .hook import Hook
 from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
 from .skin import BatchSkin

@@ -1,17 +1,6 @@
-"""The skins of a batch inside `mujoco_warp.step`: launches only, so that the step can be captured in a CUDA
-graph.
+"""One BioTac in every world of a batch: its part of each stage of a step, as launches only. `hook.py` puts
+them in order."""
 
-Once per step, when mujoco_warp asks for passive forces, and as in `coupling/implicit/world.py` for one world:
-1. The linear models of the last step enter the dynamics, and mujoco_warp's own later stages predict where
-   the bodies go.
-2. The skins are solved, while their bodies give way from there as their inertia lets them.
-3. Their new linear models take the old ones' place. Where that moved a body mujoco_warp predicts again, and
-   the skins of worlds in which something else held it are solved again.
-4. Push is withheld where the skins would give more energy than was put into them, and mujoco_warp goes on.
-The readings are written when mujoco_warp asks for the velocity sensors. contact_force, which is what acts
-in the step, is written again when it asks for acceleration sensors, after its constraint solver."""
-
-import functools
 import math
 import typing
 
@@ -24,18 +13,13 @@ from ..coupling.loads import core_geom
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
-from ..skin.program import Fork
 from . import kernels, solid
-from .ahead import kernels_of_step
 from .implicit import dynamics, energy, integrator, rounds
 from .implicit.compliance import Response
-from .implicit.ends import Ends
-from .implicit.integrator import Integrator
 from .marks import Marks
-from .memory import Scratch
 from .release import Clearance
 from .senses import Senses
-from .skin import BatchSkin, solve_group
+from .skin import BatchSkin
 from .skins import Skins
 from .solid_contacts import SolidContacts
 
@@ -43,7 +27,7 @@ if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 
-__all__ = ["Batch", "Hook"]
+__all__ = ["Batch"]
 
 
 class Batch(Skins):
@@ -447,276 +431,3 @@ class Batch(Skins):
 
     def _find_wrenches(self):
         self._launch(rounds.wrenches, self.groups, [self.model, self._of_step], [self._wrench])
-
-
-class Hook:
-    """What a mujoco_warp Model calls: all batches of the Model step together, after callbacks that were there
-    before."""
-
-    def __init__(self, m: "mjw.Model"):
-        self.batches = []
-        self._passive, self._sensor = m.callback.passive, m.callback.sensor
-        self._contactfilter = m.callback.contactfilter
-        self._contact_force = None
-        self._corrected = []  # whose forces are corrected together
-        self._fork = Fork(m.qpos0.device)
-        self._taking_part = self._going = self._next = None  # `Marks` of worlds: in the step, in a round
-        m.callback.passive, m.callback.sensor = self.passive, self.sensor
-        m.callback.contactfilter = self.contactfilter
-
-    @classmethod
-    def of(cls, m: "mjw.Model") -> "Hook":
-        """The Model's hook, made when first asked for."""
-        return m.callback.passive.__self__ if cls.is_of(m) else cls(m)
-
-    @classmethod
-    def is_of(cls, m: "mjw.Model") -> bool:
-        """Whether the Model has one."""
-        return isinstance(getattr(m.callback.passive, "__self__", None), cls)
-
-    def add(self, batch: Batch, d: "mjw.Data") -> None:
-        if any(there._core == batch._core for there in self.batches):
-            raise ValueError("this BioTac is attached to the mujoco_warp Model already: attach it once")
-        self.batches.append(batch)
-        for one in self.batches:
-            one.meet([other for other in self.batches if other.moving])
-        if self._contact_force is None or len(self._contact_force) < d.naconmax:
-            self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)
-            self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
-        with wp.ScopedDevice(d.qpos.device):
-            self._taking_part, self._going, self._next = (Marks(d.nworld) for _ in range(3))
-
-    def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
-        """Of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
-        called."""
-        before = self._passive, self._sensor, self._contactfilter
-        self._passive = self._sensor = self._contactfilter = None
-        own = type(m.callback)()
-        own.passive, own.sensor, own.contactfilter = self.passive, self.sensor, self.contactfilter
-        try:
-            return kernels_of_step(mjm, m, own)
-        finally:
-            self._passive, self._sensor, self._contactfilter = before
-            self._corrected = []  # the memory was for another Data
-
-    def contactfilter(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        if self._contactfilter:
-            self._contactfilter(m, d)
-        for batch in self.batches:
-            if batch.active:
-                batch.solid_contacts.amend(m, d)
-
-    def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        if self._passive:
-            self._passive(m, d)
-        if self._corrected != [b for b in self.batches if b.moving]:
-            self._take_memory(m, d)
-        batches = [b for b in self.batches if b.active]
-        self._taking_part.clear()
-        self._fork.run(*(functools.partial(batch.predict, m, d, self._taking_part) for batch in batches))
-        moving = [b for b in batches if b.moving]
-        for batch in batches:
-            if batch not in moving:
-                batch.solve_one_way(m, d)
-        if moving:
-            wp.copy(self._outside, d.qfrc_passive)
-            with self._scratch:
-                wp.capture_if(self._taking_part.any, lambda: self._find_balance(m, d, moving))
-            self._fork.run(*(functools.partial(batch.pass_by, self._taking_part) for batch in moving))
-            self._act(m, d, moving)
-        self._fork.run(*(batch.end_step for batch in batches))
-
-    def _take_memory(self, m, d):
-        """What the skins that move bodies share, of the first step with them."""
-        from .loads import Loads
-
-        device = d.qacc.device
-        if device.is_cuda and device.is_capturing:
-            raise ValueError(
-                "mujoco_warp.step has not run yet: step once before the capture begins, which takes "
-                "the memory for the loops in it"
-            )
-        self._corrected = [batch for batch in self.batches if batch.moving]
-        groups = [batch.groups[0] for batch in self._corrected]
-        slots = np.cumsum([0, *(batch.nslot for batch in self._corrected)])
-        with wp.ScopedDevice(device):
-            self._outside = wp.empty_like(d.qfrc_passive)
-            self._amiss = wp.zeros(1, dtype=int)
-            self._stiffness = wp.zeros((d.nworld, m.nv, m.nv), dtype=wp.float64)
-            rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
-            self._integrator, self._ends, self._loads = (
-                Integrator(m, d),
-                Ends(d),
-                Loads(m, d, self._corrected),
-            )
-            self._slope = integrator.Slope(m, sum(groups), d.nworld)
-        self._scratch = Scratch(device)
-        for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):
-            batch.take_part(m, self._slope.correction, int(first), rows, int(row))
-
-    def _find_balance(self, m, d, moving):
-        """Models of the skins that hold where they lead, and that give no energy which is not there.
-
-        A world is going until its skins are settled. From then on no launch changes it."""
-        going, taking_part = self._going, self._taking_part
-        going.copy(taking_part)
-        _begin_dynamics(m, d)
-        if self._integrator.differs:
-            self._integrator.take_matrices(m, d)
-        self._accelerate(m, d, moving, first=True)
-        self._find_compliance(m, d, moving)
-        self._solve(moving, lambda batch: batch.solve_first(m, d))
-        self._choose(moving, lambda batch, found: batch.compare(found))
-        self._go_on(m, d, moving)
-        self._choose(moving, lambda batch, found: batch.find_energy(taking_part, found))
-        wp.capture_if(going.any, lambda: self._damp(m, d, moving))
-        self._choose(moving, lambda batch, found: batch.restrain(taking_part, found))
-        wp.capture_if(going.any, lambda: self._restrain(m, d, moving))
-        self._stiffness.zero_()
-        for batch in moving:
-            batch.add_stiffness(self._stiffness)
-        for batch in moving:
-            batch.conclude(taking_part, self._stiffness)
-        end = self._ends.find(m, d, self._integrator.qacc)
-        self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
-
-    def _choose(self, moving, choose):
-        """Which worlds go on: those that any batch chooses."""
-        self._next.clear()
-        for batch in moving:
-            choose(batch, self._next)
-        self._going.copy(self._next)
-
-    def _go_on(self, m, d, moving):
-        """Rounds of the worlds that are going, until all are settled or cannot be."""
-
-        def go_on():
-            self._accelerate(m, d, moving)
-            self._choose(moving, lambda batch, found: batch.judge(self._going, found))
-            wp.capture_if(self._going.any, lambda: self._solve(moving, lambda batch: batch.solve_again(m, d)))
-
-        wp.capture_while(self._going.any, go_on)
-
-    def _damp(self, m, d, moving):
-        """Backward Euler's step in the worlds that are going."""
-        for batch in moving:
-            batch.use_euler(m, d)
-        self._accelerate(m, d, moving)
-        self._find_compliance(m, d, moving)
-        self._go_on(m, d, moving)
-        for batch in moving:
-            batch.find_energy(self._taking_part, self._next)
-
-    def _restrain(self, m, d, moving):
-        """Withholds push in the worlds that are going."""
-
-        def withhold():
-            self._accelerate(m, d, moving)
-            self._choose(moving, lambda batch, found: batch.withhold(self._going, found))
-
-        def withdraw():
-            for batch in moving:
-                batch.withdraw(d, self._going.world)
-            self._accelerate(m, d, moving)
-
-        self._accelerate(m, d, moving)
-        for batch in moving:
-            batch.scale_push()
-        wp.capture_while(self._going.any, withhold)
-        self._choose(moving, lambda batch, found: batch.find_gain(self._taking_part, found))
-        wp.capture_if(self._going.any, withdraw)
-
-    def _find_compliance(self, m, d, moving):
-        known = m, d, self._going.world, self._integrator.inertia
-        self._fork.run(*(functools.partial(batch.find_compliance, *known) for batch in moving))
-
-    def _solve(self, moving, solve):
-        """Solves the skins, those of the condensed tier side by side."""
-        condensed = [batch for batch in moving if batch.skin.kind == "condensed"]
-
-        def solve_single(batch):
-            solve(batch)
-            batch.skin.end_solve()
-            batch.accept_models()
-
-        self._fork.run(*(functools.partial(solve, batch) for batch in condensed))
-        solve_group([batch.skin for batch in condensed], self._fork)
-        self._fork.run(*(batch.skin.end_solve for batch in condensed))
-        for batch in condensed:
-            batch.accept_models()
-        for batch in moving:
-            if batch not in condensed:
-                wp.capture_if(batch.rest.any, functools.partial(solve_single, batch))
-
-    def _act(self, m, d, moving):
-        wp.copy(d.qfrc_passive, self._outside)
-        self._fork.run(*(functools.partial(batch.act, m, d) for batch in moving))
-        for batch in moving:
-            batch.add_forces(d)
-
-    def _accelerate(self, m, d, moving, first=False):
-        """Where the bodies go under the present models, in the worlds that are going."""
-        going, correction, device = self._going.world, self._slope.correction, d.qacc.device
-        self._find_accelerations(m, d, moving, going, first)
-        if self._integrator.differs:
-
-            def compare():
-                self._integrator.integrate(m, d, correction.going)
-                self._amiss.zero_()
-                for batch in self._corrected:
-                    batch.find_amiss(d, self._integrator.qacc)
-                wp.launch(integrator.judge, d.nworld, [correction], [self._amiss], device=device)
-
-            def go_on():
-                self._slope.find(m, d, self._integrator.inertia, self._corrected)
-                self._find_accelerations(m, d, moving, correction.going)
-                compare()
-
-            wp.launch(integrator.begin_correction, d.nworld, [going, correction], device=device)
-            compare()
-            wp.capture_while(self._amiss, go_on)
-        self._fork.run(*(functools.partial(batch.evaluate, self._integrator.qacc) for batch in moving))
-
-    def _find_accelerations(self, m, d, moving, going, first=False):
-        """Those of the constraint solver, in worlds that are going."""
-        import mujoco_warp as mjw
-
-        self._act(m, d, moving)
-        mjw.fwd_acceleration(m, d, factorize=first)
-        mjw.solve(m, d)
-        integrator.accept(going, d.qacc, d.qacc_warmstart)
-
-    def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
-        import mujoco_warp as mjw
-        from mujoco_warp._src.types import Stage
-
-        if self._sensor:
-            self._sensor(m, d, stage)
-        batches = [batch for batch in self.batches if batch.active]
-        if stage == Stage.VEL:
-            self._fork.run(*(batch.look for batch in batches))
-            for batch in batches:
-                batch.solve_film()
-            self._fork.run(*(functools.partial(batch.sense, d.sensordata) for batch in batches))
-        elif stage == Stage.ACC and batches:
-            mjw.contact_force(m, d, self._contact, True, self._contact_force)
-            force = self._contact_force
-            self._fork.run(*(functools.partial(batch.find_acting, d) for batch in batches))
-            self._fork.run(*(functools.partial(batch.report_force, m, d, force) for batch in batches))
-            moving = [batch for batch in batches if batch.moving]
-            if moving:
-                self._loads.write(m, d, moving)
-
-
-def _begin_dynamics(m, d):
-    """The stages of mujoco_warp between passive forces and accelerations, which forces do not change; it does
-    them again afterwards."""
-    import mujoco_warp as mjw
-    from mujoco_warp._src import smooth
-
-    mjw.rne(m, d)
-    if m.ntendon:
-        smooth.tendon_bias(m, d, d.qfrc_bias)
-    if not m.opt.disableflags & mjw.DisableBit.ACTUATION and m.callback.control:
-        m.callback.control(m, d)
-    mjw.fwd_actuation(m, d)

@@ -66,11 +66,13 @@ class CondensedStepper(FemStepper):
           ValueError: NaN in a pose.
         """
         bound = PATIENT if patient else 1
-        memory, released = self._read(state), (geom_pos, geom_mat)
-        if bodies is not None:  # where the bodies go without the skin
-            released = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
-        if not memory.started and self._skin.overlaps(*released):  # as those of the full tier do
-            memory = self._skin.outside(*released)
+        memory = self._read(state)
+        if not memory.started:
+            released = geom_pos, geom_mat
+            if bodies is not None:  # where the bodies go without the skin
+                released = bodies.without(np.array([g.group for g in self._geoms], int), *released)
+            if self._skin.overlaps(*released):  # as those of the full tier do
+                memory = self._skin.outside(*released)
         out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies)
         new = np.zeros_like(state)
         self._layout.write(out.memory, new)
