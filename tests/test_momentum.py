@@ -86,7 +86,8 @@ LEFT = pytest.mark.xfail(strict=True, reason="the integrator's correction leaves
 def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier, floor):
     """A light body that hits at 2 m/s, rolls and sticks by turns, at a long step."""
     geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
-    model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, skin="coarse", tier=tier)
+    how = {"skin": "coarse", "tier": tier, "options": {"rounds": 1}}
+    model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, **how)
     data.qvel[:] = [0.6, 0.3, -2.22, 15, 24, 60]
     rows = list(steps(model, data, handle, 6))
     assert any(status[0] == 0 and np.linalg.norm(told) > 1e-3 for _, told, status in rows)
