@@ -19,8 +19,8 @@ __all__ = [
     "withheld_further",
 ]
 
-# [m] change of the predicted pose, rotations over a lever of LEVER, below which no skin is solved again: a solve
-# leaves its bodies open by as much, and over so short a way its linear model errs by 5e-4 of the force
+# [m] change of the predicted pose, rotations over a lever of LEVER, below which a skin is not solved again: a
+# solve leaves its bodies open by as much, and over so short a way its linear model errs by 5e-4 of the force
 TOLERANCE = 5e-6
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
