@@ -284,7 +284,7 @@ def test_a_press_of_an_sp_is_estimated(monkeypatch):
     along, around = np.array([-6e-3, -2e-3, 2e-3, 6e-3]), np.radians([-25.0, 0, 25, 50])
     part = dataclasses.replace(capsule_of(load_skin("biotac_sp/coarse")), along=along, around=around)
     monkeypatch.setattr(presses, "capsule_of", lambda skin: part)
-    monkeypatch.setattr(presses, "_SHARES", np.linspace(0, 1, 5))
+    monkeypatch.setattr(presses, "_FRACTIONS", np.linspace(0, 1, 5))
     estimator = Estimator(load_skin("biotac_sp/coarse"))
     table, rest = estimator.presses, np.array(sensors_of(SP)["sp_mf"].rest)
     assert table.signal.shape[1] == 25

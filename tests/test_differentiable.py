@@ -19,7 +19,7 @@ from biotac_mj.differentiable.linear.samples import differentiate_samples
 from biotac_mj.differentiable.record import advance, follow
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
-from biotac_mj.differentiable.touching import Held
+from biotac_mj.differentiable.touching import Anchors
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_distance_grid
 
@@ -54,7 +54,7 @@ def test_one_step_to_rounding(element, liquid):
     mat = np.tile(np.eye(3), (1, 13, 1, 1, 1))
     rest = another_shape(skin)
     steps = follow(skin, pos.numpy()[None], mat, skin.friction, skin.own, rest.numpy()).steps
-    mixed = [r for r in steps if 0 < len(r.slips) < len(r.touches) and len(r.held.sample)]
+    mixed = [r for r in steps if 0 < len(r.slips) < len(r.touches) and len(r.anchors.sample)]
     record, step = balanced(skin, mixed[-1])
     assert (skin.data.core.trial_geom.numpy() >= 0).any()
     draw = np.random.default_rng(5)
@@ -73,12 +73,12 @@ def test_one_step_to_rounding(element, liquid):
     assert all(slope.any() for slope in felt)
     by_area = torch.autograd.grad(areas, rest, felt)[0].numpy()
     slopes["rest"] = torch.from_numpy(slopes["vert"] + by_area)
-    slopes["anchor"] = slopes["anchor"][record.held.sample]
+    slopes["anchor"] = slopes["anchor"][record.anchors.sample]
 
     def moved(h, name, way):
         shape = rest.detach().numpy()
         if name == "anchor":
-            change = {"held": dataclasses.replace(record.held, anchor=record.held.anchor + h * way)}
+            change = {"anchors": dataclasses.replace(record.anchors, anchor=record.anchors.anchor + h * way)}
         elif name == "pose":
             change = {"poses": record.poses | {"pos": record.poses["pos"] + h * way}}
         else:
@@ -91,7 +91,7 @@ def test_one_step_to_rounding(element, liquid):
 
     sizes = {
         "pose": ((1, 1, 3), 1e-8),
-        "anchor": (record.held.anchor.shape, 1e-8),
+        "anchor": (record.anchors.anchor.shape, 1e-8),
         "rest": (rest.shape, 1e-8),
     }
     for name, (shape, size) in sizes.items():
@@ -129,11 +129,11 @@ def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, fric
     mat = np.tile(np.eye(3), (6, 1, 1, 1))
     before = follow(skin, pos[None, :5, None], mat[None, :5], skin.friction, skin.own).steps[-1]
     geoms, outer, force = skin.geoms, skin.data.outer, []
-    begun, held = skin.state(geoms).save(), Held.of(outer)
+    begun, anchors = skin.state(geoms).save(), Anchors.of(outer)
     poses = {name: getattr(geoms.struct, name).numpy().copy() for name in ("pos_last", "mat_last")}
     for far in first + 2e-7 * np.arange(81):
         skin.state(geoms).load(begun)
-        held.give(outer)
+        anchors.give(outer)
         for name, value in poses.items():
             getattr(geoms.struct, name).numpy()[:] = value
         geoms.set_pose(pos[5:] + far * along, mat[5])

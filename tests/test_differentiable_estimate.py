@@ -53,7 +53,7 @@ def small_table():
     whenever the skin's code changes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presses, "capsule_of", part_of)
-        patch.setattr(presses, "_SHARES", np.linspace(0, 1, 5))
+        patch.setattr(presses, "_FRACTIONS", np.linspace(0, 1, 5))
         yield
 
 

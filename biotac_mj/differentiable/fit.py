@@ -42,7 +42,7 @@ class _Press:
         """Whether it is one of these."""
         return self.skin is skin and self.indentation is indentation and self.parameters == parameters
 
-    def ahead(self, scaled: np.ndarray) -> list[torch.Tensor | None]:
+    def guesses(self, scaled: np.ndarray) -> list[torch.Tensor | None]:
         """Nodes (nvert, 1, 3) of each step with other parameters, to first order; None where none was found,
         or a step may have several balances: which one is found there depends on the press alone, and not on
         those before."""
@@ -95,16 +95,16 @@ class Forces:
         )
         scaled = np.array([p.scaled(float(v)) for p, v in zip(parameters, values)])
         last = self._last if self._last and self._last.of(skin, indentation, parameters) else None
-        trajectory = press(near=last and last.ahead(scaled))
+        trajectory = press(guesses=last and last.guesses(scaled))
         if last and trajectory.steps[-1].changes[0].lost:
             trajectory = press()
         by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
-        ahead = Inputs(
+        tangents = Inputs(
             np.zeros((len(parameters), 1, len(steps.pos), 1, 6)),
             np.array(by_friction)[:, None],
             dict(zip(NUMBERS, slopes[..., None])),
         )
-        found = push_forward(skin, trajectory, ahead, last and last.slopes)
+        found = push_forward(skin, trajectory, tangents, last and last.slopes)
         self._last = _Press(skin, indentation, list(parameters), scaled, trajectory.steps, found.nodes)
         change = found.wrench[:, 0, steps.ends, 0, :3]
         force = np.array([trajectory.steps[i].wrench[0, 0, :3].numpy() for i in steps.ends])

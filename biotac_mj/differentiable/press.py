@@ -117,7 +117,7 @@ def press(
             for name, value in (("core_pos", core_pos), ("core_quat", core_quat))
         )
         pos, quat = relative_pose(core_pos, core_quat, pos, quat)
-    count, alone = skin.geoms.count, pos.ndim == 3
+    count, single = skin.geoms.count, pos.ndim == 3
     if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
         raise ValueError(
             f"pos has shape {tuple(pos.shape)} and quat {tuple(quat.shape)}: pass (nstep, {count}, 3) and "
@@ -127,7 +127,7 @@ def press(
         raise ValueError("pos is empty or not finite: give at least one step and numbers [m]")
     if not (quat.norm(dim=-1) > 1e-100).all() or not torch.isfinite(quat).all():
         raise ValueError("a quat is zero or not finite: give w x y z of any other length")
-    if alone:
+    if single:
         pos, quat = pos[None], quat[None]
     nworld = len(pos)
     if friction is None:
@@ -152,7 +152,7 @@ def press(
             own = pos[one], mat[one], friction[one], made[one], constants[w], *_shape_of(skin, shape)
             parts.append(_Press.apply(skin, changes, times, smoothing, *own))
         found = [torch.cat(of) for of in zip(*parts)]
-    if alone:
+    if single:
         found = [one[0] for one in found]
     return Pressed(*found, changes)
 
@@ -254,15 +254,15 @@ def _rest_of(skin, nodes, nworld):
 
 def _refuse_together(skin, device, rest_nodes, smoothing):
     """What only worlds that go one after another can have, or a device that is not there."""
-    alone = "is not there for worlds that go together: leave `together` out"
+    missing = "is not there for worlds that go together: leave `together` out"
     if skin.model.has_liquid:
-        raise ValueError(f"liquid {alone}, or take liquid=False")
+        raise ValueError(f"liquid {missing}, or take liquid=False")
     if skin.model.material.remembers:
-        raise ValueError(f"rubber with prony, mullins or hysteresis {alone}")
+        raise ValueError(f"rubber with prony, mullins or hysteresis {missing}")
     if rest_nodes is not None:
-        raise ValueError(f"rest_nodes {alone}")
+        raise ValueError(f"rest_nodes {missing}")
     if smoothing:
-        raise ValueError(f"smoothing {alone}")
+        raise ValueError(f"smoothing {missing}")
     try:
         wp.get_device(device)
     except (ValueError, RuntimeError) as error:

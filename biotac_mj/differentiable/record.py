@@ -14,7 +14,7 @@ from ..skin.program import Launcher
 from ..skin.state import SavedState
 from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, SkinWorlds
-from .touching import Held, at_sharp_edges, find_touching, rows, touching_samples
+from .touching import Anchors, at_sharp_edges, find_touching, rows, touching_samples
 
 __all__ = ["Changes", "Record", "Trajectory", "advance", "follow", "hold_pressure", "restore"]
 
@@ -55,7 +55,7 @@ class Record:
       x, x_last: (nvert, nworld, 3) nodes when it ended and began [m].
       begun: state of a single world on the CPU when it began; with a largest energy below any in the step in
         which a filling comes to rest, which leaves rubber that has borne no more than that. Else None.
-      held: what stuck then.
+      anchors: what stuck then.
       poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, nworld, ...).
       numbers: of the worlds, (nworld,).
       wrench: (nworld, ngroup, 6) of the skin on the geoms. pressure: (nworld,) of the liquid above the
@@ -72,7 +72,7 @@ class Record:
     x: torch.Tensor
     x_last: torch.Tensor
     begun: SavedState | None
-    held: Held
+    anchors: Anchors
     poses: dict
     numbers: dict
     wrench: torch.Tensor
@@ -108,7 +108,7 @@ def follow(
     dt: np.ndarray | None = None,
     constants: np.ndarray | None = None,
     smoothing: float = 0.0,
-    near: Sequence[torch.Tensor | None] | None = None,
+    guesses: Sequence[torch.Tensor | None] | None = None,
 ) -> Trajectory:
     """Takes the geoms along paths, from skins at rest.
 
@@ -120,8 +120,8 @@ def follow(
       dt: (nstep,) times of the steps [s]; needed by a Prony series.
       constants: of the rubber's memory; None: the skin's.
       smoothing: half width of first touch, see `press` [m].
-      near: for each step nodes (nvert, nworld, 3) at which it begins to look for its balance [m], None: where
-        the step before leads. Then the press ends with the first step that is lost.
+      guesses: for each step nodes (nvert, nworld, 3) at which it begins to look for its balance [m], None:
+        where the step before leads. Then the press ends with the first step that is lost.
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
@@ -149,12 +149,12 @@ def follow(
     steps, before = [], None
     for t in range(pos.shape[1]):
         geoms.set_pose(pos[:, t], mat[:, t])
-        if near and near[t] is not None:
-            wp.to_torch(data.increment).copy_(near[t] - wp.to_torch(data.x))
+        if guesses and guesses[t] is not None:
+            wp.to_torch(data.increment).copy_(guesses[t] - wp.to_torch(data.x))
             data.worlds.guessed.fill_(1)
         before = advance(skin, geoms, before, float(dt[t]), constants)
         steps.append(before)
-        if near and any(changes.lost for changes in before.changes):
+        if guesses and any(changes.lost for changes in before.changes):
             break
     return Trajectory(rest, steps, vert)
 
@@ -173,19 +173,19 @@ def advance(
     before, None: there is none. constants: of the rubber's memory."""
     data, outer, struct = skin.data, skin.data.outer, geoms.struct
     begun = skin.state(geoms).save() if skin.model.has_liquid or data.memory else None
-    held, x_last = Held.of(outer), wp.to_torch(data.x).clone()
+    anchors, x_last = Anchors.of(outer), wp.to_torch(data.x).clone()
     names = ("pos", "mat", "pos_last", "mat_last", "friction")
     poses = {name: wp.to_torch(getattr(struct, name)).clone() for name in names}
     step(skin.model, data, geoms, dt)
     x = wp.to_torch(data.x).clone()
     _put_poses(geoms, poses)  # the step makes the last poses these
-    seen = find_touching(outer, skin.sample_weights, struct, x, x_last, held)
+    seen = find_touching(outer, skin.sample_weights, struct, x, x_last, anchors)
     sharp = seen.sample[at_sharp_edges(struct, seen)]
     geoms.advance()
     slips = (rows(outer.trial_anchor)[seen.sample] != seen.stick).any(1)
     slips &= rows(struct.friction)[seen.geom] > 0 if geoms.count else slips
     touches, slips = seen.sample, seen.sample[slips]
-    yields, loads = _sides(skin, geoms, begun, before, bool((x != x_last).any()))
+    yields, loads = _kink_branches(skin, geoms, begun, before, bool((x != x_last).any()))
     counts = {"lost": torch.as_tensor(~data.converged | (data.worlds.increment.numpy() > 0)).long()}
     of_worlds = {"sharp": sharp}
     if before is not None:
@@ -206,12 +206,12 @@ def advance(
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else x.new_zeros(skin.nworld)
     on_core = len(touching_samples(data.core.trial_geom)[0]) if data.core else 0
     return Record(
-        geoms, x, x_last, begun, held, poses, skin.read(*_WORLD), skin.tensor(data.wrench).clone(), pressure,
-        touches, slips, yields, loads, on_core, changes, dt, constants, skin.smoothing,
+        geoms, x, x_last, begun, anchors, poses, skin.read(*_WORLD), skin.tensor(data.wrench).clone(),
+        pressure, touches, slips, yields, loads, on_core, changes, dt, constants, skin.smoothing,
     )  # fmt: skip
 
 
-def _sides(skin, geoms, begun, before, moved):
+def _kink_branches(skin, geoms, begun, before, moved):
     """Which of the rubber's friction elements slipped in a step, and which points bore more than ever, by
     what they remember now and did when it began; rubber that lies still is on the side where it was."""
     if not skin.data.memory:
@@ -243,7 +243,7 @@ def restore(skin: SkinWorlds, record: Record) -> None:
         data.dt.fill_(record.dt)
         data.memory.begin_step(Launcher("cpu"), data.dt, data.worlds.softness)
         skin.write({"softness": record.numbers["softness"]})
-    record.held.give(data.outer)
+    record.anchors.give(data.outer)
     wp.to_torch(data.x).copy_(record.x)
     _put_poses(record.geoms, record.poses)
     skin.solver(record.geoms).evaluate_forces()

@@ -230,7 +230,7 @@ class SkinWorlds:
         """After a solve that took so many products with the tangent at x (nvert, nworld, 3) [m]."""
         self.products += count
         if self.factors and self.nworld == 1:
-            self.factors.watch(count, x[:, 0].numpy())
+            self.factors.count(count, x[:, 0].numpy())
 
     def multiply_rubber(self, p: torch.Tensor) -> torch.Tensor:
         """Tangent of the rubber where forces were evaluated last (`record.restore`), times p (nvert, nworld,

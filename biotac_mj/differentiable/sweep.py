@@ -116,14 +116,14 @@ def pull_back(skin: SkinWorlds, trajectory: Trajectory, outputs: Outputs, shape:
 
 
 def push_forward(
-    skin: SkinWorlds, trajectory: Trajectory, inputs: Inputs, near: np.ndarray | None = None
+    skin: SkinWorlds, trajectory: Trajectory, inputs: Inputs, guess: np.ndarray | None = None
 ) -> Outputs:
     """Tangents of the outputs from those of the inputs, k of them at once.
 
     Args:
       inputs: with arrays of a leading k: pose (k, nworld, nstep, ngeom, 6), friction (k, nworld, ngeom),
         numbers (k, nworld), ...
-      near: (k, nworld, nstep, nvert, 3) nodes' tangents of nearly the same press, from which less is left to
+      guess: (k, nworld, nstep, nvert, 3) nodes' tangents of nearly the same press, from which less is left to
         find.
 
     Returns:
@@ -133,7 +133,7 @@ def push_forward(
     steps, k, like = trajectory.steps, len(inputs.pose), trajectory.steps[0].x
     pose, friction = skin.tensor(inputs.pose).permute(0, 2, 3, 1, 4), skin.tensor(inputs.friction).mT
     numbers = {name: skin.tensor(inputs.numbers[name]) for name in NUMBERS}
-    near = None if near is None else skin.tensor(near).permute(2, 0, 3, 1, 4)
+    guess = None if guess is None else skin.tensor(guess).permute(2, 0, 3, 1, 4)
     moves, none = inputs.vert is not None, like.new_zeros(skin.nworld)
     x, pressure, anchors = [torch.zeros_like(like)] * k, [none] * k, [None] * k
     memory, out = [no_memory(skin)] * k, []
@@ -160,7 +160,7 @@ def push_forward(
                 vert[i] if moves else None,
                 memory[i],
                 constants[i] if t is not None else 0 * constants[i],
-                None if near is None or t is None else near[t, i],
+                None if guess is None or t is None else guess[t, i],
             )
             wrench.append(six)
         return torch.stack(wrench)

@@ -14,7 +14,7 @@ from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
 
-__all__ = ["Held", "Touching", "at_sharp_edges", "find_touching", "rows", "touching_samples"]
+__all__ = ["Anchors", "Touching", "at_sharp_edges", "find_touching", "rows", "touching_samples"]
 
 _NEARER = (
     0.25  # of a sample's spacing, by which another side of a geom is nearer: 90 degrees, no tessellation
@@ -22,7 +22,7 @@ _NEARER = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Held:
+class Anchors:
     """What a surface remembers when a step begins.
 
     Attributes:
@@ -75,7 +75,7 @@ class Touching:
       plane: (m, 4) normal and offset [m], in the geom's frame, of what they meet of an edge; else zeros.
       point, last: (m, 3) where they push, and where they were when the step began [m].
       local: (m, 3) in the geom's frame.
-      old: (m,) number in `Held` of those that touched the same geom when the step began, else -1.
+      old: (m,) number in `Anchors` of those that touched the same geom when the step began, else -1.
       stick: (m, 3) where they stick if they do, in the geom's frame.
     """
 
@@ -110,14 +110,14 @@ def find_touching(
     geoms: Geoms,
     x: torch.Tensor,
     x_last: torch.Tensor,
-    held: Held,
+    anchors: Anchors,
 ) -> Touching:
     """Finds them.
 
     Args:
       state: of the surface, after an evaluation. weights: (s, 3) of the samples of a face.
       geoms: with poses of the end and of the beginning of the step.
-      x, x_last: (nvert, nworld, 3) nodes then [m]. held: when the step began.
+      x, x_last: (nvert, nworld, 3) nodes then [m]. anchors: when the step began.
     """
     nworld, s = state.trial_geom.shape[1], len(weights)
     sample, geom = touching_samples(state.trial_geom)
@@ -127,15 +127,15 @@ def find_touching(
     corner = x.reshape(-1, 3)[node]
     point, last = (torch.einsum("ma,mak->mk", weight, at) for at in (corner, x_last.reshape(-1, 3)[node]))
     number = torch.full((state.trial_geom.size,), -1, device=sample.device)
-    number[held.sample] = torch.arange(len(held.sample), device=sample.device)
+    number[anchors.sample] = torch.arange(len(anchors.sample), device=sample.device)
     old = number[sample]
     known = torch.nonzero(old >= 0).ravel()
-    old[known[held.geom[old[known]] != geom[known]]] = -1
+    old[known[anchors.geom[old[known]] != geom[known]]] = -1
     known = old >= 0
     poses = (rows(getattr(geoms, name))[geom] for name in ("pos", "mat", "pos_last", "mat_last"))
     pos, mat, pos_last, mat_last = poses
     stick, local = _in_frame(last, pos_last, mat_last), _in_frame(point, pos, mat)
-    stick[known] = held.anchor[old[known]]
+    stick[known] = anchors.anchor[old[known]]
     at, plane, fraction = _meet_edges(geoms, geom, local, weight, corner)
     area = wp.to_torch(state.surface.area).double()[kind] / s * fraction
     point = torch.einsum("ma,mak->mk", at, corner)

@@ -60,10 +60,10 @@ def for_jax(function: Callable, *shapes: Sequence[int]) -> Callable:
                 kept.popitem(last=False)
         return given, found
 
-    def ahead(*arrays):
+    def forward(*arrays):
         return tuple(one.detach().cpu().numpy().astype(_real(jax)) for one in run(*arrays)[1])
 
-    def back(arrays, cotangents):
+    def backward(arrays, cotangents):
         given, found = run(*arrays)
         pairs = [
             (one, torch.from_numpy(np.array(slope, np.float64)).to(one.device))
@@ -83,14 +83,14 @@ def for_jax(function: Callable, *shapes: Sequence[int]) -> Callable:
         return jax.ShapeDtypeStruct(shape, _real(jax))
 
     def call(*arrays):
-        return jax.pure_callback(ahead, tuple(map(like, shapes)), *arrays, vmap_method="sequential")
+        return jax.pure_callback(forward, tuple(map(like, shapes)), *arrays, vmap_method="sequential")
 
-    def call_back(arrays, cotangents):
+    def call_backward(arrays, cotangents):
         wanted = tuple(like(np.shape(array)) for array in arrays)
-        return jax.pure_callback(back, wanted, arrays, cotangents, vmap_method="sequential")
+        return jax.pure_callback(backward, wanted, arrays, cotangents, vmap_method="sequential")
 
     press = jax.custom_vjp(call)
-    press.defvjp(lambda *arrays: (call(*arrays), arrays), call_back)
+    press.defvjp(lambda *arrays: (call(*arrays), arrays), call_backward)
 
     def of_arrays(*arrays):
         found = press(*(jax.numpy.asarray(array, _real(jax)) for array in arrays))

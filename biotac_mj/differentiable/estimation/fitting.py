@@ -20,8 +20,8 @@ from .presses import Presses, frame_of, outcome_of, slopes_of_film
 
 __all__ = ["Fit", "fit", "noise_of"]
 
-_STARTS, _APART = 3, 2e-3  # places of the table to begin at, and how far they are apart [m]
-_ITERATIONS, _STRIDE = 20, 0.5  # of a start; longest move of one [mm]
+_STARTS, _SPACING = 3, 2e-3  # places of the table to begin at, and how far they are apart [m]
+_ITERATIONS, _LONGEST = 20, 0.5  # of a start; longest move of one [mm]
 _CONVERGED = 0.1  # gain of ln of the likelihood below which a start is done: far inside the interval
 
 
@@ -31,7 +31,7 @@ class Fit:
 
     Attributes:
       outcome: (7,) of `outcome_of`, mean of the presses that were found. covariance: (7, 7) of it.
-      unexplained: share of the electrodes' change, RMS, that the likeliest press misses.
+      unexplained: fraction of the electrodes' change, RMS, that the likeliest press misses.
     """
 
     outcome: np.ndarray
@@ -79,8 +79,8 @@ def fit(presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.nd
         for p, press in zip(likely, found)
     )
     n = presses.geometry.design.nelectrode
-    share = float(np.linalg.norm((best.missed * noise)[:n]) / np.linalg.norm(signal[:n]))
-    return Fit(mean, covariance, share)
+    fraction = float(np.linalg.norm((best.missed * noise)[:n]) / np.linalg.norm(signal[:n]))
+    return Fit(mean, covariance, fraction)
 
 
 def _covariance(press, size):
@@ -98,7 +98,7 @@ def _starts(presses, signal, noise):
     far = (((presses.signal[:, : len(signal)] - signal) / noise) ** 2).sum(1)
     chosen, place = [], presses.outcome[:, 1:4]
     for k in np.argsort(far):
-        if all(np.linalg.norm(place[k] - place[j]) > _APART for j in chosen):
+        if all(np.linalg.norm(place[k] - place[j]) > _SPACING for j in chosen):
             chosen.append(k)
         if len(chosen) == _STARTS:
             break
@@ -110,7 +110,7 @@ class _Search:
 
     def __init__(self, presses, film, signal, noise, start):
         self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
-        self._steps = presses.way(*presses.at[start])
+        self._steps = presses.path(*presses.at[start])
         self._axes = frame_of(self._steps, presses.at[start, 1])
 
     def run(self) -> _Press | None:
@@ -126,7 +126,7 @@ class _Search:
             normal = here.missed_by.T @ here.missed_by / scale + np.diag(_PRIOR)
             pull = -here.missed_by.T @ here.missed / scale - _PRIOR * at
             move = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), pull)
-            move *= min(1.0, _STRIDE / np.linalg.norm(move[:3]))
+            move *= min(1.0, _LONGEST / np.linalg.norm(move[:3]))
             try:
                 there = self._simulate(at + move)
             except NoFilmError:  # deeper than the skin is thick

@@ -32,12 +32,12 @@ __all__ = ["Capsule", "Presses", "capsule_of", "deepest", "frame_of", "outcome_o
 
 _TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a clamped finger's skin, roughly
 _ROUND = np.radians([85, 64, 43, 21])  # of an end
-_SHARES = np.linspace(0, 1, 8)  # of the deepest press
+_FRACTIONS = np.linspace(0, 1, 8)  # of the deepest press
 _DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] of a press, from the core: as `data.generation.plan` presses
 _FINER = 2  # points for each of the table's
-_LIGHTEST = 1 / 32  # share at which the lightest press is
+_LIGHTEST = 1 / 32  # fraction at which the lightest press is
 _FILL = 1e-9  # [m^3] the unit of slopes by the fill
-_FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, ways of the electrodes
+_FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, moves of the electrodes
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,16 +91,16 @@ def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
     return torch.cat([force.norm().log()[None], centre, -along])
 
 
-def deepest(way: Indentation, core: wp.array) -> float:
+def deepest(indentation: Indentation, core: wp.array) -> float:
     """How deep an indenter may go until the core is 0.6 mm away [m], 2.4 mm at most. All of its surface
     counts: a finger may stand in a ring.
 
     Args:
-      way: a press of 2.4 mm. core: points of its surface, vec3 [m].
+      indentation: a press of 2.4 mm. core: points of its surface, vec3 [m].
     """
-    count = len(way.tip)
-    placed = Placed(way.indenter, count)
-    placed.place(way.tip, np.tile(matrix(way.quat), (count, 1, 1)))
+    count = len(indentation.tip)
+    placed = Placed(indentation.indenter, count)
+    placed.place(indentation.tip, np.tile(matrix(indentation.quat), (count, 1, 1)))
     gap = np.minimum.accumulate(placed.nearest(core))
     if gap[-1] >= _CLEAR:
         return _DEEPEST
@@ -108,22 +108,24 @@ def deepest(way: Indentation, core: wp.array) -> float:
 
 
 def frame_of(steps: Steps, around: float) -> np.ndarray:
-    """(2, 3) axes about which a press tilts: one round the finger, one along it, both across its way."""
-    way = steps.pos[0, 0] - steps.pos[-1, 0]
-    way = way / np.linalg.norm(way)
+    """(2, 3) axes about which a press tilts: one round the finger, one along it, both across its path."""
+    out = steps.pos[0, 0] - steps.pos[-1, 0]
+    out = out / np.linalg.norm(out)
     first = np.array([0, np.sin(around), np.cos(around)])
-    first -= way * (way @ first)
+    first -= out * (out @ first)
     first /= np.linalg.norm(first)
-    return np.array([first, np.cross(way, first)])
+    return np.array([first, np.cross(out, first)])
 
 
-def slopes_of_film(film: FilmConduction, x: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """ln Z (19,) of a film under nodes x (nvert, 3) [m], and its slopes (k, 19) by ways (k, nvert, 3) of
-    them."""
+def slopes_of_film(
+    film: FilmConduction, x: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """ln Z (19,) of a film under nodes x (nvert, 3) [m], and its slopes (k, 19) along directions (k, nvert,
+    3) of them."""
     nodes, slopes = torch.from_numpy(x.copy()), []
-    for way in ways:
+    for direction in directions:
         with forward_ad.dual_level():
-            dual = forward_ad.make_dual(nodes, torch.from_numpy(np.ascontiguousarray(way)))
+            dual = forward_ad.make_dual(nodes, torch.from_numpy(np.ascontiguousarray(direction)))
             value, slope = forward_ad.unpack_dual(impedance(film, dual).log())
         slopes.append(slope.numpy())
     return value.numpy(), np.array(slopes)
@@ -136,13 +138,13 @@ class Presses:
       skin: under one geom. geometry: of it. indenter: the geom, as `biotac press --indenter`.
 
     Attributes:
-      at: (n, 3) along [m] and around [rad] the capsule, share of the deepest press there.
+      at: (n, 3) along [m] and around [rad] the capsule, fraction of the deepest press there.
       signal: (n, nelectrode + 1), changes of ln Z, and of the liquid's pressure [kPa]. by_press: (n, 3,
-        nelectrode + 1) of it by two tilts of the way [rad] and the fill [ul].
+        nelectrode + 1) of it by two tilts of the path [rad] and the fill [ul].
       by_sensor: (n, 3, nelectrode + 1) by ln of the residual film, and by electrodes that lie further along
         and across the finger [mm].
       outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) of it by tilts and fill.
-      weight: (n,) ln of the share of the skin that each stands for. deepest: (n,) whether none is deeper
+      weight: (n,) ln of the fraction of the skin that each stands for. deepest: (n,) whether none is deeper
         at its place.
     """
 
@@ -150,37 +152,37 @@ class Presses:
         self.skin, self.geometry, self._indenter = skin, geometry, indenter
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
         self._capsule = capsule = capsule_of(geometry)
-        axes = capsule.along, capsule.around, _SHARES
+        axes = capsule.along, capsule.around, _FRACTIONS
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
         table = cached("presses", inputs, self._make, code)
-        along, around, share = (
+        along, around, fraction = (
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )
-        share[0] = _LIGHTEST
-        self.at = at = np.stack(np.meshgrid(along, around, share, indexing="ij"), -1).reshape(-1, 3)
+        fraction[0] = _LIGHTEST
+        self.at = at = np.stack(np.meshgrid(along, around, fraction, indexing="ij"), -1).reshape(-1, 3)
         self.signal, self.by_press, self.by_sensor, self.outcome, self.outcome_by = (
             RegularGridInterpolator(axes, table[name], method="cubic")(at)
             for name in ("signal", "by_press", "by_sensor", "outcome", "outcome_by")
         )
         self.outcome[:, 0] += np.log(at[:, 2])
-        self.deepest = at[:, 2] == share[-1]
+        self.deepest = at[:, 2] == fraction[-1]
         self.weight = np.log(np.cos(capsule.turn(at[:, 0])))
 
-    def simulate(self, along: float, around: float, share: float = 1.0) -> tuple[Trajectory, Steps]:
-        """A press at a place [m], [rad]: its steps, and their way."""
-        steps, skin = self.way(along, around, share), self.skin
+    def simulate(self, along: float, around: float, fraction: float = 1.0) -> tuple[Trajectory, Steps]:
+        """A press at a place [m], [rad]: its steps, and their path."""
+        steps, skin = self.path(along, around, fraction), self.skin
         return follow(skin, steps.pos[None], steps.mat[None], skin.friction, skin.own), steps
 
-    def way(self, along: float, around: float, share: float = 1.0) -> Steps:
+    def path(self, along: float, around: float, fraction: float = 1.0) -> Steps:
         """The steps of a press at a place [m], [rad]."""
         point = self._capsule.at(along, around)
 
         def plan(depth):
-            samples = len(_SHARES) - 1
+            samples = len(_FRACTIONS) - 1
             return plan_indentation(self._indenter, point, depth, 0.0, samples=samples, skin=self.geometry)
 
-        return steps_of(plan(share * deepest(plan(_DEEPEST), self._core_samples)))[0]
+        return steps_of(plan(fraction * deepest(plan(_DEEPEST), self._core_samples)))[0]
 
     def middle(self, touches: torch.Tensor) -> np.ndarray:
         """(3,) of samples by number, on the resting skin [m]."""
@@ -190,10 +192,10 @@ class Presses:
         return np.einsum("ma,mak->mk", weight, corner).mean(0)
 
     def _make(self):
-        """The table: (along, around, share, ...) of each attribute, the force of the outcome over the
-        share."""
+        """The table: (along, around, fraction, ...) of each attribute, the force of the outcome over the
+        fraction."""
         capsule, width = self._capsule, self.geometry.design.nelectrode + 1
-        shape = len(capsule.along), len(capsule.around), len(_SHARES)
+        shape = len(capsule.along), len(capsule.around), len(_FRACTIONS)
         widths = {
             "signal": (width,), "by_press": (3, width), "by_sensor": (3, width), "outcome": (7,),
             "outcome_by": (3, 7),
@@ -224,14 +226,14 @@ class Presses:
                         functools.partial(outcome_of, middle=middle), wrench
                     )
                     table["outcome"][here] = outcome_of(wrench, middle).numpy()
-                    table["outcome"][here][0] -= np.log(_SHARES[k])
+                    table["outcome"][here][0] -= np.log(_FRACTIONS[k])
                     table["outcome_by"][here] = ahead.wrench[:, 0, end, 0] @ slopes.numpy().T
         for name in ("outcome", "outcome_by"):
             table[name][:, :, 0] = table[name][:, :, 1]
         return table
 
     def _tangents(self, steps, around):
-        """Two tilts of the way about its beginning, and the fill."""
+        """Two tilts of the path about its beginning, and the fill."""
         pose = np.zeros((3, 1, len(steps.pos), 1, 6))
         for k, axis in enumerate(frame_of(steps, around)):
             pose[k, 0, :, 0] = np.concatenate(
@@ -251,20 +253,20 @@ class _Films:
         core, at = CoreSurface(geometry.core_vert, geometry.core_face), geometry.electrode_pos
         films = [FilmConduction(geometry)]
         films += [FilmConduction(geometry, residual_film=floor) for floor in _FLOORS]
-        for way in np.eye(3)[[0, 2]]:
+        for axis in np.eye(3)[[0, 2]]:
             for size in (-_MOVED, _MOVED):
-                _, foot, face = core.closest(at + size * way)
+                _, foot, face = core.closest(at + size * axis)
                 moved = {"electrode_pos": foot, "electrode_normal": core.normal[face]}
                 films.append(FilmConduction(dataclasses.replace(geometry, **moved)))
         self._own, self._others = films[0], films[1:]
         self._rest = [np.log(film.impedance(rest)) for film in films]
-        apart = np.array([np.log(_FLOORS[1] / _FLOORS[0]), 2e3 * _MOVED, 2e3 * _MOVED])
-        self._apart = apart[:, None]
+        steps_apart = np.array([np.log(_FLOORS[1] / _FLOORS[0]), 2e3 * _MOVED, 2e3 * _MOVED])
+        self._steps_apart = steps_apart[:, None]
 
-    def read(self, x: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Changes of ln Z from rest (nelectrode,), their slopes by ways (k, nvert, 3) of the nodes (k,
+    def read(self, x: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Changes of ln Z from rest (nelectrode,), their slopes by directions (k, nvert, 3) of the nodes (k,
         nelectrode), and by what is other (3, nelectrode)."""
-        value, slopes = slopes_of_film(self._own, x, ways)
+        value, slopes = slopes_of_film(self._own, x, directions)
         others = [np.log(film.impedance(x)) - rest for film, rest in zip(self._others, self._rest[1:])]
-        by_other = (np.array(others[1::2]) - others[::2]) / self._apart
+        by_other = (np.array(others[1::2]) - others[::2]) / self._steps_apart
         return value - self._rest[0], slopes, by_other

@@ -103,13 +103,13 @@ def _is_the_simulated_one(args, pressed):
 def _inverted(args, pressed, design):
     """Skin, geom, settings and film of the press where nothing else is asked for, else the defaults."""
     own = {name: value for name, value in (pressed or {}).items() if value is not None}
-    told = own.pop("options", {})
+    options = own.pop("options", {})
     if args.options:
-        told = {"skin": {}, **read_dict(args.options, "options")}
+        options = {"skin": {}, **read_dict(args.options, "options")}
         own.pop("liquid", None)
-    film, told = told.get("film"), {k: v for k, v in told.items() if args.options or k == "skin"}
+    film, options = options.get("film"), {k: v for k, v in options.items() if args.options or k == "skin"}
     liquid = {"liquid": own["liquid"]} if "liquid" in own else {}
-    settings = read_settings(args.material or own.get("material"), told, **liquid)
+    settings = read_settings(args.material or own.get("material"), options, **liquid)
     if settings.modulus is not None:
         raise ValueError("an estimate knows no modulus by element: leave it out of --options")
     skin, indenter = own.get("skin", shipped_skin(design, "coarse")), own.get("indenter", "sphere_7mm")

@@ -28,7 +28,7 @@ class Factors:
         """Begins with the factor at rest: a gradient does not depend on those before."""
         self.now, self._products = self._model.factor, 0
 
-    def watch(self, products: int, x: np.ndarray) -> None:
+    def count(self, products: int, x: np.ndarray) -> None:
         """After solves that took so many products with the tangent at x (nvert, 3) [m]."""
         self._products += max(products - _FEW, 0)
         if self._products > _FACTOR:

@@ -20,8 +20,8 @@ from ..skin import SkinWorlds
 
 __all__ = ["LinearMemory", "Memory"]
 
-_NEAR = 1e-9  # of the size at which friction elements slip, or of what rubber has borne: on a kink
-_SMALL = 1e-4  # of a step over a time of relaxation, below which `share_of_term` is its series
+_KINK = 1e-9  # of the size at which friction elements slip, or of what rubber has borne: on a kink
+_SHORT = 1e-4  # of a step over a time of relaxation, below which `share_of_term` is its series
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class LinearMemory:
         self._moduli(record.numbers)
         self._soften(mullins)
         self._slip(branch)
-        self._take_sides()
+        self._fix_branches()
         self._S = self._second(self._eta[:, None, None] * self._P)
 
     # --- parts ---
@@ -90,11 +90,12 @@ class LinearMemory:
     def _series(self, prony, dt):
         g, tau = prony.T
         a = dt / tau
-        share = -np.expm1(-a) / a
-        by_a = np.where(a < _SMALL, a / 3 - 0.5, (np.exp(-a) - share) / a)
-        self._left, self._left_by_time = np.exp(-a), np.exp(-a) * a / tau
-        self._share, self._share_by_strength, self._share_by_time = g * share, share, -g * by_a * a / tau
-        self._gain = self._share.sum()
+        step_weight = -np.expm1(-a) / a
+        by_a = np.where(a < _SHORT, a / 3 - 0.5, (np.exp(-a) - step_weight) / a)
+        self._decay, self._decay_by_time = np.exp(-a), np.exp(-a) * a / tau
+        self._step_weight, self._step_weight_by_strength = g * step_weight, step_weight
+        self._step_weight_by_time = -g * by_a * a / tau
+        self._gain = self._step_weight.sum()
 
     def _moduli(self, numbers):
         """Stress and energy density of what remembers, and how they depend on the law's constants: linearly,
@@ -104,8 +105,8 @@ class LinearMemory:
         with skin.another_lam() as other:
             P, _, W = memory.point_slopes(x, none)
         self._P, _, self._W = memory.point_slopes(x, none)
-        apart = float(other) - lam
-        lams = (P - self._P) / apart, (W - self._W) / apart
+        lam_step = float(other) - lam
+        lams = (P - self._P) / lam_step, (W - self._W) / lam_step
         mus = (self._P - lam * lams[0]) / mu, (self._W - lam * lams[1]) / mu
         self._mu, self._by = mu, {"mu": mus, "lam": lams}
 
@@ -118,8 +119,8 @@ class LinearMemory:
         if not (len(mullins) and mullins[0] > 0):
             return
         r, m, beta = mullins
-        near = np.abs(self._W - worst) <= _NEAR * worst
-        worst = self.before.worst[...] = np.where(near, (1 - _NEAR) * self._W, worst)
+        on_kink = np.abs(self._W - worst) <= _KINK * worst
+        worst = self.before.worst[...] = np.where(on_kink, (1 - _KINK) * self._W, worst)
         self._loads = worst <= self._W
         width = m + beta * worst
         s = (worst - W) / width
@@ -130,18 +131,18 @@ class LinearMemory:
         self._by_mullins = np.array([(1 - self._eta) / r, bell * s / width, bell * s * worst / width])
 
     def _slip(self, branch):
-        """Trial strains of the friction elements, their sizes, and the shares that are held."""
+        """Trial strains of the friction elements, their sizes, and the factors by which slip returns them."""
         self._strength, most = branch.T[0][:, None, None, None], 1.5**0.5 * branch.T[1][:, None]
         self._trial = _deviator(self._strain() - self.before.slip)
         size = np.sqrt((self._trial**2).sum((-2, -1)))
-        near = (np.abs(size - most) <= _NEAR * most) & (most > 0)
-        self.before.slip[near] += 2 * _NEAR * self._trial[near]
-        self._slips = (size > most) & ~near | (most == 0)
+        on_kink = (np.abs(size - most) <= _KINK * most) & (most > 0)
+        self.before.slip[on_kink] += 2 * _KINK * self._trial[on_kink]
+        self._slips = (size > most) & ~on_kink | (most == 0)
         self._size = np.where(size > 0, size, 1.0)[..., None, None]
-        self._held = np.where(self._slips, most / self._size[..., 0, 0], 1.0)[..., None, None]
+        self._return_factor = np.where(self._slips, most / self._size[..., 0, 0], 1.0)[..., None, None]
         self._sliding = self._slips[..., None, None]
 
-    def _take_sides(self):
+    def _fix_branches(self):
         """Rubber where nothing moves after a step in which it slipped, or bore the most, lies on a kink to
         rounding, and on which side the elements' tangent puts it must be known here."""
         rubber, before = self._skin.data.rubber, self.before
@@ -183,9 +184,9 @@ class LinearMemory:
         return P
 
     def _turn(self, T):
-        """Derivative of a trial strain's held part by the trial strain, times T: its own transpose."""
+        """Derivative of a returned trial strain by the trial strain, times T: its own transpose."""
         along = (self._trial * T).sum((-2, -1), keepdims=True) / self._size**2 * self._trial
-        return self._held * (T - np.where(self._sliding, along, 0.0))
+        return self._return_factor * (T - np.where(self._sliding, along, 0.0))
 
     def _derivative(self, change):
         return self._skin.data.memory.point_slopes(self._skin.data.x, change)[1]
@@ -202,7 +203,7 @@ class LinearMemory:
     def _felt(self, after):
         """Cotangents of the second Piola stress, of the first, and of eta, from those of what is
         remembered."""
-        sigma = _symmetric(after.last + np.tensordot(self._share, after.overstress, 1))
+        sigma = _symmetric(after.last + np.tensordot(self._step_weight, after.overstress, 1))
         tau = sigma if self._linear else _t(self._inverse) @ sigma
         return sigma, tau, _dot(tau, self._P)[:, 0, 0]
 
@@ -233,8 +234,8 @@ class LinearMemory:
         force = -self._volume[:, None, None] * self._gradient_of(balance)
         stiff, before = 1 + self._gain, self.before
         past = _symmetric(force if self._linear else _t(self._F) @ force)
-        over = self._left[:, None, None, None] * (after.overstress + past)
-        last = -np.tensordot(self._share, after.overstress, 1) - self._gain * past
+        over = self._decay[:, None, None, None] * (after.overstress + past)
+        last = -np.tensordot(self._step_weight, after.overstress, 1) - self._gain * past
         eta = eta + stiff * _dot(force, self._P)[:, 0, 0]
         worst = eta * self._by_worst + np.where(self._loads, 0.0, after.worst)
         strain = _deviator(self._strain_change(force))
@@ -242,11 +243,11 @@ class LinearMemory:
         slip = after.slip - _deviator(after.slip - self._turn(after.slip))
         slip = slip - 2 * self._strength * self._mu * _deviator(work)
         gain = (force * self._eta[:, None, None] * self._P).sum() - (past * before.last).sum()
-        share = gain + (after.overstress * (self._S - before.last)).sum((1, 2, 3))
-        left = ((after.overstress + past) * before.overstress).sum((1, 2, 3))
-        by_time = share * self._share_by_time + left * self._left_by_time
-        prony = np.stack([share * self._share_by_strength, by_time], 1)
-        shear = 2 * self._mu * (self._held * self._trial * strain).sum((1, 2, 3))
+        step_weight = gain + (after.overstress * (self._S - before.last)).sum((1, 2, 3))
+        decay = ((after.overstress + past) * before.overstress).sum((1, 2, 3))
+        by_time = step_weight * self._step_weight_by_time + decay * self._decay_by_time
+        prony = np.stack([step_weight * self._step_weight_by_strength, by_time], 1)
+        shear = 2 * self._mu * (self._return_factor * self._trial * strain).sum((1, 2, 3))
         most = 2 * self._strength * self._mu * strain - after.slip
         most = np.where(self._sliding, self._trial / self._size * most, 0.0).sum((1, 2, 3))
         branch = np.stack([shear, 1.5**0.5 * most], 1)
@@ -264,23 +265,25 @@ class LinearMemory:
     def push_force(self, before: Memory, constants: np.ndarray, moduli: dict) -> np.ndarray:
         """(nvert, 3) by which the forces of the rubber change where it is, but for what `LinearStep` has."""
         prony, mullins, branch = split_constants(self._skin.model.material, constants)
-        share, left = self._changes(prony)
+        step_weight, decay = self._changes(prony)
         eta = self._eta_change(before, mullins, moduli)[:, None, None]
         P = sum(moduli[name] * self._by[name][0] for name in self._by)
-        gain, known = share.sum(), self.before
+        gain, known = step_weight.sum(), self.before
         past = -gain * known.last - self._gain * before.last
-        past = past + np.tensordot(left, known.overstress, 1) + np.tensordot(self._left, before.overstress, 1)
+        past = (
+            past + np.tensordot(decay, known.overstress, 1) + np.tensordot(self._decay, before.overstress, 1)
+        )
         change = gain * self._eta[:, None, None] * self._P
         change = change + (1 + self._gain) * ((self._eta[:, None, None] - 1) * P + eta * self._P)
         change = change + (past if self._linear else self._F @ past)
         if len(branch):
-            held, most = self._branch_change(before, branch)
+            returned, most = self._branch_change(before, branch)
             Q = (
                 2
                 * self._mu
                 * (
-                    branch.T[0][:, None, None, None] * self._held * self._trial
-                    + self._strength * (held + most)
+                    branch.T[0][:, None, None, None] * self._return_factor * self._trial
+                    + self._strength * (returned + most)
                 )
             )
             change = change + self._push_forward(Q.sum(0))
@@ -306,27 +309,27 @@ class LinearMemory:
         P = self._derivative(F) + sum(moduli[name] * self._by[name][0] for name in self._by)
         T = self._eta[:, None, None] * P + eta[:, None, None] * self._P
         S = T if self._linear else _symmetric(self._inverse @ (T - F @ self._S))
-        terms = *self._changes(prony), self._share, self._left
-        by_share, by_left, share, left = (c[:, None, None, None] for c in terms)
-        over = by_left * self.before.overstress + left * before.overstress
-        over = over + by_share * (self._S - self.before.last) + share * (S - before.last)
+        terms = *self._changes(prony), self._step_weight, self._decay
+        by_step_weight, by_decay, step_weight, decay = (c[:, None, None, None] for c in terms)
+        over = by_decay * self.before.overstress + decay * before.overstress
+        over = over + by_step_weight * (self._S - self.before.last) + step_weight * (S - before.last)
         slip = before.slip
         if len(branch):
-            held, most = self._branch_change(before, branch)
+            returned, most = self._branch_change(before, branch)
             trial = _deviator(self._strain_change(F))
-            slip = slip + (trial - _deviator(before.slip)) - held - self._turn(trial) - most
+            slip = slip + (trial - _deviator(before.slip)) - returned - self._turn(trial) - most
         return Memory(over, S, np.where(self._loads, energy, before.worst), slip)
 
     def _changes(self, prony):
         g, tau = prony.T
-        return self._share_by_strength * g + self._share_by_time * tau, self._left_by_time * tau
+        return self._step_weight_by_strength * g + self._step_weight_by_time * tau, self._decay_by_time * tau
 
     def _eta_change(self, before, mullins, moduli):
         W = sum(moduli[name] * self._by[name][1] for name in self._by)
         return self._by_worst * before.worst + mullins @ self._by_mullins + self._by_energy * W
 
     def _branch_change(self, before, branch):
-        """Of the held parts of trial strains, where the strains stay: by slips, and by what is held at
+        """Of the trial strains that slip returns, where the strains stay: by slips, and by what is borne at
         most."""
         most = 1.5**0.5 * branch.T[1][:, None, None, None] / self._size * self._trial
         return -self._turn(_deviator(before.slip)), np.where(self._sliding, most, 0.0)

@@ -27,12 +27,12 @@ def pull_rest(skin: SkinWorlds, x: np.ndarray, balance: np.ndarray) -> np.ndarra
     points = _Points(skin, x)
     along = np.einsum("eai,eqaj->eqij", balance[points.elem], points.gradient)
     P, change, theta, direction = points.slopes(along)
-    share, F, eye = points.share, points.F, np.eye(3)
+    stiff_volume, F, eye = points.stiff_volume, points.F, np.eye(3)
     work = np.einsum("eqij,eqij->eq", P, along)[..., None, None] * eye
     S = work - np.swapaxes(F, 2, 3) @ change - np.swapaxes(along, 2, 3) @ P
-    S *= -share[..., None, None]
+    S *= -stiff_volume[..., None, None]
     if points.averaged:
-        felt = np.einsum("eq,eqij,eqij->e", share, direction, along)
+        felt = np.einsum("eq,eqij,eqij->e", stiff_volume, direction, along)
         S -= (points.averaged * felt / points.volume)[:, None, None, None] * points.of_mean(theta, direction)
     out = np.zeros((len(x), 3))
     np.add.at(out, points.elem, np.einsum("eqij,eqaj->eai", S, points.gradient))
@@ -48,7 +48,7 @@ def push_rest(skin: SkinWorlds, x: np.ndarray, change: np.ndarray) -> np.ndarray
         mean = np.einsum("eqij,eqij->e", points.of_mean(theta, direction), G) / points.volume
         dP = dP + points.averaged * mean[:, None, None, None] * direction
     trace = np.trace(G, axis1=2, axis2=3)[..., None, None]
-    dP = -points.share[..., None, None] * (trace * P + dP - P @ np.swapaxes(G, 2, 3))
+    dP = -points.stiff_volume[..., None, None] * (trace * P + dP - P @ np.swapaxes(G, 2, 3))
     out = np.zeros((len(x), 3))
     np.add.at(out, points.elem, np.einsum("eqij,eqaj->eai", dP, points.gradient))
     return out
@@ -58,17 +58,17 @@ class _Points:
     """Integration points at x (nvert, 3).
 
     Attributes:
-      elem, gradient: of `Tetrahedra`. F: (nelem, npoint, 3, 3). share: (nelem, npoint) volume, times the
-        factor on the modulus. volume: (nelem,) [m^3].
+      elem, gradient: of `Tetrahedra`. F: (nelem, npoint, 3, 3). stiff_volume: (nelem, npoint) volume, times
+        the factor on the modulus. volume: (nelem,) [m^3].
       averaged: the part of the law's second constant that the mean dilatation of an element feels [Pa].
     """
 
     def __init__(self, skin, x):
         elements, numbers = skin.model.elements, skin.read("mu", "lam")
         self._skin, self.elem, self.gradient = skin, elements.elem, elements.gradient
-        self.share = self._weight = elements.weight
+        self.stiff_volume = self._weight = elements.weight
         if elements.modulus is not None:
-            self.share = self.share * elements.modulus[:, None]
+            self.stiff_volume = self.stiff_volume * elements.modulus[:, None]
         self.volume = self._weight.sum(1)
         self.averaged = max(float(numbers["lam"] - elements.cap * numbers["mu"]), 0.0)
         self.F = np.einsum("eai,eqaj->eqij", x[self.elem], self.gradient)

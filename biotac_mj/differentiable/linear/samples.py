@@ -54,14 +54,16 @@ def _feel(
     if width > real(0.0):
         push = smooth_push(k, width, gap)[0]
     most = friction[i, o] * push
-    held = vec3()
+    stick_force = vec3()
     anchor = y
     if most > real(0.0):
         if width > real(0.0):
-            held, _K, anchor = smooth_stick_or_slip(y, stick[i, o], normal, most, k * stick_ratio, width)
+            stick_force, _K, anchor = smooth_stick_or_slip(
+                y, stick[i, o], normal, most, k * stick_ratio, width
+            )
         else:
-            held, _K, anchor = stick_or_slip(y, stick[i, o], normal, most, k * stick_ratio)
-    force = push * normal + held
+            stick_force, _K, anchor = stick_or_slip(y, stick[i, o], normal, most, k * stick_ratio)
+    force = push * normal + stick_force
     if o < 3:
         felt_out[i, o] = force[o]
     else:

@@ -16,7 +16,7 @@ import warp as wp
 from ...threads import single_thread
 from ..record import Record, restore
 from ..skin import NUMBERS, SkinWorlds
-from ..touching import Held, find_touching, rows
+from ..touching import Anchors, find_touching, rows
 from .inverse import FaceBlocks, FactorInverse, StepInverse, solve_by_gmres
 from .liquid import LinearLiquid
 from .memory import LinearMemory, Memory
@@ -65,13 +65,13 @@ class LinearStep:
         data, ratio = skin.data, skin.model.options.stick_ratio
         stiffness, struct = record.numbers["contact_stiffness"], record.geoms.struct
         x, x_last, samples = record.x, record.x_last, skin.sample_weights
-        at = self.touching = find_touching(data.outer, samples, struct, x, x_last, record.held)
+        at = self.touching = find_touching(data.outer, samples, struct, x, x_last, record.anchors)
         self._outer = LinearSurface(at, struct, data.outer, stiffness, ratio, record.smoothing)
         group = torch.as_tensor(record.geoms.groups, device=x.device).long()
         self._group = (group[at.kind] if len(at.geom) else at.geom) * skin.nworld + at.world
         self._core = None
         if data.core and (rows(data.core.trial_geom) >= 0).any():
-            core, none = skin.model.core(skin.nworld).struct, Held.none(x.device)
+            core, none = skin.model.core(skin.nworld).struct, Anchors.none(x.device)
             there = find_touching(data.core, samples, core, x, x, none)
             self._core = LinearSurface(there, core, data.core, stiffness, ratio, core=True)
 
@@ -182,9 +182,9 @@ class LinearStep:
             for name, slope in moduli.items():
                 given[name] += slope
         if shape:
-            held = (1 - self._free) * (g - self._whole_tangent(balance, transpose=True))
+            fixed = (1 - self._free) * (g - self._whole_tangent(balance, transpose=True))
             by_rubber = pull_rest(self._skin, self.record.x[:, 0].numpy(), balance[:, 0].numpy())
-            given["vert"] = held[:, 0].numpy() + by_rubber
+            given["vert"] = fixed[:, 0].numpy() + by_rubber
             if memory:
                 given["vert"] += self.memory.pull_rest(deformation)
         return given
@@ -195,11 +195,11 @@ class LinearStep:
         vert: torch.Tensor | None = None,
         memory: Memory | None = None,
         constants: torch.Tensor | None = None,
-        near: torch.Tensor | None = None,
+        guess: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, Memory | None]:
         """Tangents of what the step gives, as `pull` names them, from those of what it was given, of rest
         positions (nvert, 3), of what the rubber remembered and of that memory's constants; what is not named
-        does not change. near: (nvert, nworld, 3) a guess of the nodes' tangents."""
+        does not change. guess: (nvert, nworld, 3) a guess of the nodes' tangents."""
         given = self.none() | given
         outer, core, at, s = self._outer, self._core, self.touching, self._outer.slopes
         felt, anchor = outer.push(given)
@@ -219,12 +219,12 @@ class LinearStep:
             moduli = {name: float(given[name]) for name in ("mu", "lam")}
             own = constants.numpy()
             force += torch.from_numpy(self.memory.push_force(memory, own, moduli))[:, None]
-        held = torch.zeros_like(force)
+        fixed = torch.zeros_like(force)
         if vert is not None:
-            held = (1 - self._free) * vert[:, None]
+            fixed = (1 - self._free) * vert[:, None]
             moved = push_rest(self._skin, self.record.x[:, 0].numpy(), vert.numpy())
-            force += torch.from_numpy(moved)[:, None] - self._whole_tangent(held)
-        x = self.solve(force, start=None if near is None else near * self._free) + held
+            force += torch.from_numpy(moved)[:, None] - self._whole_tangent(fixed)
+        x = self.solve(force, start=None if guess is None else guess * self._free) + fixed
         if memory:
             there = None if vert is None else vert.numpy()
             memory = self.memory.push(memory, own, moduli, x[:, 0].numpy(), there)

@@ -161,14 +161,14 @@ def rollout(
             f"numbers of steps {sorted(lengths)} and of worlds {sorted(worlds)}: give nstep, or what drives, "
             "of one length, and worlds of one number"
         )
-    (nstep,), nworld, alone = lengths, max(worlds, default=1), not worlds
+    (nstep,), nworld, single = lengths, max(worlds, default=1), not worlds
     names, runs = tuple(given), [_Run(model, data, nstep, agree) for _ in range(nworld)]
     ends = []
     for w, run in enumerate(runs):
         own = [v[w] if v.ndim > len(shape[n]) + (n in _DRIVEN) else v for n, v in given.items()]
         ends.append(_Rollout.apply(run, names, *own))
     out = [torch.stack(one) for one in zip(*ends)]
-    if alone:
+    if single:
         out = [one[0] for one in out]
     skins, per = runs[0].skins, [out[i::3] for i in (4, 5, 6)]
     each = [{s.name: value for s, value in zip(skins, one)} for one in per]
@@ -260,8 +260,8 @@ class _Run:
         """One step: of its beginning (ny,), of what drove it by name, and of the skins."""
         bodies, kept, start, nv = self.bodies, self.kept[t], self.starts[t], self.model.nv
         by, by_wrench = bodies.step_slopes(start, [k.wrench for k in kept], names)
-        ahead = [s.instance.two_way and not k.idle for s, k in zip(self.skins, kept)]
-        gammas = [k.gamma if later else None for k, later in zip(kept, ahead)]
+        solved_at_end = [s.instance.two_way and not k.idle for s, k in zip(self.skins, kept)]
+        gammas = [k.gamma if later else None for k, later in zip(kept, solved_at_end)]
         poses = bodies.pose_slopes(start, self.qvel[t], gammas, names)
         before = [self.begin if t == 0 else [k.state for k in self.kept[t - 1]]][0]
         linear, base, units, bases = [], [], [], []
@@ -279,7 +279,7 @@ class _Run:
             linear.append(one)
             base.append(one.pull(skins[i], pushed.reshape(-1, 6)))
             # ways in which velocities' cotangents come back as wrenches
-            back = by_wrench[i][nv : 2 * nv].T if ahead[i] else np.zeros((len(pushed), 0))
+            back = by_wrench[i][nv : 2 * nv].T if solved_at_end[i] else np.zeros((len(pushed), 0))
             scale = np.tile(_LEVER, len(pushed) // 6)[:, None]
             left, size, _ = np.linalg.svd(scale * back, full_matrices=False)
             left = left[:, size > _RANK * size.max(initial=0.0)] / scale
@@ -289,7 +289,7 @@ class _Run:
         # of the velocities at the end, w = what the poses there say, in which w itself comes back
         w, loop = np.zeros(nv), np.eye(nv)
         for i, one in enumerate(linear):
-            if not ahead[i]:
+            if not solved_at_end[i]:
                 continue
             slope = poses[i]["after"]
             w += slope.T @ (base[i] if one is None else base[i].pose)
