@@ -132,7 +132,8 @@ def test_evidence_beside_what_looks_alike_is_an_integral(plain):
     fit = dataclasses.replace(fit, effects=[(latency, {**latency.default(), "delay": 0.05})])
     raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in (fit.effects, [])]
     change = np.quantile(np.abs(np.concatenate([a - b for a, b in zip(*raw)])), 0.98, axis=0)
-    share = np.min(null.size / np.maximum(change, 1e-12))
+    square = (change / null.size) ** 2
+    share = np.sqrt((1 - (square**2).sum() / square.sum() ** 2) / square.max())
     for gain in (5.0, 50.0, 5000.0):
         t = np.linspace(-12, 12, 200001)
         log = -gain * ((1 - t) ** 2 - 1) - 0.5 * (t / share) ** 2  # likelihood over that at none, and prior

@@ -223,17 +223,20 @@ def _candidate(comparison, effect, fit, current, chance, usable):
 def _beside_alike(comparison, fit, current, gain) -> float:
     """Evidence [nats] of the last effect of a fit over a model that is off by the same pattern.
 
-    By as much as is expected of the model without it (`Fit.size`) that may be off in any way, in all channels
-    together: of this effect by a share of prior N(0, e^2), as large as that where the effect is largest. With
-    a likelihood that is quadratic
-    in the effect's size, and has `gain` at it, that leaves gain / (1 + 2 gain e^2) and an Occam factor."""
+    By as much as is expected of the model without it (`Fit.size`) that may be off in several channels
+    together, where the likelihood has each by itself: by a share of this effect, of prior
+    N(0, e^2 (1 - 1 / m)) in m channels, e as large as that where the effect is largest. With a likelihood
+    that is quadratic in the effect's size, and has `gain` at it, that leaves
+    gain / (1 + 2 gain e^2 (1 - 1 / m)) and an Occam factor."""
     effect, theta = fit.effects[-1]
     if effect.wiring:  # electrodes are read in another's place, or are not
         return gain
     models = fit.effects, fit.effects[:-1]
     raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in models]
     change = np.quantile(np.abs(np.concatenate([a - b for a, b in zip(*raw)])), 0.98, axis=0)
-    alike = 2 * max(gain, 0.0) * float(np.min(current.size / np.maximum(change, 1e-12))) ** 2
+    square = (np.maximum(change, 1e-12) / current.size) ** 2
+    single = float((square**2).sum() / square.sum() ** 2)  # 1 / m
+    alike = 2 * max(gain, 0.0) * (1 - single) / float(square.max())
     return gain / (1 + alike) + 0.5 * float(np.log1p(alike))
 
 
