@@ -229,7 +229,7 @@ def _beside_alike(comparison, fit, current, gain) -> float:
     that is quadratic in the effect's size, and has `gain` at it, that leaves
     gain / (1 + 2 gain e^2 (1 - 1 / m)) and an Occam factor."""
     effect, theta = fit.effects[-1]
-    if effect.wiring:  # electrodes are read in another's place, or are not
+    if effect.wiring or effect.per_channel:  # read in another's place, or not; of each channel by itself
         return gain
     models = fit.effects, fit.effects[:-1]
     raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in models]
