@@ -18,7 +18,7 @@ DEVICES = ["cpu", *(["cuda:0"] if wp.is_cuda_available() else [])]
 
 def model_of(material=None, device="cpu", **options):
     """A ball whose steps may take so little work that conjugate gradients must not have to help much."""
-    ball, options = finger(), {"max_work": 60, "tolerance": 1e-4, "max_newton": 60} | options
+    ball, options = finger(), {"max_work": 44, "tolerance": 1e-4, "max_newton": 60} | options
     return SkinModel(ball.geometry, material or ball.material, SkinOptions(**options), device)
 
 

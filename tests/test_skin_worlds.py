@@ -490,7 +490,7 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     wp.launch_tiled(
         judge_balance,
         dim=[1],
-        inputs=[1e-4, 0, data.rest_pressure, *arrays, st],
+        inputs=[1e-4, 750, 0, data.rest_pressure, *arrays, st],
         outputs=[go_on],
         block_dim=1,
         device="cpu",
@@ -514,7 +514,7 @@ def test_viscous_skin_is_in_balance_within_an_increment(lag, stride, rz, balance
     part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
     part[0], worth[0], worth[1] = rz * tolerance**2, 1e-4, 1.0
     arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
-    given = [tolerance, 0, data.rest_pressure, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
+    given = [tolerance, 750, 0, data.rest_pressure, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
     wp.launch_tiled(judge_balance, dim=[1], inputs=given, block_dim=1, device="cpu")
     assert bool(st.active.numpy()[0]) is not balanced
 

@@ -494,7 +494,7 @@ class SkinStep:
         """Residual, preconditioner and the first direction; which worlds are in balance."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
-        bounds = [m.options.tolerance, int(m.has_liquid), self.d.rest_pressure]
+        bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid), self.d.rest_pressure]
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
         if m.has_liquid:
             given = [m.free_mask, self.d.gradient, st]

@@ -15,6 +15,7 @@ __all__ = [
     "gamma_of",
     "in_store",
     "poorly_corrected",
+    "share_that_pushes",
     "stayed",
     "withheld_further",
 ]
@@ -89,6 +90,18 @@ def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> An
     is to be corrected of wrenches `wrench`, all largest entries [N]. Not where the simulation has blown up:
     nothing is greater than nan."""
     return wrong > tolerance * max(excess, wrench)
+
+
+def share_that_pushes(push: Any, fall: Any) -> Any:
+    """Share of its stiffness with which a model of no balance still pushes where its body goes without the
+    skin, so that it holds nobody back who leaves: it knows nothing of skin that parts.
+
+    Args:
+      push: of its wrench along a direction; fall: what all of the stiffness takes from that on the way there.
+    """
+    if push > type(push)(0.0) and fall > push:
+        return push / fall
+    return type(push)(1.0)
 
 
 def stayed(before: Any, reached: Any) -> Any:

@@ -20,7 +20,7 @@ from ...geometry.closest import (
     pseudonormals,
 )
 from ...geometry.solid import bounds_solid
-from ..types import double, real, single, vec3
+from ..types import double, mat33, real, single, vec3
 
 __all__ = [
     "NEAR_SURFACE",
@@ -29,6 +29,7 @@ __all__ = [
     "Grids",
     "bake_distance_grid",
     "grid_value",
+    "mesh_curvature",
     "mesh_distance",
     "mesh_field",
     "pack_grids",
@@ -299,23 +300,31 @@ def _spline_slopes(t: real):
 
 
 @wp.func
+def _spline_centre(grids: Grids, k: int, p: vec3):
+    """The nearest centre of a spline with neighbours on all sides, and the place from there, in cells."""
+    n = grids.shape[k]
+    # beyond the grid a lower bound, as `grid_value` is
+    top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
+    s = wp.min(wp.max((p - grids.origin[k]) / grids.spacing[k], vec3()), top)
+    i = wp.vec3i()
+    for a in range(3):
+        i[a] = wp.clamp(int(wp.round(s[a])), 1, n[a] - 2)
+    return i, s - vec3(real(i[0]), real(i[1]), real(i[2]))
+
+
+@wp.func
 def _from_spline(grids: Grids, k: int, p: vec3):
     """Gradient and value of the quadratic spline: both are continuous."""
     n = grids.shape[k]
     h = grids.spacing[k]
-    # beyond the grid a lower bound, as `grid_value` is
-    top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
-    s = wp.min(wp.max((p - grids.origin[k]) / h, vec3()), top)
-    i = wp.clamp(int(wp.round(s[0])), 1, n[0] - 2)
-    j = wp.clamp(int(wp.round(s[1])), 1, n[1] - 2)
-    l = wp.clamp(int(wp.round(s[2])), 1, n[2] - 2)
-    x = _spline_weights(s[0] - real(i))
-    y = _spline_weights(s[1] - real(j))
-    z = _spline_weights(s[2] - real(l))
-    dx = _spline_slopes(s[0] - real(i))
-    dy = _spline_slopes(s[1] - real(j))
-    dz = _spline_slopes(s[2] - real(l))
-    first = grids.first[k] + ((i - 1) * n[1] + j - 1) * n[2] + l - 1
+    i, t = _spline_centre(grids, k, p)
+    x = _spline_weights(t[0])
+    y = _spline_weights(t[1])
+    z = _spline_weights(t[2])
+    dx = _spline_slopes(t[0])
+    dy = _spline_slopes(t[1])
+    dz = _spline_slopes(t[2])
+    first = grids.first[k] + ((i[0] - 1) * n[1] + i[1] - 1) * n[2] + i[2] - 1
     gradient = vec3()
     value = real(0.0)
     for a in range(3):
@@ -325,6 +334,40 @@ def _from_spline(grids: Grids, k: int, p: vec3):
             gradient += vec3(dx[a] * y[b] * row[0], x[a] * dy[b] * row[0], x[a] * y[b] * row[1])
     gradient = gradient / h
     return wp.vec4d(gradient[0], gradient[1], gradient[2], value)
+
+
+@wp.func(inline=False)  # long, and seldom asked for
+def mesh_curvature(grids: Grids, k: int, p: vec3):
+    """Second derivatives of a spline's distance [1/m]: how its gradient turns. Zero of a mesh that is sharp,
+    whose faces are flat."""
+    K = mat33()
+    if grids.coefficient.shape[0] > 0:
+        n = grids.shape[k]
+        h = grids.spacing[k]
+        i, t = _spline_centre(grids, k, p)
+        values = mat33()  # rows: along an axis, of the coefficients around the place
+        slopes = mat33()
+        for a in range(3):
+            values[a] = _spline_weights(t[a])
+            slopes[a] = _spline_slopes(t[a])
+        bend = vec3(real(1.0), real(-2.0), real(1.0))
+        first = grids.first[k] + ((i[0] - 1) * n[1] + i[1] - 1) * n[2] + i[2] - 1
+        for a in range(3):
+            for b in range(3):
+                at = first + (a * n[1] + b) * n[2]
+                row = _spline_row(grids, at, values[2], slopes[2])
+                over = _spline_row(grids, at, bend, bend)[0]
+                K[0, 0] = K[0, 0] + bend[a] * values[1, b] * row[0]
+                K[1, 1] = K[1, 1] + values[0, a] * bend[b] * row[0]
+                K[2, 2] = K[2, 2] + values[0, a] * values[1, b] * over
+                K[0, 1] = K[0, 1] + slopes[0, a] * slopes[1, b] * row[0]
+                K[0, 2] = K[0, 2] + slopes[0, a] * values[1, b] * row[1]
+                K[1, 2] = K[1, 2] + values[0, a] * slopes[1, b] * row[1]
+        K[1, 0] = K[0, 1]
+        K[2, 0] = K[0, 2]
+        K[2, 1] = K[1, 2]
+        K = K / (h * h)
+    return K
 
 
 @wp.func

@@ -16,6 +16,7 @@ import warp as wp
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, has, keep_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
+from .meshes import mesh_curvature
 from .posed import Geoms, distance_to, face_radius, held_at, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
@@ -276,6 +277,9 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     push = smooth_push(k, width, gap)
                     fn = push[0]
                     K = push[1] * wp.outer(normal, normal)
+            if wp.static(shapes != SOLIDS):
+                if geoms.kind[touched] == 7:  # as the skin moves along it a smooth surface turns its push
+                    K = K - fn * mesh_curvature(geoms.grids, geoms.grid[touched], local)
             force = fn * normal
             if slips == FIXED and mu > real(0.0):
                 c.bound[i, w] = wp.max(mu * fn, real(0.0))

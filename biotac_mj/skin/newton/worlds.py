@@ -44,7 +44,7 @@ _LAGGED_TO = wp.constant(wp.float64(0.05))  # of the error at which a round of l
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
-_SLOW = wp.constant(8)  # iterations of a try after which artificial viscosity may begin
+_SLOW = wp.constant(4)  # iterations of a try after which artificial viscosity may begin
 # by which the viscosity shrinks after a good full step, and grows after a bad one
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # viscosity that counts as none, and with which skin is stiffer than contact
@@ -286,10 +286,18 @@ def begin_worlds(
     st.reference[w] = wp.max(wp.abs(st.last_pressure[w]), _REFERENCE)
 
 
+@wp.func
+def _finishes(error: real, last: real, tolerance: real, left: int):
+    """Whether a try whose error goes on falling as it did in its last iteration ends with so much work: two
+    for each iteration, of Newton's method with whole steps."""
+    return error < last and wp.log(tolerance / error) * real(2.0) > real(left) * wp.log(error / last)
+
+
 @wp.kernel
 def judge_balance(
     # In:
     tolerance: real,
+    max_work: int,
     has_liquid: int,
     rest_pressure: wp.array(dtype=real),
     part: wp.array3d(dtype=real),
@@ -393,7 +401,9 @@ def judge_balance(
             st.swell[w] = kappa * gz
             st.pressure[w] = pressure + rest - kappa * gz
             st.volume[w] = volume + gz
-    elif iterations - since >= patience or done >= allowed:
+    elif iterations - since >= patience or (
+        done >= allowed and not _finishes(wp.sqrt(far / work), error, enough, max_work - done)
+    ):
         st.active[w] = 0
         st.failed[w] = 1
     else:
