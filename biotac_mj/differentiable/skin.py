@@ -50,15 +50,18 @@ def _sum_corners(
 
 
 class _Replayed:
-    """A program that is a CUDA graph from its second run on: the first compiles its kernels and makes
-    PyTorch's workspaces, which no capture may."""
+    """A program, recorded when it first runs. On CUDA it is a graph from its second run on: the first
+    compiles its kernels and makes PyTorch's workspaces, which no capture may."""
 
     def __init__(self, device, record):
-        self._program, self._device, self._runs, self._graph = Program(device, record), device, 0, None
+        self._device, self._record, self._program, self._graph = device, record, None, None
 
     def run(self):
-        self._runs += 1
-        if not self._device.is_cuda or self._runs == 1:
+        if self._program is None:
+            self._program = Program(self._device, self._record)
+            self._program.run()
+            return
+        if not self._device.is_cuda:
             self._program.run()
             return
         if self._graph is None:
