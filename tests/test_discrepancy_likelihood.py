@@ -131,8 +131,9 @@ def test_evidence_beside_what_looks_alike_is_an_integral(plain):
     fit = fit_effects(comparison, [(latency, {**latency.default(), "delay": 0.05})], chosen, null)
     fit = dataclasses.replace(fit, effects=[(latency, {**latency.default(), "delay": 0.05})])
     raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in (fit.effects, [])]
-    change = np.quantile(np.abs(np.concatenate([a - b for a, b in zip(*raw)])), 0.98, axis=0)
-    square = (change / null.size) ** 2
+    K = kernel(comparison.trajectories, [np.arange(len(t.time)) for t in comparison.trajectories])
+    change = np.abs(np.concatenate([a - b for a, b in zip(*raw)])) / np.sqrt(np.diag(K))[:, None]
+    square = (np.quantile(change, 0.98, axis=0) / null.size) ** 2
     share = np.sqrt((1 - (square**2).sum() / square.sum() ** 2) / square.max())
     for gain in (5.0, 50.0, 5000.0):
         t = np.linspace(-12, 12, 200001)
@@ -140,4 +141,6 @@ def test_evidence_beside_what_looks_alike_is_an_integral(plain):
         top = log.max()
         mass = np.exp(log - top).sum() * (t[1] - t[0]) / np.sqrt(2 * np.pi) / share
         alike = top + np.log(mass)
-        assert _beside_alike(comparison, fit, null, gain) == pytest.approx(gain - alike, abs=0.02 * gain**0.5)
+        assert _beside_alike(comparison, fit, null, gain, chosen) == pytest.approx(
+            gain - alike, abs=0.02 * gain**0.5
+        )

@@ -66,7 +66,8 @@ class Likelihood:
     """Of some trajectories of a Comparison.
 
     Attributes:
-      chosen: their indices. size: (width,) by how much the base model is expected to be off [counts, N].
+      chosen: their indices. size: (width,) by how much the base model is expected to be off [counts, N]
+        under the deepest press; expected: (n,) share of it in each row.
     """
 
     def __init__(self, comparison: "Comparison", chosen: np.ndarray):
@@ -76,6 +77,7 @@ class Likelihood:
         self._rows = [np.arange(0, len(t.time), every) for t in data]
         values, vectors = np.linalg.eigh(kernel(data, self._rows))
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
+        self.expected = np.sqrt(vectors**2 @ self._scale)
         self.noise = comparison.noises
         largest = np.abs(self.stacked(comparison.measured)).max(0)
         self.size = np.concatenate(

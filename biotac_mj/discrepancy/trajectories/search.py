@@ -180,7 +180,7 @@ def _round(comparison, search, usable, chosen, seed, bar):
     for expected, effect, start in short:
         fit = _fitted(comparison, effect, start, expected, current, chosen)
         fit = _solved(comparison, fit, effect, current, chosen)
-        out.append(_candidate(comparison, effect, fit, current, chance, usable))
+        out.append(_candidate(comparison, effect, fit, current, chance, usable, chosen))
         bar.update()
     for k in _remembering(out):
         fit = _remembered(comparison, out[k], current, chosen)
@@ -205,14 +205,14 @@ def _fitted(comparison, effect, start, expected, current, chosen):
     return max(fit, other, key=lambda one: one.score)
 
 
-def _candidate(comparison, effect, fit, current, chance, usable):
+def _candidate(comparison, effect, fit, current, chance, usable, chosen):
     """Candidate of a fit with one effect more than `current`."""
     gain, theta = fit.score - current.score, fit.effects[-1][1]
     p = float((1 + (chance >= gain).sum()) / (1 + len(chance)))
     # as much again of every further effect: laws of other forms leave something
     asked = len(fit.effects) * _asked(usable)
     refused = ["evidence"] if gain < asked else []
-    refused += ["resolution"] if gain >= asked > _beside_alike(comparison, fit, current, gain) else []
+    refused += ["resolution"] if gain >= asked > _beside_alike(comparison, fit, current, gain, chosen) else []
     refused += ["chance"] if p > SETTINGS.rate else []
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
@@ -220,10 +220,10 @@ def _candidate(comparison, effect, fit, current, chance, usable):
     return Candidate(effect, fit, float(gain), p, refused)
 
 
-def _beside_alike(comparison, fit, current, gain) -> float:
+def _beside_alike(comparison, fit, current, gain, chosen) -> float:
     """Evidence [nats] of the last effect of a fit over a model that is off by the same pattern.
 
-    By as much as is expected of the model without it (`Fit.size`) that may be off in several channels
+    By as much as is expected of the model without it, row by row, that may be off in several channels
     together, where the likelihood has each by itself: by a share of this effect, of prior
     N(0, e^2 (1 - 1 / m)) in m channels, e as large as that where the effect is largest. With a likelihood
     that is quadratic in the effect's size, and has `gain` at it, that leaves
@@ -233,8 +233,9 @@ def _beside_alike(comparison, fit, current, gain) -> float:
         return gain
     models = fit.effects, fit.effects[:-1]
     raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in models]
-    change = np.quantile(np.abs(np.concatenate([a - b for a, b in zip(*raw)])), 0.98, axis=0)
-    square = (np.maximum(change, 1e-12) / current.size) ** 2
+    likelihood = of(comparison, chosen)
+    change = np.abs(likelihood.stacked([a - b for a, b in zip(*raw)])) / likelihood.expected[:, None]
+    square = (np.maximum(np.quantile(change, 0.98, axis=0), 1e-12) / current.size) ** 2
     single = float((square**2).sum() / square.sum() ** 2)  # 1 / m
     alike = 2 * max(gain, 0.0) * (1 - single) / float(square.max())
     return gain / (1 + alike) + 0.5 * float(np.log1p(alike))
