@@ -113,7 +113,7 @@ def measure_clearance(
     """Clearance of the geoms from the skin, where that is less than the margin, and from the core, where they
     overlap: `ProximityQuery` of one world. A thread for each face, then for each point of the core."""
     f, w = wp.tid()
-    if close[w] == 0:
+    if close[w] == 0 or clearance[w][0] < contact_range(laws, w):  # one that touches is not to be measured
         return
     if f < face.shape[0]:
         own = w % x.shape[1]
@@ -256,7 +256,7 @@ class Clearance:
       ball: centre and radius [m] of a ball around the skin at rest.
       close: (nworld,) wp.array int, 1 where a geom is so close to the ball that its distance is needed.
       found: (nworld,) wp.array vec2d, clearance from the skin where less than the margin, and from the core
-        where less than 0; else infinite [m].
+        where less than 0; else infinite [m]. Where the skin is touched it is that of any touch.
     """
 
     def __init__(self, model: SkinModel, nworld: int):
