@@ -44,7 +44,7 @@ _LAGGED_TO = wp.constant(wp.float64(0.05))  # of the error at which a round of l
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
-_SLOW = wp.constant(4)  # iterations of a try after which artificial viscosity may begin
+_SLOW = wp.constant(8)  # iterations of a try after which artificial viscosity may begin
 # by which the viscosity shrinks after a good full step, and grows after a bad one
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # viscosity that counts as none, and with which skin is stiffer than contact
@@ -433,7 +433,7 @@ def choose_viscosity(tolerance: real, st: Worlds):
     if good == 0 and viscosity == real(0.0) and st.error[w] < _NEAR and stale < _SLOW:
         return
     if good == 0:
-        viscosity = wp.max(_SLOWER * viscosity, real(1.0))
+        viscosity = _SLOWER * wp.max(viscosity, real(1.0))
     elif viscosity > _AT_ONCE and st.error[w] > tolerance:
         viscosity = viscosity / _QUICKER
     else:
