@@ -460,9 +460,10 @@ class Instance:
         with skin.lock:
             rows = skin.stepper.contact_rows(self._result.state)
             push = skin.stepper.contact_push(self._result.state)
+            x = skin.stepper.vert_xpos(self._result.state)
         sample, geom = rows[:, :2].T.astype(int)
         face, first = np.unique(sample // skin.stepper.sample_area[1], return_index=True)
-        corner = self._result.vert_xpos[skin.geometry.outer_face[face]]
+        corner = x[skin.geometry.outer_face[face]]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         normal /= np.linalg.norm(normal, axis=1)[:, None]
         push = push[face]
