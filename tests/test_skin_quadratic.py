@@ -265,6 +265,8 @@ def test_coupled_skin_keeps_its_nodes(tmp_path):
     biotac_mj.plugin.check()
     xpos = handle.vert_xpos(model, data)
     assert xpos.shape == rest.shape
+    pressure = handle.contact_pressure(model, data, of="faces")
+    assert pressure.shape == (len(four_nodes("coarse").outer_face),) and pressure.any()
     assert 5e-5 < abs(xpos - rest).max() < 5e-4
 
 

@@ -455,21 +455,17 @@ class Instance:
         normal (ngeom, 3)."""
         skin, ngeom = self.setup.skin, len(self.touching.geoms)
         load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
-        if self._result.state is None or not hasattr(skin.stepper, "contact_push"):
+        if self._result.state is None or not hasattr(skin.stepper, "touched_faces"):
             return load, moment, outward
         with skin.lock:
-            rows = skin.stepper.contact_rows(self._result.state)
-            push = skin.stepper.contact_push(self._result.state)
+            face, geom, push = skin.stepper.touched_faces(self._result.state)
             x = skin.stepper.vert_xpos(self._result.state)
-        sample, geom = rows[:, :2].T.astype(int)
-        face, first = np.unique(sample // skin.stepper.sample_area[1], return_index=True)
         corner = x[skin.geometry.outer_face[face]]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         normal /= np.linalg.norm(normal, axis=1)[:, None]
-        push = push[face]
-        np.add.at(load, geom[first], push)
-        np.add.at(moment, geom[first], push[:, None] * corner.mean(axis=1))
-        np.add.at(outward, geom[first], push[:, None] * normal)
+        np.add.at(load, geom, push)
+        np.add.at(moment, geom, push[:, None] * corner.mean(axis=1))
+        np.add.at(outward, geom, push[:, None] * normal)
         return load, moment, outward
 
     def _push_on(self, other, group):

@@ -94,7 +94,7 @@ class CondensedStepper(FemStepper):
     def contact_force(self, state: np.ndarray) -> np.ndarray:
         return self._skin.contact_force(self._read(state))[: self._geometry.nvert]
 
-    def contact_push(self, state: np.ndarray) -> np.ndarray:
+    def _push(self, state):
         return self._skin.normal_push(self._read(state), self._touched_faces(state))
 
     def resting(self, state: np.ndarray) -> bool:

@@ -174,7 +174,18 @@ class FemStepper:
         return self._data.contact_force[0]
 
     def contact_push(self, state: np.ndarray) -> np.ndarray:
-        """(nface,) normal push of what touches on the outer faces in a state [N]."""
+        """(nface,) normal push of what touches on the geometry's outer faces in a state [N]."""
+        return self._push(state).reshape(len(self._geometry.outer_face), -1).sum(axis=1)
+
+    def touched_faces(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers (k,) of the geometry's outer faces that something touches in a state, the geom on each, and
+        its normal push [N]."""
+        push = self.contact_push(state)
+        parts = self._model.outer.face.shape[0] // len(push)  # of a face, with more nodes than the geometry's
+        face, first = np.unique(self._touched_faces(state) // parts, return_index=True)
+        return face, self.contact_rows(state)[first, 1].astype(int), push[face]
+
+    def _push(self, state):
         self._unpack(state)
         step = prepare_step(self._model, self._data, self._geom_set)
         return step.normal_push(self._touched_faces(state))
