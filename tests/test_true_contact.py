@@ -491,3 +491,25 @@ def test_in_a_batch_an_apex_comes_to_the_same_balance():
             mjw.step(m, d)
         height = d.qpos.numpy()[:, 0]
     np.testing.assert_allclose(height, height[0], atol=1e-4)
+
+
+def test_touch_of_two_skins_that_meet_has_both_halves():
+    """Each of the two answers for half of what acts between them; sites on the links feel all of it."""
+    link = '<site name="{0}" size=".08"/><site name="m{0}" quat="1 {1} 0 0"/>'
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>'
+        f'<body name="a">{link.format("a", -1)}</body>'
+        '<body name="b" pos="0 0 .015"><joint type="slide" axis="0 0 1" damping="5"/>'
+        f'<inertial mass=".05" pos="0 0 0" diaginertia="1e-5 1e-5 1e-5"/>{link.format("b", 1)}</body>'
+        '</worldbody><sensor><touch site="a"/><touch site="b"/></sensor></mujoco>'
+    )
+    for name in "ab":
+        biotac_mj.attach(
+            spec, site=f"m{name}", tier="condensed", skin="coarse", readings=False, prefix=f"{name}_"
+        )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 150)
+    weight = 9.81 * model.body_subtreemass[model.body("b").id]
+    assert data.cfrc_ext[model.body("b_core").id][5] == pytest.approx(weight, rel=2e-3)
+    np.testing.assert_allclose(data.sensordata[:2], weight, rtol=1e-2)

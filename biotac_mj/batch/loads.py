@@ -181,10 +181,24 @@ def find_touches(
                 wrench_out[k, w][i + 3] = share * turn[i]
 
 
+@wp.func
+def feels(
+    body: int,
+    other: int,
+    is_core: wp.array(dtype=int),
+    body_weldid: wp.array(dtype=int),
+    body_rootid: wp.array(dtype=int),
+):
+    """Whether a site on `body` feels a touch of `other`: itself, or a BioTac's core that is welded to it."""
+    welded = body_weldid[body] == body_weldid[other] and body_rootid[body] == body_rootid[other]
+    return body == other or (is_core[other] == 1 and welded)
+
+
 @wp.kernel
 def add_touch(
     # In:
     core: int,
+    is_core: wp.array(dtype=int),
     geom: wp.array(dtype=int),
     sensor: wp.array(dtype=int),
     sensor_objid: wp.array(dtype=int),
@@ -214,9 +228,9 @@ def add_touch(
     turn = widen(xmat[w, core])
     for k in range(geom.shape[0]):
         sign = real(0.0)
-        if b == geom_bodyid[geom[k]]:
+        if feels(b, geom_bodyid[geom[k]], is_core, body_weldid, body_rootid):
             sign = real(-1.0)
-        elif body_weldid[b] == body_weldid[core] and body_rootid[b] == body_rootid[core]:
+        elif feels(b, core, is_core, body_weldid, body_rootid):
             sign = real(1.0)
         push = wp.dot(wp.spatial_top(wrench[k, w]), normal[k, w])
         if sign != real(0.0) and push > real(0.0):
@@ -299,13 +313,10 @@ def list_touches(
     i = wp.atomic_add(count, 0, 1)
     turn = widen(xmat[w, core])
     n = turn * normal[k, w]
-    least = wp.min(wp.abs(n[0]), wp.min(wp.abs(n[1]), wp.abs(n[2])))
-    axis = vec3(real(0.0), real(0.0), real(1.0))
-    if wp.abs(n[0]) == least:
-        axis = vec3(real(1.0), real(0.0), real(0.0))
-    elif wp.abs(n[1]) == least:
-        axis = vec3(real(0.0), real(1.0), real(0.0))
-    t = wp.normalize(wp.cross(n, axis))
+    t = vec3(real(0.0), real(1.0), real(0.0))  # as MuJoCo makes frames
+    if wp.abs(n[1]) >= real(0.5):
+        t = vec3(real(0.0), real(0.0), real(1.0))
+    t = wp.normalize(t - wp.dot(t, n) * n)
     frame = wp.matrix_from_rows(n, t, wp.cross(n, t))
     force = frame * (turn * force)
     torque = frame * (turn * wp.spatial_bottom(wrench[k, w]))
@@ -345,6 +356,9 @@ class Loads:
 
         with wp.ScopedDevice(d.qpos.device):
             self._wrench, self._touch, self._contact = map(those, ((_FORCE, _TORQUE), (_TOUCH,), (_CONTACT,)))
+            cores = np.zeros(m.nbody, np.int32)
+            cores[[batch._core for batch in batches]] = 1
+            self._is_core = wp.array(cores, dtype=int)
             self._applied, self._rows = wp.empty_like(d.xfrc_applied), wp.empty_like(d.efc.force)
             if len(self._contact):
                 self._prepare_contacts(d, batches)
@@ -387,7 +401,7 @@ class Loads:
                 batch.find_touches()
         if len(self._touch):
             for batch in batches:
-                batch.add_touch(m, d, self._touch)
+                batch.add_touch(m, d, self._touch, self._is_core)
         if len(self._contact):
             self._write_contacts(m, d, batches)
 

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import across
 from .solid_contacts import CONTACT, contacts_of
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
@@ -88,7 +87,7 @@ class Loads:
         pyramidal = self.model.opt.cone == _PYRAMIDAL
         for k, t in enumerate(touches):
             row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]
-            frame = np.concatenate([t.normal[None], *across(t.normal[None])])
+            frame = _frame(t.normal)
             one["pos"], one["frame"], one["friction"], one["dim"] = t.pos, frame.ravel(), 1.0, 6
             one["geom"] = one["geom1"], one["geom2"] = self._core_geom[t.core], t.geom
             one["flex"] = one["elem"] = one["vert"] = -1
@@ -112,10 +111,15 @@ class Loads:
         model, data, site = self.model, self.data, int(self.model.sensor_objid[sensor])
         body, weld, root = int(model.site_bodyid[site]), model.body_weldid, model.body_rootid
         adr, cutoff = int(model.sensor_adr[sensor]), model.sensor_cutoff[sensor]
+
+        def feels(other):
+            one = other in self._core_geom and weld[body] == weld[other] and root[body] == root[other]
+            return body == other or one
+
         for t in touches:
-            if body == model.geom_bodyid[t.geom]:
+            if feels(int(model.geom_bodyid[t.geom])):
                 ray = -t.normal
-            elif weld[body] == weld[t.core] and root[body] == root[t.core]:
+            elif feels(t.core):
                 ray = t.normal
             else:
                 continue
@@ -124,6 +128,14 @@ class Loads:
                 data.sensordata[adr] += max(float(t.force @ t.normal), 0.0)
         if cutoff > 0.0:
             data.sensordata[adr] = min(data.sensordata[adr], cutoff)
+
+
+def _frame(normal):
+    """Axes (3, 3) of a contact as MuJoCo makes them of its normal."""
+    first = np.array([0.0, 1.0, 0.0] if abs(normal[1]) < 0.5 else [0.0, 0.0, 1.0])
+    first -= (first @ normal) * normal
+    first /= np.linalg.norm(first)
+    return np.stack([normal, first, np.cross(normal, first)])
 
 
 def core_geom(model: ModelView, core: int) -> int:
