@@ -290,7 +290,8 @@ def _play(args):
         return
     given = [f"--{name}" for name in of_task if getattr(args, name)]
     if given:
-        raise ValueError(f"{given[0]} is of a task: begin with one of {', '.join(TASKS)}")
+        said = " ".join(args.recording) or "nothing"
+        raise ValueError(f"{given[0]} is of one task, and {said} is none: pass one of {', '.join(TASKS)}")
     from ..view import view
 
     more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)

@@ -268,7 +268,7 @@ class BatchTask(abc.ABC):
         """One decision of all worlds.
 
         Args:
-          actions: (num_envs, num_actions), of which -1 to 1 counts.
+          actions: (num_envs, num_actions), of which -1 to 1 counts; a tensor, or what becomes one.
 
         Returns:
           observations (of worlds that ended: of their new episode), reward (num_envs,), terminated
@@ -279,12 +279,13 @@ class BatchTask(abc.ABC):
         Raises:
           ValueError: actions of another shape.
         """
+        actions = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
         if actions.shape != (self.num_envs, self.num_actions):
             raise ValueError(
                 f"actions has shape {tuple(actions.shape)}: pass ({self.num_envs}, {self.num_actions})"
             )
         waits = (self._age == 0)[:, None]  # while it tares
-        self._advance(torch.where(waits, 0.0, self._moves(actions.to(self.device).clamp(-1, 1))))
+        self._advance(torch.where(waits, 0.0, self._moves(actions.clamp(-1, 1))))
         paid, on, good, error = self._judge()
         on &= self.force.max(1).values <= self.cfg.gentle
         reward = on * paid
