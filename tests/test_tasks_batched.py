@@ -278,7 +278,8 @@ def test_learning_goes_on_where_it_was_stopped(tmp_path, capsys):
 
 def test_what_only_a_task_has_is_refused_elsewhere(capsys):
     assert main(["play", "press.h5", "--episodes", "3"]) == 2
-    assert "--episodes is of one task, and press.h5 is none: pass one of roll_rod, insert_peg" in capsys.readouterr().err
+    said = "--episodes is of one task, and press.h5 is none: pass one of roll_rod, insert_peg"
+    assert said in capsys.readouterr().err
     with pytest.raises(FileNotFoundError, match="no policy of juggle comes .* give --policy script"):
         find_policy("juggle")
     assert tuple(TASKS) == NAMES
