@@ -455,7 +455,8 @@ class Instance:
         normal (ngeom, 3)."""
         skin, ngeom = self.setup.skin, len(self.touching.geoms)
         load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
-        if self._result.state is None or not hasattr(skin.stepper, "touched_faces"):
+        known = self._result is not None and self._result.state is not None
+        if not known or not hasattr(skin.stepper, "touched_faces"):
             return load, moment, outward
         with skin.lock:
             face, geom, push = skin.stepper.touched_faces(self._result.state)
