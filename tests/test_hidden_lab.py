@@ -74,9 +74,9 @@ def test_rounds_are_counted_by_what_was_hidden(lab, monkeypatch):
 
     def row(kind, hidden, modulus, named, best, decided=False):
         record = {"named": named, "decided": decided, "verdict": "unknown (x)", "contacts": 9}
-        record |= {"explanations": [[best, 1.0]]}
+        record |= {"explanations": [[best, 1.0]], "confidence": [0.9] * len(named)}
         truth = {"kind": kind, "effects": [[name, 1.0, 0] for name in hidden], "base": {"modulus": modulus}}
-        return {"truth": truth, "arms": {"designed": [record], "random": [record]}}
+        return [{"truth": truth, "arm": arm, "rounds": [record]} for arm in rounds.ARMS]
 
     rows = [
         row("single", ["latency"], 1.0, [["latency", "lowpass"]], ["latency"], True),
@@ -85,7 +85,7 @@ def test_rounds_are_counted_by_what_was_hidden(lab, monkeypatch):
         row("none", [], 1.0, [["modulus"]], []),
         row("outside", ["ripple"], 1.0, [], []),
     ]
-    c = rounds.counted(rows)["designed, round 1"]
+    c = rounds.counted(sum(rows, []))["designed, round 1"]
     assert (c["right"], c["names"], c["found"], c["singles"], c["both"], c["pairs"]) == (1, 4, 1, 1, 0, 1)
     assert (c["decided"], c["wrongly"], c["false"], c["clean"]) == (1, 1, 1, 2)
     assert (c["unknown"], c["outside"], c["labs"]) == (1, 1, 5)

@@ -11,6 +11,7 @@ import warnings
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import cross
 from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.metric import Metric
@@ -35,6 +36,7 @@ NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
+_TINY = np.finfo(float).tiny
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
@@ -434,20 +436,20 @@ class Instance:
         gets all, on the axis of the wrench."""
         load, moment, outward = self._pushes()
         out = []
-        for k in np.flatnonzero(wrench.any(axis=1)):
-            force, torque = wrench[k, :3], wrench[k, 3:]
-            geoms = np.flatnonzero(self.touching.group == k)
+        for k in wrench.any(axis=1).nonzero()[0]:
+            force, torque = wrench[k : k + 1, :3], wrench[k : k + 1, 3:]
+            geoms = (self.touching.group == k).nonzero()[0]
             pushed = geoms[load[geoms] > 0.0]
             if len(pushed):
                 part, pos = load[pushed] / load[pushed].sum(), moment[pushed] / load[pushed, None]
                 normal = outward[pushed]
             else:
-                square = max(force @ force, np.finfo(float).tiny)
-                pushed, part, pos = geoms[:1], np.ones(1), np.cross(force, torque)[None] / square
-                normal = force[None]
-            normal = normal / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
-            turn = torque - np.cross(part @ pos, force)
-            out += [(int(g), x, n, a * force, a * turn) for g, x, n, a in zip(pushed, pos, normal, part)]
+                square = max((force * force).sum(), _TINY)
+                pushed, part, pos, normal = geoms[:1], np.array([1.0]), cross(force, torque) / square, force
+            normal = normal / np.sqrt(np.maximum((normal * normal).sum(axis=1), _TINY))[:, None]
+            turn = (torque - cross((part @ pos)[None], force))[0]
+            for g, x, n, a in zip(pushed.tolist(), pos, normal, part):
+                out.append((g, x, n, a * force[0], a * turn))
         return out
 
     def _pushes(self):

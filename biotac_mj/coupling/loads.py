@@ -9,14 +9,15 @@ what acts.
 The rows of a skin lie where MuJoCo expects those of welds: what they push is left out there and counted
 here."""
 
-import contextlib
 import ctypes
+import math
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from .solid_contacts import CONTACT, contacts_of
+from ..geometry.rigid import cross
+from .solid_contacts import CONTACT
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
 __all__ = ["PYRAMID", "Loads", "core_geom"]
@@ -27,6 +28,7 @@ _FORCE, _TORQUE, _TOUCH, _CONTACT = (
 )
 _ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
 _PYRAMIDAL = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+_ONE_CONTACT = ctypes.c_char * CONTACT.itemsize
 PYRAMID = 10  # edges of a contact's friction pyramid with six components
 
 
@@ -60,30 +62,38 @@ class Loads:
         touches = [t for instance, wrench in acting.items() for t in self._touches(instance, wrench)]
         if not touches:
             return
-        with self._listed(touches):
+        data = self.data.struct
+        kept = data.contact, data.ncon, data.efc_force
+        contacts, forces = self._listed(touches)
+        data.contact, data.ncon = ctypes.addressof(contacts), len(contacts)
+        data.efc_force = ctypes.addressof(forces)
+        try:
             LIBRARY.mj_rnePostConstraint(self.model.address, self.data.address)
             self._again.opt = self.model.struct.opt
             LIBRARY.mj_sensorAcc(ctypes.addressof(self._again), self.data.address)
+        finally:
+            data.contact, data.ncon, data.efc_force = kept
         for i in self._touch_sensors:
             self._add_touch(i, touches)
 
     def _touches(self, instance, wrench):
         core = instance.touching.core
         frame, origin = self.data.xmat[core].reshape(3, 3), self.data.xpos[core]
-        for k, pos, *vectors in instance.touches(wrench):
+        for k, pos, normal, force, torque in instance.touches(wrench):
             geom = int(instance.touching.geom[k])
-            yield _Touch(core, geom, origin + frame @ pos, *(frame @ v for v in vectors))
+            yield _Touch(core, geom, origin + frame @ pos, frame @ normal, frame @ force, frame @ torque)
 
-    @contextlib.contextmanager
     def _listed(self, touches):
-        """Lets MuJoCo see the touches as contacts, and the skins' rows without their forces."""
+        """MuJoCo's contacts with the touches behind them, and the forces of all rows: none of the skins' own,
+        and those of the touches."""
         data = self.data.struct
-        kept = data.contact, data.ncon, data.efc_force
-        contact = np.zeros(data.ncon + len(touches), CONTACT)
-        contact[: data.ncon] = contacts_of(self.data)
-        force = np.zeros(data.nefc + PYRAMID * len(touches))
-        force[: data.nefc] = self.data.efc_force
-        force[np.concatenate([np.zeros(0, int), *(i.metric.numbers() for i in self.coupled)])] = 0.0
+        contacts = (_ONE_CONTACT * (data.ncon + len(touches)))()
+        forces = (ctypes.c_double * (data.nefc + PYRAMID * len(touches)))()
+        ctypes.memmove(contacts, data.contact, data.ncon * CONTACT.itemsize)
+        ctypes.memmove(forces, data.efc_force, data.nefc * 8)
+        contact, force = np.frombuffer(contacts, CONTACT), np.frombuffer(forces)
+        for one in self.coupled:
+            force[one.metric.numbers()] = 0.0
         pyramidal = self.model.opt.cone == _PYRAMIDAL
         for k, t in enumerate(touches):
             row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]
@@ -93,17 +103,10 @@ class Loads:
             one["flex"] = one["elem"] = one["vert"] = -1
             one["efc_address"] = row
             value = np.concatenate([frame @ t.force, frame @ t.torque])
-            if (
-                pyramidal
-            ):  # the mean of two edges' sum is the normal force's part, their difference a component
+            if pyramidal:  # two edges: their sum is a fifth of the normal force, their difference a component
                 value = (value[0] / 5 + value[1:, None] * np.array([1.0, -1.0])).ravel() / 2
             force[row : row + len(value)] = value
-        data.contact, data.efc_force = contact.ctypes.data, force.ctypes.data
-        data.ncon = len(contact)
-        try:
-            yield
-        finally:
-            data.contact, data.ncon, data.efc_force = kept
+        return contacts, forces
 
     def _add_touch(self, sensor, touches):
         """Adds the touches whose ray out of the sensor's body meets the site, as MuJoCo does with its own.
@@ -132,10 +135,12 @@ class Loads:
 
 def _frame(normal):
     """Axes (3, 3) of a contact as MuJoCo makes them of its normal."""
-    first = np.array([0.0, 1.0, 0.0] if abs(normal[1]) < 0.5 else [0.0, 0.0, 1.0])
-    first -= (first @ normal) * normal
-    first /= np.linalg.norm(first)
-    return np.stack([normal, first, np.cross(normal, first)])
+    frame = np.zeros((3, 3))
+    frame[0], frame[1, 1 if abs(normal[1]) < 0.5 else 2] = normal, 1.0
+    frame[1] -= (frame[1] @ normal) * normal
+    frame[1] /= math.sqrt(frame[1] @ frame[1])
+    frame[2] = cross(frame[:1], frame[1:2])[0]
+    return frame
 
 
 def core_geom(model: ModelView, core: int) -> int:

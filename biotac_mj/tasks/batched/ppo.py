@@ -38,7 +38,7 @@ class Numbers:
     taught: float = 0.7
     lessons: int = 60
     several: int = 2048
-    remembered: int = 2**19
+    remembered: int = 524288
 
 
 class Lessons:
