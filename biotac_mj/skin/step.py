@@ -446,10 +446,10 @@ class SkinStep:
 
     def _lag_friction(self):
         """Tells what friction is bounded by where the worlds are, or where their part begins."""
-        bound = self.k.bound
+        bound, on = self.k.bound, self.st.lagged  # others keep the pressure that their tangents have
         self._place(self.st.load_factor, self.st.returns)
-        self._launch(faces.forget_bounds, bound.shape, [self.st.moving, bound])
-        self._forces.evaluate(self._launcher, self.st.moving)
+        self._launch(faces.forget_bounds, bound.shape, [on, bound])
+        self._forces.evaluate(self._launcher, on)
         self._launch(load_path.lag_friction, self.d.nworld, [self.st, self._any_lagged])
 
     def _place(self, fraction, on):

@@ -167,6 +167,7 @@ def start_increment(
     w = wp.tid()
     if w == 0:
         any_increment[0] = 0
+    st.lagged[w] = 0
     if st.moving[w] == 1:
         st.active[w] = 1
         st.failed[w] = 0
@@ -174,6 +175,7 @@ def start_increment(
         begin_try(st, w, limit, max_work)
         if st.cut_back[w] > 0 or st.by_load[w] == 1:
             st.slips[w] = FIXED
+            st.lagged[w] = 1
             any_lagged[0] = 1
 
 
@@ -183,7 +185,7 @@ def lag_friction(st: Worlds, any_lagged: wp.array(dtype=int)):
     w = wp.tid()
     if w == 0:
         any_lagged[0] = 0
-    if st.moving[w] == 1 and st.slips[w] == FIXED:
+    if st.lagged[w] == 1:
         st.work[w] = st.work[w] + 1
         st.slips[w] = LAGGED
 

@@ -107,6 +107,7 @@ class Worlds:
     trial_factor: wp.array(dtype=real)  # load factor that is tried
     increment: wp.array(dtype=real)  # between both; 0: the first try
     cut_back: wp.array(dtype=int)  # 1: the last increment was too long, and none grows; 2: an earlier one
+    lagged: wp.array(dtype=int)  # the bound of friction is to be that of a balance
     kept: wp.array(dtype=int)  # the last increment converged: the next one begins there
     returns: wp.array(dtype=int)  # the next try begins where the increment does, not where the last try ended
     rounds: wp.array(dtype=int)  # equilibria with lagged friction bounds, in this increment
