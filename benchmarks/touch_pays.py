@@ -137,14 +137,16 @@ def _hits(score):
 
 
 def _against(cards, none):
-    """Of seeds, where there are several (Welch's test of their rates), else of the episodes (Fisher's)."""
-    from scipy.stats import fisher_exact, ttest_ind
+    """Of seeds, where there are several (paired t test of their rates), else of the episodes (Fisher's)."""
+    from scipy.stats import fisher_exact, ttest_rel
 
     if not none or cards is none:
         return ""
-    if min(len(cards), len(none)) > 1:
-        rates = [[card["success"] for card in group if "success" in card] for group in (cards, none)]
-        return f"{ttest_ind(*rates, equal_var=False, alternative='greater').pvalue:.2g}"
+    rates = [{c["seed"]: c["success"] for c in group if "success" in c} for group in (cards, none)]
+    both = sorted(rates[0].keys() & rates[1].keys())
+    if len(both) > 1:
+        columns = ([rate[seed] for seed in both] for rate in rates)
+        return f"{ttest_rel(*columns, alternative='greater').pvalue:.2g}"
     pairs = [_pooled(group) for group in (cards, none)]
     if not all(pairs):
         return ""

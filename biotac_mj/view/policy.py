@@ -20,6 +20,7 @@ from .offscreen import Offscreen, find_gl
 __all__ = ["play_task", "save_gif", "show_page", "show_window"]
 
 _SIZE = 480, 360  # of a GIF [pixel]
+_SHOWN, _LAST = 2.2, 0.6  # a GIF has episodes of so long in all, and shows the end of each so long [s]
 
 
 def play_task(
@@ -39,7 +40,7 @@ def play_task(
     Args:
       policy: a file; None takes the one that comes with the package; "script" knows the truth; "random".
       episodes: how many to score, in worlds side by side; None shows one after the other.
-      json: prints scores as JSON. render: GIF of one episode. window: MuJoCo's viewer in place of the page
+      json: prints scores as JSON. render: GIF of episodes. window: MuJoCo's viewer in place of the page
         at `port`.
       seed: of beginnings. hand: of the rod's task.
 
@@ -125,21 +126,24 @@ def _decisions(env, act, mirror):
 
 
 def save_gif(env: BatchTask, act: Callable, path: pathlib.Path | str) -> None:
-    """Draws one episode of the first world, as fast as it went."""
+    """Draws episodes of the first world, as fast as they went, until `_SHOWN` is over."""
     from PIL import Image
 
-    mirror, frames = Mirror(env), []
+    mirror, frames, lasts = Mirror(env), [], []
+    each = round(1e3 * env.cfg.substeps * env.cfg.timestep)
     camera = mujoco.MjvCamera()
     mirror.point(camera)
     with Offscreen(env.model, *_SIZE, find_gl()) as screen:
         for number in _decisions(env, act, mirror):
             if frames and number == 0:
-                break
+                lasts[-1] = round(1e3 * _LAST)
+                if sum(lasts) > 1e3 * _SHOWN:
+                    break
             frames.append(Image.fromarray(screen.render(mirror.data, camera)))
+            lasts.append(each)
     few = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
-    each = round(1e3 * env.cfg.substeps * env.cfg.timestep)
     with replacing(path) as temporary:
-        few[0].save(temporary, format="GIF", save_all=True, append_images=few[1:], duration=each, loop=0)
+        few[0].save(temporary, format="GIF", save_all=True, append_images=few[1:], duration=lasts, loop=0)
     print(f"  wrote {path}: {len(frames)} decisions")
 
 

@@ -30,9 +30,9 @@ def fit_mixing(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray) -
     """Matrix (19, k) that predicted changes of counts (n, k) are multiplied with to become measured ones
     (n, 19): gains, cross-talk and common coupling of a sensor, and of k > 19 what the further columns add.
 
-    A ridge regression towards one gain for all electrodes (Hoerl and Kennard, 1970); the penalty is the one
-    with which touches that are left out, one after another, are predicted best. Fewer than three touches give
-    that common gain alone.
+    A ridge regression towards gains (Hoerl and Kennard, 1970). Penalty, and whether the gains are one for all
+    electrodes or one for each, are those with which touches that are left out, one after another, are
+    predicted best. Fewer than three touches give the common gain alone.
 
     Args:
       predicted: (n, k), k at least 19, the first 19 of the electrodes. owner: (n,) touch of each row.
@@ -49,27 +49,34 @@ def fit_mixing(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray) -
     touches = [owner == k for k in np.unique(owner)]
     squares = np.stack([x[t].T @ x[t] for t in touches])  # (touches, k, k)
     products = np.stack([y[t].T @ x[t] for t in touches])  # (touches, n, k)
+    square, product = squares.sum(0), products.sum(0)
     if len(touches) < 3:
-        return _ridge(squares.sum(0), products.sum(0), np.inf)
-    errors = np.zeros((len(_PENALTIES) + 1, len(touches)))
-    penalties = [*_PENALTIES, np.inf]
+        return _ridge(square, product, np.inf, _common_gain)
+    choices = [(penalty, prior) for prior in (_common_gain, _own_gains) for penalty in (*_PENALTIES, np.inf)]
+    errors = np.zeros((len(choices), len(touches)))
     for k, touch in enumerate(touches):
-        square, product = squares.sum(0) - squares[k], products.sum(0) - products[k]
-        for i, penalty in enumerate(penalties):
-            rest = x[touch] @ _ridge(square, product, penalty).T - y[touch]
-            errors[i, k] = np.sqrt((rest**2).mean(1)).mean()
-    return _ridge(squares.sum(0), products.sum(0), penalties[int(errors.mean(1).argmin())])
+        for i, choice in enumerate(choices):
+            mixing = _ridge(square - squares[k], product - products[k], *choice)
+            errors[i, k] = np.sqrt(((x[touch] @ mixing.T - y[touch]) ** 2).mean(1)).mean()
+    return _ridge(square, product, *choices[int(errors.mean(1).argmin())])
 
 
-def _ridge(square, product, penalty):
-    """Matrix (n, k) of ridge regression towards a common gain, from x'x (k, k) and y'x (n, k)."""
+def _ridge(square, product, penalty, prior):
+    """Matrix (n, k) of ridge regression towards a prior, from x'x (k, k) and y'x (n, k)."""
     n, k = product.shape
-    gain = np.trace(product[:, :n]) / max(np.trace(square[:n, :n]), 1e-9)
-    prior = gain * np.eye(n, k)
+    begin = np.eye(n, k) * prior(np.diag(square)[:n], np.diag(product))[:, None]
     if np.isinf(penalty):
-        return prior
+        return begin
     size = penalty * np.trace(square) / k + 1e-9
-    return prior + np.linalg.solve(square + size * np.eye(k), (product - prior @ square).T).T
+    return begin + np.linalg.solve(square + size * np.eye(k), (product - begin @ square).T).T
+
+
+def _common_gain(square, product):
+    return np.full(len(square), product.sum() / max(square.sum(), 1e-9))
+
+
+def _own_gains(square, product):
+    return product / np.maximum(square, 1e-9)
 
 
 def evaluate_new_sensor(

@@ -93,6 +93,17 @@ def build(
     for geom in spec.geoms:  # its links do not meet one another, which saves pairs of meshes
         if geom.contype or geom.conaffinity:
             geom.contype, geom.conaffinity = 0, 1
+    spec.add_texture(  # projected along the rod: stripes show how far it is rolled
+        name="rod",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[1, 1, 1],
+        rgb2=[0.35, 0.35, 0.35],
+        width=128,
+        height=128,
+    )
+    stripes = spec.add_material(name="rod")
+    stripes.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "rod"
     body = spec.worldbody.add_body(name="rod", pos=[0, 0, 1])
     body.add_freejoint(name="rod")
     body.add_geom(
@@ -100,6 +111,7 @@ def build(
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         size=[rod.radius, rod.half_length, 0],
         mass=rod.mass,
+        material="rod",
         rgba=[0.85, 0.45, 0.15, 1],
     )
     return spec, attach_to_hand(spec, "shadow_hand", fingers=FINGERS, batch=batch, **settings)

@@ -60,8 +60,12 @@ class Policy(Network):
 
 
 def save_policy(path: pathlib.Path | str, policy: Policy, card: dict) -> None:
-    """Writes a safetensors file; card: what it saw and how it did, in the metadata."""
-    tensors = {name: value.detach().cpu().contiguous() for name, value in policy.state_dict().items()}
+    """Writes a safetensors file, weights in half precision; card: what it saw and how it did, in the
+    metadata."""
+    tensors = {
+        name: (value.half() if name.startswith("layers.") else value).detach().cpu().contiguous()
+        for name, value in policy.state_dict().items()
+    }
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         save_file(tensors, temporary, metadata={"card": json.dumps(card)})

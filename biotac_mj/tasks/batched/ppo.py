@@ -22,7 +22,10 @@ class Numbers:
         update changes the policy by `divergence` [nat].
       norm: of gradients at most.
       taught: part of the time of learning in which policies imitate the teacher. PPO follows.
-      lessons: steps of imitation between updates, each from `several` states of the newest `remembered`.
+      study: time of imitation between updates, as a part of that of acting; lessons: steps in it at most,
+        each from `several` states of the newest `remembered`.
+      renew: where episodes begin with states that were kept, these are kept anew after so many times the
+        decisions that this takes: a policy that meets the same few again learns these by heart.
     """
 
     steps: int = 8
@@ -36,9 +39,11 @@ class Numbers:
     divergence: float = 0.01
     norm: float = 1.0
     taught: float = 0.7
-    lessons: int = 60
+    study: float = 0.4
+    lessons: int = 400
     several: int = 2048
     remembered: int = 524288
+    renew: int = 5
 
 
 class Lessons:

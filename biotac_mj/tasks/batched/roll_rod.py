@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import os
 import pathlib
 
@@ -136,7 +137,6 @@ class RollRod(BatchTask):
         self.num_actions = 11 if s.actions == "servos" else 6
         menagerie = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
         self._hand = hand or menagerie / "shadow_hand" / "right_hand.xml"
-        self._place_before = None  # of the last decision of a script
         self._rod_made = rod
         super().__init__(num_envs, *args, settings=s, **keywords)
 
@@ -145,7 +145,8 @@ class RollRod(BatchTask):
 
     def _find_start(self, mjm):
         self.pinch = find_pinch(mjm, self._rod_made)
-        self.camera = self.pinch.centre, 0.2, 150.0, -20.0
+        x, y, _ = self.pinch.axis  # along the rod: its roll between the pads is seen best
+        self.camera = self.pinch.centre, 0.11, math.degrees(math.atan2(y, x)) + 10.0, -15.0
         return self.pinch.qpos
 
     def _vary(self):
@@ -166,6 +167,8 @@ class RollRod(BatchTask):
         self._xpos, self._xmat = wp.to_torch(d.xpos), wp.to_torch(d.xmat)
         self._pads = tensor(p.pads.T, dtype=torch.float32) if self.num_actions == 6 else None
         self._target = torch.zeros(self.num_envs, device=self.device)
+        # at the last decision of a script; none in an episode that begins
+        self._place_before = torch.full((self.num_envs,), torch.nan, device=self.device)
         self._held_at = torch.zeros(self.num_envs, 3, device=self.device)
         where = wp.from_torch(self._held_at, dtype=wp.vec3)
         until, of_fixture = (s.hold, s.release), (s.stiffness, s.damping, s.twist)
@@ -211,11 +214,9 @@ class RollRod(BatchTask):
         """
         if self.cfg.goal != "place" or self.cfg.actions != "pads":
             raise ValueError("a script rolls the rod to a place by its pads: take settings=PLACE")
-        place = self.place.clone()
-        begun = self.episode_length_buf == 0
-        before = place if self._place_before is None else torch.where(begun, place, self._place_before)
-        self._place_before = place
-        coming = place + _LATE * (place - before)
+        place = self.place
+        coming = place + _LATE * torch.nan_to_num(place - self._place_before)
+        self._place_before[:] = place
         way = ((self._target - coming) / self.cfg.rate).clamp(-1, 1)[:, None]
         return way * torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0], device=self.device)
 
@@ -248,6 +249,7 @@ class RollRod(BatchTask):
 
     def _tell(self, which):
         self._target = self._target.where(~which, self._uniform(*self.cfg.target, self.num_envs))
+        self._place_before.masked_fill_(which, torch.nan)
 
     def _place(self, some):
         s, n = self.cfg, self.num_envs

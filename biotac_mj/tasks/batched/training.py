@@ -33,7 +33,7 @@ __all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
 RANDOMISED = ("gain", "warmup", "drift")
 _KEEP = 30.0  # [s] between files
 _STRAY = 0.3  # deviation of actions from the teacher's while he acts: he shows the way back too
-_HISTORY = 4  # decisions that a policy sees
+_HISTORY = 12  # decisions that a policy sees: noise of the encoders is new in each
 
 
 class Run:
@@ -77,18 +77,9 @@ class Run:
         self._ended[0] += int(done[w].sum())
         self._ended[1] += int(extras["success"][w].sum())
 
-    def learn(self, seconds: float, lessons: Lessons | None = None, progress: float = 0.0) -> None:
-        """Updates after `steps` decisions, `seconds` after the last time.
-
-        Args:
-          lessons: of the teacher; None: it learns from what its actions brought. progress: part of the time
-            of the teacher that is over.
-        """
-        self.learner.update(self.known(), lessons is None)
-        s = self.learner.numbers
-        for _ in range(s.lessons if lessons else 0):
-            self.learner.imitate(*lessons.draw(self.observe, s.several), progress)
-        self.seconds += seconds
+    def learn(self, alone: bool) -> None:
+        """Updates after `steps` decisions, see `Learner.update`."""
+        self.learner.update(self.known(), alone)
         if self._ended[0]:
             row = dict(zip(("ended", "success"), self._ended, strict=True))
             self.rows.append(row | {"decisions": self.decisions, "seconds": self.seconds})
@@ -170,8 +161,10 @@ def train(
     choices = {observe for observe, _ in runs}
     lessons = Lessons(choices, numbers.remembered, 0, env.device)
     begin = last = kept = time.perf_counter()
-    shown = env.max_episode_length  # decisions in which the teacher acts
+    # decisions in which a teacher acts, and by which a policy scales what it sees
+    first = 0 if resume else env.max_episode_length
     of_teacher = 0.0 if resume else 60 * minutes * numbers.taught  # [s]
+    since = 0  # decisions since states were kept
     while last < begin + 60 * minutes:
         learns = last < begin + of_teacher
         for _ in range(numbers.steps):
@@ -181,17 +174,28 @@ def train(
                 lessons.add(seen, right)
                 for run in learners:
                     run.compare(right)
-            if learns and shown > 0:
-                shown -= 1
+            if first > 0:
+                first -= 1
                 for run in learners:
-                    run.learner.watch(seen[run.observe], run.known(slice(None)))
-                actions = right + _STRAY * torch.randn_like(right)
+                    run.learner.watch(seen_by(env, run.observe), run.known(slice(None)))
+                if learns:
+                    actions = right + _STRAY * torch.randn_like(right)
             _, reward, terminated, truncated, extras = env.step(actions)
             for run in learners:
                 run.record(reward, terminated | truncated, extras)
-        now = time.perf_counter()
+        since += numbers.steps
+        acted = _now(env) - last
         for run in learners:
-            run.learn(now - last, *(lessons, (now - begin) / of_teacher) if learns else ())
+            run.learn(not learns)
+        if learns:
+            _study(learners, lessons, acted, (last - begin) / of_teacher)
+        if env.cfg.prepare and since >= numbers.renew * env.cfg.prepare:
+            env.prepare_held()
+            env.stagger()
+            since = 0
+        now = _now(env)
+        for run in learners:
+            run.seconds += now - last
         last = now
         if last > kept + _KEEP:
             kept = last
@@ -204,6 +208,24 @@ def train(
         run.keep(out, task, about)
     ends = play(env, [(run.worlds, run.act) for run in learners])
     return [run.keep(out, task, about | end) for run, end in zip(learners, ends, strict=True)]
+
+
+def _now(env):
+    """[s], when the device has done what it was given."""
+    if env.device != "cpu":
+        torch.cuda.synchronize(env.device)
+    return time.perf_counter()
+
+
+def _study(learners, lessons, acted, progress):
+    """All learn from lessons for a part of the time (`Numbers.study`) in which they acted [s]; progress: part
+    of the teacher's time that is over."""
+    numbers, begin = learners[0].learner.numbers, time.perf_counter()
+    for _ in range(numbers.lessons):
+        for run in learners:
+            run.learner.imitate(*lessons.draw(run.observe, numbers.several), progress)
+        if _now(run.env) - begin > numbers.study * acted:
+            break
 
 
 def _about(env):
