@@ -332,6 +332,21 @@ def test_latency_is_measured():
     assert abs(found.parameters["delay"][0] - 0.12) < 0.01 and found.verified
 
 
+def test_a_frame_of_the_bus_is_no_latency_and_a_metronome_no_rhythm():
+    """A sound log's electrodes are up to one frame late, and a robot presses at an even pace."""
+    e, force, rng = pressed(5, 40)
+    t = np.arange(len(e)) / RATE
+    late = np.column_stack([np.interp(t - 0.007, t, column) for column in e.T])
+    assert "latency" not in ids(diagnose_recording(PlainRecording(noisy(late, rng), force)))
+    bent = np.cos(2 * np.pi * 1.5 * t)[:, None] * [1.0, 0.3] + [0.0, 1.0]  # the same press again and again
+    said = {}
+    for name, own in (("with", np.column_stack([bent, bent[:, :1]])), ("without", None)):
+        x = 2500 + 100 * bent @ rng.standard_normal((2, 19))
+        own = None if own is None else own + 0.01 * rng.standard_normal(own.shape)
+        said[name] = diagnose_recording(PlainRecording(noisy(x, rng), own)).rest.text
+    assert "rhythm" in said["without"] and "rhythm" not in said["with"], said
+
+
 @pytest.mark.slow  # quick: a clock that changes its pace, and lost rows
 def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
     """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing. A clock

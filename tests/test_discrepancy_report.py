@@ -157,11 +157,25 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
     other = dataclasses.replace(WARM, id="thermal", name="temperature", ties={"warmup": "warm-up"})
     both = dataclasses.replace(VERDICT, effects=[WARM, other], unknown=True)
     assert both.headline.count("temperature") == 1 and "for the rest no cause is known" in both.headline
-    assert "is in the force, 0.3 N RMS;" in dataclasses.replace(VERDICT, lead="force").headline
     doubtful = dataclasses.replace(VERDICT, effects=[dataclasses.replace(WARM, confirmed=False)])
     assert "data kept aside contradict it" in doubtful.headline and "added" not in doubtful.headline
     assert "no known cause" in dataclasses.replace(VERDICT, effects=[]).headline
-    assert "agree within noise" in dataclasses.replace(VERDICT, effects=[], significant=False).headline
+    assert "is in the force, 0.3 N RMS; warm-up" in dataclasses.replace(VERDICT, lead="force").headline
+    agree = dataclasses.replace(VERDICT, effects=[], significant=False)
+    assert "agree within" not in agree.headline and "may be off by" in agree.headline
+    small = {"electrodes": Gap("counts", 2.03, 2.03, 2.0, "the electrodes")}
+    assert "agree within noise" in dataclasses.replace(agree, gap=small).headline
+
+
+def test_a_headline_says_where_nothing_is_gained():
+    same = Gap("counts", 2.031, 2.028, 1.0, "the electrodes")
+    force = Gap("N", 0.3, 0.2, 0.2, "the force")
+    for gap, end in (
+        ({"electrodes": same}, "; warm-up (or temperature) gains nothing there."),
+        ({"electrodes": same, "force": force}, "gains nothing there, but the force goes from 0.3 to 0.2 N."),
+    ):
+        said = dataclasses.replace(VERDICT, gap=gap).headline
+        assert said.endswith(end) and "added" not in said
 
 
 def test_the_summary_has_effect_proof_gap_and_what_is_unknown():

@@ -134,17 +134,13 @@ def _of_rows(session):
     if len(x) < 128:
         return {"low": 0.0}, {}
     size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
-    window = np.hanning(size)[:, None]
-    line = np.vander(np.linspace(-1, 1, size), 2)
-    project = line @ np.linalg.pinv(line)
-    parts = [x[a : a + size] for a in range(0, len(x) - size + 1, size // 2)]
-    power = np.mean([np.abs(np.fft.rfft((y - project @ y) * window, axis=0)) ** 2 for y in parts], axis=0)
-    power += (window**2).sum() / 12  # rounding
+    power, over = _spectrum(x, size, (np.hanning(size) ** 2).sum() / 12)  # rounding
     f = np.fft.rfftfreq(size, 1 / rate)
-    around = running_median(power, 2 * max(4, size // 32) + 1, "nearest")
     band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
-    over = np.log(power / around)[band]
-    beats = 2 * np.sqrt(power[band]) / window.sum()  # [counts]
+    over = over[band]
+    if r.force is not None:  # a touch that comes again is none of the sensor's
+        over = over - np.maximum(_spectrum(r.force[rows], size, 1e-12)[1][band].max(1), 0)[:, None]
+    beats = 2 * np.sqrt(power[band]) / np.hanning(size).sum()  # [counts]
     third = np.argsort(over, axis=1)[:, -3]
     at = {"rhythm": int(over.mean(1).argmax())}
     at["rhythm1"] = int(over[np.arange(len(over)), third].argmax())
@@ -185,6 +181,17 @@ def _of_rows(session):
         "low6": float(np.sort(low)[-6]),
         "swells": _swells(x) if r.absolute else 0.0,  # the law is one of counts
     }, said
+
+
+def _spectrum(x, size, least):
+    """(f, c) power of x (n, c) in windows of `size` rows, straight lines taken out, and the logarithm of how far
+    it rises above that around."""
+    window, line = np.hanning(size)[:, None], np.vander(np.linspace(-1, 1, size), 2)
+    project = line @ np.linalg.pinv(line)
+    parts = [x[a : a + size] for a in range(0, len(x) - size + 1, size // 2)]
+    power = np.mean([np.abs(np.fft.rfft((y - project @ y) * window, axis=0)) ** 2 for y in parts], axis=0)
+    power += least
+    return power, np.log(power / running_median(power, 2 * max(4, size // 32) + 1, "nearest"))
 
 
 def _touched(x):

@@ -18,6 +18,7 @@ __all__ = ["SCHEMA", "VERSION", "Estimate", "Finding", "Gap", "Verdict", "electr
 
 SCHEMA, VERSION = "biotac_mj.verdict", 3
 _NOISELESS = 2e-6  # counts or newtons: a simulated force has no noise, which is taken for half of that
+_ABOVE = 1.05  # times noise and resolution, from which on something is above them
 _EVERYWHERE = 12  # electrodes, beyond which they are not listed
 
 
@@ -84,13 +85,18 @@ class Gap:
         """Share of the mean square above noise that is taken away, nan where nothing is above it."""
         noise = self.noise if math.isfinite(self.noise) else 0.0
         above = self.before**2 - noise**2
-        return min((self.before**2 - self.after**2) / above, 1.0) if self.before > 1.05 * noise else math.nan
+        return min((self.before**2 - self.after**2) / above, 1.0) if self.before > _ABOVE * noise else math.nan
 
     @property
     def taken(self) -> float:
         """RMS that is taken away, by squares, negative where it is added."""
         square = self.before**2 - self.after**2
         return math.copysign(math.sqrt(abs(square)), square)
+
+    @property
+    def gained(self) -> bool:
+        """Whether what was found makes it smaller, in as many digits as a report has."""
+        return float(f"{self.after:.3g}") < float(f"{self.before:.3g}")
 
     @property
     def loudness(self) -> float:
@@ -266,10 +272,10 @@ class Verdict:
         size = f"{gap.before:.3g} {gap.unit} RMS"
         size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""
         if not self.significant:
-            return (
-                "Sensor and simulation agree within noise and resolution; the largest difference is in "
-                f"{gap.name}, {size}."
-            )
+            begin = "Sensor and simulation agree within noise and resolution"
+            if gap.loudness > _ABOVE:
+                begin = "No difference is larger than the comparison itself may be off by"
+            return f"{begin}; the largest difference is in {gap.name}, {size}."
         text = f"The largest gap is in {gap.name}, {size}"
         if not self.effects:
             return f"{text}; no known cause is sure enough for a name."
@@ -283,7 +289,12 @@ class Verdict:
                 names[f.title] = None
                 told |= f.ties.keys()
         rest = "; for the rest no cause is known" if self.unknown else ""
-        return f"{text}; with {' and '.join(names)} added it is {gap.after:.3g} {gap.unit}{rest}."
+        what = " and ".join(names)
+        if gap.gained:
+            return f"{text}; with {what} added it is {gap.after:.3g} {gap.unit}{rest}."
+        other = max(self.gap.values(), key=lambda one: one.taken / max(one.before, 1e-12))
+        there = f", but {other.name} goes from {other.before:.3g} to {other.after:.3g} {other.unit}"
+        return f"{text}; {what} gains nothing there{there if other.gained else ''}{rest}."
 
     def to_dict(self) -> dict:
         """What verdict.json holds: numbers, strings, lists and dicts only, no NaN."""

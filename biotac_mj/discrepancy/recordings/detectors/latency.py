@@ -5,6 +5,9 @@ the place of the contact, force alone does not) by ridge regression on blocks of
 on the electrodes' side of the regression, so that it never changes what has to be explained. Both sides are
 smoothed alike, by 20 ms, which takes the electrodes' noise out of the comparison.
 
+A log's electrodes are of the bus's last frame and its force is of now, so every log is late by up to a frame.
+Delays of a frame are therefore part of the model that a latency is compared with.
+
 Where they do not even move at the same times, one of them was logged by another clock, or with another touch
 (`clock_offset`)."""
 
@@ -16,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from ....effects.effect import shifted
 from ....sensor.channels import log_impedance
 from ...evidence import sign_flip
+from ...trajectories.base.nuisance import ages
 from ..candidates import Candidate, Detector
 from ..conditional import Components
 from ..recording import FORCE_MOVED
@@ -29,6 +33,7 @@ _RIDGE = 1e-4
 _ROWS = 4000
 _AXES = 6  # principal components
 _P = 0.02
+_SOUND = 5  # delays that are tried within a frame
 _TAUS = np.geomspace(0.007, 0.4, 12)  # [s] of low-passes that a delay is compared with
 _TIE = 1.64  # standard errors, paired over blocks
 _BAND = (0.1, 1.0)  # [s] of smoothing between which touches move: noise is faster, drift slower
@@ -127,10 +132,12 @@ def delayed(session: Session) -> Candidate | None:
     view = force_view(session, session.fit)
     if view is None:
         return None
-    delays = _tried(view.rate)
+    low, high = ages(session.recording.design)
+    delays = _tried(view.rate, low, high)
     table = np.stack([view.at_delay(d) for d in delays])
     best = int(table.mean(1).argmin())
-    gain = view.errors().mean(1) - table[best]
+    sound = table[(low <= delays) & (delays <= high)]
+    gain = sound[sound.mean(1).argmin()] - table[best]
     p, seconds = sign_flip(gain), session.fit.sum() / view.rate
     if p >= _P or gain.mean() <= 0:
         return None
@@ -164,12 +171,12 @@ def delayed(session: Session) -> Candidate | None:
     )
 
 
-def _tried(rate):
-    """Delays [s] on either side of none, but none itself."""
+def _tried(rate, low, high):
+    """(m,) delays [s], rising: some within low .. high, which a sound log has, and rows on either side."""
     fine = max(1, round(0.01 * rate))
     near, far = np.arange(-5, 11) * fine, np.unique(np.geomspace(12 * fine, 0.6 * rate, 8).astype(int))
-    rows = np.unique(np.concatenate([-far[far < 0.3 * rate], near, far]))
-    return rows[rows != 0] / rate
+    delays = np.concatenate([-far[far < 0.3 * rate], near, far]) / rate
+    return np.unique(np.concatenate([delays, np.linspace(low, high, _SOUND)]))
 
 
 def _vertex(x, y):

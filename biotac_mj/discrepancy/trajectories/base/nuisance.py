@@ -14,7 +14,7 @@ from ....geometry.design import Design, designs
 from ....geometry.skins import shipped_skin
 from ....sensor.acquisition_kernels import SLOT_RATE
 
-__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
+__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "ages", "widen"]
 
 # In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
 # is a finding (`effects.contact.Friction`). The film has 20 to 100 um where 50 are the default
@@ -55,7 +55,7 @@ class Nuisance:
 
     def late(self, design: Design) -> float:
         """[s] by which the electrodes of a row of a sensor are late."""
-        return self.age * design.slots / SLOT_RATE
+        return self.age * _frame(design)
 
     @property
     def written(self) -> "Nuisance":
@@ -77,6 +77,17 @@ class Nuisance:
 
 
 KNOWN = Nuisance()  # nothing is off
+
+
+def ages(design: Design) -> tuple[float, float]:
+    """Least and most [s] by which the electrodes of a sound log are late."""
+    at = [f.name for f in dataclasses.fields(Nuisance)].index("age")
+    return float(LOW[at] * _frame(design)), float(HIGH[at] * _frame(design))
+
+
+def _frame(design):
+    """[s] of the bus's frame."""
+    return design.slots / SLOT_RATE
 
 
 @functools.cache
