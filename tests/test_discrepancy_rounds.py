@@ -27,7 +27,7 @@ class Shown:
     def __init__(self, residuals, columns, information, weight):
         self.shown, self.information, self.weight = list(zip(residuals, columns)), information, weight
 
-    def residuals(self, comparison):
+    def residuals(self, comparison, known=None):
         return self.shown
 
 
@@ -109,6 +109,27 @@ def first():
     data = measured([(effect, {**effect.default(), "tau": 0.02})], n=8)
     some = [by_id(name) for name in ("lowpass", "latency", "depth0")]
     return data, some, diagnose(Springs(), data, effects=some, progress=False)
+
+
+def test_a_plan_looks_for_effects_that_no_contact_has_shown():
+    """Presses that never slide do not show friction, and what is decided about a filter leaves it open."""
+    some = [by_id(name) for name in ("lowpass", "friction")]
+    data = measured([(some[0], {**some[0].default(), "tau": 0.02})], n=8)
+    beliefs = diagnose(Springs(), data, effects=some, progress=False).beliefs
+    assert [one.ids for one in beliefs.unseen] == [["lowpass", "friction"]]
+    plan = planned(beliefs, Springs(), BOUNDS, 4, 24, progress=False)
+    assert any(one.contact.slide for one in plan.contacts)
+
+
+def test_a_contact_that_shows_what_no_data_show_is_chosen():
+    """An effect of one contact in four, on which names that are decided are silent."""
+    left = np.zeros((4, 9)), np.ones((4, 9, 1)), 1e6 * np.eye(1)
+    shown = np.zeros((4, 9))
+    shown[2, :3] = 2.0
+    comparison = type("Contacts", (), {"trajectories": [None] * 4})
+    first = Shown(*left, 1.0)
+    assert Separation([first], comparison, [Shown(shown, *left[1:], 0.03)]).chosen(1) == [2]
+    assert Separation([first], comparison).chosen(1) != [2]
 
 
 def test_a_plan_tells_more_than_random_contacts(first, tmp_path):

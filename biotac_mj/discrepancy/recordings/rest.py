@@ -184,8 +184,8 @@ def _of_rows(session):
 
 
 def _spectrum(x, size, least):
-    """(f, c) power of x (n, c) in windows of `size` rows, straight lines taken out, and the logarithm of how far
-    it rises above that around."""
+    """(f, c) power of x (n, c) in windows of `size` rows, straight lines taken out, and the logarithm of how
+    far it rises above that around."""
     window, line = np.hanning(size)[:, None], np.vander(np.linspace(-1, 1, size), 2)
     project = line @ np.linalg.pinv(line)
     parts = [x[a : a + size] for a in range(0, len(x) - size + 1, size // 2)]

@@ -85,7 +85,9 @@ class Gap:
         """Share of the mean square above noise that is taken away, nan where nothing is above it."""
         noise = self.noise if math.isfinite(self.noise) else 0.0
         above = self.before**2 - noise**2
-        return min((self.before**2 - self.after**2) / above, 1.0) if self.before > _ABOVE * noise else math.nan
+        return (
+            min((self.before**2 - self.after**2) / above, 1.0) if self.before > _ABOVE * noise else math.nan
+        )
 
     @property
     def taken(self) -> float:

@@ -2,6 +2,7 @@
 parameters: kept in the report's folder for the next experiment, and for the round that follows it."""
 
 import dataclasses
+import itertools
 import json
 import pathlib
 import typing
@@ -20,6 +21,7 @@ from .settings import SETTINGS
 from .trajectory import Trajectory, read_trajectories, write_trajectories
 
 if typing.TYPE_CHECKING:
+    from ...effects.effect import Effect
     from .search import Search
     from .whitening import Comparison
 
@@ -73,9 +75,12 @@ class Explanation:
                 effects = [*self.effects[:i], moved, *self.effects[i + 1 :]]
                 yield size / scale, SHAPE_PRIOR if shape else SETTINGS.wide, effects, self.nuisance
 
-    def residuals(self, comparison: "Comparison") -> list[tuple[np.ndarray, np.ndarray]]:
+    def residuals(
+        self, comparison: "Comparison", known: list[tuple[np.ndarray, np.ndarray]] | None = None
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per trajectory (m,) what is left, and (m, k) by how much less of it one of each parameter makes it;
-        squares are nats twice over."""
+        squares are nats twice over. known: what the explanation without the last effect gave, whose columns
+        are taken as they are."""
         rows = [np.sqrt(len(t.time)) for t in comparison.trajectories]
 
         def scaled(effects, nuisance):
@@ -85,9 +90,31 @@ class Explanation:
         here = scaled(self.effects, self.nuisance)
         columns = [
             [(a - b) / step for a, b in zip(here, scaled(effects, nuisance))]
-            for step, _, effects, nuisance in self.moves()
+            for step, _, effects, nuisance in itertools.islice(self.moves(), *_after(known))
         ]
-        return [(r, np.stack(parts, axis=1)) for r, parts in zip(here, zip(*columns))]
+        own = [np.stack(parts, axis=1) for parts in zip(*columns)]
+        if known is not None:
+            own = [np.hstack([columns, more]) for (_, columns), more in zip(known, own)]
+        return list(zip(here, own))
+
+    def with_unseen(self, effect: "Effect", score: float) -> "Explanation":
+        """This one with an effect of a realistic size besides, of which the data say so much [nats], and
+        nothing of its parameters."""
+        theta = {**effect.default(), **effect.grid[len(effect.grid) // 2]}
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], len(effect.free))
+        for (name, size), sign in zip(sizes(effect), signs if len(signs) > 1 else [1.0]):
+            p = effect.params[name]
+            theta[name] = float(np.clip(theta[name] + sign * size, p.low, p.high))
+        out = dataclasses.replace(self, effects=[*self.effects, (effect, theta)], score=self.score + score)
+        known = len(self.information)
+        information = np.diag([1 / prior**2 for _, prior, _, _ in out.moves()])
+        information[:known, :known] = self.information
+        return dataclasses.replace(out, information=information)
+
+
+def _after(known):
+    """Where the parameters begin that are not known."""
+    return (0 if known is None else known[0][1].shape[1], None)
 
 
 def weights(scores: Sequence[float], effects: Sequence[int]) -> np.ndarray:
@@ -103,7 +130,8 @@ class Beliefs:
     """Explanations of some data, the likeliest first.
 
     Attributes:
-      explanations. repeatability: of poses [m]. noise: as `measurement_noise` has it. end: of the session's
+      explanations; unseen: the likeliest with one more effect of the catalogue each, of which the data show
+      little. repeatability: of poses [m]. noise: as `measurement_noise` has it. end: of the session's
         clock [s]. doubts: why a diagnosis is not sure of the likeliest one.
     """
 
@@ -112,6 +140,7 @@ class Beliefs:
     noise: dict
     end: float
     doubts: list[str] = dataclasses.field(default_factory=list)
+    unseen: list[Explanation] = dataclasses.field(default_factory=list)
 
     @property
     def rivals(self) -> list[Explanation]:
@@ -161,16 +190,8 @@ class Beliefs:
             "end": self.end,
             "doubts": self.doubts,
             "noise": {k: None if v is None else np.asarray(v).tolist() for k, v in self.noise.items()},
-            "explanations": [
-                {
-                    "effects": [{"id": effect.id, "theta": theta} for effect, theta in one.effects],
-                    "nuisance": dataclasses.asdict(one.nuisance),
-                    "score": one.score,
-                    "weight": one.weight,
-                    "information": one.information.tolist(),
-                }
-                for one in self.explanations
-            ],
+            "explanations": [_written(one) for one in self.explanations],
+            "unseen": [_written(one) for one in self.unseen],
         }
         with replacing(folder / "beliefs.json") as temporary:
             temporary.write_text(json.dumps(document, indent=1, allow_nan=False))
@@ -187,18 +208,33 @@ class Beliefs:
         round_ = _round(folder)
         document = json.loads((round_ / "beliefs.json").read_text())
         sim = load_simulator(round_ / "given.yaml", extra)
-        explanations = [
-            Explanation(
-                [(_effect(e["id"], e["theta"], extra, sim.design), e["theta"]) for e in one["effects"]],
-                Nuisance(**one["nuisance"]),
-                one["score"],
-                np.array(one["information"]),
-                one["weight"],
-            )
-            for one in document["explanations"]
-        ]
+        explanations, unseen = (
+            [
+                Explanation(
+                    [(_effect(e["id"], e["theta"], extra, sim.design), e["theta"]) for e in one["effects"]],
+                    Nuisance(**one["nuisance"]),
+                    one["score"],
+                    np.array(one["information"]),
+                    one["weight"],
+                )
+                for one in document[key]
+            ]
+            for key in ("explanations", "unseen")
+        )
         noise = {k: None if v is None else np.array(v) for k, v in document["noise"].items()}
-        return cls(explanations, document["repeatability"], noise, document["end"], document["doubts"]), sim
+        rest = document["repeatability"], noise, document["end"], document["doubts"], unseen
+        return cls(explanations, *rest), sim
+
+
+def _written(one):
+    """An Explanation as JSON has it."""
+    return {
+        "effects": [{"id": effect.id, "theta": theta} for effect, theta in one.effects],
+        "nuisance": dataclasses.asdict(one.nuisance),
+        "score": one.score,
+        "weight": one.weight,
+        "information": one.information.tolist(),
+    }
 
 
 def _round(folder):
@@ -239,7 +275,20 @@ def believed(comparison: "Comparison", search: "Search", doubts: list[str], chos
     out = [dataclasses.replace(one, weight=float(w)) for one, w in zip(out, probable)]
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     out.sort(key=lambda one: -one.weight)
-    return Beliefs(out, comparison.repeatability, comparison.noise, end, doubts)
+    unseen = _unseen(out, search)
+    return Beliefs(out, comparison.repeatability, comparison.noise, end, doubts, unseen)
+
+
+def _unseen(explanations, search):
+    """The likeliest explanation with each effect of the catalogue that none of the others adds to it."""
+    first, known = explanations[0], {frozenset(one.ids) for one in explanations}
+    out = []
+    for gain, effect in search.unseen:
+        if effect.wiring or effect.id in first.ids or frozenset([*first.ids, effect.id]) in known:
+            continue
+        weight = first.weight * float(np.exp(min(gain, 0.0))) / len(CATALOGUE)
+        out.append(dataclasses.replace(first.with_unseen(effect, gain), weight=weight))
+    return out
 
 
 def pooled(earlier: Sequence[pathlib.Path | str], data: list[Trajectory]) -> list[Trajectory]:

@@ -51,33 +51,42 @@ class Separation:
     """Expected evidence between explanations, from what contacts would show [nats].
 
     With x = r_k - r_j what k leaves where j is true, k may still move its parameters, of which `information`
-    is known: D = (x'x - g'(L + S'S)^-1 g) / 2 with g = S'x, all sums over contacts."""
+    is known: D = (x'x - g'(L + S'S)^-1 g) / 2 with g = S'x, all sums over contacts.
 
-    def __init__(self, explanations: Sequence[Explanation], comparison: Comparison):
+    unseen: of the first explanation with one more effect each. What no data show yet is as likely as it was
+    before them, so a contact that would show it is worth as much as one that tells names apart."""
+
+    def __init__(
+        self,
+        explanations: Sequence[Explanation],
+        comparison: Comparison,
+        unseen: Sequence[Explanation] = (),
+    ):
         shown = [one.residuals(comparison) for one in explanations]
+        shown += [one.residuals(comparison, shown[0]) for one in unseen]
+        self.seen = len(explanations)
+        explanations = [*explanations, *unseen]
         self.weight = np.array([one.weight for one in explanations])
+        self.weight /= self.weight.sum()
         self.known = [one.information for one in explanations]
         contacts, k = range(len(comparison.trajectories)), range(len(explanations))
-        # of every contact and pair (true, other): x'x, and the other's S'x; the other's S'S
-        self.square = np.array(
-            [[[np.sum((shown[b][u][0] - shown[a][u][0]) ** 2) for b in k] for a in k] for u in contacts]
-        )
-        self.pull = [
-            [[shown[b][u][1].T @ (shown[b][u][0] - shown[a][u][0]) for b in k] for a in k] for u in contacts
-        ]
+        # of every contact: (true, other) x'x; of each other its S'x (k, true), and its S'S
+        left = [np.stack([one[u][0] for one in shown]) for u in contacts]
+        self.square = np.array([((r[:, None] - r) ** 2).sum(2) for r in left])
+        self.pull = [[shown[b][u][1].T @ (left[u][b] - left[u]).T for b in k] for u in contacts]
         self.gram = [[shown[b][u][1].T @ shown[b][u][1] for b in k] for u in contacts]
 
     def nats(self, times: np.ndarray) -> np.ndarray:
         """(true, other) expected evidence of contacts made so many `times` (contacts,)."""
         some, count = np.flatnonzero(times), len(self.weight)
         out = np.zeros((count, count))
+        if not len(some):
+            return out
+        square = np.tensordot(times[some], self.square[some], 1)
         for b in range(count):
             known = self.known[b] + sum(times[u] * self.gram[u][b] for u in some)
-            for a in range(count):
-                if a != b and len(some):
-                    pull = sum(times[u] * self.pull[u][a][b] for u in some)
-                    square = times[some] @ self.square[some, a, b]
-                    out[a, b] = 0.5 * max(square - pull @ np.linalg.solve(known, pull), 0.0)
+            pull = sum(times[u] * self.pull[u][b] for u in some)
+            out[:, b] = 0.5 * np.maximum(square[:, b] - (pull * np.linalg.solve(known, pull)).sum(0), 0.0)
         return out
 
     def worth(self, times: np.ndarray) -> float:
@@ -110,10 +119,11 @@ class Separation:
         return out
 
     def alike(self, budget: int) -> list[tuple[int, int]]:
-        """Pairs (a, b), both likely, that no contact, made `budget` times, tells apart by `ODDS`."""
+        """Pairs (a, b) of what data show, both likely, that no contact, made `budget` times, tells apart by
+        `ODDS`."""
         most = np.max([self.nats(budget * one) for one in np.eye(len(self.gram))], axis=0)
         most = np.maximum(most, most.T)
-        likely = np.flatnonzero(self.weight > _LIKELY)
+        likely = np.flatnonzero(self.weight[: self.seen] > _LIKELY)
         pairs = [(a, b) for a in likely for b in likely if a < b]
         return [(a, b) for a, b in pairs if most[a, b] < np.log(ODDS)]
 
@@ -147,6 +157,9 @@ def planned(
         clock += float(trajectories[-1].time[-1]) + _BETWEEN
     fields = quick.fields(trajectories, progress)
     able = [one for one in beliefs.rivals if _solved(one, fields)]
+    unseen = [
+        one for one in beliefs.unseen if able[:1] == beliefs.rivals[:1] and _shows(one, trajectories, fields)
+    ]
     runs = [
         quick.run(trajectories, fields, False, [*quick.effects, *one.effects], nuisance=one.nuisance)
         for one in able
@@ -157,15 +170,14 @@ def planned(
         raise ValueError(f"no contact stays below {bounds.force:g} N: give a larger --force")
     # what the model is off by grows with what a contact shows
     shown = [_showing(trajectories[u], runs[0][u]) for u in within]
-    separation = Separation(
-        able, Comparison(quick, shown, fields.part(within), beliefs.noise, beliefs.repeatability)
-    )
+    comparison = Comparison(quick, shown, fields.part(within), beliefs.noise, beliefs.repeatability)
+    separation = Separation(able, comparison, unseen)
     times, contacts, clock = np.zeros(len(within)), [], beliefs.end + _PAUSE
     for u in separation.chosen(budget):
         contact, at, mat = some[within[u]]
         before = separation.nats(times)
         times[u] += 1
-        reason = _reason(able, separation.nats(times) - before)
+        reason = _reason([*able, *unseen], separation.weight, separation.nats(times) - before)
         one = trajectory_of(contact, at, mat, clock, f"contact{len(contacts) + 1}", n)
         clock += float(one.time[-1]) + _BETWEEN
         contacts.append(Planned(contact, one, reason))
@@ -184,14 +196,18 @@ def _solved(one, fields):
     )
 
 
+def _shows(one, trajectories, fields):
+    """Whether contacts may show the last effect of an explanation."""
+    return _solved(one, fields) and not one.effects[-1][0].applicable(trajectories)
+
+
 def _showing(t, run):
     """A trajectory with the readings of a run."""
     return dataclasses.replace(t, electrodes=np.clip(run.counts, 0, 4095), pdc=run.pdc, force=run.force)
 
 
-def _reason(explanations, gain):
-    """Which two explanations a contact tells apart most, by their weights."""
-    weight = np.array([one.weight for one in explanations])
+def _reason(explanations, weight, gain):
+    """Which two explanations a contact tells apart most, by their weights (explanations,)."""
     a, b = np.unravel_index(np.argmax(np.outer(weight, weight) * gain), gain.shape)
     if gain[a, b] < _NOTHING:
         return "the base model's own parameters"

@@ -64,13 +64,15 @@ class Search:
 
     Attributes:
       fit: Fit with all effects. found: Candidates in their order. rounds: lists of Candidate, best first.
-      fits: of every explanation that was tried, by the ids of its effects.
+      fits: of every explanation that was tried, by the ids of its effects. unseen: [(evidence beside what was
+      found, by straight lines [nats], effect)] of the last round, and of effects that the data cannot show.
     """
 
     fit: Fit
     found: list[Candidate]
     rounds: list[list[Candidate]]
     fits: dict[frozenset, Fit]
+    unseen: list[tuple] = dataclasses.field(default_factory=list)
 
 
 def found(
@@ -170,6 +172,7 @@ def _round(comparison, search, usable, chosen, seed, bar):
     known = {e.id for e, _ in current.effects}
     effects = [narrowed(comparison, current, e, chosen) for e in usable if e.id not in known]
     ranked, chance = screened(comparison, current, effects, chosen, seed)
+    search.unseen = [(gain, effect) for gain, effect, _ in ranked]
     short = [r for r in ranked[: SETTINGS.refit] if r[0] > 0]
     # differences do not reach far where poses are moved
     short += [r for r in ranked if r not in short and r[1].pose_offset and not known]

@@ -130,13 +130,14 @@ def diagnose(
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields
     comparison = about_rests(sim, data, fields, repeatability)
-    usable, notes = [], of_data(data, comparison)
+    usable, hidden, notes = [], [], of_data(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:
         one = effect.on(sim.design).among(some).solved(list(fields.slopes))
         why = one.applicable(some)
         if why:
             notes.append(f"{effect.name} cannot be known: {why}")
+            hidden.append(one)
         else:
             usable.append(one)
     with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress or None, leave=False) as bar:
@@ -150,6 +151,7 @@ def diagnose(
         stated = comparison.calibrated(first.nuisance)
         bar.update()
         comparison, null, search = _explained(stated, usable, chosen, seed, bar)
+        search.unseen += [(0.0, one) for one in hidden]
         bar.update()
         report = _settle(comparison, null, search, chosen, aside, notes, usable)
         bar.update()
