@@ -332,7 +332,7 @@ def test_latency_is_measured():
     assert abs(found.parameters["delay"][0] - 0.12) < 0.01 and found.verified
 
 
-def test_a_frame_of_the_bus_is_no_latency_and_a_metronome_no_rhythm():
+def test_a_frame_is_no_latency_and_a_metronome_no_rhythm():
     """A sound log's electrodes are up to one frame late, and a robot presses at an even pace."""
     e, force, rng = pressed(5, 40)
     t = np.arange(len(e)) / RATE
