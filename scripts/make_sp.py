@@ -8,8 +8,12 @@ Sources of the numbers (millimetres, published frame: x to the fingertip, z out 
            is the ellipsoid through its 24 places beside the facet, within 0.01 mm; the facet is the plane
            through E21 to E24, at 14 degrees to the axis; the outer skin is the ellipsoid through all 28
            places on the skin, within 0.1 mm.
-  [chosen] the skin's thickness, which is not published: the BioTac's 1.5 mm. It also explains the rest counts
-           of three sensors best: of 0.2 to 1.6 mm it leaves least of ln Z (`--check` prints it for each).
+  [axes]   the skin's thickness, which is not published: what lies between the semi axes of the unfilled skin
+           (14.03, 9.74, 9.74) and of the core (12.437, 8.153, 8.153) of the finite-element model there
+           (`biotac.m`), since an unfilled skin lies on its core. It explains the rest counts of three sensors
+           as well as any thickness (`--check` prints it for each) and that model's presses
+           (`benchmarks/comsol_sp.py`).
+  [chosen] the backing's.
 """
 
 import argparse
@@ -31,7 +35,7 @@ ASSETS = pathlib.Path(__file__).parents[1] / "biotac_mj" / "assets" / "designs" 
 CORE = (np.array([12.32, 7.93, 7.98]), -0.07)  # [table]
 SKIN = (np.array([14.07, 9.63, 9.72]), -1.06)  # [table]
 FACET = (np.array([-0.2419, -0.9703, 0.0]), 7.809)  # [table], unit normal and distance from the origin
-THICKNESS = 1.5  # [chosen]
+THICKNESS = 1.59  # [axes]
 BACKING = 1.0  # thickness of the plate on which the skin is held [chosen]
 RINGS = {"coarse": 8, "default": 11, "fine": 18}
 
@@ -66,7 +70,7 @@ def correlations():
     goal = np.array([log_impedance(sensor.rest) for sensor in known.values()])
     scatter = np.corrcoef(goal)
     print("between the sensors:", scatter[np.triu_indices(len(goal), 1)].round(2))
-    for thickness in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.5, 1.6):
+    for thickness in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.5, 1.59, 1.7):
         film = FilmConduction(sp_skin("try", RINGS["default"], thickness=thickness), sensor=None)
         log_z = np.log(film.rest / 1e4)
         own = [np.corrcoef(row, log_z)[0, 1] for row in (*goal, goal.mean(0))]
