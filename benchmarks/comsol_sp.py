@@ -14,10 +14,10 @@ Nothing is fitted but where contact begins, one number a press: the mean distanc
 over force. --skin presses a shipped skin instead, --core lets it touch its core.
 
 Compared are, at the forces of that model's rows: changes from rest of the gaps under the three electrodes
-nearest to the plate (RMS), travel at the last row, and there the force over the area of contact, which column
-7 of `forces_*.csv` is (`pc` of `biotac.m`). The liquid's pressure above rest stands beside it. A gap is there,
-and here, what lies between the outer surface and the core along the ray from the frame's origin through the
-electrode (`Skin.m`): of rubber and liquid together.
+nearest to the plate (RMS), travel at the last row, and there the force over the area of contact, which is
+column 7 of `forces_*.csv` (`pc` of `biotac.m`). The liquid's pressure above rest stands beside it. A gap is
+there, and here, what lies between the outer surface and the core along the ray from the frame's origin
+through the electrode (`Skin.m`): of rubber and liquid together.
 """
 
 import argparse
