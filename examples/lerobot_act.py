@@ -1,5 +1,5 @@
 """Train ACT of LeRobot on an exported data set: it foresees the object's next poses from its pose and the
-electrodes. Needs lerobot, in an environment of its own; a minute on one core.
+electrodes. Needs lerobot (pip install lerobot[dataset], in an environment of its own); a minute on one core.
 
     biotac data generate --count 200 --labelled 0 --skin coarse --tier condensed --batch 12 --out out/small
     biotac data export out/small --out out/lerobot
@@ -9,32 +9,14 @@ LeRobot normalises and trains whatever begins with `observation.`; ACT itself re
 `observation.environment_state` and images, so the electrodes are given to it under the second name."""
 
 import argparse
-import re
-import sys
 import time
 
 import torch
-
-# A torchvision without its compiled operators refuses to be imported; no image is read here, so none is used.
-while True:
-    try:
-        import torchvision  # noqa: F401
-
-        break
-    except RuntimeError as error:
-        missing = re.search(r"operator (torchvision::\w+) does not exist", str(error))
-        if missing is None:
-            raise
-        torch.library.define(missing[1], "(Tensor x) -> Tensor")
-        for name in [name for name in sys.modules if name.startswith("torchvision")]:
-            del sys.modules[name]
-
-from lerobot.configs.types import FeatureType, PolicyFeature  # noqa: E402
-from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata  # noqa: E402
-from lerobot.datasets.utils import dataset_to_policy_features  # noqa: E402
-from lerobot.policies.act.configuration_act import ACTConfig  # noqa: E402
-from lerobot.policies.act.modeling_act import ACTPolicy  # noqa: E402
-from lerobot.policies.factory import make_pre_post_processors  # noqa: E402
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
 
 TOUCH, ENVIRONMENT = "observation.tactile.electrodes", "observation.environment_state"
 AHEAD = 8  # frames that are foreseen
@@ -47,13 +29,16 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(0)
     meta = LeRobotDatasetMetadata("biotac_mj/set", root=args.set)
-    features = dataset_to_policy_features(meta.features)
+
+    def feature(kind, name):
+        return PolicyFeature(kind, tuple(meta.features[name]["shape"]))
+
     config = ACTConfig(
         input_features={
-            "observation.state": features["observation.state"],
-            ENVIRONMENT: PolicyFeature(FeatureType.ENV, features[TOUCH].shape),
+            "observation.state": feature(FeatureType.STATE, "observation.state"),
+            ENVIRONMENT: feature(FeatureType.ENV, TOUCH),
         },
-        output_features={"action": features["action"]},
+        output_features={"action": feature(FeatureType.ACTION, "action")},
         chunk_size=AHEAD,
         n_action_steps=AHEAD,
         dim_model=256,

@@ -102,7 +102,7 @@ def build(
         width=128,
         height=128,
     )
-    stripes = spec.add_material(name="rod")
+    stripes = spec.add_material(name="rod", texrepeat=[3, 3])
     stripes.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "rod"
     body = spec.worldbody.add_body(name="rod", pos=[0, 0, 1])
     body.add_freejoint(name="rod")

@@ -41,7 +41,7 @@ class Numbers:
     taught: float = 0.7
     study: float = 0.4
     lessons: int = 400
-    several: int = 2048
+    several: int = 8192
     remembered: int = 524288
     renew: int = 5
 

@@ -146,7 +146,7 @@ class RollRod(BatchTask):
     def _find_start(self, mjm):
         self.pinch = find_pinch(mjm, self._rod_made)
         x, y, _ = self.pinch.axis  # along the rod: its roll between the pads is seen best
-        self.camera = self.pinch.centre, 0.11, math.degrees(math.atan2(y, x)) + 10.0, -15.0
+        self.camera = self.pinch.centre, 0.1, math.degrees(math.atan2(y, x)) + 20.0, -15.0
         return self.pinch.qpos
 
     def _vary(self):
