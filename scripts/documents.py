@@ -2,9 +2,10 @@
 
     python scripts/documents.py README.md docs/tutorials/first_press.md
 
-Blocks marked `sh` and `python` run, all of a page in one folder, its Python in one session. What a Python
-block
-prints stands in the block marked `text` after it. A picture beside the page (`![...](name.png)`) is what the
+Blocks marked `sh`, `python` and `py` run, all of a page in one folder, its Python in one session. A `py` block
+is a fragment of a reader's program: it finds a new `spec`, with sites and geoms of the names that pages use,
+and a `model` with its `data` and `handle`. `examples/` of the repository lies in the folder. What a block of
+Python prints stands in the block marked `text` after it. A picture beside the page (`![...](name.png)`) is what the
 code
 writes under that name. `tests/test_documents.py` runs the pages again and compares.
 """
@@ -22,15 +23,33 @@ import biotac_mj
 
 __all__ = ["BLOCK", "agree", "blocks", "pictures", "printed", "run", "with_output"]
 
-BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$(?:\n\n^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(sh|python|py)\n(.*?)^```$(?:\n\n^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 _MINUTES = 20  # more than any page takes
+
+_SCENE = """<mujoco><worldbody>
+  <body name="index_tip"><joint/><geom size="0.004" mass="0.01" contype="0" conaffinity="0"/>
+    <site name="fingertip" quat="1 -1 0 0"/><site name="tip" pos="0 0.1 0" quat="1 -1 0 0"/></body>
+  <body pos="-0.01 0 0.0135"><joint type="slide" axis="0 0 1"/><geom size="0.005" mass="0.1"/></body>
+  <geom name="mug" size="0.005" pos="0.3 0 0"/><geom name="block" size="0.005" pos="0.4 0 0"/>
+  <geom name="file" size="0.005" pos="0.5 0 0"/><geom name="thing" size="0.005" pos="0.6 0 0"/>
+</worldbody></mujoco>"""
 
 # All Python of a page is one session, as in a notebook. An error names the page and its line.
 _RUNNER = """
 import contextlib, io, json, os, subprocess, sys
+def give(session):
+    import mujoco, biotac_mj
+    new = lambda: mujoco.MjSpec.from_string(scene)
+    if "spec" not in session:
+        spec = new()
+        handle = biotac_mj.attach(spec, site="fingertip", skin="coarse", tier="condensed")
+        model = spec.compile()
+        given = dict(mujoco=mujoco, biotac_mj=biotac_mj, model=model, data=mujoco.MjData(model), handle=handle)
+        session.update(given | {"camera": mujoco.MjvCamera()} | session)
+    session["spec"] = new()
 os.environ.setdefault("MPLBACKEND", "Agg")
-name, blocks = json.loads(sys.stdin.read())
+name, blocks, scene = json.loads(sys.stdin.read())
 session, printed = {"__name__": "__main__"}, []
 for language, line, text, _ in blocks:
     said = io.StringIO()
@@ -40,6 +59,8 @@ for language, line, text, _ in blocks:
         if done.returncode:
             sys.exit(1)
     else:
+        if language == "py":
+            give(session)
         with contextlib.redirect_stdout(said):
             exec(compile("\\n" * line + text, name, "exec"), session)
     printed.append(said.getvalue())
@@ -57,8 +78,9 @@ def blocks(text: str) -> list[tuple[str, int, str, str]]:
 
 def run(name: str, found: list, folder: pathlib.Path) -> subprocess.CompletedProcess:
     """Runs a page's blocks in a folder, with the commands of this Python's environment; stdout is JSON of
-    what
-    each printed."""
+    what each printed."""
+    if not (folder / "examples").exists():
+        (folder / "examples").symlink_to(pathlib.Path(__file__).resolve().parents[1] / "examples")
     paths = {
         "PATH": f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": os.pathsep.join(
@@ -67,7 +89,7 @@ def run(name: str, found: list, folder: pathlib.Path) -> subprocess.CompletedPro
     }
     return subprocess.run(
         [sys.executable, "-c", _RUNNER],
-        input=json.dumps([name, found]),
+        input=json.dumps([name, found, _SCENE]),
         cwd=folder,
         env={**os.environ, **paths},
         capture_output=True,

@@ -1,21 +1,95 @@
-"""README, tutorials and how-to pages do what they say: their blocks run in order, in one folder, and print
-what
-stands in the page."""
+"""README and the documentation do what they say: the blocks of a page run in order, in one folder, and print
+what stands in the page. What cannot run in a test is named, with the reason; its commands are understood."""
 
+import argparse
 import pathlib
 import re
+import shlex
+import subprocess
+import sys
 
 import pytest
 from documents import BLOCK, agree, blocks, pictures, printed, run, with_output
 
+from biotac_mj import cli
+from biotac_mj.view import find_gl
+
 REPO = pathlib.Path(__file__).resolve().parents[1]
-DOCUMENTS = [REPO / "README.md", REPO / "docs" / "start.md", *sorted((REPO / "docs/tutorials").glob("*.md"))]
-DOCUMENTS += [p for p in sorted((REPO / "docs" / "howto").glob("*.md")) if BLOCK.search(p.read_text())]
+PAGES = [REPO / "README.md", REPO / "CONTRIBUTING.md", *sorted((REPO / "docs").rglob("*.md"))]
+PAGES = [page for page in PAGES if page.name != "api.md" and "_build" not in page.parts]
 NEEDS = {"ros.md": "rosbags", "mjlab.md": "mjlab", "isaaclab.md": "mujoco_warp", "mjx.md": "jax"}
+# page and beginning of a block -> why no test of the pages runs it, and what tests it
+LEFT_OUT = {
+    ("README.md", "pip install ."): "a network; `make test-wheel` installs the wheel",
+    ("CONTRIBUTING.md", "make test"): "it runs the tests",
+    ("CONTRIBUTING.md", "git tag"): "a release; test_package.py has the notes",
+    ("start.md", "git clone"): "a network; timed on a fresh clone in docs/lab/tests.md",
+    ("start.md", "source .venv"): "the environment of make",
+    ("start.md", "pip install ."): "a network; `make test-wheel` installs the wheel",
+    ("gradients.md", "biotac lab estimate"): "a recording with places; test_differentiable_estimate.py",
+    ("train.md", "biotac data generate --count 2600"): "a GPU; test_data_generate.py",
+    ("train.md", "biotac_mj.attach(spec"): "three choices for one finger; test_attach.py",
+    ("data_sets.md", "biotac data generate --count 2600"): "a GPU; test_data_generate.py",
+    ("mesh.md", "biotac lab mesh"): "a mesh of the reader's; test_geometry_import.py",
+    ("pads.md", "biotac design new dome"): "tables and meshes of the reader's; test_own_design.py",
+    ("recordings.md", "biotac recording import"): "logs of the reader's; test_recordings_loggers.py",
+    ("recordings.md", "biotac data resimulate"): "a log of the reader's; test_resimulation.py",
+    ("rendering.md", "biotac view --hand"): "MuJoCo Menagerie; test_menagerie.py",
+    ("rendering.md", "biotac play ball"): "it serves until it is stopped; test_web_view.py",
+    ("rendering.md", "biotac play insert_peg"): "minutes; test_tasks_batched.py",
+    ("checkup.md", "# prompts them"): "a sensor; test_checkup.py",
+    ("experiments.md", "biotac diagnose"): "a sensor; test_discrepancy_rounds.py",
+    ("cluster.md", "pip install"): "a network; test_shards.py has three nodes",
+    ("cluster.md", "ray start"): "machines; test_shards.py has three nodes",
+    ("isaaclab.md", "tip = robot"): "Isaac Lab",
+    ("ros.md", "from biotac_mj.neighbours.ros"): "ROS; test_ros.py has doubles of rclpy and rospy",
+    ("your_hand.md", "spec = mujoco.MjSpec.from_file"): "MuJoCo Menagerie; test_menagerie.py",
+    ("your_hand.md", "left = "): "MuJoCo Menagerie; test_menagerie.py",
+    ("verdict.md", "from biotac_mj.discrepancy"): "minutes; test_samples.py runs the verb of it",
+    ("discrepancy.md", "from biotac_mj.discrepancy"): "data of the reader's; test_discrepancy_poses.py",
+}
+
+
+def left_out(page, text):
+    """Why a block does not run, None: it runs."""
+    for (name, begin), why in LEFT_OUT.items():
+        if page.name == name and text.startswith(begin):
+            return why
+    if re.search(r"Offscreen|--render", text) and find_gl() is None:
+        return "a GL library"
+    return None
+
+
+def commands(text):
+    """Lines of the text's blocks that call biotac."""
+    for line in re.findall(r"^    biotac (.*)$", text, re.M):
+        yield line.replace("[", "").replace("]", "")  # what may be left out
+    for language, _, block, _ in blocks(text):
+        if language == "sh":
+            yield from re.findall(r"^biotac (.*)$", block, re.M)
+
+
+def mentions(text):
+    """(verb and job, its options) of each `biotac ...` in a line of prose, of code or of help."""
+    for words in re.findall(r"`biotac ([^`\n{]+)", text):
+        found = re.match(r"[a-z-]+( [a-z]+)?", words)
+        if found:
+            yield found[0], re.findall(r"(?<![\w-])--[a-z][\w-]*", words)
+
+
+def verbs(parser=None, name=""):
+    """{verb and job: its parser}, groups too."""
+    parser = parser or cli.parser()
+    found = {name: parser}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for word, inner in action.choices.items():
+                found |= verbs(inner, f"{name} {word}".strip())
+    return found
 
 
 def test_a_block_that_fails_is_named_with_its_line(tmp_path):
-    text = "# A\n\n```sh\necho a > f\n```\n```console\nfalse\n```\n```python\nn = 1\n```\n"
+    text = "# A\n\n```sh\necho a > f\n```\n```text\nfalse\n```\n```python\nn = 1\n```\n"
     found = blocks(text)
     assert [(kind, line) for kind, line, *_ in found] == [("sh", 3), ("python", 9)]
     assert run("a.md", found, tmp_path).returncode == 0 and (tmp_path / "f").read_text() == "a\n"
@@ -53,14 +127,85 @@ def test_outputs_agree_to_what_machines_differ_by(written, got, same):
     assert agree(written, got) is same
 
 
+def test_every_block_runs_or_is_named():
+    """A block has a language that says what becomes of it, and what is left out is there."""
+    for page in PAGES:
+        kinds = set(re.findall(r"^ *```([^\n`]+)$", page.read_text(), re.M))
+        assert kinds <= {"sh", "python", "py", "text", "yaml", "bibtex", "{toctree}"}, (page.name, kinds)
+        if page.parent.name != "lab":  # what measures for hours stands there, and is understood
+            assert not re.search(r"^    (biotac|python|pip|make) ", page.read_text(), re.M), page.name
+    found = [(page.name, text) for page in PAGES for _, _, text, _ in blocks(page.read_text())]
+    for (name, begin), why in LEFT_OUT.items():
+        assert any(n == name and text.startswith(begin) for n, text in found), (name, begin, why)
+
+
+def test_commands_of_all_blocks_are_understood():
+    """Verbs, options and choices of every line that calls biotac, comments left out."""
+    shown = [line for page in PAGES for line in commands(page.read_text())]
+    assert len(shown) > 60
+    for line in shown:
+        try:
+            cli.parser().parse_args(shlex.split(line, comments=True))
+        except (SystemExit, ValueError) as error:
+            pytest.fail(f"biotac {line}: {error}")
+
+
+def test_commands_that_prose_code_and_help_name_exist():
+    """Verbs and options between backticks: in pages, docstrings, messages, and what --help prints."""
+    known, seen, wrong = verbs(), 0, []
+    said = {str(page.relative_to(REPO)): page.read_text() for page in [*PAGES, REPO / "docs" / "api.md"]}
+    for folder in ("biotac_mj", "benchmarks", "examples", "scripts"):
+        code = (REPO / folder).rglob("*.py")
+        # a text of several literals is one
+        said |= {str(p.relative_to(REPO)): re.sub(r'"\n\s*f?"', "", p.read_text()) for p in code}
+    for name, parser in known.items():
+        helps = [parser.description, parser.epilog, *(action.help for action in parser._actions)]
+        said[f"biotac {name} --help"] = "\n".join(filter(None, helps))
+    for where, text in said.items():
+        for words, options in mentions(text):
+            verb = words if words in known else words.split()[0]
+            one = verbs(known[verb], verb) if verb in known else {}  # of a group any job
+            taken = {option for parser in one.values() for option in parser._option_string_actions}
+            wrong += [f"{where}: biotac {words} {option}" for option in options if option not in taken]
+            wrong += [] if one else [f"{where}: no biotac {words}"]
+            seen += 1
+    assert not wrong, "\n".join(wrong)
+    assert seen > 200
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_scripts_and_tests_that_pages_name_exist():
+    """`python FILE ...` has the options that a page gives it, `pytest ... -k WORDS` finds a test."""
+    helps, found = {}, set()
+    for page in PAGES:
+        called = r"(?:^    |`)(?:[A-Z_]+=\S+ )?(?:python (?:-m )?)?((?:pytest|benchmarks|examples|scripts)\b[^`\n]*)"
+        found |= set(re.findall(called, page.read_text(), re.M))
+    for line in sorted(found):
+        words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
+        if words[0] == "pytest":
+            files = [word for word in words if word.startswith("tests/")]
+            chosen = [*files, *(["-k", words[words.index("-k") + 1]] if "-k" in words else [])]
+            command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-m", "slow or not slow", *chosen]
+            done = subprocess.run(command, capture_output=True, text=True, cwd=REPO)
+            assert done.returncode == 0, f"{line}: no such test"
+        elif re.match(r"(benchmarks|examples|scripts)/\w+\.py", words[0]):
+            if words[0] not in helps:
+                command = [sys.executable, REPO / words[0], "--help"]
+                done = subprocess.run(command, capture_output=True, text=True, cwd=REPO)
+                assert done.returncode == 0, f"{words[0]}: {done.stderr[-500:]}"
+                helps[words[0]] = done.stdout
+            for option in (word for word in words if word.startswith("--")):
+                assert option in helps[words[0]], f"{line}: no {option}"
+    assert len(helps) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name)
 def test_blocks_run_in_order(path, tmp_path):
     if path.name in NEEDS:
         pytest.importorskip(NEEDS[path.name], reason=f"{path.name} needs {NEEDS[path.name]}")
     name, text = str(path.relative_to(REPO)), path.read_text()
-    found = blocks(text)
-    assert found, f"{name} has no block marked sh or python"
+    found = [block for block in blocks(text) if not left_out(path, block[2])]
     done = run(name, found, tmp_path)
     assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
     for (_, line, _, written), got in zip(found, printed(done), strict=True):

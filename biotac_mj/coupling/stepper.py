@@ -195,7 +195,14 @@ def register_readings(name: str, factory: Callable) -> None:
     _readings[name] = factory
 
 
-def _factory(table, name):
+def _named(config):
+    """The readings, or the network that they come from, as whoever made the settings named them."""
+    if config.readings != "learned":
+        return f"readings {config.readings!r}"
+    return f"signal {config.options.get('readings', {}).get('weights') or 'learned'!r}"
+
+
+def _factory(table, name, named=None):
     if isinstance(table[name], str):
         module, attribute = table[name].split(":")
         try:
@@ -204,7 +211,7 @@ def _factory(table, name):
             if error.name not in ("torch", "safetensors"):
                 raise
             raise ModuleNotFoundError(
-                f"{name!r} needs {error.name}: pip install 'biotac-mj[learning]'", name=error.name
+                f"{named or repr(name)} needs {error.name}: pip install 'biotac-mj[learning]'", name=error.name
             ) from None
     return table[name]
 
@@ -245,18 +252,17 @@ def make_readings(
         do not know.
     """
     check_names(config)
-    readings = _factory(_readings, config.readings)(config, geometry)
+    readings = _factory(_readings, config.readings, _named(config))(config, geometry)
     if config.thermal is not None:
         if not hasattr(readings, "feel_heat"):
-            raise ValueError(f"readings {config.readings!r} know no heat: leave thermal out")
+            raise ValueError(f"{_named(config)} knows no heat: leave thermal out")
         readings.feel_heat(geoms)
     if config.textures is not None:
         if not (
             hasattr(readings, "feel_vibration") and (stepper is None or hasattr(stepper, "contact_rows"))
         ):
             raise ValueError(
-                f"readings {config.readings!r} on stepper {config.stepper!r} know no vibration: leave "
-                "textures out"
+                f"{_named(config)} on stepper {config.stepper!r} knows no vibration: leave textures out"
             )
         readings.feel_vibration(geoms, stepper)
     return readings

@@ -7,8 +7,11 @@
 `task` has what all share, `touch` what a policy may feel, `libraries` what RSL-RL, skrl and Gymnasium ask of
 an environment."""
 
+import inspect
 import typing
 
+from ...coupling.settings import SettingKeywords
+from ...fields import refuse_unknown
 from ...short_repr import short_repr
 from .follow_edge import FollowEdge
 from .insert_peg import InsertPeg
@@ -35,13 +38,29 @@ TASKS = {"roll_rod": RollRod, "insert_peg": InsertPeg, "follow_edge": FollowEdge
 
 
 def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
-    """A task of TASKS; keywords as its class has them. The rod is rolled to a place.
+    """A task of TASKS; keywords as its class has them, or as `biotac_mj.batch.attach` has them for the
+    BioTacs. The rod is rolled to a place.
 
     Raises:
-      ValueError: there is no such task.
+      ValueError: there is no such task. TypeError: there is no such keyword.
     """
     if task not in TASKS:
         raise ValueError(f"no task {short_repr(task)}: choose one of {', '.join(TASKS)}")
+    try:
+        refuse_unknown(keywords, _keywords(TASKS[task]), f"a call of make({task!r})")
+    except ValueError as error:
+        raise TypeError(str(error)) from None
     if task == "roll_rod":
         keywords = {"settings": PLACE} | keywords
     return TASKS[task](num_envs=num_envs, **keywords)
+
+
+def _keywords(kind):
+    """Of a task's class, in the order in which they matter: its own, those of all tasks, those of BioTacs."""
+    own = [
+        name
+        for base in (kind, BatchTask)
+        for name, one in inspect.signature(base).parameters.items()
+        if name != "num_envs" and one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)
+    ]
+    return dict.fromkeys((*own, *SettingKeywords.__annotations__))
