@@ -2,7 +2,7 @@
 
 python benchmarks/recorded.py REC.h5 [REC.h5 ...] [--until 0.7] [--json OUT]
 
-Models of the first rows, as `biotac learn train REC --out FILE.safetensors` keeps them, are judged on the rows that follow:
+Models of the first rows, as `biotac learn train REC --out FILE` keeps them, are judged on rows that follow:
 how
 many lie inside the intervals of 90 %, and whether novelty tells an electrode that is stuck at its mean, with
 and without noise, from one that works. `--until` leaves the last rows alone: what is chosen is chosen there.

@@ -355,76 +355,29 @@ def camera():
 class Film:
     """Frames of a moving picture: the hand, and under it what the electrodes of each fingertip say."""
 
-    SIZE, STRIP, SCALE = (720, 400), 180, 6.0  # of the render, height of the maps [pixel]; [pixel / mm]
-    BAR = 260  # width of the scale of colours [pixel]
+    SIZE = 720, 400  # of the render [pixel]
 
     def __init__(self):
-        from PIL import ImageFont
+        from biotac_mj.view.maps import Maps
 
-        from biotac_mj.geometry import load_skin
-        from biotac_mj.press.report import unroll
-
-        around = unroll(load_skin("coarse").electrode_pos) * [1, -1]  # tip on the left, E1..E6 below
-        self.place = self.SCALE * (around - (around.min(0) + around.max(0)) / 2)
-        self.font = ImageFont.load_default(size=14)
-        self.frames, self.screen, self.rest = [], None, None
+        self.maps, self.frames, self.screen, self.rest = Maps("coarse"), [], None, None
 
     def __call__(self, data, handles):
-        from PIL import Image, ImageDraw
-
-        from biotac_mj.coupling.show import electrode_colors
         from biotac_mj.view import Offscreen, find_gl
 
         self.screen = self.screen or Offscreen(data.model, *self.SIZE, find_gl())
         counts = np.array([h.read(data, "electrodes") for h in handles.values()])
         self.rest = counts if self.rest is None else self.rest
-        (width, height), strip = self.SIZE, self.STRIP
-        picture = Image.new("RGB", (width, height + strip), "white")
-        picture.paste(Image.fromarray(self.screen.render(data, camera())))
-        draw = ImageDraw.Draw(picture)
-        for i, (finger, handle) in enumerate(handles.items()):
-            center = np.array([(i + 0.5) * width / len(handles), height + 24 + 0.5 * (strip - 56)])
+        changes = {}
+        for (finger, handle), change in zip(handles.items(), counts - self.rest, strict=True):
             force = np.linalg.norm(handle.read(data, "contact_force")[:3])
-            draw.text(
-                (center[0], height + 4), f"{NAMES[finger]}  {force:.1f} N", "black", self.font, anchor="ma"
-            )
-            low, high = self.place.min(0), self.place.max(0)
-            tip = np.concatenate([center + low - 12, center + high + 12])
-            draw.rounded_rectangle(tip.tolist(), radius=(tip[3] - tip[1]) / 2.5, fill="#cfe8da")
-            for place, color in zip(self.place, electrode_colors(counts[i] - self.rest[i])):
-                box = np.concatenate([center + place - 6, center + place + 6])
-                draw.ellipse(box.tolist(), tuple((255 * color[:3]).astype(int)), "#555")
-        self._scale(draw, width, height + strip)
-        self.frames.append(picture)
-
-    def _scale(self, draw, width, bottom):
-        """What the colours mean, at the bottom edge."""
-        from biotac_mj.coupling.show import electrode_colors
-        from biotac_mj.sensor.colors import FULL_CHANGE
-
-        left, half = (width - self.BAR) / 2, self.BAR / 2
-        for x in range(self.BAR):
-            color = electrode_colors(np.array([(x / half - 1) * FULL_CHANGE]))[0, :3]
-            draw.line([left + x, bottom - 20, left + x, bottom - 10], tuple((255 * color).astype(int)))
-        for x, anchor, text in (
-            (left - 6, "rm", f"-{FULL_CHANGE:.0f} counts, less liquid"),
-            (left + self.BAR + 6, "lm", f"+{FULL_CHANGE:.0f}, more"),
-        ):
-            draw.text((x, bottom - 15), text, "black", self.font, anchor=anchor)
+            changes[f"{NAMES[finger]}  {force:.1f} N"] = change
+        self.frames.append(self.maps.below(self.screen.render(data, camera()), changes))
 
     def write(self, path):
         """An animated GIF whose frames share their colours."""
-        from PIL import Image
-
-        from biotac_mj.coupling.show import electrode_colors
-
         path.parent.mkdir(parents=True, exist_ok=True)
-        # the dots are few pixels: their colours have to be asked for
-        ramp = (255 * electrode_colors(np.linspace(-300, 300, 48))[:, :3]).astype(np.uint8)
-        middle = self.frames[len(self.frames) // 2].quantize(208, method=Image.Quantize.MAXCOVERAGE)
-        palette = Image.new("P", (1, 1))
-        palette.putpalette(middle.getpalette()[: 3 * 208] + ramp.ravel().tolist())
-        first, *rest = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in self.frames]
+        first, *rest = self.maps.quantize(self.frames)
         duration = [40] * len(rest) + [1500]  # the last one stays
         first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
         self.screen.close()

@@ -2,12 +2,11 @@
 
     python scripts/documents.py README.md docs/tutorials/first_press.md
 
-Blocks marked `sh`, `python` and `py` run, all of a page in one folder, its Python in one session. A `py` block
-is a fragment of a reader's program: it finds a new `spec`, with sites and geoms of the names that pages use,
-and a `model` with its `data` and `handle`. `examples/` of the repository lies in the folder. What a block of
-Python prints stands in the block marked `text` after it. A picture beside the page (`![...](name.png)`) is what the
-code
-writes under that name. `tests/test_documents.py` runs the pages again and compares.
+Blocks marked `sh`, `python` and `py` run, all of a page in one folder, its Python in one session. A `py`
+block is a fragment of a reader's program: it finds a new `spec`, with sites and geoms of the names that pages
+use, and a `model` with its `data` and `handle`. `examples/` of the repository lies in the folder. What a block
+of Python prints stands in the block marked `text` after it. A picture beside the page (`![...](name.png)`) is
+what the code writes under that name. `tests/test_documents.py` runs the pages again and compares.
 """
 
 import json
@@ -45,8 +44,9 @@ def give(session):
         spec = new()
         handle = biotac_mj.attach(spec, site="fingertip", skin="coarse", tier="condensed")
         model = spec.compile()
-        given = dict(mujoco=mujoco, biotac_mj=biotac_mj, model=model, data=mujoco.MjData(model), handle=handle)
-        session.update(given | {"camera": mujoco.MjvCamera()} | session)
+        given = dict(mujoco=mujoco, biotac_mj=biotac_mj, model=model, handle=handle)
+        given |= {"data": mujoco.MjData(model), "camera": mujoco.MjvCamera()}
+        session.update(given | session)
     session["spec"] = new()
 os.environ.setdefault("MPLBACKEND", "Agg")
 name, blocks, scene = json.loads(sys.stdin.read())

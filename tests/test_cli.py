@@ -130,6 +130,7 @@ def test_help_is_light():
         ),
         (["press", "--depth", "-1mm"], "depth is -1 mm: it must be a positive number"),
         (["lab", "mesh", "nowhere"], "no mesh at nowhere"),
+        (["play", "insert_peg", "--policy", "no.safetensors"], "no policy at no.safetensors: give script"),
         (["lab", "mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
     ],
 )

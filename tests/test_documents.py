@@ -178,14 +178,24 @@ def test_scripts_and_tests_that_pages_name_exist():
     """`python FILE ...` has the options that a page gives it, `pytest ... -k WORDS` finds a test."""
     helps, found = {}, set()
     for page in PAGES:
-        called = r"(?:^    |`)(?:[A-Z_]+=\S+ )?(?:python (?:-m )?)?((?:pytest|benchmarks|examples|scripts)\b[^`\n]*)"
+        ours = r"(?:pytest|benchmarks|examples|scripts)\b[^`\n]*"
+        called = rf"(?:^    |`)(?:[A-Z_]+=\S+ )?(?:python (?:-m )?)?({ours})"
         found |= set(re.findall(called, page.read_text(), re.M))
     for line in sorted(found):
         words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
         if words[0] == "pytest":
             files = [word for word in words if word.startswith("tests/")]
             chosen = [*files, *(["-k", words[words.index("-k") + 1]] if "-k" in words else [])]
-            command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-m", "slow or not slow", *chosen]
+            command = [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-q",
+                "--collect-only",
+                "-m",
+                "slow or not slow",
+                *chosen,
+            ]
             done = subprocess.run(command, capture_output=True, text=True, cwd=REPO)
             assert done.returncode == 0, f"{line}: no such test"
         elif re.match(r"(benchmarks|examples|scripts)/\w+\.py", words[0]):

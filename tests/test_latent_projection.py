@@ -199,3 +199,9 @@ def test_pointnets_weights_know_no_way_back(tmp_path, points):
     assert load_forward(path, skin).log_change(u)[0].shape == (1, 19)
     with pytest.raises(ValueError, match="holds no inverse model"):
         load_inverse(path, skin)
+
+
+def test_errors_name_the_network_as_it_was_asked_for():
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
+    with pytest.raises(ValueError, match="signal 'latent_projection' knows no heat"):
+        biotac_mj.attach(spec, site="tip", skin="coarse", signal=NAME, thermal={})

@@ -283,6 +283,13 @@ def test_what_only_a_task_has_is_refused_elsewhere(capsys):
     assert said in capsys.readouterr().err
     with pytest.raises(FileNotFoundError, match="no policy of juggle comes .* give --policy script"):
         find_policy("juggle")
+
+
+def test_a_misspelt_keyword_is_answered_with_those_of_the_task():
+    with pytest.raises(TypeError, match=r"has 'observes': did you mean 'observe'\? .*history.*sensor"):
+        make("follow_edge", num_envs=2, observes="force")
+    with pytest.raises(TypeError, match="has 'rodd': did you mean 'rod'"):
+        make("roll_rod", rodd=None)
     assert tuple(TASKS) == NAMES
 
 

@@ -156,7 +156,7 @@ def add_checkup(verbs: argparse._SubParsersAction) -> None:
         _checkup,
         "Say the steps of a checkup of a sensor, three minutes for anybody, and write them as a protocol.",
     )
-    verb.add_argument("--against", default="", metavar="NAME", help="what the sensor will be held against")
+    verb.add_argument("--against", metavar="NAME", help="what the sensor will be held against")
     verb.add_argument(
         "--out", type=output_file(), default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
     )

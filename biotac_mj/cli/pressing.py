@@ -1,9 +1,10 @@
-"""The verbs `biotac press`, `view`, `samples`, `mount`, `import-mesh` and `design`."""
+"""The verbs `biotac press`, `view`, `play`, `design`, and of groups `samples`, `list`, `mount` and `mesh`."""
 
 import argparse
 
 from ..arguments import SEED, check_device, output_file, output_folder, place, quantity, real, whole
 from ..files import check_output_file, refuse_inputs
+from ..reading import reading
 from .common import add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP, TASKS
 
@@ -282,9 +283,13 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
 def _play(args):
     of_task = ("policy", "episodes", "json", "render", "window")
     if len(args.recording) == 1 and args.recording[0] in TASKS:
+        check_device(args.device)
+        if args.policy not in (None, "script", "random"):  # before seconds of imports
+            trained = "`python -m biotac_mj.tasks.batched.training TASK --out FOLDER`"
+            with reading(args.policy, "policy", f"give script, random, or a file that {trained} wrote"):
+                pass
         from ..view.policy import play_task
 
-        check_device(args.device)
         more = {name: getattr(args, name) for name in (*of_task, "hand", "port", "device", "seed")}
         play_task(args.recording[0], **more)
         return

@@ -211,7 +211,8 @@ def _factory(table, name, named=None):
             if error.name not in ("torch", "safetensors"):
                 raise
             raise ModuleNotFoundError(
-                f"{named or repr(name)} needs {error.name}: pip install 'biotac-mj[learning]'", name=error.name
+                f"{named or repr(name)} needs {error.name}: pip install 'biotac-mj[learning]'",
+                name=error.name,
             ) from None
     return table[name]
 

@@ -94,7 +94,7 @@ def checkup_verb(args: argparse.Namespace) -> None:
     """Says the steps of a checkup and writes them as a protocol."""
     from ..recordings.protocol import STEPS, Protocol, write_protocol
 
-    plan = Protocol.planned(args.against)
+    plan = Protocol.planned(args.against or "")
     for number, one in enumerate(plan.segments, 1):
         step = STEPS[one.kind]
         print(f"{number}. {one.start:.0f} to {one.stop:.0f} s, {one.kind}: {step.line} Tells {step.tells}.")

@@ -15,6 +15,7 @@ from ..geometry import load_skin
 from ..sensor.colors import electrode_colors
 from ..tasks.batched.playing import HELD_OUT, acting, agree, env_of, play
 from ..tasks.batched.task import BatchTask
+from .maps import Maps
 from .offscreen import Offscreen, find_gl
 
 __all__ = ["play_task", "save_gif", "show_page", "show_window"]
@@ -126,11 +127,10 @@ def _decisions(env, act, mirror):
 
 
 def save_gif(env: BatchTask, act: Callable, path: pathlib.Path | str) -> None:
-    """Draws episodes of the first world, as fast as they went, until `_SHOWN` is over."""
-    from PIL import Image
-
+    """Draws episodes of the first world, as fast as they went, until `_SHOWN` is over, with the electrodes of
+    each finger."""
     mirror, frames, lasts = Mirror(env), [], []
-    each = round(1e3 * env.cfg.substeps * env.cfg.timestep)
+    maps, each = Maps(env.biotac["skin"]), round(1e3 * env.cfg.substeps * env.cfg.timestep)
     camera = mujoco.MjvCamera()
     mirror.point(camera)
     with Offscreen(env.model, *_SIZE, find_gl()) as screen:
@@ -139,9 +139,10 @@ def save_gif(env: BatchTask, act: Callable, path: pathlib.Path | str) -> None:
                 lasts[-1] = round(1e3 * _LAST)
                 if sum(lasts) > 1e3 * _SHOWN:
                     break
-            frames.append(Image.fromarray(screen.render(mirror.data, camera)))
+            changes = {finger: mirror.counts(finger) - mirror.at_rest(finger) for finger in env.batches}
+            frames.append(maps.below(screen.render(mirror.data, camera), changes))
             lasts.append(each)
-    few = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
+    few = maps.quantize(frames, 64)
     with replacing(path) as temporary:
         few[0].save(temporary, format="GIF", save_all=True, append_images=few[1:], duration=lasts, loop=0)
     print(f"  wrote {path}: {len(frames)} decisions")
