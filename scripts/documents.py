@@ -3,9 +3,9 @@
     python scripts/documents.py README.md docs/tutorials/first_press.md
 
 Blocks marked `sh`, `python` and `py` run, all of a page in one folder, its Python in one session. A `py`
-block is a fragment of a program: it finds a new `spec`, with sites and geoms of the names that pages
-use, and a `model` with its `data` and `handle`. `examples/` of the repository lies in the folder. What a
-block of Python prints stands in the block marked `text` after it. A picture beside the page (`![...](name.png)`) is
+block is a fragment of a program: it finds a new `spec`, with sites and geoms of the names that pages use, and
+a `model` with its `data` and `handle`. `examples/` of the repository lies in the folder. What a block of
+Python prints stands in the block marked `text` after it. A picture beside the page (`![...](name.png)`) is
 what the code writes under that name. `tests/test_documents.py` runs the pages again and compares.
 """
 
