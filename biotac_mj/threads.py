@@ -1,8 +1,8 @@
-"""Threads of the host: one of BLAS, since over the small matrices of a skin and its film more only wait for
-each other, and skins side by side in several.
+"""Threads of the host: one thread for BLAS, whose threads wait for each other on matrices this small, and
+several for skins.
 
-A skin's kernels run without Python's lock, and its solve is a function of its arguments, so results are the
-same to the bit for any number of threads."""
+A skin's kernels release Python's lock, and a solve is a function of its arguments, so results are equal to
+the bit for any number of threads."""
 
 import concurrent.futures
 import contextlib
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["cores", "run_abreast", "single_thread"]
+__all__ = ["cores", "run_in_threads", "single_thread"]
 
 
 @functools.cache
@@ -22,7 +22,7 @@ def _libraries():
 
 @contextlib.contextmanager
 def single_thread() -> Iterator[None]:
-    """Holds BLAS to one thread; some microseconds where it is held to one already."""
+    """Limits BLAS to one thread; takes some microseconds if it has one already."""
     changed = [(library, n) for library in _libraries() if (n := library.get_num_threads() or 1) > 1]
     for library, _ in changed:
         library.set_num_threads(1)
@@ -34,7 +34,7 @@ def single_thread() -> Iterator[None]:
 
 
 def cores() -> int:
-    """How many processor cores this process may use."""
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -43,15 +43,15 @@ def _pool(threads: int, process: int):
     return concurrent.futures.ThreadPoolExecutor(threads, thread_name_prefix="biotac_mj")
 
 
-def run_abreast(tasks: Sequence[Callable[[], None]], threads: int) -> None:
-    """Calls tasks that do not wait for each other in up to so many threads; what the first of them raises is
-    raised when all have ended."""
+def run_in_threads(tasks: Sequence[Callable[[], None]], threads: int) -> None:
+    """Calls independent tasks in up to `threads` threads. When all have ended, raises the exception of the
+    first task that failed."""
     if threads < 2 or len(tasks) < 2:
         for task in tasks:
             task()
         return
     pool = _pool(threads, os.getpid())  # a forked process has none of its parent's threads
-    with single_thread():  # held for all of them, so that none changes it while another one is busy
+    with single_thread():  # for all of them, so that no task changes it during another one
         running = [pool.submit(task) for task in tasks]
         concurrent.futures.wait(running)
     for one in running:

@@ -35,7 +35,7 @@ class Elements:
     def force(self, x) -> np.ndarray:
         """Nodal forces [N] at positions x, (nvert, 3) of a single world or (nvert, nworld, 3) [m]."""
         self._x, x = self._array(x, vec3), np.asarray(x)
-        self.elements.push_corners(self._launcher, self._x, self._on, self._inverted)
+        self.elements.evaluate_corners(self._launcher, self._x, self._on, self._inverted)
         return self._gather(self.elements.corner_force).reshape(x.shape)
 
     def product(self, p) -> np.ndarray:
@@ -52,7 +52,7 @@ class Elements:
     def upright(self, x) -> np.ndarray:
         """Whether no element of a world (nworld,) is inverted at x."""
         self._inverted.zero_()
-        self.elements.push_corners(self._launcher, self._array(x, vec3), self._on, self._inverted)
+        self.elements.evaluate_corners(self._launcher, self._array(x, vec3), self._on, self._inverted)
         inverted = self._inverted.numpy() >= 2
         self._inverted.zero_()
         return ~inverted

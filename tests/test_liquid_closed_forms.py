@@ -194,7 +194,7 @@ def elastic_product(here, data, p):
     """The rubber's share of `multiply_tangent`."""
     kept = [
         (a, a.numpy().copy())
-        for a in (data.worlds.borne, data.worlds.kappa, data.outer.touching)
+        for a in (data.worlds.tangent_pressure, data.worlds.kappa, data.outer.touching)
         + ((data.core.touching,) if data.core else ())
     ]
     for array, _ in kept:

@@ -232,7 +232,7 @@ def test_filled_stiffness_is_the_derivative_of_the_forces():
         data = SkinData(model)
         data.x.numpy()[:, 0] = x
         elements = data.element_forces()
-        elements.push_corners(Launcher("cpu"), data.x, wp.ones(1, dtype=int), wp.zeros(1, dtype=int))
+        elements.evaluate_corners(Launcher("cpu"), data.x, wp.ones(1, dtype=int), wp.zeros(1, dtype=int))
         out = np.zeros_like(x)
         np.add.at(out, model.elements.mesh.elem.numpy().T.ravel(), elements.corner_force.numpy()[:, 0])
         a, b, c = (x[model.geometry.inner_face[:, i]] for i in range(3))

@@ -17,7 +17,7 @@ from biotac_mj.skin import (
 )
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.meshes import bake_distance_grid
-from biotac_mj.skin.contact.touch import COUPLED, FIXED, LAGGED, OWN
+from biotac_mj.skin.contact.touch import CONSISTENT, CURRENT, LAGGED, RECORDED
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -311,7 +311,7 @@ def test_contact_tangent(mode):
         p -= (p @ normal)[:, None] * normal
     if mode in ("slip", "coupled"):  # a step ends on the edge between stick and slip: go on a bit
         plane_at(geoms, 1e-2 - 4e-4, h, mat)
-    data.worlds.slips.fill_(COUPLED if mode == "coupled" else OWN)
+    data.worlds.friction_mode.fill_(CONSISTENT if mode == "coupled" else CURRENT)
     size = 1e-9
     force, product = evaluate(model, data, geoms, x)
     drag = np.linalg.norm(force.sum(0) - force.sum(0) @ normal * normal)
@@ -331,7 +331,7 @@ def test_contact_tangent(mode):
 
 
 def test_led_friction_does_not_know_the_push():
-    """Bounded as where it was told: the same where the push has doubled, with a symmetric tangent that is
+    """Bounded as where it was forces: the same where the push has doubled, with a symmetric tangent that is
     minus the derivative of the forces."""
     h, mu = 4e-3, 0.1
     model, geoms = pad(nu=0.3, law="corotational"), GeomSet(["plane"], [()], friction=[mu])
@@ -339,23 +339,25 @@ def test_led_friction_does_not_know_the_push():
     for k in range(3):
         plane_at(geoms, 5e-3 + 2e-4 * k, h - 1e-4 * k)
         step(model, data, geoms)
-    x, told = data.vert_xpos[0], {}
-    for slips in (FIXED, LAGGED, OWN):
-        data.worlds.slips.fill_(slips)
-        if slips != FIXED:
+    x, forces = data.vert_xpos[0], {}
+    for mode in (RECORDED, LAGGED, CURRENT):
+        data.worlds.friction_mode.fill_(mode)
+        if mode != RECORDED:
             plane_at(geoms, 6e-3, h - 2.02e-4)
         force, product = evaluate(model, data, geoms, x)
-        told[int(slips)] = force.sum(0)
-        if slips == LAGGED:
+        forces[int(mode)] = force.sum(0)
+        if mode == LAGGED:
             p = np.random.default_rng(0).standard_normal(x.shape)
             expected, size = product(p), 1e-9
             ends = [evaluate(model, data, geoms, x + s * size * p)[0] for s in (-1, 1)]
             np.testing.assert_allclose(
                 (ends[0] - ends[1]) / (2 * size), expected, atol=1e-4 * abs(expected).max()
             )
-    assert told[OWN][2] < 1.5 * told[FIXED][2] < 0 and told[LAGGED][2] == pytest.approx(told[OWN][2])
-    assert told[OWN][0] == pytest.approx(-mu * told[OWN][2], rel=1e-3)
-    assert told[LAGGED][0] == pytest.approx(-mu * told[FIXED][2], rel=1e-3)
+    assert forces[CURRENT][2] < 1.5 * forces[RECORDED][2] < 0 and forces[LAGGED][2] == pytest.approx(
+        forces[CURRENT][2]
+    )
+    assert forces[CURRENT][0] == pytest.approx(-mu * forces[CURRENT][2], rel=1e-3)
+    assert forces[LAGGED][0] == pytest.approx(-mu * forces[RECORDED][2], rel=1e-3)
 
 
 def test_contact_tangent_where_slip_is_a_power_of_the_push():
@@ -371,7 +373,7 @@ def test_contact_tangent_where_slip_is_a_power_of_the_push():
     x = data.vert_xpos[0].copy()
     x[:, 2] = np.where(x[:, 2] > 0.9 * h, h - 1e-4, x[:, 2])  # flat: a push alike everywhere
     plane_at(geoms, 6e-3, h - 1.01e-4, DOWN)
-    data.worlds.slips.fill_(COUPLED)
+    data.worlds.friction_mode.fill_(CONSISTENT)
     size, down = 1e-9, np.tile([0, 0, -1.0], (len(x), 1))
     force, product = evaluate(model, data, geoms, x)
     expected = product(down).sum(0)

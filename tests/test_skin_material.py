@@ -56,7 +56,7 @@ class Law:
     def stress(self, F, dF=None):
         elements, n, launcher = self._elements(len(F)), len(F), Launcher("cpu")
         on, inverted = (wp.full(1, k, dtype=int) for k in (1, 0))
-        elements.push_corners(launcher, self._array(F), on, inverted)
+        elements.evaluate_corners(launcher, self._array(F), on, inverted)
         corner = -6 * elements.corner_force.numpy()
         if dF is not None:
             elements.multiply_corners(launcher, self._array(F), self._array(dF), on)

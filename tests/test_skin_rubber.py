@@ -101,12 +101,14 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
 
     def possible(x):
         data.x.numpy()[:, 0] = x
-        data.worlds.asked.fill_(1)
+        data.worlds.unfinished.fill_(1)
         data.worlds.failed.zero_()
         solved._launcher = Launcher("cpu")
         # as in a step, forces come first: they find what is inverted
         data.worlds.inverted.zero_()
-        solved.k.elements.push_corners(solved._launcher, data.x, data.worlds.asked, data.worlds.inverted)
+        solved.k.elements.evaluate_corners(
+            solved._launcher, data.x, data.worlds.unfinished, data.worlds.inverted
+        )
         solved._end_try()
         return data.worlds.failed.numpy()[0] == 0
 

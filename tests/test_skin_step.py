@@ -350,7 +350,13 @@ def test_viscosity_acts_near_balance_only_without_progress(model, error, stale, 
     """Rounding ends within some iterations; a circle of four times the tolerance does not."""
     st = SkinData(model, 1).worlds
     state = {"active": 1, "alpha": 1.0, "tries": 1, "error": error, "last_error": 0.9 * error}
-    for name, value in {**state, "iterations": 30, "began": 0, "since": 30 - stale, "viscosity": 0.0}.items():
+    for name, value in {
+        **state,
+        "iterations": 30,
+        "start_iterations": 0,
+        "since": 30 - stale,
+        "viscosity": 0.0,
+    }.items():
         getattr(st, name).fill_(value)
     wp.launch(worlds.choose_viscosity, 1, [model.options.tolerance, st], device="cpu")
     assert st.viscosity.numpy()[0] == lag

@@ -24,14 +24,14 @@ from biotac_mj.skin import (
     prepare_step,
     step,
 )
-from biotac_mj.skin.contact.touch import COUPLED, LAGGED, OWN
-from biotac_mj.skin.newton.load_path import judge_increment
+from biotac_mj.skin.contact.touch import CONSISTENT, CURRENT, LAGGED
+from biotac_mj.skin.newton.load_path import choose_increment
 from biotac_mj.skin.newton.worlds import (
     CONVERGED,
     INSIDE_CORE,
     NOT_CONVERGED,
     NOT_FINITE,
-    judge_balance,
+    check_convergence,
 )
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.state_arrays import StateArrays
@@ -259,7 +259,7 @@ def test_slip_that_goes_with_the_push():
         other.set_pose(poses([world], DEPTHS[1])[0] + [[1e-3, 0, -2e-4], [0, 0, 0]])
         ready = prepare_step(model, again, other)
         for coupled in (0, 1):
-            again.worlds.slips.fill_(COUPLED if coupled else OWN)
+            again.worlds.friction_mode.fill_(CONSISTENT if coupled else CURRENT)
             ready.evaluate_forces()
             again.worlds.active.fill_(1)
             ready.M.begin_step(ready._launcher, again.x)
@@ -360,14 +360,14 @@ def test_shapes_that_no_skin_can_have_are_refused(element):
     inner = inner[geometry.vert[inner, 1] < -5e-3]
     x[inner, 2, 1] += 3e-3  # the pad's inside, pushed up into the core
     data.x.assign(x)
-    data.worlds.asked.fill_(1)
+    data.worlds.unfinished.fill_(1)
     data.worlds.failed.zero_()
     ready.evaluate_forces()
     ready._end_try()
     assert data.worlds.failed.numpy().tolist() == [0, 1, 1]
     data.worlds.inverted.zero_()  # the core alone
     data.worlds.failed.zero_()
-    data.worlds.asked.fill_(1)
+    data.worlds.unfinished.fill_(1)
     ready._end_try()
     assert data.worlds.failed.numpy().tolist() == [0, 0, 1]
 
@@ -389,7 +389,7 @@ def test_elements_of_single_precision_are_those_of_double(law, element):
     for precision in (DOUBLE, SINGLE):
         data._chosen = SimpleNamespace(precision=precision)
         elements = data.element_forces()
-        elements.push_corners(program, data.x, on, inverted)
+        elements.evaluate_corners(program, data.x, on, inverted)
         elements.multiply_corners(program, data.x, wp.array(p, dtype=precision.vec, ndim=2), on)
         found.append((elements.corner_force.numpy(), elements.corner.numpy()))
     (force, product), (other, rough) = found
@@ -443,7 +443,7 @@ def test_an_inverted_element_or_crossed_core_is_no_balance(element, device):
             x[node, 1, 1] += gap + 1e-3
             x[node, 2, 1] += gap + 4e-4
         data.x.assign(x)
-        data.worlds.asked.fill_(1)
+        data.worlds.unfinished.fill_(1)
         data.worlds.failed.zero_()
         ready.evaluate_forces()  # as at the end of every step
         ready._once(ready._end_try)
@@ -481,74 +481,93 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     st = data.worlds
     st.active.fill_(1)
     st.touched.fill_(1)
-    st.limit.fill_(30)
-    st.allowed.fill_(750)
-    part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
-    part[0], worth[0], worth[1] = rz, 1e-4, 1.0  # residual squared [N^2], work of the load [J]
-    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
-    go_on = wp.zeros(1, dtype=int, device="cpu")
+    st.iteration_limit.fill_(30)
+    st.work_limit.fill_(750)
+    part, norms = (np.zeros((k, 1, 1)) for k in (2, 4))
+    part[0], norms[0], norms[1] = rz, 1e-4, 1.0  # residual squared [N^2], work of the load [J]
+    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, norms)]
+    any_active = wp.zeros(1, dtype=int, device="cpu")
     wp.launch_tiled(
-        judge_balance,
+        check_convergence,
         dim=[1],
         inputs=[1e-4, 750, 0, data.rest_pressure, *arrays, st],
-        outputs=[go_on],
+        outputs=[any_active],
         block_dim=1,
         device="cpu",
     )
-    assert bool(st.active.numpy()[0]) is not balanced and bool(go_on.numpy()[0]) is not balanced
+    assert bool(st.active.numpy()[0]) is not balanced and bool(any_active.numpy()[0]) is not balanced
     assert st.error.numpy()[0] == pytest.approx(abs(rz) ** 0.5, rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    "lag, stride, rz, balanced",
+    "viscosity, increment, rz, balanced",
     [(0.0, 0.0, 0.9, True), (3.0, 0.0, 0.1, False), (3.0, 0.25, 0.2, True), (3.0, 0.25, 0.3, False)],
 )
-def test_viscous_skin_is_in_balance_within_an_increment(lag, stride, rz, balanced):
+def test_viscous_skin_is_in_balance_within_an_increment(viscosity, increment, rz, balanced):
     """Where a bound of its error says so: what the stiffer rubber tells, times one plus the lag. rz: over
     what is allowed."""
     data = SkinData(finger())
     st, tolerance = data.worlds, 1e-3
-    values = {"active": 1, "touched": 1, "limit": 30, "allowed": 750, "viscosity": lag, "increment": stride}
+    values = {
+        "active": 1,
+        "touched": 1,
+        "iteration_limit": 30,
+        "work_limit": 750,
+        "viscosity": viscosity,
+        "increment": increment,
+    }
     for name, value in values.items():
         getattr(st, name).fill_(value)
-    part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
-    part[0], worth[0], worth[1] = rz * tolerance**2, 1e-4, 1.0
-    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
+    part, norms = (np.zeros((k, 1, 1)) for k in (2, 4))
+    part[0], norms[0], norms[1] = rz * tolerance**2, 1e-4, 1.0
+    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, norms)]
     given = [tolerance, 750, 0, data.rest_pressure, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
-    wp.launch_tiled(judge_balance, dim=[1], inputs=given, block_dim=1, device="cpu")
+    wp.launch_tiled(check_convergence, dim=[1], inputs=given, block_dim=1, device="cpu")
     assert bool(st.active.numpy()[0]) is not balanced
 
 
 @pytest.mark.parametrize(
-    "began, rounds, opened, ahead, after",
+    "start, rounds, error, trial, after",
     [
-        (5, 0, 0.9, 1.0, dict(asked=0, reason=CONVERGED, load_factor=1.0)),  # found again at once: its own
+        (
+            5,
+            0,
+            0.9,
+            1.0,
+            dict(unfinished=0, reason=CONVERGED, load_factor=1.0),
+        ),  # found again at once: its own
         (
             3,
             0,
             0.9,
             1.0,
-            dict(moving=1, returns=0, kept=0, rounds=1, load_factor=0.5),
+            dict(moving=1, restores=0, accepted=0, rounds=1, load_factor=0.5),
         ),  # once more, from here
-        (3, 1, 0.9, 1.0, dict(moving=1, returns=0, kept=0, rounds=2, load_factor=0.5)),
-        (3, 2, 0.9, 1.0, dict(moving=1, returns=1, kept=1, rounds=3, load_factor=1.0)),  # it slips on
-        (3, 2, 0.09, 1.0, dict(moving=1, returns=0, kept=0, rounds=3, load_factor=0.5)),
-        (5, 2, 0.09, 0.75, dict(moving=1, returns=1, kept=1, rounds=0, load_factor=0.75, trial_factor=1.0)),
+        (3, 1, 0.9, 1.0, dict(moving=1, restores=0, accepted=0, rounds=2, load_factor=0.5)),
+        (3, 2, 0.9, 1.0, dict(moving=1, restores=1, accepted=1, rounds=3, load_factor=1.0)),  # it slips on
+        (3, 2, 0.09, 1.0, dict(moving=1, restores=0, accepted=0, rounds=3, load_factor=0.5)),
+        (
+            5,
+            2,
+            0.09,
+            0.75,
+            dict(moving=1, restores=1, accepted=1, rounds=0, load_factor=0.75, trial_factor=1.0),
+        ),
     ],
 )
-def test_led_friction_comes_to_rest_or_slips_on(began, rounds, opened, ahead, after):
+def test_lagged_friction_bounds_converge_or_slip_goes_on(start, rounds, error, trial, after):
     st = SkinData(finger()).worlds
     values = {
-        "asked": 1,
-        "slips": LAGGED,
+        "unfinished": 1,
+        "friction_mode": LAGGED,
         "iterations": 5,
-        "began": began,
+        "start_iterations": start,
         "rounds": rounds,
-        "opened": opened,
+        "start_error": error,
     }
-    values |= {"trial_factor": ahead, "load_factor": 0.5, "increment": ahead - 0.5, "reason": NOT_CONVERGED}
+    values |= {"trial_factor": trial, "load_factor": 0.5, "increment": trial - 0.5, "reason": NOT_CONVERGED}
     for name, value in values.items():
         getattr(st, name).fill_(value)
     flags = [wp.zeros(n, dtype=int, device="cpu") for n in (2, 1)]
-    wp.launch(judge_increment, 1, [1 / 32, 2500, st, *flags], device="cpu")
+    wp.launch(choose_increment, 1, [1 / 32, 2500, st, *flags], device="cpu")
     assert {name: getattr(st, name).numpy()[0] for name in after} == after

@@ -10,7 +10,7 @@ import biotac_mj
 from biotac_mj.geometry import load_skin
 from biotac_mj.press.approach import surface_point
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, step
-from biotac_mj.threads import run_abreast
+from biotac_mj.threads import run_in_threads
 
 QUAT = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
 
@@ -78,7 +78,7 @@ def test_all_tasks_end_before_the_first_error_is_raised():
             raise ValueError(f"task {i}")
 
     with pytest.raises(ValueError, match="task 1"):
-        run_abreast([lambda i=i: work(i) for i in range(5)], 3)
+        run_in_threads([lambda i=i: work(i) for i in range(5)], 3)
     assert sorted(done) == [0, 1, 2, 3, 4]
 
 

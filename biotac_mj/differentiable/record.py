@@ -162,8 +162,8 @@ def follow(
 def hold_pressure(skin: SkinWorlds) -> None:
     """The pressure of a liquid that keeps its volume is an unknown of its own."""
     incompressible = math.isinf(skin.model.options.bulk_modulus)
-    kappa, holds = (wp.to_torch(getattr(skin.data.worlds, name)) for name in ("kappa", "holds"))
-    holds.copy_((kappa == 0) | incompressible)
+    kappa, keeps_volume = (wp.to_torch(getattr(skin.data.worlds, name)) for name in ("kappa", "keeps_volume"))
+    keeps_volume.copy_((kappa == 0) | incompressible)
 
 
 def advance(

@@ -135,7 +135,7 @@ class SkinWorlds:
         lists = [elements.start, elements.slot]
 
         def push(program):
-            elements.push_corners(program, x, on, inverted)
+            elements.evaluate_corners(program, x, on, inverted)
             program.launch(_sum_corners, total.shape, [*lists, elements.corner_force], [total])
 
         def collect(program):

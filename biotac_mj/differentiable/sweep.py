@@ -179,14 +179,14 @@ def push_forward(
 
 def pull_pressure(skin: SkinWorlds, record: Record, given: dict) -> torch.Tensor:
     """(nworld,) cotangent of the pressure when a step began, from those of what the step was given."""
-    holds = torch.as_tensor(skin.data.worlds.holds.numpy(), device=skin.torch_device)
-    return given["reference"] * _slope_of_reference(record) + holds * given["offset"]
+    keeps_volume = torch.as_tensor(skin.data.worlds.keeps_volume.numpy(), device=skin.torch_device)
+    return given["reference"] * _slope_of_reference(record) + keeps_volume * given["offset"]
 
 
 def _push_pressure(skin: SkinWorlds, record: Record, pressure: torch.Tensor) -> dict:
     """Tangents of what a step was given by the pressure (nworld,) when it began."""
-    holds = torch.as_tensor(skin.data.worlds.holds.numpy(), device=skin.torch_device)
-    return {"reference": pressure * _slope_of_reference(record), "offset": pressure * holds}
+    keeps_volume = torch.as_tensor(skin.data.worlds.keeps_volume.numpy(), device=skin.torch_device)
+    return {"reference": pressure * _slope_of_reference(record), "offset": pressure * keeps_volume}
 
 
 def _slope_of_reference(record: Record) -> float:

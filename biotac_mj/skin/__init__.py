@@ -1,7 +1,7 @@
 """The skin: finite elements in Warp."""
 
 from ..quiet import quiet_warp
-from . import alone, fill  # noqa: F401  tell the step how a world is solved alone, SkinModel its rest
+from . import fill, second_solve  # noqa: F401  they register themselves in `model` and `step`
 from .contact.law import ContactLaw
 from .contact.meshes import bake_distance_grid
 from .data import SkinData

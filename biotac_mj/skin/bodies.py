@@ -1,7 +1,7 @@
-"""How the bodies that touch a skin give way while it is solved: one goes to its predicted pose with the
-wrench that was predicted, and by the compliance of its inertia and of what holds it elsewhere with another.
+"""Compliance of the bodies that touch a skin. A body is at its predicted pose under the predicted wrench;
+another wrench moves it by the compliance of its inertia and of its other constraints.
 
-So to contact a body is a compliance of rank six beside the skin's own (`docs/design.md`)."""
+To contact, a body is thus a compliance of rank six in series with the skin's own (`docs/design.md`)."""
 
 import dataclasses
 
@@ -19,26 +19,25 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Bodies:
-    """The bodies of each group of geoms [group, world]; wrenches are of the skin on them, wrenches and
-    motions about the origin of the BioTac's frame, linear part first. Where poses are prescribed there are
-    none."""
+    """The compliant body of each group of geoms [group, world]. Wrenches are those of the skin on the bodies;
+    wrenches and motions are about the origin of the BioTac frame, linear part first. Empty where poses are
+    prescribed."""
 
-    # motion of one by a wrench on another [group, group, world]
-    compliance: wp.array3d(dtype=wp.spatial_matrixd)
-    predicted: wp.array2d(dtype=wp.spatial_vectord)  # wrenches with which their poses were predicted
-    origin: wp.array2d(dtype=vec3)  # own points of the bodies at these poses
-    arm: wp.array2d(dtype=vec3)  # and where the step begins, where motions are measured
-    spin: wp.array2d(dtype=vec3)  # rotation vectors from there to these poses
-    begun: wp.array2d(dtype=wp.spatial_vectord)  # wrenches of what is remembered, when the step begins
-    converged: wp.array2d(dtype=wp.spatial_vectord)  # of the last converged load increment
-    posed: wp.array2d(dtype=wp.spatial_vectord)  # those with which the geoms are where they are
-    wrench: wp.array2d(dtype=wp.spatial_vectord)  # for a product with the compliance, and its result
-    motion: wp.array2d(dtype=wp.spatial_vectord)
-    column: wp.array2d(dtype=int)  # of its six among the equations after those of contact; -1: none is near
+    compliance: wp.array3d(dtype=wp.spatial_matrixd)  # motion by a wrench [moved group, loaded group, world]
+    predicted: wp.array2d(dtype=wp.spatial_vectord)  # wrenches at the predicted poses
+    origin: wp.array2d(dtype=vec3)  # reference points of the bodies at the predicted poses [m]
+    arm: wp.array2d(dtype=vec3)  # and at the start of the step, where motions are measured [m]
+    spin: wp.array2d(dtype=vec3)  # rotation vectors from the start of the step to the predicted poses [rad]
+    begun: wp.array2d(dtype=wp.spatial_vectord)  # wrenches at the start of the step
+    converged: wp.array2d(dtype=wp.spatial_vectord)  # at the end of the last accepted load increment
+    posed: wp.array2d(dtype=wp.spatial_vectord)  # of the present poses of the geoms
+    wrench: wp.array2d(dtype=wp.spatial_vectord)  # factor of a product with the compliance
+    motion: wp.array2d(dtype=wp.spatial_vectord)  # and its result
+    column: wp.array2d(dtype=int)  # first of the body's six equations in the condensed system; -1: none
 
 
 def make_bodies(groups: int, nworld: int) -> Bodies:
-    """Of so many groups of geoms, on Warp's default device, that do not give way."""
+    """Rigid bodies (zero compliance) for `groups` groups of geoms, on Warp's default device."""
     b = Bodies()
     b.compliance = wp.zeros((groups, groups, nworld), dtype=wp.spatial_matrixd)
     for name in ("predicted", "begun", "converged", "posed", "wrench", "motion"):
@@ -50,9 +49,9 @@ def make_bodies(groups: int, nworld: int) -> Bodies:
 
 @wp.func
 def follow_wrench(h: int, w: int, b: Bodies, m: wp.spatial_vectord, pos: vec3, mat: mat33):
-    """Pose of a geom of body h, moved by m from where it is predicted at pos, mat."""
+    """Pose of a geom of body h that is moved by m from its predicted pose pos, mat."""
     more = vec3(m[3], m[4], m[5])
-    # bodies turn by both at once, which is not by one after the other
+    # the rotation by the sum of two rotation vectors is not the product of both rotations
     turn = rigid_warp.rotation(b.spin[h, w] + more) * wp.transpose(rigid_warp.rotation(b.spin[h, w]))
     origin = b.origin[h, w]
     go = vec3(m[0], m[1], m[2]) + wp.cross(more, b.arm[h, w])
@@ -61,15 +60,15 @@ def follow_wrench(h: int, w: int, b: Bodies, m: wp.spatial_vectord, pos: vec3, m
 
 @dataclasses.dataclass(frozen=True)
 class BodyMotion:
-    """How the bodies of a skin's geoms give way: predicted ones move by compliance (wrench - predicted).
+    """Compliance of the bodies of a skin's geoms: they move by compliance (wrench - predicted wrench).
 
     Attributes:
       compliance: (ngroup, ngroup, 6, 6) motion of one body by a wrench on another [m/N], about the origin of
-        the BioTac's frame, linear part first.
-      wrench: (ngroup, 6) of the skin ON the bodies with which their poses were predicted [N, N m].
-      pos, arm: (ngroup, 3) the bodies' own points at these poses, and where the step begins: motions are
-        measured there [m].
-      spin: (ngroup, 3) rotation vectors from there to these poses [rad].
+        the BioTac frame, linear part first.
+      wrench: (ngroup, 6) predicted wrench of the skin ON the bodies [N, N m].
+      pos, arm: (ngroup, 3) reference points of the bodies at the predicted poses, and at the start of the
+        step, where motions are measured [m].
+      spin: (ngroup, 3) rotation vectors from the start of the step to the predicted poses [rad].
     """
 
     compliance: np.ndarray
@@ -79,11 +78,12 @@ class BodyMotion:
     spin: np.ndarray
 
     def moved(self, wrench: np.ndarray) -> np.ndarray:
-        """(ngroup, 6) motions from the predicted poses by wrenches (ngroup, 6)."""
+        """Motions (ngroup, 6) from the predicted poses by wrenches (ngroup, 6)."""
         return np.einsum("ghij,hj->gi", self.compliance, wrench - self.wrench)
 
     def without(self, group: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> tuple:
-        """Poses (ngeom, 3), (ngeom, 3, 3) of the geoms without the skin's wrenches, for predicted ones."""
+        """Poses (ngeom, 3), (ngeom, 3, 3) of the geoms without the skin's wrenches, from the predicted
+        poses."""
         m, origin = self.moved(np.zeros_like(self.wrench)), self.pos[group]
         turn = (rotation(self.spin + m[:, 3:]) @ rotation(-self.spin))[group]
         go = (m[:, :3] + cross(m[:, 3:], self.arm))[group]

@@ -14,7 +14,7 @@ from .contact.faces import Contact, Laws
 from .contact.law import WorldLaws
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
-from .newton.bodies import Drag
+from .newton.bodies import BodyContact
 from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
@@ -135,7 +135,7 @@ class SkinData:
       x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
         and the pose of the BioTac frame in the world at the end of the step.
       bodies: `bodies.Bodies` of geoms whose bodies give way, see `make_bodies_compliant`; None: poses are
-        prescribed. drag: what the skin does to them, a `newton.bodies.Drag`.
+        prescribed. drag: what the skin does to them, a `newton.bodies.BodyContact`.
 
     Raises:
       ValueError: materials that differ from the model's in kind, an unknown or impossible preconditioner, or
@@ -187,13 +187,13 @@ class SkinData:
         stiffness = [model.options.contact_stiffness or stiffness_of_contact(m) for m in materials]
         self.worlds.contact_stiffness.assign(stiffness)
         self.laws = WorldLaws(model, materials, np.array(stiffness))
-        self.worlds.pulls, self.worlds.by_load = self.laws.pulls, self.laws.by_load
+        self.worlds.adhesive, self.worlds.load_dependent = self.laws.pulls, self.laws.load_dependent
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
         remembers = model.material.remembers
         self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None
         self._preconditioner, self._chosen = None, _choose(model, preconditioner)
         self.steps, self._vectors, self.external = {}, None, None  # see `step`
-        self.bodies = self.drag = None
+        self.bodies = self.body_contact = None
         self._touched, self._of_groups, self._counts = {}, {}, (0, 0)
         self.reset()
 
@@ -223,11 +223,17 @@ class SkinData:
             surfaces, m = (self.outer, self.core), self.model
             if self._chosen is SparsePreconditioner:
                 self._preconditioner = SparsePreconditioner(
-                    m, surfaces, self.worlds, self.chunk, self.bodies, self.drag
+                    m, surfaces, self.worlds, self.chunk, self.bodies, self.body_contact
                 )
             else:
                 self._preconditioner = DensePreconditioner(
-                    m, surfaces, self.worlds, self.chunk, self.contact_capacity, self.bodies, self.drag
+                    m,
+                    surfaces,
+                    self.worlds,
+                    self.chunk,
+                    self.contact_capacity,
+                    self.bodies,
+                    self.body_contact,
                 )
         return self._preconditioner
 
@@ -292,13 +298,16 @@ class SkinData:
         self._forget_steps()
         self._preconditioner, w, n = None, self.nworld, 6 * ngroup
         with wp.ScopedDevice(self.model.device):
-            self.bodies, self.drag = make_bodies(ngroup, w), Drag()
-            self.drag.group = wp.zeros((len(self.model.outer.face), w), dtype=int)
-            for name in ("skin_wrench", "off", "step", "displacement", "pending"):
-                setattr(self.drag, name, wp.zeros((ngroup, w), dtype=vec6))
-            self.drag.inverse = wp.zeros((w, n, n), dtype=real)
-            self.drag.pivot = wp.zeros((w, n), dtype=int)
-            self.drag.known, self.drag.looks = wp.zeros(w, dtype=int), wp.zeros(w, dtype=int)
+            self.bodies, self.body_contact = make_bodies(ngroup, w), BodyContact()
+            self.body_contact.group = wp.zeros((len(self.model.outer.face), w), dtype=int)
+            for name in ("skin_wrench", "residual", "step", "displacement", "pending"):
+                setattr(self.body_contact, name, wp.zeros((ngroup, w), dtype=vec6))
+            self.body_contact.inverse = wp.zeros((w, n, n), dtype=real)
+            self.body_contact.pivot = wp.zeros((w, n), dtype=int)
+            self.body_contact.wrench_known, self.body_contact.has_pending = (
+                wp.zeros(w, dtype=int),
+                wp.zeros(w, dtype=int),
+            )
 
     def _forget_steps(self):
         for one in self.steps.values():

@@ -164,7 +164,7 @@ def _go(bare, data, nothing, what, put, size=0.25):
         tolerance = _ARRIVED if done + size == 1 else _UNDERWAY
         bare.options = dataclasses.replace(options, tolerance=tolerance)
         put(done + size)
-        step(bare, data, nothing, alone=False)
+        step(bare, data, nothing, second_solve=False)
         converged = data.converged.all()
         if converged and (data.volume <= _most_liquid(bare)).all():
             done += size

@@ -1,5 +1,5 @@
-"""Forces at the nodes of all worlds where they are, and their tangent along a direction: of rubber, contact,
-core, liquid and inertia. Launches alone, for a program."""
+"""Forces at the nodes of all worlds, and their tangent times a direction: rubber, contact, core, liquid and
+inertia. All methods put launches into a program."""
 
 import itertools
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ from .types import mat33, real, vec3
 
 __all__ = ["Forces", "Vectors"]
 
-_LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
-_BLOCKS = 1 << 10  # likewise
-_FACES = 4  # of the cavity, that a thread adds up for many worlds
-_MARKS = itertools.count()  # one for each step's geoms
-_WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few worlds on CUDA and otherwise
+_LISTED = 1 << 16  # most threads for listed faces: each takes several faces if there are more
+_BLOCKS = 1 << 10  # most blocks of threads, likewise
+_FACES = 4  # faces of the cavity that one thread sums, with many worlds
+_MARKS = itertools.count()  # a number for each step's geoms
+_WRENCH_CHUNKS = 4, 32  # faces whose forces one thread sums: with few worlds on CUDA, otherwise
 
 
 class Vectors:
@@ -35,14 +35,14 @@ class Vectors:
         self.nchunk = -(-n // self.chunk)
         inner = 0 if model.inner is None else len(model.inner.face)
         implicit = model.options.dynamics == "implicit"
-        lawful = model.options.contact_law is not None
+        has_law = model.options.contact_law is not None
         surfaces = [s for s in (data.outer, data.core) if s]
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
-            self.begun = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
-            self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
-            self.part = wp.zeros((3, self.nchunk, w), dtype=real)
-            self.held = wp.zeros((n, w), dtype=data.precision.scalar)
+            self.x_start = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
+            self.norms = wp.zeros((4, self.nchunk, w), dtype=real)
+            self.partial = wp.zeros((3, self.nchunk, w), dtype=real)
+            self.viscous_work = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
             self.flags = wp.zeros(9, dtype=int)
             self.no_vector = wp.zeros((0, w), dtype=vec3)
@@ -50,10 +50,10 @@ class Vectors:
             self.no_flag = wp.zeros((0, w), dtype=int)
             self.no_face = wp.zeros(0, dtype=wp.vec3i)
             self.no_block = wp.zeros((0, w), dtype=mat33)
-            # friction that samples may bear at most, as it was where a part of the way began [N]
+            # bound of each sample's friction at the start of the load increment [N]
             self.bound = wp.zeros((len(model.outer.face) * len(model.sample), w), dtype=real)
             self.no_bound = wp.zeros((0, w), dtype=real)
-            self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
+            self.corner_normal_force = wp.zeros((3 * len(model.outer.face) if has_law else 0, w), dtype=real)
             few = model.device.is_cuda and w <= FEW
             self.face_chunk = 1 if few else data.chunk if w < 256 else _FACES
             self.face_chunks = -(-inner // self.face_chunk)
@@ -69,37 +69,41 @@ class Vectors:
 
 
 class Forces:
-    """Of the worlds of `data` under `geoms`.
+    """Forces of the worlds of `data` with `geoms`.
 
     Attributes:
-      ball: centre [m] and radius [m] around the skin.
-      beside: launches functions that do not need each other's results.
-      wrench_chunk, wrench_chunks: faces whose forces are summed by one thread, and how often that is.
+      ball: centre [m] and radius [m] of a ball around the skin.
+      in_parallel: launches functions that do not need each other's results.
+      wrench_chunk, wrench_chunks: faces whose forces one thread sums, and the number of such chunks.
+      node_forces: `SurfaceForces` of the outer surface and of the core's, and `LiquidForces`.
     """
 
     def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet, vectors: Vectors):
         self.m, self.d, self.geoms, self.k, self.st = model, data, geoms, vectors, data.worlds
-        self._of_nodes = nodes.nodes_kernels(data.precision)
-        self._of_krylov = krylov.krylov_kernels(data.precision)
+        self._nodes_kernels = nodes.nodes_kernels(data.precision)
+        self._krylov_kernels = krylov.krylov_kernels(data.precision)
         self.implicit = model.options.dynamics == "implicit"
-        few = model.device.is_cuda and data.nworld <= FEW  # many worlds fill the device without
-        self.beside = Fork(model.device, few).run
+        few = model.device.is_cuda and data.nworld <= FEW  # more worlds fill the device by themselves
+        self.in_parallel = Fork(model.device, few).run
         self.wrench_chunk = _WRENCH_CHUNKS[not few]
         self._lanes = LANES_FEW if few else 1
         self._summed = *data.x.shape, self._lanes
         self.wrench_chunks = -(-len(model.outer.face) // self.wrench_chunk)
         with wp.ScopedDevice(model.device):
             self._part = wp.zeros((2 * geoms.ngroup, self.wrench_chunks, data.nworld), dtype=vec3)
-        self._lawless = faces.empty_laws(model.device)
+        self._slots, self.node_forces = nodes.NodeSlots(), self._node_forces()
+        self._slots.lanes = self._lanes
+        self._slots.start, self._slots.slot = vectors.elements.start, vectors.elements.slot
+        self._no_laws = faces.empty_laws(model.device)
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
         self.ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
         self._mark = next(_MARKS)
         self._surfaces = [self._surface(data.outer, geoms.count, data.laws.struct, vectors.bound)]
-        self._surfaces += [self._surface(data.core, 1, self._lawless, vectors.no_bound)]
+        self._surfaces += [self._surface(data.core, 1, self._no_laws, vectors.no_bound)]
 
     def _surface(self, state, ngeom, laws, bound):
-        """Clearances and contact of a surface."""
+        """`ClearanceCache` and `Contact` of a surface."""
         if state is None:
             return None
         cache, (center, radius) = broadphase.ClearanceCache(), self.ball
@@ -109,22 +113,22 @@ class Forces:
         with wp.ScopedDevice(self.m.device):
             cache.pos, cache.mat = (wp.zeros((ngeom, self.d.nworld), dtype=t) for t in (vec3, mat33))
         m, stiffness = self.m, self.st.contact_stiffness
-        law = [m.sample, m.options.stick_ratio, stiffness, laws, self.k.begun, bound]
+        law = [m.sample, m.options.stick_ratio, stiffness, laws, self.k.x_start, bound]
         return cache, state.contact(*law)
 
     @property
     def contact(self) -> faces.Contact:
-        """Of the outer surface."""
+        """`Contact` of the outer surface."""
         return self._surfaces[0][1]
 
     @property
     def external(self) -> wp.array:
-        """Forces that somebody adds at the nodes, of length zero without."""
+        """External forces at the nodes [node, world] [N], of length zero if there are none."""
         return self.k.no_vector if self.d.external is None else self.d.external
 
     @property
     def gradient(self) -> wp.array:
-        """Of the liquid's volume, of length zero without."""
+        """Gradient of the liquid's volume [node, world] [m^2], of length zero without a liquid."""
         return self.d.gradient if self.m.has_liquid else self.k.no_vector
 
     def launch(
@@ -135,84 +139,57 @@ class Forces:
         inputs: Sequence,
         outputs: Sequence = (),
     ) -> None:
-        """A kernel over dim."""
+        """Launches a kernel over dim."""
         threads = THREADS_FEW if self.d.nworld <= FEW else 256
         program.launch(kernel, dim, inputs, outputs, threads)
 
     def decide(self, program: Launcher, kernel: wp.Kernel, inputs: Sequence, outputs: Sequence = ()) -> None:
-        """A block of threads for each world."""
+        """Launches a kernel with a block of threads for each world."""
         program.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
 
-    def evaluate(self, program: Launcher, on: wp.array, kept: int = 0) -> None:
-        """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia. kept:
-        1 while Newton's method has a pressure of its own in the tangent."""
-        m, d, k, st = self.m, self.d, self.k, self.st
-        self.beside(
-            lambda: k.elements.push_corners(program, d.x, on, st.inverted),
-            lambda: self._inside(program, on, kept),
-            lambda: self._contact(program, d.outer, self.geoms, k.near[0], 0, on),
+    def evaluate(self, program: Launcher, on: wp.array, keep_pressure: int = 0) -> None:
+        """Evaluates all forces at x in the worlds that are on. keep_pressure: 1 while the tangent keeps the
+        pressure that Newton's method predicts."""
+        d, k, st = self.d, self.k, self.st
+        self.in_parallel(
+            lambda: k.elements.evaluate_corners(program, d.x, on, st.inverted),
+            lambda: self._evaluate_inside(program, on, keep_pressure),
+            lambda: self._evaluate_contact(program, d.outer, self.geoms, k.near[0], 0, on),
         )
-        none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
-        core, wet = none, [k.no_list, k.no_list, k.no_vector]
-        if d.core:
-            core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner]
-        if m.has_liquid:
-            wet = [m.inner.start, m.inner.slot, k.wet_corner]
-        inside = [k.elements.start, k.elements.slot, k.elements.corner_force]
-        outside = [m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner]
         self.launch(
             program, nodes.assemble_force, self._summed,
-            [self._lanes, *inside, *outside, *core, *wet, self.external, st.pressure, on],
-            [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
+            [self._slots, k.elements.corner_force, self.external, st.pressure, on, *self.node_forces],
+            [d.force],
         )  # fmt: skip
         if self.implicit:
             self._resist_motion(program, on)
 
     def multiply(self, program: Launcher) -> None:
-        """Tangent of all forces times p, but for what the liquid's pressure changes by."""
+        """q = tangent of all forces times p, at constant pressure of the liquid."""
         m, d, k, st = self.m, self.d, self.k, self.st
         e = k.elements
         e.multiply_corners(program, d.x, k.p, st.running)
-        inertia = wp.vec3d(0.0, 0.0, 0.0)
-        if self.implicit:
-            inertia = wp.vec3d(1.0, m.options.mass_damping, m.options.stiffness_damping)
-        wet = [k.no_face, k.no_list, k.no_list, k.no_vector]
-        if m.has_liquid:
-            wet = [m.inner.face, m.inner.start, m.inner.slot, k.wet]
-        surfaces = [
-            *self._blocks(m.outer, d.outer),
-            *self._blocks(m.core_surface if d.core else None, d.core),
-        ]
+        inputs = [self._slots, e.corner, *self.node_forces, m.free_mask, self._inertia(), d.x, k.p, st]
         self.launch(
-            program,
-            self._of_krylov.assemble_product,
-            self._summed,
-            [
-                self._lanes,
-                e.start,
-                e.slot,
-                e.corner,
-                *surfaces,
-                *wet,
-                m.free_mask,
-                inertia,
-                k.node_volume,
-                d.dt,
-                d.x,
-                k.p,
-                st,
-            ],
-            [k.q, k.held],
+            program, self._krylov_kernels.assemble_product, self._summed, inputs, [k.q, k.viscous_work]
         )
 
-    def tell_volume(self, program: Launcher) -> None:
-        """Of a cavity without liquid, whose volume no force has asked for."""
+    def _inertia(self):
+        o, out = self.m.options, krylov.Inertia()
+        out.on, out.node_volume, out.dt = int(self.implicit), self.k.node_volume, self.d.dt
+        if self.implicit:
+            out.mass_damping, out.stiffness_damping = o.mass_damping, o.stiffness_damping
+        return out
+
+    def compute_volume(self, program: Launcher) -> None:
+        """Computes the volume of a cavity without liquid, which no force needs."""
         if self.m.inner is not None and not self.m.has_liquid:
             self.launch(program, worlds.all_on, self.d.nworld, [], [self.st.moving])
             self._fill(program, self.st.moving)
 
-    def tell_wrench(self, program: Launcher, touched_by: wp.array, wrench: wp.array) -> None:
-        """On the groups of geoms, and which geoms touch, of the forces that were evaluated last."""
+    def compute_wrench(self, program: Launcher, touched_by: wp.array, wrench: wp.array) -> None:
+        """Computes the wrenches on the groups of geoms from the last evaluation, and marks geoms that
+        touch."""
         d, g = self.d, self.geoms
         if g.ngroup:
             inputs = [self.wrench_chunk, g.struct, d.x, self.contact]
@@ -222,37 +199,37 @@ class Forces:
             program.launch_blocks(faces.sum_wrench, sums, [self._part], [wrench], worlds.BLOCK)
 
     def commit_contacts(self, program: Launcher, on: wp.array) -> None:
-        """What friction remembers, where a balance was found."""
+        """Stores the friction anchors of an equilibrium."""
         self.launch(program, faces.commit_contacts, self.d.outer.touching.shape, [on], [self.contact])
 
     def _resist_motion(self, program, on):
-        """Inertia and damping."""
-        d, k, o, kernels = self.d, self.k, self.m.options, self._of_nodes
+        """Adds inertia and damping to the forces."""
+        d, k, o, kernels = self.d, self.k, self.m.options, self._nodes_kernels
         mass = [self.st.density, o.mass_damping, k.node_volume, d.dt]
         positions = [k.target, d.x_last, d.x]
         self.launch(program, kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
         e = k.damped
         if e:
             self.launch(program, kernels.displacement, d.x.shape, [d.x_last, d.x, on], [k.q])
-            e.push_corners(program, d.x, on, self.st.inverted)
+            e.evaluate_corners(program, d.x, on, self.st.inverted)
             e.multiply_corners(program, d.x, k.q, on)
             inputs = [e.start, e.slot, e.corner, o.stiffness_damping, d.dt, on, d.force]
             self.launch(program, kernels.add_damping, d.x.shape, inputs)
 
-    def _inside(self, program, on, kept):
-        """The skin's inner side: core and liquid."""
+    def _evaluate_inside(self, program, on, keep_pressure):
+        """Evaluates contact with the core, and the liquid."""
         m, d = self.m, self.d
         if d.core:
-            self._contact(program, d.core, m.core(d.nworld), self.k.near[1], 1, on)
+            self._evaluate_contact(program, d.core, m.core(d.nworld), self.k.near[1], 1, on)
         if m.has_liquid:
-            self._fill(program, on, kept)
+            self._fill(program, on, keep_pressure)
 
-    def _contact(self, program, state, geoms, near, still, on):
+    def _evaluate_contact(self, program, state, geoms, near, surface, on):
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s, on_cuda = self.m, self.d, self.k, state.surface, self.m.device.is_cuda
-        cache, contact = self._surfaces[still]
+        cache, contact = self._surfaces[surface]
         laws, shapes = contact.laws, geoms.shapes
-        if shapes == touch.SOLIDS and not on_cuda:  # which takes the core's kernels anyway
+        if shapes == touch.SOLIDS and not on_cuda:  # the core needs those kernels anyway
             shapes = touch.MESHES
         kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), shapes)
         dim, nsample = state.touching.shape, len(m.sample)
@@ -263,17 +240,18 @@ class Forces:
         self.launch(program, broadphase.list_near, threads, unknown, [cache, contact, near])
         if len(laws.reach):
             inputs = [geoms.struct, d.x, on, near, contact]
-            self.launch(program, faces.push, dim, inputs, [k.corner_push])
-            self.launch(program, faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
-        law = [geoms.struct, d.x, self.st.slips]
+            self.launch(program, faces.normal_forces, dim, inputs, [k.corner_normal_force])
+            inputs = [s.start, s.slot, k.corner_normal_force, on]
+            self.launch(program, faces.sum_normal_forces, d.x.shape, inputs, [laws])
+        law = [geoms.struct, d.x, self.st.friction_mode]
         if on_cuda:
             blocks = min(_BLOCKS, -(-dim[0] * dim[1] * nsample // touch.BLOCK))
             program.launch_blocks(kernels.by_sample, [blocks], [blocks, *law], [cache, contact], touch.BLOCK)
         else:
             self.launch(program, kernels.by_face, threads, [threads, *law], [cache, contact])
 
-    def _fill(self, program, on, kept=0):
-        """The liquid's volume; with it, its pressure."""
+    def _fill(self, program, on, keep_pressure=0):
+        """Computes the liquid's volume and pressure."""
         m, d, k, st = self.m, self.d, self.k, self.st
         c = d.core
         law = [st.contact_stiffness, st.reference]
@@ -286,14 +264,41 @@ class Forces:
             [k.fraction, k.wet, k.wet_corner],
         )  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume
-        inputs = [enclosed, k.fraction, st.offset, st.kappa, st.natural, kept, on]
-        self.decide(program, liquid.settle_pressure, inputs, [st.volume, st.pressure, st.borne])
+        inputs = [enclosed, k.fraction, st.offset, st.kappa, st.natural, keep_pressure, on]
+        self.decide(program, liquid.settle_pressure, inputs, [st.volume, st.pressure, st.tangent_pressure])
         if m.has_liquid and c:
-            inputs = [m.sample, area, *law, st.borne, *touched, k.near[1], on, c.block]
+            inputs = [m.sample, area, *law, st.tangent_pressure, *touched, k.near[1], on, c.block]
             self.launch(program, liquid.release_pressure, c.touching.shape, inputs)
 
-    def _blocks(self, surface, state):
-        k = self.k
+    def _node_forces(self):
+        """Structs of the outer surface, the core's surface and the liquid, empty where there is none."""
+        m, d, k = self.m, self.d, self.k
+        liquid = nodes.LiquidForces()
+        if m.has_liquid:
+            liquid.face, liquid.start, liquid.slot = m.inner.face, m.inner.start, m.inner.slot
+            liquid.wet, liquid.corner, liquid.node, liquid.gradient = (
+                k.wet,
+                k.wet_corner,
+                m.wet_node,
+                d.gradient,
+            )
+        else:
+            liquid.face, liquid.start, liquid.slot, liquid.node = k.no_face, k.no_list, k.no_list, k.no_list
+            liquid.wet, liquid.corner, liquid.gradient = k.no_vector, k.no_vector, k.no_vector
+        core = m.core_surface if d.core else None
+        return self._surface_forces(m.outer, d.outer), self._surface_forces(core, d.core), liquid
+
+    def _surface_forces(self, surface, state):
+        k, out = self.k, nodes.SurfaceForces()
         if state is None:
-            return [k.no_face, k.no_list, k.no_list, k.no_flag, k.no_block]
-        return [surface.face, surface.start, surface.slot, state.touching, state.block]
+            out.face, out.start, out.slot, out.touching = k.no_face, k.no_list, k.no_list, k.no_flag
+            out.corner, out.block, out.node_force = k.no_vector, k.no_block, k.no_vector
+            return out
+        out.face, out.start, out.slot, out.touching = (
+            surface.face,
+            surface.start,
+            surface.slot,
+            state.touching,
+        )
+        out.corner, out.block, out.node_force = state.corner, state.block, state.node_force
+        return out

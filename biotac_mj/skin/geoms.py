@@ -126,8 +126,8 @@ class GeomSet:
         """Which of them there are, see `contact.touch.contact_kernels`."""
         return shapes_of(self.types)
 
-    def alone(self) -> "GeomSet":
-        """The same geoms for one world on the CPU, poses and frictions not set."""
+    def single_world(self) -> "GeomSet":
+        """The same geoms for one world on the CPU, without poses and frictions."""
         size, rounding = self.struct.size.numpy(), self.struct.rounding.numpy()
         made = [self.types, size, None, self.groups, rounding, self._grids, self._own]
         return GeomSet(*made) if self.count else GeomSet([], [])

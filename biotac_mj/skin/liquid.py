@@ -340,12 +340,12 @@ class Liquid:
         kappa = np.where(np.isfinite(K), K, WATER) / natural_volume if self._model.has_liquid else 0.0
         self._write("natural", natural_volume)
         self._write("kappa", kappa)
-        self._write("holds", (np.asarray(kappa) == 0) | np.isinf(K))
+        self._write("keeps_volume", (np.asarray(kappa) == 0) | np.isinf(K))
 
     def keep_pressure(self, pressure: ArrayLike) -> None:
         """Takes liquid in and out so that its pressure above the surroundings stays this [Pa]."""
         self._write("kappa", 0.0)
-        self._write("holds", 1)
+        self._write("keeps_volume", 1)
         self._write("last_pressure", pressure)
 
     def set(self, bulk_modulus: ArrayLike | None = None, fill_volume: ArrayLike | None = None) -> None:

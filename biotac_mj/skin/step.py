@@ -1,26 +1,22 @@
-"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned
-conjugate gradients.
+"""One step of the skin: Newton's method for equilibrium, with preconditioned conjugate gradients.
 
-    step(model, data, geoms, dt)               # poses that were set in, positions and wrenches out
+    step(model, data, geoms, dt)               # poses in, positions and wrenches out
 
-A step is launches alone, with loops and branches between them that look at flags on the device (`program`): a
-recorded list on the CPU, one captured graph on CUDA, alone or inside the caller's own graph:
+A step consists of kernel launches, with loops and branches that read flags on the device (`program`): a
+recorded list on the CPU, a captured graph on CUDA, which may be part of the caller's graph:
 
-    prepare_step(model, data, geoms)           # allocates and compiles; then, inside a capture or without
-    one: launch_step(model, data, geoms)
+    prepare_step(model, data, geoms)           # allocates and compiles
+    launch_step(model, data, geoms)            # inside a capture, or without one
 
 Everything that changes between steps is read from device arrays: poses and frictions `geoms.struct.pos, .mat,
-.friction` [geom, world], materials `data.rubber`, laws of contact `data.laws.struct`, the liquids
-`data.worlds.kappa, .natural, .holds`, `data.dt`, and the pose of the BioTac frame `data.frame_pos,
+.friction` [geom, world], materials `data.rubber`, contact laws `data.laws.struct`, the liquids
+`data.worlds.kappa, .natural, .keeps_volume`, `data.dt`, and the pose of the BioTac frame `data.frame_pos,
 .frame_mat` (implicit dynamics). Overwrite them, then step.
 
-A world that does not converge is solved in load increments: its geoms move from where they were when the last
-step ended, as far as the skin finds equilibria, and friction slips on from increment to increment; no skin
-fits between the core and a geom deep inside it. A world that does not reach the end stays at its last
-equilibrium (`data.load_factor`), is counted in `data.worlds.nonconverged` and has its reason in
-`data.worlds.reason`; so does one whose input is not finite, which stays where it was. Other worlds are not
-affected. Converged worlds are skipped; those that are not `data.worlds.wanted` take no part, and stay as the
-last step left them."""
+A world that does not converge is solved in load increments along the geoms' path from the last step. A world
+that does not reach the end of the path stops at its last equilibrium (`data.load_factor`), is counted in
+`data.worlds.nonconverged` and has its reason in `data.worlds.reason`. A world whose input is not finite keeps
+its state. Other worlds are not affected. Worlds that are not `data.worlds.wanted` are skipped."""
 
 import dataclasses
 import types
@@ -31,13 +27,13 @@ import warp as wp
 
 from ..threads import single_thread
 from .bodies import make_bodies
+from .compliant_bodies import CompliantBodies
 from .contact import broadphase, faces, penetration
 from .contact.posed import LoadPath
 from .contact.touch import BLOCK, contact_kernels
 from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet
-from .give import CompliantBodies
 from .model import SkinModel
 from .newton import krylov, load_path, nodes, worlds
 from .precondition import Residual
@@ -58,10 +54,10 @@ _FREE = (
     "stiffness_damping",
     "max_core_depth",
 )
-# (SkinModel, SkinData, GeomSet) -> alone.Alone; set by `alone`, which steps too and stands above this module
-make_alone = None
+# (SkinModel, SkinData, GeomSet) -> SecondSolve; set by the module `second_solve`, which imports this one
+make_second_solve = None
 
-_SHORTEST = 1 / 32  # load increment
+_LEAST_INCREMENT = 1 / 32  # of the load factor
 
 
 def step(
@@ -71,26 +67,27 @@ def step(
     dt: float | np.ndarray | None = None,
     core_pos: np.ndarray | None = None,
     core_mat: np.ndarray | None = None,
-    alone: bool = True,
+    second_solve: bool = True,
 ) -> None:
-    """Advances every world to the balance of forces with the geoms where they are now.
+    """Advances every world to equilibrium at the present poses of the geoms.
 
-    A world that finds no balance there comes as far as it can, see `data.load_factor`; it is counted in
-    `data.nonconverged` and flagged in `data.converged`. The next step goes on from there.
+    A world that does not converge stops at the last equilibrium on its load path, see `data.load_factor`; it
+    is counted in `data.nonconverged` and flagged in `data.converged`. The next step starts from there.
 
-    With the dense preconditioner (CUDA, many worlds) such a world is solved once more by itself before, on
-    the CPU (`alone.Alone`): that takes as long as a hard step of a single skin, while the others wait.
+    With the dense preconditioner (CUDA, many worlds) such a world is first solved again on the CPU
+    (`second_solve.SecondSolve`). That takes as long as a difficult step of a single skin, and the other
+    worlds wait.
 
     Args:
       model, data: the skin.
-      geoms: touching geoms, poses in the BioTac frame at the end of the step.
-      dt: time step [s], a number or (nworld,); needed by implicit dynamics and by skin with a Prony series.
+      geoms: touching geoms, with their poses in the BioTac frame at the end of the step.
+      dt: time step [s], a number or (nworld,); needed by implicit dynamics and by a Prony series.
       core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of
-        the step, for the inertia of implicit dynamics; None means that it does not move.
-      alone: whether worlds without a balance are solved once more; skins with inertia never are.
+        the step, for implicit dynamics; None: it does not move.
+      second_solve: whether worlds that did not converge are solved again; skins with inertia never are.
 
     Raises:
-      ValueError: geoms of another number of worlds, adhesion that reaches further than a mesh geom's distance
+      ValueError: geoms of another number of worlds, adhesion beyond the range in which a mesh geom's distance
         is known, or a time step that is missing or not positive.
     """
     ready = prepare_step(model, data, geoms)
@@ -101,17 +98,16 @@ def step(
     else:
         with single_thread():
             ready.run()
-    if alone and not ready.implicit and data.precision is SINGLE:
-        ready.solve_lost(data)
+    if second_solve and not ready.implicit and data.precision is SINGLE:
+        ready.solve_again(data)
 
 
 def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep":
-    """Allocates and compiles what `launch_step` needs; again only where the model's options or the geoms are
-    others.
+    """Allocates and compiles what `launch_step` needs, once for each geoms and options of the model.
 
     Raises:
-      ValueError: geoms of another number of worlds, options that the data was not made for, or called first
-        while a graph is captured.
+      ValueError: geoms of another number of worlds, options that the data was not made for, or a first call
+        during the capture of a graph.
     """
     if geoms.nworld != data.nworld:
         raise ValueError(
@@ -131,15 +127,15 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
 
 
 def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
-    """Of a step's kernels on CUDA those that take long to compile, whatever the rubber, for skins that meet
-    such shapes (`GeomSet.shapes`): for `program.compile_ahead`."""
+    """Modules of a step's kernels on CUDA that take long to compile, with their block sizes, for
+    `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
     found = [(contact_kernels(False, False, shapes).by_sample.module, BLOCK)]
     found += [(kernel.module, threads) for kernel, threads in kernels_up_to()]
     return [*found, (penetration, 256), (faces, 256), (broadphase, 256)]
 
 
 def _refuse_other_options(model, data):
-    """What model and data were made for cannot change; tolerances, limits and damping can."""
+    """Refuses options that changed since the data was made, except tolerances, limits and damping."""
     now, made = model.options, data.made_for
     names = [f.name for f in dataclasses.fields(now) if f.name not in _FREE]
     changed = [name for name in names if getattr(now, name) != getattr(made, name)]
@@ -152,10 +148,9 @@ def _refuse_other_options(model, data):
 
 
 def launch_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> None:
-    """Launches a step of every world on the device's current stream: for use inside a captured graph, or
-    without one.
+    """Launches a step of every world on the device's current stream, inside a captured graph or without one.
 
-    Takes the poses from `geoms.struct` as they are when it runs. Raises what `prepare_step` raises.
+    The poses in `geoms.struct` are read when it runs. Raises the errors of `prepare_step`.
     """
     prepare_step(model, data, geoms).launch()
 
@@ -182,25 +177,25 @@ def _set_time(model, data, dt, core_pos, core_mat):
 
 
 class SkinStep:
-    """A step of the worlds of `data` under `geoms`, see the module's docstring.
+    """A step of the worlds of `data` with `geoms`, see the module's docstring.
 
     Raises:
       ValueError: `data` and `geoms` do not fit, see `prepare_step`.
     """
 
     def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet):
-        # takes long: it begins before the preconditioner is made
+        # it takes long, and the preconditioner is made meanwhile
         compile_ahead(model.device, [module_for_cuda(model.elements, model.rubber_options)])
-        # the data owns its steps: a reference back would keep gigabytes until the garbage collector passes
+        # the data owns its steps: a strong reference would keep gigabytes until the next garbage collection
         self.m, self.d, self.geoms = model, weakref.proxy(data), geoms
         if data._vectors is None:
             data._vectors = Vectors(model, data)
         self.k, self.st, self.M = data._vectors, data.worlds, data.preconditioner
         self._forces = Forces(model, self.d, geoms, self.k)
-        self._of_nodes = nodes.nodes_kernels(data.precision)
-        self._of_krylov = krylov.krylov_kernels(data.precision)
+        self._nodes_kernels = nodes.nodes_kernels(data.precision)
+        self._krylov_kernels = krylov.krylov_kernels(data.precision)
         self.implicit, w = self._forces.implicit, data.nworld
-        self._giving = CompliantBodies(self._forces) if data.bodies else None
+        self._compliant = CompliantBodies(self._forces) if data.bodies else None
         with wp.ScopedDevice(model.device):
             self._bodies = data.bodies or make_bodies(0, w)
             self._path = LoadPath()
@@ -210,79 +205,82 @@ class SkinStep:
             self._path.mat_start, self._path.mat_end = (
                 wp.zeros((geoms.count, w), dtype=mat33) for _ in range(2)
             )
-        self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
+        self._geom_memory = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
         (
             self._any_open,
-            self._any_lost,
+            self._any_failed,
             self._any_increment,
             self._any_short,
             self._any_lagged,
-            self._any_looks,
+            self._any_pending,
         ) = (flags[i : i + 1] for i in range(3, 9))
         self._graph = None
         if model.device.is_cuda:
             compile_kernels(model.device, self._record)
-            if self.M.needs_torch:  # whose workspaces are made before anything is captured
+            if self.M.needs_torch:  # torch allocates its workspaces before a capture
                 self._warm_up()
         self._program = Program(model.device, self._record)
-        self._evaluation = self._alone = None
+        self._evaluation = self._second_solve = None
 
     def run(self) -> None:
-        """One step, on the current stream."""
-        self.d.geom_memory(self.geoms.count, self.geoms.ngroup)  # its outputs are now the data's
+        """Runs one step on the current stream."""
+        self.d.geom_memory(self.geoms.count, self.geoms.ngroup)  # makes its outputs those of the data
         if not self.m.device.is_cuda:
-            with single_thread():  # small systems are not faster in several, and end in other bits
+            with single_thread():  # more threads are not faster on small systems, and change the last bits
                 self._program.run()
             return
         self.record()
         wp.capture_launch(self._graph)
 
     def record(self) -> None:
-        """Captures the step as a CUDA graph, which takes some 15 ms: the first `run` does it otherwise. On
-        the CPU a step is recorded when it is made."""
+        """Captures the step as a CUDA graph, which takes some 15 ms, before the first `run` does it. On the
+        CPU a step is recorded when it is made."""
         if self.m.device.is_cuda and self._graph is None:
             with wp.ScopedCapture(self.m.device) as capture:
                 self._program.run()
             self._graph = capture.graph
 
     def forget(self) -> None:
-        """Lets go of what was recorded; it cannot run again."""
+        """Frees what was recorded; the step cannot run again."""
         self._program.forget()
         if self._evaluation:
             self._evaluation.forget()
 
     def launch(self) -> None:
-        """Launches a step, for the caller's capture."""
+        """Launches a step inside the caller's capture."""
         self._program.run()
 
-    # --- for looking at a skin where it is: forces and tangent, without a step ---
+    # --- forces and tangent without a step ---
 
     def evaluate_forces(self) -> None:
-        """Writes the forces at `data.x` and what belongs to them, in all worlds."""
-        wp.copy(self.k.begun, self.d.x_last)
+        """Evaluates the forces at `data.x` in all worlds."""
+        wp.copy(self.k.x_start, self.d.x_last)
         self.st.moving.fill_(1)
-        if not self._evaluation:  # recorded, as steps are: a gradient comes here once a step
+        if not self._evaluation:  # recorded, since gradients evaluate the forces once a step
             self._evaluation = Program(self.m.device, self._record_evaluation)
         self._evaluation.run()
-        self._launcher = Launcher(self.m.device)  # of whoever looks further
+        self._launcher = Launcher(self.m.device)  # for further evaluations by the caller
 
-    def normal_push(self, touched: np.ndarray) -> np.ndarray:
-        """(nface,) normal push of the geoms on the outer faces at `data.x` [N], in a single world; 0 on those
-        that are not among `touched`, numbers of faces."""
-        return faces.normal_push(self._forces.contact, self.geoms.struct, self.d.x, touched)
+    def normal_force_of_faces(self, touched: np.ndarray) -> np.ndarray:
+        """Normal forces (nface,) of the geoms on the outer faces at `data.x` [N], in a single world.
+
+        Args:
+          touched: (n,) indices of the faces that are evaluated; the others get 0.
+        """
+        return faces.normal_force_of_faces(self._forces.contact, self.geoms.struct, self.d.x, touched)
 
     def _record_evaluation(self, program):
         self._launcher = program
         self._forces.evaluate(self._launcher, self.st.moving)
 
     def multiply_tangent(self, p: np.ndarray, at_pressure: bool = False) -> np.ndarray:
-        """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed
+        """Tangent of all forces at the last `evaluate_forces`, times p (nvert, nworld, 3); zero at fixed
         nodes.
 
         Args:
-          at_pressure: of a liquid that keeps its pressure, instead of one that resists changes of its volume.
+          at_pressure: whether the liquid keeps its pressure, instead of resisting changes of its volume.
         """
         k, st = self.k, self.st
         k.p.assign(np.ascontiguousarray(p))
@@ -292,47 +290,48 @@ class SkinStep:
         if self.m.has_liquid and not at_pressure:
             free = self.m.free_mask.numpy()[:, None, None]
             gradient = self.d.gradient.numpy() * free
-            swell = st.kappa.numpy() * (gradient * p).sum((0, 2))
-            q += swell[:, None] * gradient
+            pressure_response = st.kappa.numpy() * (gradient * p).sum((0, 2))
+            q += pressure_response[:, None] * gradient
         return q
 
-    # --- for whoever solves with the tangent of contact of its own: into a program, of worlds that run ---
+    # --- for callers that solve with another contact tangent: launches into a program ---
 
     def put_preconditioner(self, program: Launcher) -> None:
-        """Takes what is in `touching` and `block` of the surfaces into the preconditioner, in the active
-        worlds; k.worth holds no zeros."""
+        """Updates the preconditioner of the active worlds with `touching` and `block` of the surfaces;
+        k.norms must not be zero."""
         k = self.k
         self.M.begin_step(program, self.d.x)
-        residual = Residual(k.worth, k.r, self._forces.gradient)
-        self.M.update(program, self.st, residual, k.z, k.part, self._forces.beside)
+        residual = Residual(k.norms, k.r, self._forces.gradient)
+        self.M.update(program, self.st, residual, k.z, k.partial, self._forces.in_parallel)
 
     def put_inverse(self, program: Launcher, r: wp.array) -> None:
-        """k.z becomes the approximate inverse of that times r, zero at fixed nodes; k.part holds the square
-        of r by chunks."""
+        """k.z = approximate inverse of the tangent times r, zero at fixed nodes; k.partial must hold the
+        square of r by chunks."""
         k = self.k
-        self.M.apply(program, self.st, k.part, r, self._forces.gradient, k.z, k.part)
+        self.M.apply(program, self.st, k.partial, r, self._forces.gradient, k.z, k.partial)
 
     def _once(self, body):
         self.st.moving.fill_(1)
         self._launcher = Launcher(self.m.device)
         body()
 
-    def look(self) -> None:
-        """Forces and tangents at `data.x` of the worlds that are moving and active, whose flags go out."""
+    def refresh(self) -> None:
+        """Evaluates forces and tangents at `data.x` in the worlds that are moving and active, and clears
+        these flags."""
         self._launcher = Launcher(self.m.device)
-        wp.copy(self.k.begun, self.d.x_last)
+        wp.copy(self.k.x_start, self.d.x_last)
         self._forces.evaluate(self._launcher, self.st.moving)
         self._precondition()
         self.st.active.zero_()
         self.st.moving.zero_()
 
-    def solve_lost(self, data: SkinData) -> None:
-        """Solves the worlds of the step that found no balance once more, see `alone`."""
-        if self._alone is None:
+    def solve_again(self, data: SkinData) -> None:
+        """Solves the worlds that did not converge in the last step again, see `second_solve`."""
+        if self._second_solve is None:
             if data.converged.all():
                 return
-            self._alone = make_alone(self.m, data, self.geoms)
-        self._alone.solve(self, data, self.geoms)
+            self._second_solve = make_second_solve(self.m, data, self.geoms)
+        self._second_solve.solve(self, data, self.geoms)
 
     # --- the step ---
 
@@ -341,45 +340,45 @@ class SkinStep:
         self._launcher = program
         m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
         n, w = m.nvert, d.nworld
-        motion, touched_by, wrench = self._of_geoms
-        if self._giving:
-            self._giving.begin(program, touched_by)
+        motion, touched_by, wrench = self._geom_memory
+        if self._compliant:
+            self._compliant.begin(program, touched_by)
         self.M.begin_step(program, d.x)
         bounds = [m.options.max_newton, m.options.max_work]
         given = [m.law, m.material.youngs_modulus, *bounds, g.struct, motion, st]
         self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._path, k.flags])
-        if self._giving:
-            self._giving.begin_pending(program, self._path, self._any_looks)
+        if self._compliant:
+            self._compliant.begin_pending(program, self._path, self._any_pending)
         if d.memory:
             d.memory.begin_step(program, d.dt, st.softness)
         if self.implicit:
             frames = [d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt]
-            self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
-        self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.begun])
-        if self._giving:
-            program.branch(self._any_looks, self._find_pending)
+            self._launch(nodes.predict_free_flight, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
+        self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.x_start])
+        if self._compliant:
+            program.branch(self._any_pending, self._find_pending)
         self._try()
-        program.loop(self._any_open, self._go_on)
+        program.loop(self._any_open, self._try_next)
         self._launch(load_path.end_path, w, [st], [self._any_short])
         program.branch(self._any_short, self._stay)
         self._finish(motion, touched_by, wrench)
 
     def _find_pending(self):
-        """A step from the last balance to where the geoms come, of the worlds that look ahead: what touches
-        there is known, where the last increment leads it is not."""
-        st, giving, on = self.st, self._giving, self._giving.looks
+        """First iteration of the worlds with compliant bodies in contact: from the last equilibrium, whose
+        contact is known, with the geoms' motion as the load."""
+        st, compliant, on = self.st, self._compliant, self._compliant.has_pending
         self._pose(st.load_factor, on)
         self._forces.evaluate(self._launcher, on)
-        giving.start_pending(self._launcher)
+        compliant.start_pending(self._launcher)
         self._precondition()
-        giving.find_pending(self._launcher)
+        compliant.find_pending(self._launcher)
         self._solve()
         self._launcher.loop(self._solve_on, self._continue_solve)
-        self._go_all_the_way()
-        giving.end_pending(self._launcher)
+        self._take_full_step()
+        compliant.end_pending(self._launcher)
 
     def _try(self):
-        """Newton's method where the geoms are, in the active worlds."""
+        """Newton's method at the present poses, in the active worlds."""
         m, g, w = self.m, self.geoms, self.d.nworld
         if m.has_core and g.count:
             points = len(m.core_vert) + 1
@@ -388,43 +387,43 @@ class SkinStep:
             core = m.core(w).struct
             constants = [chunk, m.options.max_core_depth, m.core_vert, core, g.struct]
             outputs = [self.st.active, self.st.failed, self.st.deep]
-            self._launch(penetration.refuse_deep, dim, constants, outputs)
-        self._forces.evaluate(self._launcher, self.st.active, kept=1)
-        if self._giving:
-            self._giving.tell(self._launcher)
+            self._launch(penetration.mark_deep_geoms, dim, constants, outputs)
+        self._forces.evaluate(self._launcher, self.st.active, keep_pressure=1)
+        if self._compliant:
+            self._compliant.compute_wrench(self._launcher)
         self._check()
         self._launcher.loop(self._newton_on, self._iterate)
         self._end_try()
 
-    def _go_on(self):
+    def _try_next(self):
         """The next try of the open worlds."""
         d, k, st, m, g = self.d, self.k, self.st, self.m, self.geoms
-        if not (self.implicit or d.memory):  # else rest is not where a skin that is left is
-            self._launch(worlds.find_lost, d.nworld, [st], [self._any_lost])
-            self._launcher.branch(self._any_lost, self._rest_untouched)
-        bounds, passed = [_SHORTEST if g.count else 1.0, m.options.max_work], k.flags[3:5]
-        self._launch(load_path.judge_increment, d.nworld, [*bounds, st, passed, self._any_increment])
-        self._launch(load_path.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
-        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
-        self._forces.commit_contacts(self._launcher, st.kept)
-        if self._giving:
-            self._giving.keep(self._launcher, st.kept)
-        self._launcher.branch(self._any_increment, self._start_part)
+        if not (self.implicit or d.memory):  # with these a skin without contact may be elsewhere
+            self._launch(worlds.mark_failed, d.nworld, [st], [self._any_failed])
+            self._launcher.branch(self._any_failed, self._restart_untouched)
+        bounds, passed = [_LEAST_INCREMENT if g.count else 1.0, m.options.max_work], k.flags[3:5]
+        self._launch(load_path.choose_increment, d.nworld, [*bounds, st, passed, self._any_increment])
+        self._launch(load_path.accept_geoms, (g.count, d.nworld), [g.struct, st.accepted])
+        self._launch(nodes.accept_nodes, d.x.shape, [d.x, st.accepted], [k.x_start])
+        self._forces.commit_contacts(self._launcher, st.accepted)
+        if self._compliant:
+            self._compliant.accept(self._launcher, st.accepted)
+        self._launcher.branch(self._any_increment, self._start_increment)
         self._try()
 
-    def _rest_untouched(self):
-        """A skin that all that touched it has left in one step is far from its rest, and found in many parts
-        where Newton's method begins at the last balance."""
+    def _restart_untouched(self):
+        """Starts a try from the reference configuration in worlds where nothing touches it. A skin that all
+        geoms left in one step is far from it, and would take many load increments."""
         d, st = self.d, self.st
-        self._launch(nodes.lie_at_rest, d.x.shape, [d.rest_vert, st.moving], [d.x])
-        if self._giving:
-            self._giving.let_go(self._launcher, st.moving)
+        self._launch(nodes.set_to_reference, d.x.shape, [d.rest_vert, st.moving], [d.x])
+        if self._compliant:
+            self._compliant.release(self._launcher, st.moving)
             self._pose(st.trial_factor, st.moving)
         self._forces.evaluate(self._launcher, st.moving)
-        self._launch(faces.leave_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
-        self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st])
+        self._launch(faces.switch_off_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
+        self._launch(worlds.begin_reference_try, d.nworld, [self.m.options.max_work, st])
 
-    def _start_part(self):
+    def _start_increment(self):
         """The next load increment of the worlds that are moving."""
         d, st, o = self.d, self.st, self.m.options
         self._launch(
@@ -433,52 +432,55 @@ class SkinStep:
             [o.max_newton, o.max_work, st, self._any_increment, self._any_lagged],
         )
         self._launch(
-            penetration.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._path]
+            penetration.start_path_outside,
+            d.nworld,
+            [*self._forces.ball, self.geoms.struct, st.moving],
+            [self._path],
         )
-        if self._giving:
-            self._giving.find_unknown_wrenches(self._launcher)
-            self._place(st.load_factor, self._giving.needs_wrench)
-            self._forces.evaluate(self._launcher, self._giving.needs_wrench)
-            self._giving.begin_path(self._launcher, self._giving.needs_wrench)
+        if self._compliant:
+            self._compliant.mark_unknown_wrenches(self._launcher)
+            self._place(st.load_factor, self._compliant.needs_wrench)
+            self._forces.evaluate(self._launcher, self._compliant.needs_wrench)
+            self._compliant.begin_path(self._launcher, self._compliant.needs_wrench)
         self._launcher.branch(self._any_lagged, self._lag_friction)
-        self._place(st.trial_factor, st.returns)
+        self._place(st.trial_factor, st.restores)
         self.M.renew(self._launcher, d.x)
 
     def _lag_friction(self):
-        """Tells what friction is bounded by where the worlds are, or where their part begins."""
-        bound, on = self.k.bound, self.st.lagged  # others keep the pressure that their tangents have
-        self._place(self.st.load_factor, self.st.returns)
-        self._launch(faces.forget_bounds, bound.shape, [on, bound])
+        """Records the friction bounds at the present equilibrium, or at the start of the increment."""
+        bound, on = self.k.bound, self.st.lagged  # other worlds keep the pressure of their tangents
+        self._place(self.st.load_factor, self.st.restores)
+        self._launch(faces.clear_bounds, bound.shape, [on, bound])
         self._forces.evaluate(self._launcher, on)
         self._launch(load_path.lag_friction, self.d.nworld, [self.st, self._any_lagged])
 
     def _place(self, fraction, on):
-        """Geoms at a share of their way, nodes where they were last in balance."""
-        if self._giving:
-            self._giving.go_back(self._launcher, on)
+        """Sets the geoms to a load factor of their path, and the nodes to the last equilibrium."""
+        if self._compliant:
+            self._compliant.restore(self._launcher, on)
         self._pose(fraction, on)
-        self._launch(nodes.return_nodes, self.d.x.shape, [self.k.begun, on], [self.d.x])
+        self._launch(nodes.restore_nodes, self.d.x.shape, [self.k.x_start, on], [self.d.x])
 
     def _pose(self, fraction, on):
-        """Geoms at a share of their way, where their bodies go from there."""
+        """Sets the geoms to a load factor of their path, moved by their compliant bodies."""
         g = self.geoms
         inputs = [self._path, fraction, on, self._bodies]
         self._launch(load_path.place_geoms, (g.count, self.d.nworld), inputs, [g.struct])
 
     def _stay(self):
-        """Forces where the load path ended, and the tangents of what touches, as if it were asked for."""
+        """Sets nodes and geoms to the end of the load path, and evaluates forces and tangents there."""
         self._place(self.st.load_factor, self.st.moving)
         self._forces.evaluate(self._launcher, self.st.moving)
         self._precondition()
 
     def _end_try(self):
-        """Finds the worlds that go on. Balance of an inverted element, or of skin that went through the core,
-        is none."""
+        """Marks the worlds that continue. Equilibrium with an inverted element, or with skin that passed
+        through the core, counts as a failure."""
         m, d, st = self.m, self.d, self.st
         if d.core:
             surface, core = d.core.surface.node, m.core(d.nworld).struct
-            inputs = [m.crushed_depth, surface, core, d.x, st.asked]
-            self._launch(penetration.crushed_on_core, (len(surface), d.nworld), inputs, [st.failed])
+            inputs = [m.crushed_depth, surface, core, d.x, st.unfinished]
+            self._launch(penetration.mark_crushed, (len(surface), d.nworld), inputs, [st.failed])
         self._launch(load_path.end_try, d.nworld, [st, self._any_open])
 
     def _iterate(self):
@@ -491,30 +493,28 @@ class SkinStep:
         self._check()
 
     def _check(self):
-        """Residual, preconditioner and the first direction; which worlds are in balance."""
+        """Updates residual, preconditioner and the first direction, and tests for convergence."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
         bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid), self.d.rest_pressure]
-        self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
+        self._decide(worlds.check_convergence, [*bounds, k.partial, k.norms, st], [self._newton_on])
         if m.has_liquid:
             given = [m.free_mask, self.d.gradient, st]
             self._launch(nodes.correct_pressure, self.d.x.shape, given, [self.d.x, self.d.force])
 
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
-        core = [m.core_surface.start, d.core.node_force] if d.core else [k.no_list, k.no_vector]
-        outer, liquid = [m.outer.start, d.outer.node_force], [m.wet_node, self._forces.gradient]
-        forces = [d.force, *outer, *core, self._forces.external, *liquid]
+        forces = [d.force, *self._forces.node_forces, self._forces.external]
         self._launch(
-            self._of_nodes.residuals, (k.nchunk, d.nworld),
-            [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st.active],
-            [k.r, k.worth, st.touched, self._newton_on],
+            self._nodes_kernels.residuals, (k.nchunk, d.nworld),
+            [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st],
+            [k.r, k.norms, self._newton_on],
         )  # fmt: skip
-        if self._giving:
-            self._giving.settle(self._launcher)
-            self._giving.push(self._launcher)
-        residual = Residual(k.worth, k.r, self._forces.gradient)
-        self.M.update(self._launcher, st, residual, k.p, k.part, self._forces.beside)
+        if self._compliant:
+            self._compliant.begin_iteration(self._launcher)
+            self._compliant.add_residual(self._launcher)
+        residual = Residual(k.norms, k.r, self._forces.gradient)
+        self.M.update(self._launcher, st, residual, k.p, k.partial, self._forces.in_parallel)
 
     def _solve(self):
         self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
@@ -522,65 +522,67 @@ class SkinStep:
 
     def _continue_solve(self):
         k, st = self.k, self.st
-        self.M.apply(self._launcher, st, k.part, k.r, self._forces.gradient, k.z, k.part)
-        self._decide(krylov.choose_beta, [k.part, st])
-        self._launch(self._of_krylov.next_direction, self.d.x.shape, [k.z, st, k.p])
+        self.M.apply(self._launcher, st, k.partial, k.r, self._forces.gradient, k.z, k.partial)
+        self._decide(krylov.choose_beta, [k.partial, st])
+        self._launch(self._krylov_kernels.next_direction, self.d.x.shape, [k.z, st, k.p])
         self._advance_solve(0)
 
     def _advance_solve(self, first):
-        """A step of conjugate gradients along p."""
-        m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._of_krylov
+        """One iteration of conjugate gradients along p."""
+        m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._krylov_kernels
         self._forces.multiply(self._launcher)
-        if self._giving:
-            self._giving.resist(self._launcher)
+        if self._compliant:
+            self._compliant.soften_product(self._launcher)
         chunks, gradient = (k.nchunk, d.nworld), self._forces.gradient
-        inputs = [k.chunk, k.p, k.q, k.held, gradient, m.wet_node, st.running]
-        self._launch(kernels.measure_product, chunks, inputs, [k.part, self._solve_on])
-        self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
+        inputs = [k.chunk, k.p, k.q, k.viscous_work, gradient, m.wet_node, st.running]
+        self._launch(kernels.measure_product, chunks, inputs, [k.partial, self._solve_on])
+        self._decide(krylov.choose_alpha, [m.options.max_cg, k.partial, st], [self._solve_on])
         inputs = [k.chunk, first, k.p, k.q, gradient, m.wet_node, st, k.dx, k.r]
-        self._launch(kernels.update_solution, chunks, inputs, [k.part])
+        self._launch(kernels.update_solution, chunks, inputs, [k.partial])
 
     def _search(self):
-        self._go_all_the_way()
-        self._look()
+        self._take_full_step()
+        self._measure_slope()
 
-    def _go_all_the_way(self):
-        """Takes the step that the linear solve has found."""
-        d, k, first = self.d, self.k, self._of_krylov.first_length
+    def _take_full_step(self):
+        """Takes the full step of the linear solve."""
+        d, k, first = self.d, self.k, self._krylov_kernels.first_length
         chunks = (k.nchunk, d.nworld)
-        if self._giving:
-            self._giving.step(self._launcher)
+        if self._compliant:
+            self._compliant.step(self._launcher)
             self._pose(self.st.trial_factor, self.st.active)
-        self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.part])
+        self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.partial])
 
     def _continue_search(self):
         k = self.k
-        self._launch(self._of_krylov.move, self.d.x.shape, [k.dx, self.st, self.d.x])
-        if self._giving:
-            self._giving.move(self._launcher)
+        self._launch(self._krylov_kernels.move, self.d.x.shape, [k.dx, self.st, self.d.x])
+        if self._compliant:
+            self._compliant.move(self._launcher)
             self._pose(self.st.trial_factor, self.st.moving)
-        self._look()
+        self._measure_slope()
 
-    def _look(self):
+    def _measure_slope(self):
         d, k = self.d, self.k
-        self._forces.evaluate(self._launcher, self.st.moving, kept=1)
+        self._forces.evaluate(self._launcher, self.st.moving, keep_pressure=1)
         inputs = [k.chunk, d.force, k.dx, self._forces.gradient, self.m.wet_node, self.st]
-        self._launch(self._of_krylov.measure_slope, (k.nchunk, d.nworld), inputs, [k.part, self._search_on])
-        if self._giving:
-            self._giving.add_slope(self._launcher, k.part)
-        self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
+        self._launch(
+            self._krylov_kernels.measure_slope, (k.nchunk, d.nworld), inputs, [k.partial, self._search_on]
+        )
+        if self._compliant:
+            self._compliant.add_slope(self._launcher, k.partial)
+        self._decide(worlds.choose_length, [k.partial, self.st], [self._search_on])
 
     def _finish(self, motion, touched_by, wrench):
         d, k, st, g = self.d, self.k, self.st, self.geoms
         w = d.nworld
-        self._forces.beside(
-            lambda: self._forces.tell_volume(self._launcher),
-            lambda: self._forces.tell_wrench(self._launcher, touched_by, wrench),
+        self._forces.in_parallel(
+            lambda: self._forces.compute_volume(self._launcher),
+            lambda: self._forces.compute_wrench(self._launcher, touched_by, wrench),
             lambda: self._forces.commit_contacts(self._launcher, st.wanted),
         )
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
-        self._launch(load_path.release_geoms, (g.count, w), [g.struct, self._path, st], [motion])
+        self._launch(load_path.end_geoms, (g.count, w), [g.struct, self._path, st], [motion])
         frame = [d.frame_pos, d.frame_mat]
         end = [int(self.implicit), st.wanted, d.x, k.world, *frame, d.dt, d.x_last]
         self._launch(nodes.end_nodes, d.x.shape, end, [d.increment, d.velocity])
@@ -597,7 +599,7 @@ class SkinStep:
         self._forces.decide(self._launcher, kernel, inputs, outputs)
 
     def _warm_up(self):
-        """Runs what every iteration does once, with no world switched on."""
+        """Runs every kernel of an iteration once, without active worlds."""
         self._launcher = Launcher(self.m.device)
         for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
             flag.zero_()

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 
-from ...threads import run_abreast
+from ...threads import run_in_threads
 from ..instance import LEVER, NO_PASSIVE, NO_SENSOR, STAGES, Instance
 from ..loads import Loads
 from ..solid import SOLVED
@@ -292,9 +292,9 @@ class World:
         for skin, solve in solves.items():
             shared.setdefault(skin.instance.setup.skin, []).append(solve)
         for one in [one for one in shared if not one.solved]:
-            run_abreast(shared.pop(one), 1)
+            run_in_threads(shared.pop(one), 1)
             one.solved = True
-        run_abreast([functools.partial(run_abreast, mine, 1) for mine in shared.values()], threads)
+        run_in_threads([functools.partial(run_in_threads, mine, 1) for mine in shared.values()], threads)
 
     def _predict(self, skins, outside):
         """Finds where the bodies go under the skins' models; returns how far that is from where the skins

@@ -95,7 +95,7 @@ class CondensedStepper(FemStepper):
         return self._skin.contact_force(self._read(state))[: self._geometry.nvert]
 
     def _push(self, state):
-        return self._skin.normal_push(self._read(state), self._touched_faces(state))
+        return self._skin.normal_force_of_faces(self._read(state), self._touched_faces(state))
 
     def resting(self, state: np.ndarray) -> bool:
         return not self._part(state, "forces")[0]

@@ -188,7 +188,7 @@ class FemStepper:
     def _push(self, state):
         self._unpack(state)
         step = prepare_step(self._model, self._data, self._geom_set)
-        return step.normal_push(self._touched_faces(state))
+        return step.normal_force_of_faces(self._touched_faces(state))
 
     def _touched_faces(self, state):
         return self.contact_rows(state)[:, 0].astype(int) // self.sample_area[1]
@@ -239,9 +239,9 @@ class FemStepper:
         if not started and not self.resting(state):
             geoms.advance()
         if self.inertial:
-            step(model, d, geoms, dt, core_pos[1:], core_mat[1:], alone=False)
+            step(model, d, geoms, dt, core_pos[1:], core_mat[1:], second_solve=False)
         else:
-            step(model, d, geoms, dt, alone=False)
+            step(model, d, geoms, dt, second_solve=False)
         new = np.zeros_like(state)
         self._pack(new)
         if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *released, 0.0):

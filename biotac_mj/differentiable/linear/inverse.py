@@ -136,7 +136,7 @@ class StepInverse:
         for flag in (st.active, st.running):
             flag.fill_(1)
         st.viscosity.zero_()
-        k.worth.fill_(1.0)  # of no account: an update has no residual here
+        k.norms.fill_(1.0)  # of no account: an update has no residual here
         k.r.zero_()
         for state, blocks in ((skin.data.outer, outer), (skin.data.core, core)):
             if state is None:

@@ -12,7 +12,7 @@ import warp as wp
 
 from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
-from ...skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
+from ...skin.contact.touch import smooth_stick_or_slip, smooth_traction, stick_or_slip
 from ...skin.data import ContactState
 from ...skin.types import real, vec3
 from ..tensors import add_rows, skew
@@ -52,7 +52,7 @@ def _feel(
         gap = dn[3]
     push = -k * gap
     if width > real(0.0):
-        push = smooth_push(k, width, gap)[0]
+        push = smooth_traction(k, width, gap)[0]
     most = friction[i, o] * push
     stick_force = vec3()
     anchor = y

@@ -29,7 +29,7 @@ def rest_tangent(model: "SkinModel") -> sp.csc_matrix:
     data = SkinData(model)
     at_rest = prepare_step(model, data, GeomSet([], []))
     at_rest.evaluate_forces()
-    data.worlds.borne.fill_(model.rest.pressure)
+    data.worlds.tangent_pressure.fill_(model.rest.pressure)
     at_rest.k.wet.fill_(vec3(1 / 3, 1 / 3, 1 / 3))
     if data.core:
         data.core.touching.zero_()

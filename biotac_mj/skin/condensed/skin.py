@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..bodies import BodyMotion
-from ..contact.faces import normal_push
+from ..contact.faces import normal_force_of_faces
 from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
@@ -254,9 +254,9 @@ class CondensedSkin:
         out[self.linear.node[node], axis] = memory.force[outer]
         return out
 
-    def normal_push(self, memory: Memory, touched: np.ndarray) -> np.ndarray:
+    def normal_force_of_faces(self, memory: Memory, touched: np.ndarray) -> np.ndarray:
         """(nface,) normal push of the geoms on the outer faces [N]; 0 on those that are not among `touched`,
         numbers of faces."""
         self._load(memory)
         self._views["pos"][:], self._views["mat"][:] = memory.geom_pos, memory.geom_mat
-        return normal_push(self._step.touch, self.geoms.struct, self._data.x, touched)
+        return normal_force_of_faces(self._step.touch, self.geoms.struct, self._data.x, touched)

@@ -54,7 +54,7 @@ def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constant
     l.bulk_stiffness = real(0.0)
     if st.kappa[w] > real(0.0):
         give = real(0.0)  # of a liquid that keeps its volume
-        if st.holds[w] == 0:
+        if st.keeps_volume[w] == 0:
             give = real(1.0) / st.kappa[w]
         l.bulk_stiffness = real(1.0) / (give + l.swell * c.liquid_give)
     return l

@@ -19,12 +19,12 @@ __all__ = [
     "commit_face",
     "empty_laws",
     "face_samples",
-    "forget_bounds",
-    "leave_touched",
-    "normal_push",
+    "clear_bounds",
+    "switch_off_touched",
+    "normal_force_of_faces",
     "partial_wrench",
-    "push",
-    "sum_pushes",
+    "normal_forces",
+    "sum_normal_forces",
     "sum_wrench",
 ]
 
@@ -43,7 +43,7 @@ class Laws:
     reach: wp.array(dtype=real)  # range of adhesion [m]
     smoothing: wp.array(dtype=real)  # half width of first touch [m]; empty where nobody asks for it
     node_area: wp.array(dtype=real)  # of the surface [nvert] [m^2]
-    node_push: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
+    node_normal_force: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
 
 
 def empty_laws(device: wp.DeviceLike) -> Laws:
@@ -153,7 +153,7 @@ def block_index(a: int, b: int):
 
 
 @wp.kernel
-def leave_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
+def switch_off_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
     """Switches off the worlds in which a face touches."""
     f, w = wp.tid()
     if on[w] == 1 and touching[f, w] == 1:
@@ -161,7 +161,7 @@ def leave_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
 
 
 @wp.kernel
-def forget_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
+def clear_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
     """Where nothing will touch there is no friction."""
     i, w = wp.tid()
     if on[w] == 1:
@@ -169,7 +169,7 @@ def forget_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
 
 
 @wp.kernel
-def push(
+def normal_forces(
     # In:
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
@@ -204,7 +204,7 @@ def push(
         corner_out[3 * f + c, w] = total[c]
 
 
-def normal_push(contact: Contact, geoms: Geoms, x: wp.array, faces: np.ndarray) -> np.ndarray:
+def normal_force_of_faces(contact: Contact, geoms: Geoms, x: wp.array, faces: np.ndarray) -> np.ndarray:
     """(nface,) size of the normal push on some faces of the only world [N], 0 on the others.
 
     Args:
@@ -215,12 +215,12 @@ def normal_push(contact: Contact, geoms: Geoms, x: wp.array, faces: np.ndarray) 
     near[faces] = 1
     near, on = (wp.array(a, dtype=int, device=device) for a in (near, np.ones(1, np.int32)))
     corner = wp.zeros((3 * count, 1), dtype=real, device=device)
-    wp.launch(push, near.shape, [geoms, x, on, near, contact], [corner], device=device)
+    wp.launch(normal_forces, near.shape, [geoms, x, on, near, contact], [corner], device=device)
     return corner.numpy().reshape(count, 3).sum(axis=1)
 
 
 @wp.kernel
-def sum_pushes(
+def sum_normal_forces(
     # In:
     start: wp.array(dtype=int),
     slot: wp.array(dtype=int),
@@ -235,7 +235,7 @@ def sum_pushes(
     total = real(0.0)
     for k in range(start[i], start[i + 1]):
         total += corner[slot[k], w]
-    laws.node_push[i, w] = total
+    laws.node_normal_force[i, w] = total
 
 
 @wp.kernel

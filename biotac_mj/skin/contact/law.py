@@ -125,8 +125,8 @@ class WorldLaws:
                 setattr(self.struct, name, wp.zeros(n, dtype=real))
             self.struct.smoothing = wp.zeros(0, dtype=real)
             self.struct.node_area = wp.zeros(nvert, dtype=real)
-            self.struct.node_push = wp.zeros((nvert, nworld), dtype=real)
-            self.pulls, self.by_load = (wp.zeros(nworld, dtype=int) for _ in range(2))
+            self.struct.node_normal_force = wp.zeros((nvert, nworld), dtype=real)
+            self.pulls, self.load_dependent = (wp.zeros(nworld, dtype=int) for _ in range(2))
         if self.law is None:
             return
         self.stiffness = stiffness
@@ -201,7 +201,7 @@ class WorldLaws:
             (s.parting, parting),
             (s.reach, reach),
             (self.pulls, (parting > 0).astype(np.int32)),
-            (self.by_load, (values["friction_exponent"] > 0).astype(np.int32)),
+            (self.load_dependent, (values["friction_exponent"] > 0).astype(np.int32)),
         ):
             array.assign(value)
 

@@ -10,9 +10,9 @@ from .shapes import distance, rough_bound
 __all__ = [
     "come_from_outside",
     "core_clearance",
-    "crushed_on_core",
-    "draw_back",
-    "refuse_deep",
+    "mark_crushed",
+    "start_path_outside",
+    "mark_deep_geoms",
     "rest_gap",
 ]
 
@@ -42,7 +42,7 @@ def rest_gap(
 
 
 @wp.kernel
-def crushed_on_core(
+def mark_crushed(
     # In:
     limit: real,
     node: wp.array(dtype=int),
@@ -85,7 +85,7 @@ def core_clearance(
 
 
 @wp.kernel
-def refuse_deep(
+def mark_deep_geoms(
     # In:
     chunk: int,
     limit: real,
@@ -111,7 +111,7 @@ def refuse_deep(
 
 
 @wp.func
-def _drawn_back(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: mat33):
+def _outside(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: mat33):
     """Where a geom at pos, mat comes from if it comes from outside: clear of a ball."""
     p = pos
     rounds = int(_ROUNDS)  # a variable: unrolled, the module takes a minute to compile for CUDA
@@ -125,7 +125,7 @@ def _drawn_back(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat
 
 
 @wp.kernel
-def draw_back(
+def start_path_outside(
     # In:
     center: vec3,
     radius: real,
@@ -149,7 +149,7 @@ def draw_back(
         p = path.pos_start[g, w]
         if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
             R = path.mat_end[g, w]
-            p = _drawn_back(geoms, g, center, radius, path.pos_end[g, w], R)
+            p = _outside(geoms, g, center, radius, path.pos_end[g, w], R)
             path.pos_start[g, w] = p
             path.mat_start[g, w] = R
 
@@ -167,4 +167,4 @@ def come_from_outside(
     g, w = wp.tid()
     last = geoms.pos_last[g, w]
     if not wp.isfinite(last[0] + last[1] + last[2]):
-        pos_out[g, w] = _drawn_back(geoms, g, center, radius, geoms.pos[g, w], geoms.mat[g, w])
+        pos_out[g, w] = _outside(geoms, g, center, radius, geoms.pos[g, w], geoms.mat[g, w])

@@ -22,15 +22,15 @@ from .shapes import distance, lower_bound, primitive_distance
 
 __all__ = [
     "BLOCK",
-    "COUPLED",
+    "CONSISTENT",
     "LAGGED",
     "MESHES",
-    "OWN",
+    "CURRENT",
     "SKINS",
     "SOLIDS",
-    "FIXED",
+    "RECORDED",
     "contact_kernels",
-    "smooth_push",
+    "smooth_traction",
     "smooth_stick_or_slip",
     "stick_or_slip",
 ]
@@ -41,7 +41,7 @@ SOLIDS, MESHES, SKINS = "solids", "meshes", "skins"  # what kernels know
 BLOCK = 256  # threads of a block of `by_sample`; a face has so many samples at most
 # How friction is bounded: by its own push, with a symmetric tangent, or with the coupling of slip to push;
 # by its push, which is stored; by the stored push of an earlier equilibrium
-OWN, COUPLED, FIXED, LAGGED = (wp.constant(i) for i in range(4))
+CURRENT, CONSISTENT, RECORDED, LAGGED = (wp.constant(i) for i in range(4))
 _LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
 
 
@@ -74,7 +74,7 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
 
 
 @wp.func
-def smooth_push(k: real, width: real, gap: real):
+def smooth_traction(k: real, width: real, gap: real):
     """Push and its slope of contact springs k that come in along a parabola, from a gap of `width` to minus
     that, where they are the springs; a kink of the slope at zero without a width."""
     if gap <= -width:
@@ -192,12 +192,12 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         share: real,
         geoms: Geoms,
         c: Contact,
-        slips: int,
+        friction_mode: int,
         near: wp.int64,
     ):
         """Contact of sample i at b of a face, which stands for a share of area [m^2], with a set of geoms:
         geom (-1: none), the geom that it has touched, least distance [m], force [N], its tangent [N/m],
-        anchor, and where in the face it pushes. slips: one of OWN, COUPLED, FIXED, LAGGED."""
+        anchor, and where in the face it pushes. slips: one of CURRENT, CONSISTENT, RECORDED, LAGGED."""
         k = c.stiffness[w] * share
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
@@ -265,7 +265,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 if c.laws.exponent[w] != real(0.0):
                     pressure = real(0.0)
                     for n in range(3):
-                        pressure += b[n] * c.laws.node_push[t[n], w] / c.laws.node_area[t[n]]
+                        pressure += b[n] * c.laws.node_normal_force[t[n], w] / c.laws.node_area[t[n]]
                     if pressure > real(_LEAST) * c.laws.pressure[w]:
                         follows = real(1.0) - c.laws.exponent[w]
                     pressure = wp.max(pressure, real(_LEAST) * c.laws.pressure[w])
@@ -274,16 +274,16 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 K = k * wp.outer(normal, normal)
             if wp.static(smooth):
                 if width > real(0.0):
-                    push = smooth_push(k, width, gap)
+                    push = smooth_traction(k, width, gap)
                     fn = push[0]
                     K = push[1] * wp.outer(normal, normal)
             if wp.static(shapes != SOLIDS):
                 if geoms.kind[touched] == 7:  # as the skin moves along it a smooth surface turns its push
                     K = K - fn * mesh_curvature(geoms.grids, geoms.grid[touched], local)
             force = fn * normal
-            if slips == FIXED and mu > real(0.0):
+            if friction_mode == RECORDED and mu > real(0.0):
                 c.bound[i, w] = wp.max(mu * fn, real(0.0))
-            if mu > real(0.0) and (fn > real(0.0) or slips == LAGGED):
+            if mu > real(0.0) and (fn > real(0.0) or friction_mode == LAGGED):
                 if c.anchor_geom[i, w] == touched:
                     stick = c.anchor[i, w]
                 else:
@@ -294,7 +294,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 if wp.static(shapes == SKINS):
                     stick = held_at(geoms, touched, w, stick)
                 most = mu * fn
-                if slips == LAGGED:
+                if friction_mode == LAGGED:
                     most = c.bound[i, w]
                 if width > real(0.0):
                     ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, k * c.stick_ratio, width)
@@ -304,7 +304,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     held = stick
                     ft, Kt, stick = stick_or_slip(local, held, normal, most, k * c.stick_ratio)
                     force = force + ft
-                    if slips == COUPLED and wp.length_sq(stick - held) > real(0.0):  # it slips
+                    if friction_mode == CONSISTENT and wp.length_sq(stick - held) > real(0.0):  # it slips
                         Kt = Kt + follows * mu / most * wp.outer(ft, K * normal)
                     K = K + Kt
             R = geoms.mat[touched, w]
@@ -314,7 +314,13 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
 
     @wp.func
     def touch_face(
-        f: int, w: int, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Contact, slips: int, near: wp.int64
+        f: int,
+        w: int,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        c: Contact,
+        friction_mode: int,
+        near: wp.int64,
     ):
         """Evaluates a face; returns a lower bound of its clearance [m], -1 where it touches."""
         nsample = c.sample.shape[0]
@@ -330,7 +336,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             i = f * nsample + s
             b = c.sample[s]
             touched, bond, gap, force, K, stick, at = touch_sample(
-                i, w, b, t, x0, x1, x2, share, geoms, c, slips, near
+                i, w, b, t, x0, x1, x2, share, geoms, c, friction_mode, near
             )
             clearance = wp.min(clearance, gap)
             c.trial_geom[i, w] = touched
@@ -356,7 +362,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
         c: Contact,
-        slips: int,
+        friction_mode: int,
     ):
         """Evaluates the first `count` faces listed[w] with the geoms near[w] of each, by the threads of a
         block: by one for each sample, where they are `BLOCK`; else by one alone."""
@@ -383,7 +389,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 v = c.face[f]
                 share = c.area[f] / real(nsample)
                 touched, bond, _gap, force, K, stick, push = touch_sample(
-                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], share, geoms, c, slips,
+                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], share, geoms, c, friction_mode,
                     near[w, at],
                 )  # fmt: skip
                 c.trial_geom[i, w] = touched
@@ -409,7 +415,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         threads: int,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
-        slips: wp.array(dtype=int),
+        friction_mode: wp.array(dtype=int),
         # In and out:
         cache: ClearanceCache,
         contact: Contact,
@@ -419,7 +425,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             f = cache.near[at] // x.shape[1]
             w = cache.near[at] % x.shape[1]
             t = contact.face[f]
-            clearance = touch_face(f, w, geoms, x, contact, slips[w], ALL)
+            clearance = touch_face(f, w, geoms, x, contact, friction_mode[w], ALL)
             keep_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
     @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=(BLOCK, 2))
@@ -428,7 +434,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         blocks: int,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
-        slips: wp.array(dtype=int),
+        friction_mode: wp.array(dtype=int),
         # In and out:
         cache: ClearanceCache,
         contact: Contact,
@@ -456,7 +462,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 share = contact.area[f] / real(nsample)
                 touched, bond, clearance, force, K, stick, push = touch_sample(
                     i, w, contact.sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], share, geoms, contact,
-                    slips[w], ALL,
+                    friction_mode[w], ALL,
                 )  # fmt: skip
                 contact.trial_geom[i, w] = touched
                 contact.bond[i, w] = bond

@@ -1,16 +1,16 @@
-"""Bodies that give way while Newton's method seeks the balance of a skin, see `skin.bodies`.
+"""Newton's method with compliant bodies, see `skin.bodies`.
 
-Unknowns are the nodes x and the wrenches y with which the bodies are posed, d = A (y - w0); in balance they
-are those of the skin, w. With the tangent D of contact, the bodies' rigid motions R and S = R' D R a step is
+Unknowns are the nodes x and the wrenches y at which the bodies are posed, d = A (y - w0). In equilibrium y
+equals the skin's wrench w. With the contact tangent D, the bodies' rigid motions R and S = R' D R, a step is
 
     (K + D - D R B R' D) dx = F + D R B (w - y),      dy = (1 + S A)^-1 (w - y + R' D dx),
 
-where B = A (1 + S A)^-1 is symmetric and of rank six for each body: it softens contact, and forces have a
-potential as they have without bodies. So the residual gets a term, products of conjugate gradients get one,
-and the line search one for its slope. Where the skin is viscous bodies resist as it does: A is less by it.
+where B = A (1 + S A)^-1 is symmetric and of rank six for each body. It softens contact, and the forces still
+have a potential. The bodies add one term to the residual, to each product and to the slope of the line
+search. They have the same artificial viscosity as the skin, which divides A by 1 + viscosity.
 
-A skin that is touched begins with such a step, too: from the last balance, where its contact is known, with
-the bodies' way from there as a motion that is still to come (`pending`)."""
+The first iteration of a touched skin is such a step, too. It starts from the last equilibrium, whose contact
+is known, and takes the geoms' motion in this step as its load (`pending`)."""
 
 import functools
 import types
@@ -25,73 +25,71 @@ from ..types import Precision, mat33, real, sum_of_block, vec3, vec6
 from .worlds import Worlds, total_of
 
 __all__ = [
-    "Drag",
+    "BodyContact",
     "add_slope",
-    "find_unknown_wrenches",
+    "mark_unknown_wrenches",
     "begin_pending",
     "begin_bodies",
     "bodies_kernels",
     "end_pending",
     "find_step",
-    "measure_drag",
+    "measure_stiffness",
     "find_pending",
     "move_bodies",
-    "respond",
+    "body_motion",
     "set_where",
-    "settle_bodies",
-    "switch_to",
+    "begin_iteration",
+    "copy_flags",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Drag:
-    """What bodies feel of the skin where it is; a face that touches counts for one group [face, world]."""
+class BodyContact:
+    """Contact of the skin with compliant bodies in an iteration; arrays are [group, world] unless stated."""
 
-    group: wp.array2d(dtype=int)
-    skin_wrench: wp.array2d(
-        dtype=wp.spatial_vectord
-    )  # wrenches of the skin at the last evaluation [group, world]
-    off: wp.array2d(dtype=wp.spatial_vectord)  # from those of their poses, where an iteration begins
-    step: wp.array2d(dtype=wp.spatial_vectord)  # by which these change in it
-    displacement: wp.array2d(dtype=wp.spatial_vectord)  # motions by that
-    pending: wp.array2d(dtype=wp.spatial_vectord)  # motions from where geoms are that are not in these
+    group: wp.array2d(dtype=int)  # to which a touching face belongs; -1: none [face, world]
+    skin_wrench: wp.array2d(dtype=wp.spatial_vectord)  # w at the last evaluation
+    residual: wp.array2d(dtype=wp.spatial_vectord)  # w - y at the start of the iteration
+    step: wp.array2d(dtype=wp.spatial_vectord)  # dy of the iteration
+    displacement: wp.array2d(dtype=wp.spatial_vectord)  # motion of the bodies by dy
+    pending: wp.array2d(dtype=wp.spatial_vectord)  # motion from the start of the step, where it is a load
     inverse: wp.array3d(dtype=real)  # of 1 + S A [world, 6 group, 6 group]
     pivot: wp.array2d(dtype=int)  # [world, 6 group]
-    looks: wp.array(dtype=int)  # whether it looks ahead [world]
-    known: wp.array(dtype=int)  # whether the wrenches are known with which the step began [world]
+    has_pending: wp.array(dtype=int)  # 1: the motion in this step is the first iteration's load [world]
+    wrench_known: wp.array(dtype=int)  # 1: the wrenches at the start of the step were evaluated [world]
 
 
 @wp.kernel
-def begin_bodies(wanted: wp.array(dtype=int), touched_by: wp.array2d(dtype=int), b: Bodies, d: Drag):
-    """The first try begins with the bodies at their predicted poses; a touched skin looks ahead."""
+def begin_bodies(wanted: wp.array(dtype=int), touched_by: wp.array2d(dtype=int), b: Bodies, d: BodyContact):
+    """Starts the step of body g at its predicted pose; a touched skin may have pending motion."""
     g, w = wp.tid()
     if wanted[w] == 1:
         b.posed[g, w] = b.predicted[g, w]
         b.converged[g, w] = b.predicted[g, w]
         b.begun[g, w] = b.predicted[g, w]
     if g == 0:
-        d.known[w] = 0
-        d.looks[w] = 0
+        d.wrench_known[w] = 0
+        d.has_pending[w] = 0
         for k in range(touched_by.shape[0]):
-            d.looks[w] = wp.max(d.looks[w], touched_by[k, w])
+            d.has_pending[w] = wp.max(d.has_pending[w], touched_by[k, w])
 
 
 @wp.kernel
-def begin_pending(geoms: Geoms, path: LoadPath, d: Drag, st: Worlds, any_out: wp.array(dtype=int)):
-    """Which worlds look ahead, and how far their bodies go."""
+def begin_pending(geoms: Geoms, path: LoadPath, d: BodyContact, st: Worlds, any_out: wp.array(dtype=int)):
+    """Pending motion of the bodies of world w, if its initial guess is not fixed and all poses are known."""
     w = wp.tid()
     known = real(0.0)
     for g in range(geoms.count):
         begin = path.pos_start[g, w]
         known += begin[0] + begin[1] + begin[2]
-    if st.wanted[w] == 0 or st.asked[w] == 0 or st.guessed[w] == 1 or not wp.isfinite(known):
-        d.looks[w] = 0
-    if d.looks[w] == 0:
+    if st.wanted[w] == 0 or st.unfinished[w] == 0 or st.guessed[w] == 1 or not wp.isfinite(known):
+        d.has_pending[w] = 0
+    if d.has_pending[w] == 0:
         return
     any_out[0] = 1
-    d.known[w] = 1
+    d.wrench_known[w] = 1
     st.repeat[w] = real(0.0)
     for g in range(geoms.count):
         d.pending[geoms.group[g], w] = motion(
@@ -100,27 +98,28 @@ def begin_pending(geoms: Geoms, path: LoadPath, d: Drag, st: Worlds, any_out: wp
 
 
 @wp.kernel
-def find_pending(part: wp.array3d(dtype=real), st: Worlds):
-    """Takes the residual of a step that begins where the last one ended. part: residual . z."""
+def find_pending(partial: wp.array3d(dtype=real), st: Worlds):
+    """Starts the linear solve of an active world. partial: residual . z."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
-    rz = total_of(part, 0, w, t)
+    rz = total_of(partial, 0, w, t)
     if t == 0:
         st.rz[w] = rz
-        st.first[w] = rz
+        st.start_rz[w] = rz
 
 
 @wp.kernel
-def switch_to(on: wp.array(dtype=int), out: wp.array(dtype=int)):
+def copy_flags(on: wp.array(dtype=int), out: wp.array(dtype=int)):
     w = wp.tid()
     out[w] = on[w]
 
 
 @wp.kernel
-def end_pending(st: Worlds, d: Drag):
+def end_pending(st: Worlds, d: BodyContact):
+    """Clears the pending motion of world w, and activates all unfinished worlds."""
     w = wp.tid()
-    st.active[w] = st.asked[w]
+    st.active[w] = st.unfinished[w]
     for g in range(d.pending.shape[0]):
         d.pending[g, w] = vec6()
 
@@ -131,23 +130,24 @@ def set_where(
     on: wp.array(dtype=int),
     out: wp.array2d(dtype=wp.spatial_vectord),
 ):
+    """out = value for body g in the worlds that are on."""
     g, w = wp.tid()
     if on[w] == 1:
         out[g, w] = value[g, w]
 
 
 @wp.kernel
-def find_unknown_wrenches(st: Worlds, d: Drag, needs_wrench_out: wp.array(dtype=int)):
-    """Worlds that go their way in parts have to know the wrenches with which it begins."""
+def mark_unknown_wrenches(st: Worlds, d: BodyContact, needs_wrench_out: wp.array(dtype=int)):
+    """Marks a moving world whose wrenches at the start of the load path have not been evaluated."""
     w = wp.tid()
     needs_wrench_out[w] = 0
-    if st.moving[w] == 1 and d.known[w] == 0:
+    if st.moving[w] == 1 and d.wrench_known[w] == 0:
         needs_wrench_out[w] = 1
-        d.known[w] = 1
+        d.wrench_known[w] = 1
 
 
 @wp.kernel
-def measure_drag(
+def measure_stiffness(
     # In:
     chunk: int,
     geoms: Geoms,
@@ -155,15 +155,15 @@ def measure_drag(
     contact: Contact,
     on: wp.array(dtype=int),
     # Out:
-    d: Drag,
-    part_out: wp.array3d(dtype=wp.spatial_matrixd),
+    d: BodyContact,
+    partial_out: wp.array3d(dtype=wp.spatial_matrixd),
 ):
-    """S = R' D R by chunks of faces [group, chunk, world]."""
+    """S = R' D R of a chunk of faces [group, chunk, world]."""
     c, w = wp.tid()
     if on[w] == 0:
         return
-    for g in range(part_out.shape[0]):
-        part_out[g, c, w] = wp.spatial_matrixd()
+    for g in range(partial_out.shape[0]):
+        partial_out[g, c, w] = wp.spatial_matrixd()
     nsample = contact.sample.shape[0]
     for f in range(c * chunk, wp.min((c + 1) * chunk, contact.face.shape[0])):
         if contact.touching[f, w] == 1:
@@ -188,19 +188,19 @@ def measure_drag(
                         turn -= back
                         bend += arm * K
                         wind -= arm * back
-                total = part_out[mine, c, w]
+                total = partial_out[mine, c, w]
                 for i in range(3):
                     for j in range(3):
                         total[i, j] = total[i, j] + move[i, j]
                         total[i, 3 + j] = total[i, 3 + j] + turn[i, j]
                         total[3 + i, j] = total[3 + i, j] + bend[i, j]
                         total[3 + i, 3 + j] = total[3 + i, 3 + j] + wind[i, j]
-                part_out[mine, c, w] = total
+                partial_out[mine, c, w] = total
 
 
 @wp.func
 def _invert(w: int, n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=int)):
-    """M[w] becomes its inverse: Gauss and Jordan's, in place, with row pivots."""
+    """Inverts M[w] in place by Gauss-Jordan elimination with row pivots."""
     for k in range(n):
         p = int(k)
         for i in range(k + 1, n):
@@ -233,8 +233,8 @@ def _invert(w: int, n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=i
 
 
 @wp.func
-def _moved(w: int, g: int, b: Bodies, wrench: wp.array2d(dtype=wp.spatial_vectord)):
-    """Motion of a body by wrenches on all."""
+def _motion_by(w: int, g: int, b: Bodies, wrench: wp.array2d(dtype=wp.spatial_vectord)):
+    """Motion of body g by wrenches on all bodies."""
     m = vec6()
     for h in range(wrench.shape[0]):
         m += b.compliance[g, h, w] * wrench[h, w]
@@ -242,14 +242,14 @@ def _moved(w: int, g: int, b: Bodies, wrench: wp.array2d(dtype=wp.spatial_vector
 
 
 @wp.func
-def _give(st: Worlds, w: int):
-    """Fraction of their compliance that bodies have in an iteration: they are viscous as the skin is."""
+def _compliance_factor(st: Worlds, w: int):
+    """Factor on the bodies' compliance by their artificial viscosity."""
     return real(1.0) / (real(1.0) + st.viscosity[w])
 
 
 @wp.func
-def _answered(w: int, g: int, d: Drag, wrench: wp.array2d(dtype=wp.spatial_vectord)):
-    """(1 + S A)^-1 times wrenches on all, of one body."""
+def _corrected(w: int, g: int, d: BodyContact, wrench: wp.array2d(dtype=wp.spatial_vectord)):
+    """(1 + S A)^-1 times wrenches on all bodies, for body g."""
     y = vec6()
     for h in range(wrench.shape[0]):
         for i in range(6):
@@ -259,34 +259,34 @@ def _answered(w: int, g: int, d: Drag, wrench: wp.array2d(dtype=wp.spatial_vecto
 
 
 @wp.kernel
-def settle_bodies(
+def begin_iteration(
     # In:
-    part: wp.array3d(dtype=wp.spatial_matrixd),
+    partial: wp.array3d(dtype=wp.spatial_matrixd),
     on: wp.array(dtype=int),
     # In and out:
     b: Bodies,
-    d: Drag,
+    d: BodyContact,
     st: Worlds,
 ):
-    """Where an iteration begins: the inverse of 1 + S A, how far wrenches are from those of the bodies'
-    poses, how that alone moves the bodies, and what energy lies in that."""
+    """Starts an iteration: the inverse of 1 + S A, the residual w - y, the motion of the bodies by it, and
+    twice its energy (`body_residual`)."""
     w, t = wp.tid()
     if on[w] == 0:
         return
-    groups = part.shape[0]
+    groups = partial.shape[0]
     for g in range(groups):
         own = wp.spatial_matrixd()
-        for c in range(t, part.shape[1], wp.block_dim()):
-            own += part[g, c, w]
+        for c in range(t, partial.shape[1], wp.block_dim()):
+            own += partial[g, c, w]
         S = wp.spatial_matrixd()
         for i in range(6):
             row = sum_of_block(vec6(own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]))
             for j in range(6):
                 S[i, j] = row[j]
         if t == 0:
-            d.off[g, w] = d.skin_wrench[g, w] - b.posed[g, w] - S * d.pending[g, w]
+            d.residual[g, w] = d.skin_wrench[g, w] - b.posed[g, w] - S * d.pending[g, w]
             for h in range(groups):
-                M = _give(st, w) * S * b.compliance[g, h, w]
+                M = _compliance_factor(st, w) * S * b.compliance[g, h, w]
                 for i in range(6):
                     for j in range(6):
                         d.inverse[w, 6 * g + i, 6 * h + j] = M[i, j]
@@ -296,79 +296,82 @@ def settle_bodies(
         return
     _invert(w, 6 * groups, d.inverse, d.pivot)
     for g in range(groups):
-        b.wrench[g, w] = _answered(w, g, d, d.off)
-    loose = real(0.0)
+        b.wrench[g, w] = _corrected(w, g, d, d.residual)
+    body_residual = real(0.0)
     for g in range(groups):
-        b.motion[g, w] = _give(st, w) * _moved(w, g, b, b.wrench)
-        loose += wp.dot(b.motion[g, w], d.off[g, w])
+        b.motion[g, w] = _compliance_factor(st, w) * _motion_by(w, g, b, b.wrench)
+        body_residual += wp.dot(b.motion[g, w], d.residual[g, w])
         b.motion[g, w] = b.motion[g, w] + d.pending[g, w]
-    st.loose[w] = loose
+    st.body_residual[w] = body_residual
 
 
 @wp.func
-def _load_of(w: int, t: int, g: int, part: wp.array3d(dtype=vec3)):
-    """Wrench of a group by chunks, summed by the threads of a block."""
+def _load_on(w: int, t: int, g: int, partial: wp.array3d(dtype=vec3)):
+    """Wrench on group g, summed over chunks by the threads of a block."""
     own = vec6()
-    for c in range(t, part.shape[1], wp.block_dim()):
-        f = part[2 * g, c, w]
-        m = part[2 * g + 1, c, w]
+    for c in range(t, partial.shape[1], wp.block_dim()):
+        f = partial[2 * g, c, w]
+        m = partial[2 * g + 1, c, w]
         own += vec6(f[0], f[1], f[2], m[0], m[1], m[2])
     return sum_of_block(own)
 
 
 @wp.kernel
-def respond(part: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: Drag, st: Worlds):
-    """Motions B R' D p of the bodies, of the chunks' R' D p."""
+def body_motion(
+    partial: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: BodyContact, st: Worlds
+):
+    """Motions B R' D p of the bodies of world w. partial: R' D p of each chunk."""
     w, t = wp.tid()
     if on[w] == 0:
         return
     groups = b.motion.shape[0]
     for g in range(groups):
-        load = _load_of(w, t, g, part)
+        load = _load_on(w, t, g, partial)
         if t == 0:
             d.step[g, w] = load
     if t > 0:
         return
     for g in range(groups):
-        b.wrench[g, w] = _answered(w, g, d, d.step)
+        b.wrench[g, w] = _corrected(w, g, d, d.step)
     for g in range(groups):
-        b.motion[g, w] = _give(st, w) * _moved(w, g, b, b.wrench)
+        b.motion[g, w] = _compliance_factor(st, w) * _motion_by(w, g, b, b.wrench)
 
 
 @wp.kernel
-def find_step(part: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: Drag, st: Worlds):
-    """How far an iteration's step takes wrenches and bodies, of R' D dx by chunks."""
+def find_step(
+    partial: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: BodyContact, st: Worlds
+):
+    """Step dy of the wrenches and of the bodies in an iteration. partial: R' D dx of each chunk."""
     w, t = wp.tid()
     if on[w] == 0:
         return
     groups = b.motion.shape[0]
     for g in range(groups):
-        load = _load_of(w, t, g, part)
+        load = _load_on(w, t, g, partial)
         if t == 0:
-            b.wrench[g, w] = d.off[g, w] + load
+            b.wrench[g, w] = d.residual[g, w] + load
     if t > 0:
         return
     for g in range(groups):
-        d.step[g, w] = _give(st, w) * _answered(w, g, d, b.wrench)
+        d.step[g, w] = _compliance_factor(st, w) * _corrected(w, g, d, b.wrench)
     viscous_work = real(0.0)
     for g in range(groups):
-        d.displacement[g, w] = _moved(w, g, b, d.step)
+        d.displacement[g, w] = _motion_by(w, g, b, d.step)
         viscous_work += wp.dot(d.displacement[g, w], d.step[g, w])
     st.viscous_work[w] = st.viscous_work[w] + st.viscosity[w] * viscous_work
 
 
 @wp.kernel
-def move_bodies(first: int, on: wp.array(dtype=int), st: Worlds, b: Bodies, d: Drag):
-    """Along the step: all of it at first, else by how much longer the search makes it."""
+def move_bodies(first: int, on: wp.array(dtype=int), st: Worlds, b: Bodies, d: BodyContact):
+    """Moves the wrench of body g by the full step (first), else by the change of the step length."""
     g, w = wp.tid()
     if on[w] == 1:
-        b.posed[g, w] = b.posed[g, w] + wp.where(first == 1, real(1.0), st.longer[w]) * d.step[g, w]
+        b.posed[g, w] = b.posed[g, w] + wp.where(first == 1, real(1.0), st.alpha_change[w]) * d.step[g, w]
 
 
 @wp.kernel
-def add_slope(st: Worlds, b: Bodies, d: Drag, part: wp.array3d(dtype=real)):
-    """The bodies' share of the residual's component along the step; before it, too, where this is the first
-    try."""
+def add_slope(st: Worlds, b: Bodies, d: BodyContact, partial: wp.array3d(dtype=real)):
+    """Adds the bodies' part of residual . direction after the step, and in the first try also before it."""
     w = wp.tid()
     if st.moving[w] == 0:
         return
@@ -376,36 +379,36 @@ def add_slope(st: Worlds, b: Bodies, d: Drag, part: wp.array3d(dtype=real)):
     before = real(0.0)
     for g in range(b.motion.shape[0]):
         now += wp.dot(d.displacement[g, w], d.skin_wrench[g, w] - b.posed[g, w])
-        before += wp.dot(d.displacement[g, w], d.off[g, w])
-    part[0, 0, w] = part[0, 0, w] + now
+        before += wp.dot(d.displacement[g, w], d.residual[g, w])
+    partial[0, 0, w] = partial[0, 0, w] + now
     if st.tries[w] == 0:
-        part[1, 0, w] = part[1, 0, w] + before
+        partial[1, 0, w] = partial[1, 0, w] + before
 
 
 @functools.cache
 def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
-    """Kernels that know directions, for one precision of them."""
+    """Kernels with directions, for one precision of these."""
     module = f"{__name__}.{precision.name}"
     vec, lower, raised = precision.vec, precision.lower, precision.raised
 
     @wp.kernel(module=module, enable_backward=False)
-    def drag(
+    def body_load(
         # In:
         chunk: int,
         x: wp.array2d(dtype=vec3),
         contact: Contact,
         p: wp.array2d(dtype=vec),
         on: wp.array(dtype=int),
-        d: Drag,
+        d: BodyContact,
         # Out:
-        part_out: wp.array3d(dtype=vec3),
+        partial_out: wp.array3d(dtype=vec3),
     ):
-        """R' D p by chunks of faces [2 group + (0, 1), chunk, world]."""
+        """R' D p of a chunk of faces [2 group + (0, 1), chunk, world]."""
         c, w = wp.tid()
         if on[w] == 0:
             return
-        for k in range(part_out.shape[0]):
-            part_out[k, c, w] = vec3()
+        for k in range(partial_out.shape[0]):
+            partial_out[k, c, w] = vec3()
         for f in range(c * chunk, wp.min((c + 1) * chunk, contact.face.shape[0])):
             if contact.touching[f, w] == 1 and d.group[f, w] >= 0:
                 k = 2 * d.group[f, w]
@@ -419,11 +422,11 @@ def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
                         force += K * raised(p[t[b], w])
                     push += force
                     turn += wp.cross(x[t[a], w], force)
-                part_out[k, c, w] = part_out[k, c, w] + push
-                part_out[k + 1, c, w] = part_out[k + 1, c, w] + turn
+                partial_out[k, c, w] = partial_out[k, c, w] + push
+                partial_out[k + 1, c, w] = partial_out[k + 1, c, w] + turn
 
     @wp.kernel(module=module, enable_backward=False)
-    def push_nodes(
+    def add_body_forces(
         # In:
         chunk: int,
         sign: real,
@@ -434,13 +437,13 @@ def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
         contact: Contact,
         on: wp.array(dtype=int),
         b: Bodies,
-        d: Drag,
+        d: BodyContact,
         # In and out:
         r: wp.array2d(dtype=vec),
         # Out:
         square_out: wp.array3d(dtype=real),
     ):
-        """r += sign D R motion; its square by chunks."""
+        """r += sign D R motion in a chunk of nodes, and the square of r."""
         c, w = wp.tid()
         if on[w] == 0:
             return
@@ -461,4 +464,4 @@ def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
                 rr += wp.length_sq(raised(r[i, w]))
         square_out[0, c, w] = rr
 
-    return types.SimpleNamespace(drag=drag, push_nodes=push_nodes)
+    return types.SimpleNamespace(body_load=body_load, add_body_forces=add_body_forces)

@@ -1,5 +1,5 @@
-"""Conjugate gradients and the line search of all worlds: products with the tangent, steps, what they
-bring."""
+"""Kernels of conjugate gradients and of the line search: products with the tangent, updates of the solution,
+scalar products."""
 
 import functools
 import types
@@ -7,49 +7,61 @@ import types
 import warp as wp
 
 from ..contact.faces import block_index
-from ..types import Precision, mat33, real, sum_of_lanes, vec3
-from .worlds import Worlds, clear_line, total_of, totals_of
+from ..types import Precision, real, sum_of_lanes, vec3
+from .nodes import LiquidForces, NodeSlots, SurfaceForces
+from .worlds import Worlds, begin_line_search, total_of, totals_of
 
-__all__ = ["begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
+__all__ = ["Inertia", "begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
 
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.struct
+class Inertia:
+    """Inertia and damping in the tangent of implicit dynamics."""
+
+    on: int  # 0: the dynamics are not implicit
+    mass_damping: real  # [1/s]
+    stiffness_damping: real  # [s]
+    node_volume: wp.array(dtype=real)  # [m^3]
+    dt: wp.array(dtype=real)  # [world] [s]
+
+
 @wp.kernel
 def begin_solve(st: Worlds, any_active: wp.array(dtype=int)):
-    """Every world that is not in balance starts its linear solve."""
+    """Starts the linear solve of world w, unless it has converged."""
     w = wp.tid()
     if w == 0:
         any_active[0] = 0
     st.running[w] = st.active[w]
     st.moving[w] = st.active[w]
     st.iterations_cg[w] = 0
-    st.before[w] = st.pressure[w]
-    st.foreseen[w] = st.pressure[w]
+    st.start_pressure[w] = st.pressure[w]
+    st.predicted_pressure[w] = st.pressure[w]
 
 
 @wp.kernel
-def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
-    """Length of a step of conjugate gradients."""
+def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
+    """Step length of conjugate gradients in world w. partial: p . q, gradient . p, viscous work."""
     w, t = wp.tid()
     if st.running[w] == 0:
         if t == 0:
             st.alpha[w] = real(0.0)
-            st.swell[w] = real(0.0)
+            st.pressure_response[w] = real(0.0)
         return
-    # read before the sums, as in `worlds.judge_balance`
+    # read before the sums, as in `worlds.check_convergence`
     kappa = st.kappa[w]
     iterations = st.iterations_cg[w]
     done = st.work[w]
     rz = st.rz[w]
     before = st.viscous_work[w]
-    total = totals_of(part, w, t)
+    total = totals_of(partial, w, t)
     if t > 0:
         return
     pq = total[0]
     gp = total[1]
     viscous_work = total[2]
-    st.swell[w] = kappa * gp
+    st.pressure_response[w] = kappa * gp
     curvature = pq + kappa * gp * gp
     first = iterations == 0
     if first:
@@ -57,20 +69,20 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, any_activ
     st.iterations_cg[w] = iterations + 1
     st.work[w] = done + 1
     if not (curvature > real(0.0)):
-        # the tangent is not positive definite there: what has been found so far is a descent direction; at
-        # once, it is the first one
+        # the tangent is not positive definite: the solution so far is a descent direction; in the first
+        # iteration, the preconditioned residual is
         st.running[w] = 0
         st.alpha[w] = real(0.0)
         if first:
             st.alpha[w] = wp.where(rz < real(0.0), real(-1.0), real(1.0))
             st.viscous_work[w] = wp.max(viscous_work, real(0.0))
-        st.foreseen[w] = st.foreseen[w] - st.alpha[w] * st.swell[w]
+        st.predicted_pressure[w] = st.predicted_pressure[w] - st.alpha[w] * st.pressure_response[w]
         return
     alpha = rz / curvature
     st.alpha[w] = alpha
-    st.foreseen[w] = st.foreseen[w] - alpha * st.swell[w]
+    st.predicted_pressure[w] = st.predicted_pressure[w] - alpha * st.pressure_response[w]
     st.viscous_work[w] = before + wp.max(alpha * alpha * viscous_work, real(0.0))
-    # a first step of length one says that the preconditioner is as good as the tangent
+    # a step length near one: the preconditioner is as accurate as the tangent
     if wp.abs(alpha - real(1.0)) <= real(0.2) or iterations + 1 >= limit:
         st.running[w] = 0
     else:
@@ -78,14 +90,14 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, any_activ
 
 
 @wp.kernel
-def choose_beta(part: wp.array3d(dtype=real), st: Worlds):
-    """Ends the linear solves that have reduced the residual enough. part: r . z."""
+def choose_beta(partial: wp.array3d(dtype=real), st: Worlds):
+    """Ends the linear solve of world w if it has reduced r . z to a hundredth. partial: r . z."""
     w, t = wp.tid()
     if st.running[w] == 0:
         return
-    first = st.first[w]
+    first = st.start_rz[w]
     before = st.rz[w]
-    rz = total_of(part, 0, w, t)
+    rz = total_of(partial, 0, w, t)
     if t > 0:
         return
     if not (rz > real(0.01) * wp.abs(first)):
@@ -97,50 +109,31 @@ def choose_beta(part: wp.array3d(dtype=real), st: Worlds):
 
 @functools.cache
 def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
-    """Kernels that know directions, for one precision of them."""
+    """Kernels with directions, for one precision of these."""
     module = f"{__name__}.{precision.name}"
     scalar, vec, lower, raised = precision.scalar, precision.vec, precision.lower, precision.raised
 
     @wp.func
-    def face_product(
-        s: int,
-        w: int,
-        face: wp.array(dtype=wp.vec3i),
-        block: wp.array2d(dtype=mat33),
-        p: wp.array2d(dtype=vec),
-    ):
+    def face_product(s: int, w: int, surface: SurfaceForces, p: wp.array2d(dtype=vec)):
+        """Contact tangent of face s // 3 times p, at its corner s % 3."""
         f = s // 3
         a = s % 3
         total = vec3()
         for b in range(3):
-            total += block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w] * raised(p[face[f][b], w])
+            K = surface.block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w]
+            total += K * raised(p[surface.face[f][b], w])
         return lower(total)
 
     @wp.kernel(module=module, enable_backward=False)
     def assemble_product(
         # In:
-        lanes: int,
-        start: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
+        elements: NodeSlots,
         corner: wp.array2d(dtype=vec),
-        outer_face: wp.array(dtype=wp.vec3i),
-        outer_start: wp.array(dtype=int),
-        outer_slot: wp.array(dtype=int),
-        outer_touching: wp.array2d(dtype=int),
-        outer_block: wp.array2d(dtype=mat33),
-        core_face: wp.array(dtype=wp.vec3i),
-        core_start: wp.array(dtype=int),
-        core_slot: wp.array(dtype=int),
-        core_touching: wp.array2d(dtype=int),
-        core_block: wp.array2d(dtype=mat33),
-        wet_face: wp.array(dtype=wp.vec3i),
-        wet_start: wp.array(dtype=int),
-        wet_slot: wp.array(dtype=int),
-        wet: wp.array2d(dtype=vec3),
+        outer: SurfaceForces,
+        core: SurfaceForces,
+        liquid: LiquidForces,
         mask: wp.array(dtype=real),
-        inertia: wp.vec3d,
-        node_volume: wp.array(dtype=real),
-        dt: wp.array(dtype=real),
+        inertia: Inertia,
         x: wp.array2d(dtype=vec3),
         p: wp.array2d(dtype=vec),
         st: Worlds,
@@ -148,8 +141,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         q_out: wp.array2d(dtype=vec),
         viscous_work_out: wp.array2d(dtype=scalar),
     ):
-        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: 1 with it,
-        damping by mass, by stiffness."""
+        """q = tangent of all forces times p at node i, at constant pressure of the liquid."""
         i, w, lane = wp.tid()
         if st.running[w] == 0:
             return
@@ -157,39 +149,41 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             q_out[i, w] = vec()
             viscous_work_out[i, w] = scalar(0.0)
             return
+        lanes = elements.lanes
         q = vec()
-        for k in range(start[i] + lane, start[i + 1], lanes):
-            q += corner[slot[k], w]
+        for k in range(elements.start[i] + lane, elements.start[i + 1], lanes):
+            q += corner[elements.slot[k], w]
         q = sum_of_lanes(q, lanes)
         viscosity = scalar(st.viscosity[w])
         viscous_work_out[i, w] = viscosity * wp.dot(p[i, w], q)
         q = (scalar(1.0) + viscosity) * q
-        if inertia[0] > real(0.0):
-            h = dt[w]
-            m = st.density[w] * node_volume[i] / (h * h)
-            q = scalar(real(1.0) + inertia[2] / h) * q + scalar((real(1.0) + inertia[1] * h) * m) * p[i, w]
+        if inertia.on == 1:
+            h = inertia.dt[w]
+            m = st.density[w] * inertia.node_volume[i] / (h * h)
+            q = scalar(real(1.0) + inertia.stiffness_damping / h) * q
+            q += scalar((real(1.0) + inertia.mass_damping * h) * m) * p[i, w]
         push = vec()
-        for k in range(outer_start[i] + lane, outer_start[i + 1], lanes):
-            s = outer_slot[k]
-            if outer_touching[s // 3, w] == 1:
-                push += face_product(s, w, outer_face, outer_block, p)
-        if core_start.shape[0] > 0:
-            for k in range(core_start[i] + lane, core_start[i + 1], lanes):
-                s = core_slot[k]
-                if core_touching[s // 3, w] == 1:
-                    push += face_product(s, w, core_face, core_block, p)
-        if wet_start.shape[0] > 0:
+        for k in range(outer.start[i] + lane, outer.start[i + 1], lanes):
+            s = outer.slot[k]
+            if outer.touching[s // 3, w] == 1:
+                push += face_product(s, w, outer, p)
+        if core.start.shape[0] > 0:
+            for k in range(core.start[i] + lane, core.start[i + 1], lanes):
+                s = core.slot[k]
+                if core.touching[s // 3, w] == 1:
+                    push += face_product(s, w, core, p)
+        if liquid.start.shape[0] > 0:
             bend = vec()
-            for k in range(wet_start[i] + lane, wet_start[i + 1], lanes):
-                s = wet_slot[k]
-                t = wet_face[s // 3]
+            for k in range(liquid.start[i] + lane, liquid.start[i + 1], lanes):
+                s = liquid.slot[k]
+                t = liquid.face[s // 3]
                 p0 = p[t[0], w]
                 d1 = p[t[1], w] - p0
                 d2 = p[t[2], w] - p0
                 e1 = lower(x[t[1], w] - x[t[0], w])
                 e2 = lower(x[t[2], w] - x[t[0], w])
-                bend += scalar(wet[s // 3, w][s % 3]) * (wp.cross(d1, e2) + wp.cross(e1, d2))
-            push += scalar(real(0.5) * st.borne[w]) * bend
+                bend += scalar(liquid.wet[s // 3, w][s % 3]) * (wp.cross(d1, e2) + wp.cross(e1, d2))
+            push += scalar(real(0.5) * st.tangent_pressure[w]) * bend
         q_out[i, w] = q + sum_of_lanes(push, lanes)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -203,10 +197,10 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         wet: wp.array(dtype=int),
         on: wp.array(dtype=int),
         # Out:
-        part_out: wp.array3d(dtype=real),
+        partial_out: wp.array3d(dtype=real),
         any_active: wp.array(dtype=int),
     ):
-        """p . q, gradient . p and what is held by chunks."""
+        """p . q, gradient . p and the viscous work of a chunk of nodes [quantity, chunk, world]."""
         c, w = wp.tid()
         if c == 0 and w == 0:
             any_active[0] = 0
@@ -214,15 +208,15 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             return
         pq = real(0.0)
         gp = real(0.0)
-        hold = real(0.0)
+        viscous = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, p.shape[0])):
             pq += real(wp.dot(p[i, w], q[i, w]))
-            hold += real(viscous_work[i, w])
+            viscous += real(viscous_work[i, w])
             if wet.shape[0] > 0 and wet[i] == 1:
                 gp += wp.dot(gradient[i, w], raised(p[i, w]))
-        part_out[0, c, w] = pq
-        part_out[1, c, w] = gp
-        part_out[2, c, w] = hold
+        partial_out[0, c, w] = pq
+        partial_out[1, c, w] = gp
+        partial_out[2, c, w] = viscous
 
     @wp.kernel(module=module, enable_backward=False)
     def update_solution(
@@ -238,14 +232,15 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         dx: wp.array2d(dtype=vec),
         r: wp.array2d(dtype=vec),
         # Out:
-        part_out: wp.array3d(dtype=real),
+        partial_out: wp.array3d(dtype=real),
     ):
-        """dx += alpha p, r -= alpha (q + swell gradient); the square of r by chunks."""
+        """dx += alpha p and r -= alpha (q + pressure_response gradient) in a chunk of nodes, and the square
+        of r."""
         c, w = wp.tid()
         if st.active[w] == 0:
             return
         alpha = scalar(st.alpha[w])
-        swell = scalar(st.alpha[w] * st.swell[w])
+        pressure_response = scalar(st.alpha[w] * st.pressure_response[w])
         rr = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, p.shape[0])):
             if first == 1:
@@ -253,15 +248,16 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             else:
                 dx[i, w] = dx[i, w] + alpha * p[i, w]
             if st.running[w] == 1:
-                rest = r[i, w] - alpha * q[i, w]
+                residual = r[i, w] - alpha * q[i, w]
                 if wet.shape[0] > 0 and wet[i] == 1:
-                    rest -= swell * lower(gradient[i, w])
-                r[i, w] = rest
-                rr += real(wp.dot(rest, rest))
-        part_out[0, c, w] = rr
+                    residual -= pressure_response * lower(gradient[i, w])
+                r[i, w] = residual
+                rr += real(wp.dot(residual, residual))
+        partial_out[0, c, w] = rr
 
     @wp.kernel(module=module, enable_backward=False)
     def next_direction(z: wp.array2d(dtype=vec), st: Worlds, p: wp.array2d(dtype=vec)):
+        """p = z + beta p at node i."""
         i, w = wp.tid()
         if st.running[w] == 1:
             p[i, w] = z[i, w] + scalar(st.beta[w]) * p[i, w]
@@ -276,26 +272,27 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         # In and out:
         x: wp.array2d(dtype=vec3),
         # Out:
-        part_out: wp.array3d(dtype=real),
+        partial_out: wp.array3d(dtype=real),
     ):
-        """Takes the whole step; the residual's component along it, before, by chunks."""
+        """Takes the full step in a chunk of nodes; force . dx before the step."""
         c, w = wp.tid()
         if st.active[w] == 0:
             return
         if c == 0:
-            clear_line(st, w)
+            begin_line_search(st, w)
         slope = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, x.shape[0])):
             d = raised(dx[i, w])
             slope += wp.dot(force[i, w], d)
             x[i, w] = x[i, w] + d
-        part_out[1, c, w] = slope
+        partial_out[1, c, w] = slope
 
     @wp.kernel(module=module, enable_backward=False)
     def move(dx: wp.array2d(dtype=vec), st: Worlds, x: wp.array2d(dtype=vec3)):
+        """Moves node i by the change of the step length."""
         i, w = wp.tid()
         if st.moving[w] == 1:
-            x[i, w] = x[i, w] + st.longer[w] * raised(dx[i, w])
+            x[i, w] = x[i, w] + st.alpha_change[w] * raised(dx[i, w])
 
     @wp.kernel(module=module, enable_backward=False)
     def measure_slope(
@@ -307,23 +304,24 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         wet: wp.array(dtype=int),
         st: Worlds,
         # Out:
-        part_out: wp.array3d(dtype=real),
+        partial_out: wp.array3d(dtype=real),
         any_active: wp.array(dtype=int),
     ):
+        """force . dx and gradient . dx of a chunk of nodes."""
         c, w = wp.tid()
         if c == 0 and w == 0:
             any_active[0] = 0
         if st.moving[w] == 0:
             return
         slope = real(0.0)
-        swell = real(0.0)
+        pressure_response = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, force.shape[0])):
             d = raised(dx[i, w])
             slope += wp.dot(force[i, w], d)
             if wet.shape[0] > 0 and wet[i] == 1:
-                swell += wp.dot(gradient[i, w], d)
-        part_out[0, c, w] = slope
-        part_out[2, c, w] = swell
+                pressure_response += wp.dot(gradient[i, w], d)
+        partial_out[0, c, w] = slope
+        partial_out[2, c, w] = pressure_response
 
     return types.SimpleNamespace(
         assemble_product=assemble_product,

@@ -1,101 +1,114 @@
-"""The way of the geoms in a step, which most worlds go at once: who does not, which part of it a world tries
-next, geoms put to a share of it, and how far they came in the end."""
+"""Load increments: the path of the geoms within a step, which increment of it a world tries next, poses at a
+load factor, and the load factor at the end. Most worlds take the whole path in one increment."""
 
 import warp as wp
 
 from ..bodies import Bodies, follow_wrench
 from ..contact.posed import Geoms, LoadPath
-from ..contact.touch import FIXED, LAGGED, OWN
+from ..contact.touch import CURRENT, LAGGED, RECORDED
 from ..types import mat33, real, vec3
-from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_viscosity
+from .worlds import (
+    CONVERGED,
+    CUT_BACK_BEFORE,
+    INSIDE_CORE,
+    LAST_CUT_BACK,
+    NO_CUTBACK,
+    NOT_CONVERGED,
+    NOT_FINITE,
+    TRIED,
+    TRYING,
+    Worlds,
+    begin_try,
+    set_viscosity,
+)
 
 __all__ = [
     "end_try",
     "end_path",
-    "judge_increment",
-    "keep_geoms",
+    "choose_increment",
+    "accept_geoms",
     "lag_friction",
     "place_geoms",
-    "release_geoms",
+    "end_geoms",
     "partial_turn",
     "start_increment",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
-_FIRST_PART = wp.constant(wp.float64(0.25))  # of a way that could not be gone at once
-_FAR = wp.constant(wp.float64(1e3))  # [m]
+_FIRST_INCREMENT = wp.constant(wp.float64(0.25))  # load increment after a first try that failed
+_FAR = wp.constant(wp.float64(1e3))  # [m] coordinate of a geom that touches nothing
 
 
 @wp.kernel
 def end_try(st: Worlds, any_open: wp.array(dtype=int)):
-    """After a try: worlds that are in balance where their way ends are done, the others open. Balance with an
-    element inside out is none."""
+    """Ends a try: worlds in equilibrium at the end of their load path are finished. An equilibrium with an
+    inverted element counts as a failure."""
     w = wp.tid()
     st.active[w] = 0
     st.moving[w] = 0
-    if st.asked[w] == 0:
+    if st.unfinished[w] == 0:
         return
     if st.inverted[w] >= 2:
         st.failed[w] = 1
-    if _is_there(st, w):
-        _arrive(st, w)
+    if _is_finished(st, w):
+        _finish(st, w)
     else:
         any_open[0] = 1
 
 
 @wp.func
-def _is_own(st: Worlds, w: int):
-    """Whether friction is that of the balance that was found: of one with lagged bounds where it is that of
-    the balance before, which is found again at once."""
-    return st.slips[w] != LAGGED or st.iterations[w] == st.began[w]
+def _bound_is_current(st: Worlds, w: int):
+    """Whether the friction bound is that of the present equilibrium. A lagged bound is, if no iteration was
+    needed."""
+    return st.friction_mode[w] != LAGGED or st.iterations[w] == st.start_iterations[w]
 
 
 @wp.func
-def _comes_to_rest(st: Worlds, w: int):
-    """Whether the bounds of friction come to rest while it holds on to where the part began: after two rounds
-    the errors at which they begin must be small, and halve."""
+def _bounds_converge(st: Worlds, w: int):
+    """Whether the rounds of lagged friction bounds converge with fixed anchors: from the second round on, the
+    error at the start of a round must halve from round to round."""
     rounds = st.rounds[w]
     most = wp.where(rounds < 3, real(1.0), real(0.8) * wp.pow(real(0.5), real(rounds)))
-    return rounds < 2 or st.opened[w] < most
+    return rounds < 2 or st.start_error[w] < most
 
 
 @wp.func
-def _is_there(st: Worlds, w: int):
-    """Whether it is in balance at the end of its way."""
-    return st.failed[w] == 0 and st.trial_factor[w] == real(1.0) and _is_own(st, w)
+def _is_finished(st: Worlds, w: int):
+    """Whether the world is in equilibrium at the end of its load path."""
+    return st.failed[w] == 0 and st.trial_factor[w] == real(1.0) and _bound_is_current(st, w)
 
 
 @wp.func
-def _arrive(st: Worlds, w: int):
+def _finish(st: Worlds, w: int):
     set_viscosity(st, w, real(0.0))
-    st.slips[w] = OWN
+    st.friction_mode[w] = CURRENT
     st.load_factor[w] = real(1.0)
     st.reason[w] = CONVERGED
-    st.asked[w] = 0
+    st.unfinished[w] = 0
 
 
 @wp.kernel
-def judge_increment(
+def choose_increment(
     shortest: real,
     max_work: int,
     st: Worlds,
     passed: wp.array(dtype=int),
     any_increment: wp.array(dtype=int),
 ):
-    """Accept or cut back each open world's load increment and choose the next: they are moving.
+    """Accepts or cuts back the load increment of each unfinished world and chooses the next one. Worlds that
+    continue are moving.
 
-    The first try is the whole load path from a guess. Increments cost together hardly more than the whole,
-    and converged ones are kept: so they begin short. Where an increment ends the skin sticks or slips, and
-    the next one slips on from there.
+    The first try takes the whole load path. Increments start short, since together they cost little more than
+    the whole path, and converged ones are kept. Anchors are committed at the end of each increment.
 
-    Where friction is several times the push, Newton's method cycles: the push bounds what slips, and depends
-    on it. So after a failed increment, and from the start for friction that depends on load, the bound is
-    lagged: it is that of the push in the last equilibrium. With fixed bounds forces have a potential, but for
-    adhesion, and an equilibrium is found. Bounds are renewed until they repeat; if they do not, the skin
-    slips on from each equilibrium, which dissipates energy, and so comes to rest.
+    Where friction is several times the normal force, Newton's method cycles, since the normal force bounds
+    the slip and depends on it. After a failed increment, and always for load-dependent friction, the bound is
+    therefore lagged: it is computed from the normal forces of the last equilibrium. With fixed bounds the
+    forces have a potential (except adhesion). The bounds are updated until they repeat. If they do not, the
+    anchors are committed at each equilibrium; slip then dissipates energy, so that the iteration ends.
 
-    passed: flags that were looked at.
+    passed: flags of earlier kernels, which are cleared.
     """
     w = wp.tid()
     if w == 0:
@@ -103,25 +116,25 @@ def judge_increment(
             passed[k] = 0
     st.active[w] = 0
     st.moving[w] = 0
-    st.kept[w] = 0
-    st.returns[w] = 0
-    if st.asked[w] == 0:
+    st.accepted[w] = 0
+    st.restores[w] = 0
+    if st.unfinished[w] == 0:
         return
-    if st.rests[w] == 1:  # the next try is that of a skin at rest
-        st.rests[w] = 2
+    if st.reference_try[w] == TRYING:
+        st.reference_try[w] = TRIED
         st.active[w] = 1
         return
-    if _is_there(st, w):
-        _arrive(st, w)
+    if _is_finished(st, w):
+        _finish(st, w)
         return
     set_viscosity(st, w, real(0.0))
-    again = st.failed[w] == 0 and not _is_own(st, w)
-    st.slips[w] = OWN
+    again = st.failed[w] == 0 and not _bound_is_current(st, w)
+    st.friction_mode[w] = CURRENT
     if again:
         st.rounds[w] = st.rounds[w] + 1
-        if _comes_to_rest(st, w):  # the same part, with friction of the balance that was found
+        if _bounds_converge(st, w):  # the same increment, with the bounds of the equilibrium that was found
             if max_work - st.work[w] < max_work / 10:
-                st.asked[w] = 0
+                st.unfinished[w] = 0
                 return
             st.moving[w] = 1
             any_increment[0] = 1
@@ -130,31 +143,31 @@ def judge_increment(
         st.rounds[w] = 0
     increment = st.increment[w]
     if st.failed[w] == 0:
-        st.kept[w] = 1
+        st.accepted[w] = 1
         st.load_factor[w] = st.trial_factor[w]
-        if st.cut_back[w] == 1 and not again:
-            st.cut_back[w] = 2
+        if st.cut_back[w] == LAST_CUT_BACK and not again:
+            st.cut_back[w] = CUT_BACK_BEFORE
         elif not again:
             increment = real(2.0) * increment
-    elif st.load_factor[w] == real(1.0):  # friction did not come to rest
+    elif st.load_factor[w] == real(1.0):  # the friction bounds did not converge
         increment = real(0.0)
     elif increment == real(0.0):
         st.reason[w] = NOT_CONVERGED
-        increment = _FIRST_PART
+        increment = _FIRST_INCREMENT
         if st.deep[w] == 1:
             st.reason[w] = INSIDE_CORE
         if st.guessed[w] == 1:
             increment = real(0.0)
     else:
         increment = real(0.5) * increment
-        st.cut_back[w] = 1
+        st.cut_back[w] = LAST_CUT_BACK
     if increment < shortest or max_work - st.work[w] < max_work / 10:
-        st.asked[w] = 0
+        st.unfinished[w] = 0
         return
     if not again:
         st.increment[w] = wp.min(increment, real(1.0) - st.load_factor[w])
         st.trial_factor[w] = st.load_factor[w] + st.increment[w]
-    st.returns[w] = 1
+    st.restores[w] = 1
     st.moving[w] = 1
     any_increment[0] = 1
 
@@ -163,7 +176,7 @@ def judge_increment(
 def start_increment(
     limit: int, max_work: int, st: Worlds, any_increment: wp.array(dtype=int), any_lagged: wp.array(dtype=int)
 ):
-    """Worlds that are moving try the next part of their way."""
+    """Starts the next load increment of the moving worlds."""
     w = wp.tid()
     if w == 0:
         any_increment[0] = 0
@@ -173,26 +186,26 @@ def start_increment(
         st.failed[w] = 0
         st.deep[w] = 0
         begin_try(st, w, limit, max_work)
-        if st.cut_back[w] > 0 or st.by_load[w] == 1:
-            st.slips[w] = FIXED
+        if st.cut_back[w] != NO_CUTBACK or st.load_dependent[w] == 1:
+            st.friction_mode[w] = RECORDED
             st.lagged[w] = 1
             any_lagged[0] = 1
 
 
 @wp.kernel
 def lag_friction(st: Worlds, any_lagged: wp.array(dtype=int)):
-    """The bounds are known: from there on they are fixed."""
+    """Fixes the friction bounds that an evaluation has recorded."""
     w = wp.tid()
     if w == 0:
         any_lagged[0] = 0
     if st.lagged[w] == 1:
         st.work[w] = st.work[w] + 1
-        st.slips[w] = LAGGED
+        st.friction_mode[w] = LAGGED
 
 
 @wp.func
 def partial_turn(begin: mat33, end: mat33, fraction: real):
-    """Attitude at a share of the turn between two, about one axis."""
+    """Rotation at a fraction of the turn from `begin` to `end`, about one axis."""
     turn = wp.quat_from_matrix(wp.transpose(begin) * end)
     u = vec3(turn[0], turn[1], turn[2])
     half = wp.atan2(wp.length(u), wp.abs(turn[3]))
@@ -210,8 +223,8 @@ def place_geoms(
     # Out:
     geoms: Geoms,
 ):
-    """Puts the geoms of the worlds that are on to a share of their way: along a line, turning about one
-    axis; and from there where their bodies go with the wrenches `posed`."""
+    """Places geom g at a load factor of its path, along a line and about one axis. A compliant body is moved
+    further by the wrench `posed`."""
     g, w = wp.tid()
     if on[w] == 0:
         return
@@ -220,7 +233,7 @@ def place_geoms(
     if f == real(1.0):
         geoms.pos[g, w] = path.pos_end[g, w]
         geoms.mat[g, w] = path.mat_end[g, w]
-    elif not wp.isfinite(begin[0] + begin[1] + begin[2]):  # bad input, and no pose before
+    elif not wp.isfinite(begin[0] + begin[1] + begin[2]):  # bad input, and no previous pose
         geoms.pos[g, w] = vec3(_FAR, _FAR, _FAR)
         geoms.mat[g, w] = wp.identity(n=3, dtype=real)
     elif f == real(0.0):
@@ -241,17 +254,18 @@ def place_geoms(
 
 
 @wp.kernel
-def keep_geoms(geoms: Geoms, kept: wp.array(dtype=int)):
-    """From there on counts how far what touches anew has slipped."""
+def accept_geoms(geoms: Geoms, accepted: wp.array(dtype=int)):
+    """Stores the poses at the end of an accepted increment: slip of new contact counts from there."""
     g, w = wp.tid()
-    if kept[w] == 1:
+    if accepted[w] == 1:
         geoms.pos_last[g, w] = geoms.pos[g, w]
         geoms.mat_last[g, w] = geoms.mat[g, w]
 
 
 @wp.kernel
 def end_path(st: Worlds, any_short: wp.array(dtype=int)):
-    """Worlds that ended before their load path did are moving, those that are where they were have failed."""
+    """Ends the load path of world w. Worlds that did not reach its end are moving; they have failed if no
+    increment converged."""
     w = wp.tid()
     f = st.load_factor[w]
     st.moving[w] = 0
@@ -268,9 +282,9 @@ def end_path(st: Worlds, any_short: wp.array(dtype=int)):
 
 
 @wp.kernel
-def release_geoms(geoms: Geoms, path: LoadPath, st: Worlds, motion_out: wp.array2d(dtype=vec3)):
-    """Makes the poses that were reached those of the last step, tells the motion to there, and writes back
-    what was set."""
+def end_geoms(geoms: Geoms, path: LoadPath, st: Worlds, motion_out: wp.array2d(dtype=vec3)):
+    """Stores the poses that geom g reached and its motion in this step [m], and restores the poses that the
+    caller set."""
     g, w = wp.tid()
     if st.wanted[w] == 0:
         return

@@ -1,6 +1,6 @@
-"""Forces at the nodes of all worlds, and the beginning and end of their step.
+"""Kernels over nodes: sums of forces, residual, inertia and damping, start and end of a step.
 
-Sums over nodes go chunk by chunk, so that their order is always the same.
+Sums over nodes are made chunk by chunk, so that their order is always the same.
 """
 
 import functools
@@ -12,19 +12,58 @@ from ..types import Precision, mat33, real, sum_of_lanes, vec3
 from .worlds import Worlds
 
 __all__ = [
+    "LiquidForces",
+    "NodeSlots",
+    "SurfaceForces",
     "assemble_force",
     "begin_nodes",
     "end_core",
     "end_nodes",
-    "fly_freely",
-    "keep_nodes",
-    "lie_at_rest",
+    "predict_free_flight",
+    "accept_nodes",
+    "set_to_reference",
     "correct_pressure",
     "nodes_kernels",
-    "return_nodes",
+    "restore_nodes",
 ]
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class NodeSlots:
+    """CSR lists of element corners: node i sums slot[start[i]] to slot[start[i + 1]], with `lanes`
+    threads."""
+
+    lanes: int
+    start: wp.array(dtype=int)
+    slot: wp.array(dtype=int)
+
+
+@wp.struct
+class SurfaceForces:
+    """Contact of a surface, to be summed into nodes; without such a surface all arrays are empty."""
+
+    face: wp.array(dtype=wp.vec3i)
+    start: wp.array(dtype=int)  # CSR lists of the corners at each node, by 3 face + corner
+    slot: wp.array(dtype=int)
+    touching: wp.array2d(dtype=int)  # [face, world]
+    corner: wp.array2d(dtype=vec3)  # forces [3 face + corner, world] [N]
+    block: wp.array2d(dtype=mat33)  # tangent [6 face + block, world] [N/m]
+    node_force: wp.array2d(dtype=vec3)  # [node, world] [N]
+
+
+@wp.struct
+class LiquidForces:
+    """Gradient of the liquid's volume, to be summed into nodes; without a liquid all arrays are empty."""
+
+    face: wp.array(dtype=wp.vec3i)
+    start: wp.array(dtype=int)  # CSR lists of the corners at each node, by 3 face + corner
+    slot: wp.array(dtype=int)
+    wet: wp.array2d(dtype=vec3)  # fraction of a face's area that is wet, by corners [face, world]
+    corner: wp.array2d(dtype=vec3)  # gradient [3 face + corner, world] [m^2]
+    node: wp.array(dtype=int)  # 1: the node belongs to the inner surface
+    gradient: wp.array2d(dtype=vec3)  # [node, world] [m^2]
 
 
 @wp.kernel
@@ -36,53 +75,55 @@ def begin_nodes(
     # In and out:
     x: wp.array2d(dtype=vec3),
     # Out:
-    begun_out: wp.array2d(dtype=vec3),
+    x_start_out: wp.array2d(dtype=vec3),
 ):
-    """Starts from the last step's increment, as far as the geoms repeat their last motion."""
+    """Initial guess of node i: the last step's increment times `repeat`."""
     i, w = wp.tid()
-    begun_out[i, w] = x[i, w]
+    x_start_out[i, w] = x[i, w]
     if st.active[w] == 1 and mask[i] > real(0.0) and st.repeat[w] > real(0.0):
         x[i, w] = x[i, w] + st.repeat[w] * increment[i, w]
 
 
 @wp.kernel
-def return_nodes(
+def restore_nodes(
     # In:
-    begun: wp.array2d(dtype=vec3),
+    x_start: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
     # Out:
     x: wp.array2d(dtype=vec3),
 ):
-    """Back to the last converged load increment."""
+    """Returns node i to the equilibrium of the last accepted load increment."""
     i, w = wp.tid()
     if on[w] == 1:
-        x[i, w] = begun[i, w]
+        x[i, w] = x_start[i, w]
 
 
 @wp.kernel
-def lie_at_rest(
+def set_to_reference(
     # In:
     rest: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
     # Out:
     x: wp.array2d(dtype=vec3),
 ):
-    """To where nothing touches; rest is [nvert, 1], or each world's own."""
+    """Moves node i to the reference configuration, rest [nvert, 1 or nworld]."""
     i, w = wp.tid()
     if on[w] == 1:
         x[i, w] = rest[i, w % rest.shape[1]]
 
 
 @wp.kernel
-def keep_nodes(x: wp.array2d(dtype=vec3), kept: wp.array(dtype=int), begun_out: wp.array2d(dtype=vec3)):
-    """The next part begins where one ended that was gone."""
+def accept_nodes(
+    x: wp.array2d(dtype=vec3), accepted: wp.array(dtype=int), x_start_out: wp.array2d(dtype=vec3)
+):
+    """Stores node i at the end of an accepted load increment."""
     i, w = wp.tid()
-    if kept[w] == 1:
-        begun_out[i, w] = x[i, w]
+    if accepted[w] == 1:
+        x_start_out[i, w] = x[i, w]
 
 
 @wp.kernel
-def fly_freely(
+def predict_free_flight(
     # In:
     x: wp.array2d(dtype=vec3),
     velocity: wp.array2d(dtype=vec3),
@@ -95,7 +136,7 @@ def fly_freely(
     world_out: wp.array2d(dtype=vec3),
     target_out: wp.array2d(dtype=vec3),
 ):
-    """Where free flight would take the nodes, seen from the moved BioTac frame."""
+    """Position of node i at the end of a step without forces, in the moved BioTac frame [m]."""
     i, w = wp.tid()
     at = mat_last[w] * x[i, w] + pos_last[w]
     world_out[i, w] = at
@@ -105,67 +146,55 @@ def fly_freely(
 @wp.kernel
 def assemble_force(
     # In:
-    lanes: int,
-    start: wp.array(dtype=int),
-    slot: wp.array(dtype=int),
+    elements: NodeSlots,
     corner: wp.array2d(dtype=vec3),
-    outer_start: wp.array(dtype=int),
-    outer_slot: wp.array(dtype=int),
-    outer_touching: wp.array2d(dtype=int),
-    outer_corner: wp.array2d(dtype=vec3),
-    core_start: wp.array(dtype=int),
-    core_slot: wp.array(dtype=int),
-    core_touching: wp.array2d(dtype=int),
-    core_corner: wp.array2d(dtype=vec3),
-    wet_start: wp.array(dtype=int),
-    wet_slot: wp.array(dtype=int),
-    wet_corner: wp.array2d(dtype=vec3),
     external: wp.array2d(dtype=vec3),
     pressure: wp.array(dtype=real),
     on: wp.array(dtype=int),
+    # In and out:
+    outer: SurfaceForces,
+    core: SurfaceForces,
+    liquid: LiquidForces,
     # Out:
     force_out: wp.array2d(dtype=vec3),
-    outer_out: wp.array2d(dtype=vec3),
-    core_out: wp.array2d(dtype=vec3),
-    gradient_out: wp.array2d(dtype=vec3),
 ):
-    """Sums what the corners of elements and faces hold into their nodes, each by so many lanes of a warp,
-    which all write the same. Arrays of length zero: there is no such thing."""
+    """Sums the forces of elements, contact, liquid and loads at node i [N]. All lanes write the same."""
     i, w, lane = wp.tid()
     if on[w] == 0:
         return
+    lanes = elements.lanes
     total = vec3()
-    for k in range(start[i] + lane, start[i + 1], lanes):
-        total += corner[slot[k], w]
+    for k in range(elements.start[i] + lane, elements.start[i + 1], lanes):
+        total += corner[elements.slot[k], w]
     total = sum_of_lanes(total, lanes)
     if external.shape[0] > 0:
         total += external[i, w]
     push = vec3()
-    for k in range(outer_start[i] + lane, outer_start[i + 1], lanes):
-        s = outer_slot[k]
-        if outer_touching[s // 3, w] == 1:
-            push += outer_corner[s, w]
+    for k in range(outer.start[i] + lane, outer.start[i + 1], lanes):
+        s = outer.slot[k]
+        if outer.touching[s // 3, w] == 1:
+            push += outer.corner[s, w]
     push = sum_of_lanes(push, lanes)
-    if outer_start[i + 1] > outer_start[i]:  # elsewhere it stays zero
-        outer_out[i, w] = push
+    if outer.start[i + 1] > outer.start[i]:  # elsewhere it stays zero
+        outer.node_force[i, w] = push
         total += push
-    if core_start.shape[0] > 0:
+    if core.start.shape[0] > 0:
         push = vec3()
-        for k in range(core_start[i] + lane, core_start[i + 1], lanes):
-            s = core_slot[k]
-            if core_touching[s // 3, w] == 1:
-                push += core_corner[s, w]
+        for k in range(core.start[i] + lane, core.start[i + 1], lanes):
+            s = core.slot[k]
+            if core.touching[s // 3, w] == 1:
+                push += core.corner[s, w]
         push = sum_of_lanes(push, lanes)
-        if core_start[i + 1] > core_start[i]:
-            core_out[i, w] = push
+        if core.start[i + 1] > core.start[i]:
+            core.node_force[i, w] = push
             total += push
-    if wet_start.shape[0] > 0:
+    if liquid.start.shape[0] > 0:
         push = vec3()
-        for k in range(wet_start[i] + lane, wet_start[i + 1], lanes):
-            push += wet_corner[wet_slot[k], w]
+        for k in range(liquid.start[i] + lane, liquid.start[i + 1], lanes):
+            push += liquid.corner[liquid.slot[k], w]
         push = sum_of_lanes(push, lanes)
-        if wet_start[i + 1] > wet_start[i]:
-            gradient_out[i, w] = push
+        if liquid.start[i + 1] > liquid.start[i]:
+            liquid.gradient[i, w] = push
             total += pressure[w] * push
     force_out[i, w] = total
 
@@ -180,14 +209,15 @@ def correct_pressure(
     x: wp.array2d(dtype=vec3),
     force: wp.array2d(dtype=vec3),
 ):
-    """Brings the volume to the pressure that `worlds.judge_balance` has found, along the volume's gradient,
-    and the liquid's forces with it. What that little motion does to other forces is not asked."""
+    """Moves node i along the volume's gradient so that the volume fits the pressure that
+    `worlds.check_convergence` has found, and corrects the liquid's force. The motion is too small to change
+    other forces."""
     i, w = wp.tid()
     pressure_correction = st.pressure_correction[w]
     if pressure_correction == real(0.0):
         return
     g = gradient[i, w]
-    force[i, w] = force[i, w] - st.swell[w] * g
+    force[i, w] = force[i, w] - st.pressure_response[w] * g
     if mask[i] > real(0.0):
         x[i, w] = x[i, w] + pressure_correction * g
 
@@ -208,6 +238,7 @@ def end_nodes(
     increment_out: wp.array2d(dtype=vec3),
     velocity_out: wp.array2d(dtype=vec3),
 ):
+    """Stores increment, position and velocity of node i at the end of a step."""
     i, w = wp.tid()
     if wanted[w] == 0:
         return
@@ -224,6 +255,7 @@ def end_core(
     pos_out: wp.array(dtype=vec3),
     mat_out: wp.array(dtype=mat33),
 ):
+    """Stores the pose of the BioTac frame at the end of a step."""
     w = wp.tid()
     pos_out[w] = pos[w]
     mat_out[w] = mat[w]
@@ -231,7 +263,7 @@ def end_core(
 
 @functools.cache
 def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
-    """Kernels that know directions, for one precision of them."""
+    """Kernels with directions, for one precision of these."""
     module = f"{__name__}.{precision.name}"
     vec, lower, raised = precision.vec, precision.lower, precision.raised
 
@@ -251,6 +283,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         # Out:
         inertial_out: wp.array2d(dtype=vec),
     ):
+        """Inertial force of node i and its damping by mass, of backward Euler [N]."""
         i, w = wp.tid()
         if on[w] == 0:
             return
@@ -267,6 +300,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         on: wp.array(dtype=int),
         out: wp.array2d(dtype=vec),
     ):
+        """Displacement of node i in this step [m]."""
         i, w = wp.tid()
         if on[w] == 1:
             out[i, w] = lower(x[i, w] - x_last[i, w])
@@ -283,7 +317,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         # In and out:
         force: wp.array2d(dtype=vec3),
     ):
-        """Rayleigh damping by the stiffness: `corner` is the tangent times the step's displacement."""
+        """Rayleigh damping of node i by the stiffness. corner: tangent times the step's displacement."""
         i, w = wp.tid()
         if on[w] == 0:
             return
@@ -299,32 +333,28 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         chunk: int,
         mask: wp.array(dtype=real),
         force: wp.array2d(dtype=vec3),
-        outer_start: wp.array(dtype=int),
-        outer: wp.array2d(dtype=vec3),
-        core_start: wp.array(dtype=int),
-        core: wp.array2d(dtype=vec3),
+        outer: SurfaceForces,
+        core: SurfaceForces,
+        liquid: LiquidForces,
         external: wp.array2d(dtype=vec3),
-        wet: wp.array(dtype=int),
-        gradient: wp.array2d(dtype=vec3),
         x: wp.array2d(dtype=vec3),
         rest: wp.array2d(dtype=vec3),
         inertial: wp.array2d(dtype=vec),
-        on: wp.array(dtype=int),
+        st: Worlds,
         # Out:
         r_out: wp.array2d(dtype=vec),
-        part_out: wp.array3d(dtype=real),
-        touch_out: wp.array(dtype=int),
+        norms_out: wp.array3d(dtype=real),
         any_active: wp.array(dtype=int),
     ):
-        """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the
-        work of inertia."""
+        """Residual r of a chunk of nodes; norms [quantity, chunk, world]: square of r, work of the loads,
+        square of the volume's gradient, work of inertia."""
         c, w = wp.tid()
         if c == 0 and w == 0:
             any_active[0] = 0
-        if on[w] == 0:
+        if st.active[w] == 0:
             return
         if c == 0:
-            touch_out[w] = 0
+            st.touched[w] = 0
         rr = real(0.0)
         work = real(0.0)
         gg = real(0.0)
@@ -335,25 +365,25 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
                 f = force[i, w]
                 rr += wp.length_sq(f)
                 r = lower(f)
-                if wet.shape[0] > 0 and wet[i] == 1:
-                    gg += wp.length_sq(gradient[i, w])
+                if liquid.node.shape[0] > 0 and liquid.node[i] == 1:
+                    gg += wp.length_sq(liquid.gradient[i, w])
             r_out[i, w] = r
             load = vec3()
-            if outer_start[i + 1] > outer_start[i]:
-                load = outer[i, w]
-            if core_start.shape[0] > 0 and core_start[i + 1] > core_start[i]:
-                load += core[i, w]
+            if outer.start[i + 1] > outer.start[i]:
+                load = outer.node_force[i, w]
+            if core.start.shape[0] > 0 and core.start[i + 1] > core.start[i]:
+                load += core.node_force[i, w]
             if external.shape[0] > 0:
                 load += external[i, w]
-            if inertial.shape[0] > 0 or wp.length_sq(load) > real(0.0):  # of few nodes otherwise
+            if inertial.shape[0] > 0 or wp.length_sq(load) > real(0.0):  # few nodes have a load
                 u = x[i, w] - rest[i, w % rest.shape[1]]
                 work += wp.dot(load, u)
                 if inertial.shape[0] > 0:
                     fly += wp.dot(raised(inertial[i, w]), u)
-        part_out[0, c, w] = rr
-        part_out[1, c, w] = work
-        part_out[2, c, w] = gg
-        part_out[3, c, w] = fly
+        norms_out[0, c, w] = rr
+        norms_out[1, c, w] = work
+        norms_out[2, c, w] = gg
+        norms_out[3, c, w] = fly
 
     return types.SimpleNamespace(
         add_inertia=add_inertia, displacement=displacement, add_damping=add_damping, residuals=residuals

@@ -1,19 +1,25 @@
-"""What decides: one thread for each world begins its step, judges its balance, steers its line
-search and ends its step."""
+"""Control of Newton's method in each world: start of a step, convergence test, artificial viscosity, line
+search, end of a step. Kernels run one thread per world, or one block where they sum over nodes."""
 
 import warp as wp
 
 from ..contact.posed import Geoms, LoadPath
-from ..contact.touch import LAGGED, OWN
+from ..contact.touch import CURRENT, LAGGED
 from ..types import real, sum_of_block, vec3, vec6
 
 __all__ = [
-    "BALANCED",
+    "NEGLIGIBLE_RESIDUAL",
     "BLOCK",
     "CONVERGED",
     "INSIDE_CORE",
+    "CUT_BACK_BEFORE",
+    "LAST_CUT_BACK",
     "NOT_CONVERGED",
     "NOT_FINITE",
+    "NO_CUTBACK",
+    "TRIED",
+    "TRYING",
+    "UNTRIED",
     "Worlds",
     "all_on",
     "begin_try",
@@ -21,11 +27,11 @@ __all__ = [
     "choose_viscosity",
     "choose_length",
     "end_worlds",
-    "find_lost",
-    "judge_balance",
+    "mark_failed",
+    "check_convergence",
     "modulus_of",
     "set_viscosity",
-    "start_at_rest",
+    "begin_reference_try",
     "total_of",
     "totals_of",
 ]
@@ -35,23 +41,29 @@ wp.set_module_options({"enable_backward": False})
 # reason of a world's last step
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
-BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
+NEGLIGIBLE_RESIDUAL = 1e-9  # [N] norm of the residual that is rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
-# times what a pressure may be off, if it is corrected by volume alone; `give` of liquid that is stiff enough
-_CORRECTED, _STIFFER = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
-_LAGGED_TO = wp.constant(wp.float64(0.05))  # of the error at which a round of lagged friction began
-_REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
+# a pressure error of up to this many tolerances is corrected without an iteration, if `compliance_ratio` is
+# at most the second number
+_CORRECTED, _STIFF_LIQUID = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
+_LAGGED_TOLERANCE = wp.constant(wp.float64(0.05))  # of the error at which a round of lagged friction starts
+_LEAST_REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] lower limit of `reference`
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
-_TRIES = wp.constant(12)  # of a line search
-_SLOW = wp.constant(8)  # iterations of a try after which artificial viscosity may begin
-# by which the viscosity shrinks after a good full step, and grows after a bad one
-_QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
-# viscosity that counts as none, and with which skin is stiffer than contact
-_AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
-_AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
-# error below which no viscosity begins, since rounding is no circle, and none is pulled ever further
-_NEAR = wp.constant(wp.float64(0.01))
+_MAX_TRIES = wp.constant(12)  # evaluations of a line search
+_VISCOUS_AFTER = wp.constant(8)  # iterations of a try before artificial viscosity may start
+# the viscosity is divided by the first after a good full step, and multiplied by the second after a bad one
+_DECREASE, _INCREASE = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
+# a lower viscosity is set to zero; a higher one makes the skin stiffer than contact, and the try fails
+_LEAST_VISCOSITY, _MOST_VISCOSITY = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
+_LIQUID_STIFFNESS = wp.constant(wp.float64(40.0))  # bulk modulus of the liquid in a line search, over E
+# error below which a bad iteration may be rounding: no viscosity starts, and adhesion does not lengthen steps
+_SMALL_ERROR = wp.constant(wp.float64(0.01))
+
+# values of `Worlds.reference_try`
+UNTRIED, TRYING, TRIED = (wp.constant(i) for i in range(3))
+# values of `Worlds.cut_back`: no increment was cut back; the last one was; an earlier one was
+NO_CUTBACK, LAST_CUT_BACK, CUT_BACK_BEFORE = (wp.constant(i) for i in range(3))
 
 
 @wp.struct
@@ -62,106 +74,107 @@ class Worlds:
     lam: wp.array(dtype=real)
     contact_stiffness: wp.array(dtype=real)  # pressure per overclosure [Pa/m]
     density: wp.array(dtype=real)  # [kg/m^3], of implicit dynamics
-    softness: wp.array(dtype=real)  # E of the model over E of the world, less where it is viscous
-    elastic: wp.array(dtype=real)  # where it does, what it is otherwise
-    viscosity: wp.array(
-        dtype=real
-    )  # artificial: rubber resists an iteration as if it were stiffer by so much
-    viscous_work: wp.array(dtype=real)  # work of the artificial viscosity along a direction [J]
+    softness: wp.array(dtype=real)  # E of the model over E of the world, reduced by the viscosity
+    elastic_softness: wp.array(dtype=real)  # the same without viscosity
+    viscosity: wp.array(dtype=real)  # artificial, over the elastic stiffness of an iteration
+    viscous_work: wp.array(dtype=real)  # of the artificial viscosity along a direction [J]
+    # liquid
     kappa: wp.array(dtype=real)  # K / natural volume [Pa/m^3]
     natural: wp.array(dtype=real)  # volume of the liquid without pressure [m^3]
-    holds: wp.array(dtype=int)  # the volume is kept: the liquid is incompressible
+    keeps_volume: wp.array(dtype=int)  # the liquid is incompressible, or its pressure is prescribed
     offset: wp.array(dtype=real)  # pressure at the natural volume [Pa]
-    reference: wp.array(dtype=real)  # of `wet_faces` [Pa]
-    last_pressure: wp.array(dtype=real)  # when the last step ended, above the surroundings [Pa]
+    reference: wp.array(dtype=real)  # p_ref of `wet_faces` [Pa]
+    last_pressure: wp.array(dtype=real)  # at the end of the last step, above the surroundings [Pa]
     pressure: wp.array(dtype=real)  # at the last evaluation [Pa]
-    before: wp.array(dtype=real)  # where the linear solve began [Pa]
-    foreseen: wp.array(dtype=real)  # where it leads to, see `choose_length` [Pa]
-    borne: wp.array(dtype=real)  # that the tangent has: the one foreseen, as far as the skin went there [Pa]
-    give: wp.array(dtype=real)  # some E over K, 1 at most
-    stiff: wp.array(dtype=real)  # fraction of the liquid's stiffness that the line search knows
-    volume: wp.array(dtype=real)  # of the liquid there [m^3]
-    wanted: wp.array(dtype=int)  # takes part in this step; who does not stays as the last one left it
-    asked: wp.array(dtype=int)  # its input can be solved, and its load path has not ended
-    active: wp.array(dtype=int)  # not yet in balance
-    running: wp.array(dtype=int)  # its linear solve goes on
-    moving: wp.array(dtype=int)  # its line search goes on
+    volume: wp.array(dtype=real)  # at the last evaluation [m^3]
+    start_pressure: wp.array(dtype=real)  # at the start of the linear solve [Pa]
+    predicted_pressure: wp.array(dtype=real)  # by the linear solve, see `choose_length` [Pa]
+    tangent_pressure: wp.array(dtype=real)  # in the tangent: moves to the predicted one by `alpha` [Pa]
+    compliance_ratio: wp.array(dtype=real)  # 40 E / K, at most 1
+    bulk_fraction: wp.array(dtype=real)  # fraction of the liquid's stiffness in the line search
+    # phase of the solve
+    wanted: wp.array(dtype=int)  # takes part in this step; other worlds keep the state of their last step
+    unfinished: wp.array(dtype=int)  # its input can be solved, and its load path has not ended
+    active: wp.array(dtype=int)  # has not converged
+    running: wp.array(dtype=int)  # its linear solve continues
+    moving: wp.array(dtype=int)  # its line search continues
     failed: wp.array(dtype=int)
     deep: wp.array(dtype=int)  # a geom is inside the core
     touched: wp.array(dtype=int)  # a geom or the core touches
-    slips: wp.array(dtype=int)  # how friction is bounded: OWN, FIXED or LAGGED, see `contact.touch`
-    pulls: wp.array(dtype=int)  # geoms pull: adhesion has no tangent where it softens
-    by_load: wp.array(dtype=int)  # its friction depends on load
-    inverted: wp.array(dtype=int)  # a tetrahedron is at the last evaluation, see `ElementForces.push_corners`
-    reason: wp.array(dtype=int)
-    nonconverged: wp.array(dtype=int)  # steps since reset
-    iterations: wp.array(dtype=int)
-    began: wp.array(dtype=int)  # iterations before the present try
-    limit: wp.array(dtype=int)  # of iterations, at which the present try ends
-    allowed: wp.array(dtype=int)  # work, at which it ends
-    error: wp.array(dtype=real)
-    last_error: wp.array(dtype=real)  # of the iteration before
-    best: wp.array(dtype=real)  # square of the error that this try has not halved since iteration `since`
-    since: wp.array(dtype=int)
+    friction_mode: wp.array(dtype=int)  # CURRENT, CONSISTENT, RECORDED or LAGGED, see `contact.touch`
+    adhesive: wp.array(dtype=int)  # has adhesion, whose softening branch has no tangent
+    load_dependent: wp.array(dtype=int)  # its friction coefficient depends on pressure
+    inverted: wp.array(dtype=int)  # by an element, at the last evaluation: `ElementForces.evaluate_corners`
+    reason: wp.array(dtype=int)  # CONVERGED, NOT_FINITE, INSIDE_CORE or NOT_CONVERGED
+    nonconverged: wp.array(dtype=int)  # steps that did not converge since the reset
+    iterations: wp.array(dtype=int)  # of Newton's method in this step
+    start_iterations: wp.array(dtype=int)  # `iterations` at the start of the try
+    iteration_limit: wp.array(dtype=int)  # of `iterations` in the try
+    work_limit: wp.array(dtype=int)  # of `work` in the try
+    error: wp.array(dtype=real)  # estimated, relative, in the energy norm
+    last_error: wp.array(dtype=real)  # of the previous iteration
+    best_square: wp.array(dtype=real)  # square of the last error that halved the one before it
+    since: wp.array(dtype=int)  # iteration in which that was reached
+    # load path
     load_factor: wp.array(dtype=real)  # fraction of the load path at which the skin is in equilibrium
-    trial_factor: wp.array(dtype=real)  # load factor that is tried
-    increment: wp.array(dtype=real)  # between both; 0: the first try
-    cut_back: wp.array(dtype=int)  # 1: the last increment was too long, and none grows; 2: an earlier one
-    lagged: wp.array(dtype=int)  # the bound of friction is to be that of a balance
-    kept: wp.array(dtype=int)  # the last increment converged: the next one begins there
-    returns: wp.array(dtype=int)  # the next try begins where the increment does, not where the last try ended
-    rounds: wp.array(dtype=int)  # equilibria with lagged friction bounds, in this increment
-    opened: wp.array(dtype=real)  # error at which the try began
-    rests: wp.array(dtype=int)  # 1: it tries to rest, after a first try that found no balance; 2: it has
-    # this step begins where the last motion leads, whatever the geoms' motion, and is never cut back
-    guessed: wp.array(dtype=int)
-    repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
+    trial_factor: wp.array(dtype=real)  # load factor of the try
+    increment: wp.array(dtype=real)  # trial_factor - load_factor; 0: the first try
+    cut_back: wp.array(dtype=int)  # NO_CUTBACK, LAST_CUT_BACK or CUT_BACK_BEFORE
+    lagged: wp.array(dtype=int)  # the friction bound is to be that of the last equilibrium
+    accepted: wp.array(dtype=int)  # the last increment converged, and the next one starts from it
+    restores: wp.array(dtype=int)  # the next try starts from the last increment's equilibrium
+    rounds: wp.array(dtype=int)  # equilibria with lagged friction bounds in this increment
+    start_error: wp.array(dtype=real)  # `error` at the start of the try
+    reference_try: wp.array(dtype=int)  # whether a try from the reference configuration was made
+    guessed: wp.array(dtype=int)  # the step repeats the last increment, and is not cut back
+    repeat: wp.array(dtype=real)  # factor on the last increment in the initial guess
+    # linear solve and line search
     alpha: wp.array(dtype=real)  # step length
-    longer: wp.array(dtype=real)  # than the one before it in this search
-    beta: wp.array(dtype=real)
-    swell: wp.array(dtype=real)  # kappa times the change of volume along a direction [Pa]
-    pressure_correction: wp.array(dtype=real)  # times the liquid's direction it corrects the volume; 0: none
-    first: wp.array(dtype=real)
-    rz: wp.array(dtype=real)
-    loose: wp.array(dtype=real)  # twice the energy by which bodies are not where wrenches bring them [J]
+    alpha_change: wp.array(dtype=real)  # step length minus the one before it in this search
+    beta: wp.array(dtype=real)  # of conjugate gradients
+    pressure_response: wp.array(dtype=real)  # kappa times the change of volume along a direction [Pa]
+    pressure_correction: wp.array(dtype=real)  # factor on the volume's gradient that corrects the pressure
+    start_rz: wp.array(dtype=real)  # `rz` at the start of the linear solve
+    rz: wp.array(dtype=real)  # residual . preconditioned residual [J]
+    body_residual: wp.array(dtype=real)  # twice the energy of the bodies' error of position [J]
     norm: wp.array(dtype=real)  # of the residual [N]
-    slope: wp.array(dtype=real)
-    low: wp.array(dtype=real)
+    slope: wp.array(dtype=real)  # residual . direction at length 0 [J]
+    low: wp.array(dtype=real)  # bracket of the step length
     high: wp.array(dtype=real)
     slope_low: wp.array(dtype=real)
     slope_high: wp.array(dtype=real)
-    side: wp.array(dtype=int)
-    tries: wp.array(dtype=int)
+    side: wp.array(dtype=int)  # end of the bracket that was replaced last: 1 high, -1 low
+    tries: wp.array(dtype=int)  # evaluations of the line search
     iterations_cg: wp.array(dtype=int)
-    work: wp.array(dtype=int)  # evaluations and products of this step so far, and what counts like them
-    spent: wp.array(dtype=int)  # work done before the step, where it is one of several tries of a caller
+    work: wp.array(dtype=int)  # evaluations and products of this step, and equivalents of them
+    spent: wp.array(dtype=int)  # work that the caller has done before, in the same step of its own
 
 
-BLOCK = 128  # threads that share the sums of one world
+BLOCK = 128  # threads that sum over the chunks of one world
 
 
 @wp.func
-def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
-    """Sum of part[k, :, w] by the threads t of a block, always in the same order; all of them get it."""
+def total_of(partial: wp.array3d(dtype=real), k: int, w: int, t: int):
+    """Sum of partial[k, :, w] by the threads t of a block, in a fixed order; all threads get it."""
     s = real(0.0)
-    for c in range(t, part.shape[1], wp.block_dim()):
-        s += part[k, c, w]
+    for c in range(t, partial.shape[1], wp.block_dim()):
+        s += partial[k, c, w]
     return sum_of_block(s)
 
 
 @wp.func
-def totals_of(part: wp.array3d(dtype=real), w: int, t: int):
-    """The first three such sums, at once."""
+def totals_of(partial: wp.array3d(dtype=real), w: int, t: int):
+    """Sums of partial[0:3, :, w], see `total_of`."""
     own = vec3()
-    for c in range(t, part.shape[1], wp.block_dim()):
-        own += vec3(part[0, c, w], part[1, c, w], part[2, c, w])
+    for c in range(t, partial.shape[1], wp.block_dim()):
+        own += vec3(partial[0, c, w], partial[1, c, w], partial[2, c, w])
     return sum_of_block(own)
 
 
 @wp.func
-def clear_line(st: Worlds, w: int):
+def begin_line_search(st: Worlds, w: int):
     st.low[w] = real(0.0)
-    st.high[w] = real(-1.0)  # none yet
+    st.high[w] = real(-1.0)  # no upper end yet
     st.side[w] = 0
     st.tries[w] = 0
     st.alpha[w] = real(1.0)
@@ -171,26 +184,27 @@ def clear_line(st: Worlds, w: int):
 @wp.func
 def set_viscosity(st: Worlds, w: int, viscosity: real):
     if st.viscosity[w] == real(0.0):
-        st.elastic[w] = st.softness[w]
-    st.softness[w] = st.elastic[w] / (real(1.0) + viscosity)
+        st.elastic_softness[w] = st.softness[w]
+    st.softness[w] = st.elastic_softness[w] / (real(1.0) + viscosity)
     st.viscosity[w] = viscosity
 
 
 @wp.func
 def begin_try(st: Worlds, w: int, limit: int, max_work: int):
-    """A try may take half of what is left: the next one, of a shorter increment, takes less."""
-    st.borne[w] = st.last_pressure[w]
-    st.began[w] = st.iterations[w]
+    """Sets the limits of a try. It may use half of the remaining work, so that a shorter increment can
+    follow."""
+    st.tangent_pressure[w] = st.last_pressure[w]
+    st.start_iterations[w] = st.iterations[w]
     st.inverted[w] = 0
-    st.limit[w] = st.iterations[w] + limit
-    st.allowed[w] = st.work[w] + (max_work - st.work[w]) / 2
+    st.iteration_limit[w] = st.iterations[w] + limit
+    st.work_limit[w] = st.work[w] + (max_work - st.work[w]) / 2
     st.since[w] = st.iterations[w]
-    st.best[w] = real(1.0e300)
+    st.best_square[w] = real(1.0e300)
 
 
 @wp.func
 def modulus_of(law: int, m: real, l: real):
-    """Young's modulus by the constants of a law [Pa]."""
+    """Young's modulus [Pa] from the two constants of a law."""
     E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
     if law == 2:
         E = real(9.0) * l * m / (real(3.0) * l + m)
@@ -213,7 +227,8 @@ def begin_worlds(
     path: LoadPath,
     flags: wp.array(dtype=int),
 ):
-    """Looks at the input; finds how far each touching geom repeats its last motion."""
+    """Starts the step of world w: checks its input, sets the load path, and finds the factor on the last
+    increment for the initial guess from how closely the touching geoms repeat their last motion."""
     w = wp.tid()
     if w == 0:
         for k in range(flags.shape[0]):
@@ -222,10 +237,10 @@ def begin_worlds(
     l = st.lam[w]
     E = modulus_of(law, m, l)
     st.softness[w] = youngs_modulus / E
-    st.give[w] = wp.min(_AS_STIFF * E / wp.max(st.kappa[w] * st.natural[w], E), real(1.0))
+    st.compliance_ratio[w] = wp.min(_LIQUID_STIFFNESS * E / wp.max(st.kappa[w] * st.natural[w], E), real(1.0))
     st.viscosity[w] = real(0.0)
     if st.wanted[w] == 0:
-        st.asked[w] = 0
+        st.unfinished[w] = 0
         st.active[w] = 0
         return
     st.reason[w] = CONVERGED
@@ -265,84 +280,83 @@ def begin_worlds(
     st.repeat[w] = repeat
     if finite == 0:
         st.reason[w] = NOT_FINITE
-    st.asked[w] = finite
+    st.unfinished[w] = finite
     st.active[w] = finite
     st.failed[w] = 0
     st.deep[w] = 0
     st.iterations[w] = 0
     st.work[w] = st.spent[w]
-    st.slips[w] = OWN
+    st.friction_mode[w] = CURRENT
     begin_try(st, w, limit, max_work)
-    if st.guessed[w] == 1:  # no increment comes after it
-        st.allowed[w] = max_work
+    if st.guessed[w] == 1:  # no increment follows
+        st.work_limit[w] = max_work
     st.load_factor[w] = real(0.0)
     st.trial_factor[w] = real(1.0)
     st.increment[w] = real(0.0)
-    st.cut_back[w] = 0
+    st.cut_back[w] = NO_CUTBACK
     st.rounds[w] = 0
-    st.rests[w] = 0
+    st.reference_try[w] = UNTRIED
     st.offset[w] = real(0.0)
-    if st.holds[w] == 1:
+    if st.keeps_volume[w] == 1:
         st.offset[w] = st.last_pressure[w]
-    st.reference[w] = wp.max(wp.abs(st.last_pressure[w]), _REFERENCE)
+    st.reference[w] = wp.max(wp.abs(st.last_pressure[w]), _LEAST_REFERENCE)
 
 
 @wp.func
 def _finishes(error: real, last: real, tolerance: real, left: int):
-    """Whether a try whose error goes on falling as it did in its last iteration ends with so much work: two
-    for each iteration, of Newton's method with whole steps."""
+    """Whether a try converges within the work `left` if its error keeps falling at the rate of the last
+    iteration. A full Newton step costs a work of two."""
     return error < last and wp.log(tolerance / error) * real(2.0) > real(left) * wp.log(error / last)
 
 
 @wp.kernel
-def judge_balance(
+def check_convergence(
     # In:
     tolerance: real,
     max_work: int,
     has_liquid: int,
     rest_pressure: wp.array(dtype=real),
-    part: wp.array3d(dtype=real),
-    worth: wp.array3d(dtype=real),
+    partial: wp.array3d(dtype=real),
+    norms: wp.array3d(dtype=real),
     st: Worlds,
     # Out:
     any_active: wp.array(dtype=int),
 ):
-    """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
-    `nodes.residuals`. The sensor reads pressure above rest, so that is what must be known well: a skin that
-    has lost half of its liquid rests at minus 20 kPa.
+    """Convergence test of each active world: in the energy norm, and of the pressure above rest, which the
+    sensor reads. partial: residual . z and gradient . z; norms: see `nodes.residuals`.
 
-    Where nothing but the pressure is missing, and not much, no iteration is needed: it becomes the one that z
-    leads to, which is known several times better. The volume that belongs to it is picometres away in stiff
-    liquid, see `nodes.correct_pressure`."""
+    If only the pressure is above its tolerance, by at most a factor of `_CORRECTED`, the world converges with
+    the pressure that z predicts. In a stiff liquid the nodes move by picometres for it, see
+    `nodes.correct_pressure`."""
     w, t = wp.tid()
     if st.active[w] == 0:
         if t == 0:
             st.pressure_correction[w] = real(0.0)
         return
-    # read before the sums, which takes as long as they do: a read behind a write waits for it
+    # read before the sums, so that both take place at the same time: a read after a write waits for it
     viscosity = st.viscosity[w]
-    best = st.best[w]
+    best = st.best_square[w]
     iterations = st.iterations[w]
-    began = st.began[w]
-    opened = st.opened[w]
+    start_iterations = st.start_iterations[w]
+    start_error = st.start_error[w]
     since = st.since[w]
-    limit = st.limit[w]
+    limit = st.iteration_limit[w]
     done = st.work[w]
-    allowed = st.allowed[w]
+    allowed = st.work_limit[w]
     touched = st.touched[w]
     kappa = st.kappa[w]
     rest = rest_pressure[w]
     pressure = st.pressure[w] - rest
     volume = st.volume[w]
     error = st.error[w]
-    slips = st.slips[w]
-    give = st.give[w]
+    friction_mode = st.friction_mode[w]
+    compliance_ratio = st.compliance_ratio[w]
     increment = st.increment[w]
-    loose = st.loose[w]
+    body_residual = st.body_residual[w]
     own = vec6()
-    for c in range(t, part.shape[1], wp.block_dim()):
+    for c in range(t, partial.shape[1], wp.block_dim()):
         own += vec6(
-            worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w], worth[2, c, w]
+            norms[0, c, w], partial[0, c, w], norms[1, c, w], norms[3, c, w], partial[1, c, w], norms[2, c, w]
         )
     total = sum_of_block(own)
     if t > 0:
@@ -358,48 +372,50 @@ def judge_balance(
         st.active[w] = 0
         st.failed[w] = 1
         return
-    if touched == 0 and rr < real(BALANCED) * real(BALANCED) and loose == real(0.0):
+    free = touched == 0 and body_residual == real(0.0)
+    if free and rr < real(NEGLIGIBLE_RESIDUAL) * real(NEGLIGIBLE_RESIDUAL):
         st.active[w] = 0
         st.error[w] = real(0.0)
         return
-    # single precision leaves more residual than nothing, so a vibration without contact is measured by the
-    # work of its inertia
+    # in single precision the residual of a vibration without contact is not zero: the work of inertia is its
+    # scale
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
     stiffer = real(1.0) + viscosity
-    off = wp.abs(rz) + loose
-    far = stiffer * stiffer * off  # stiffer rubber goes less far for the same force
+    off = wp.abs(rz) + body_residual
+    far = stiffer * stiffer * off  # stiffer rubber moves less by the same force
     st.last_error[w] = error
     st.error[w] = wp.sqrt(far / work)
     enough = tolerance
-    needs_wrench = has_liquid  # for the pressure
-    if iterations == began:
-        st.opened[w] = wp.sqrt(far / work)
-    elif slips == LAGGED:  # friction's bounds are not known better
-        enough = wp.max(tolerance, _LAGGED_TO * opened)
-        needs_wrench = 0
+    needs_pressure = has_liquid
+    if iterations == start_iterations:
+        st.start_error[w] = wp.sqrt(far / work)
+    elif friction_mode == LAGGED:  # the friction bounds are not known more accurately
+        enough = wp.max(tolerance, _LAGGED_TOLERANCE * start_error)
+        needs_pressure = 0
     if far < real(0.25) * best:
-        st.best[w] = far
+        st.best_square[w] = far
         since = iterations
         st.since[w] = since
-    # stiffer rubber's answer is less than the tangent's, at most by `stiffer`: a bound of the error
+    # viscous rubber moves less than the tangent says, at most by the factor `stiffer`: this bounds the error
     settled = wp.where(viscosity == real(0.0) or increment > real(0.0), 1, 0)
     corrects = int(0)
-    if needs_wrench == 1:
+    if needs_pressure == 1:
         pushes = stiffer * kappa * wp.abs(gz)
         allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
         if pushes > allowed_off:
-            if viscosity == real(0.0) and pushes <= _CORRECTED * allowed_off and give <= _STIFFER:
+            stiff = compliance_ratio <= _STIFF_LIQUID
+            if viscosity == real(0.0) and pushes <= _CORRECTED * allowed_off and stiff:
                 corrects = 1
             else:
                 settled = 0
-    # what has not halved the error in so many iterations will hardly do so in the fewer left
+    # an error that did not halve in more iterations than are left will not do so in these
     patience = wp.min(_PATIENCE, limit - iterations)
-    # where the preconditioner is indefinite by rounding, a negative product is as far from balance
+    # rz may be negative where rounding makes the preconditioner indefinite: its size is the error
     if stiffer * off <= enough * enough * work and settled == 1:
         st.active[w] = 0
         if corrects == 1:
             st.pressure_correction[w] = gz / gg
-            st.swell[w] = kappa * gz
+            st.pressure_response[w] = kappa * gz
             st.pressure[w] = pressure + rest - kappa * gz
             st.volume[w] = volume + gz
     elif iterations - since >= patience or (
@@ -410,106 +426,107 @@ def judge_balance(
     else:
         st.iterations[w] = iterations + 1
         st.rz[w] = rz
-        st.first[w] = rz
+        st.start_rz[w] = rz
         any_active[0] = 1
 
 
 @wp.kernel
 def choose_viscosity(tolerance: real, st: Worlds):
-    """Where Newton's method goes round in circles, as where friction turns or skin snaps off a small geom,
-    the skin is viscous: an iteration is a time step of rubber whose viscosity makes it resist as if it were
-    stiffer by that factor. It goes to where real skin comes to rest; near there the steps are good, and
-    Newton's again, so that what is found is a balance without viscosity."""
+    """Adds artificial viscosity where Newton's method cycles, as when friction reverses or skin snaps off a
+    small geom. An iteration is then an implicit time step of rubber whose viscosity is proportional to its
+    elasticity. Near equilibrium the viscosity falls to zero, so that results contain none."""
     w = wp.tid()
     if st.active[w] == 0:
         return
-    if st.iterations[w] - st.began[w] < _SLOW:
+    if st.iterations[w] - st.start_iterations[w] < _VISCOUS_AFTER:
         return
     viscosity = st.viscosity[w]
     good = int(0)
-    if st.alpha[w] == real(1.0) and st.tries[w] < _TRIES:
+    if st.alpha[w] == real(1.0) and st.tries[w] < _MAX_TRIES:
         if viscosity > real(0.0) or st.error[w] < st.last_error[w]:
             good = 1
     stale = st.iterations[w] - st.since[w]
-    if good == 0 and viscosity == real(0.0) and st.error[w] < _NEAR and stale < _SLOW:
+    if good == 0 and viscosity == real(0.0) and st.error[w] < _SMALL_ERROR and stale < _VISCOUS_AFTER:
         return
     if good == 0:
-        viscosity = _SLOWER * wp.max(viscosity, real(1.0))
-    elif viscosity > _AT_ONCE and st.error[w] > tolerance:
-        viscosity = viscosity / _QUICKER
+        viscosity = _INCREASE * wp.max(viscosity, real(1.0))
+    elif viscosity > _LEAST_VISCOSITY and st.error[w] > tolerance:
+        viscosity = viscosity / _DECREASE
     else:
         viscosity = real(0.0)
     set_viscosity(st, w, viscosity)
-    if viscosity > _FIXED:
+    if viscosity > _MOST_VISCOSITY:
         st.active[w] = 0
         st.failed[w] = 1
 
 
 @wp.kernel
-def find_lost(st: Worlds, any_lost: wp.array(dtype=int)):
-    """Worlds whose first try found no balance: the skin may have been left by what touched it. What pulls
-    may hold it all the same, however far it is from there to rest."""
+def mark_failed(st: Worlds, any_failed: wp.array(dtype=int)):
+    """Marks worlds (as moving) whose first try failed and that may be tried from the reference configuration,
+    since the geoms may have left the skin. Not with adhesion, which may still hold it."""
     w = wp.tid()
     st.moving[w] = 0
-    if st.asked[w] == 0 or st.failed[w] == 0 or st.rests[w] > 0 or st.increment[w] > real(0.0):
+    if st.unfinished[w] == 0 or st.failed[w] == 0:
         return
-    if st.deep[w] == 0 and st.pulls[w] == 0:
+    if st.reference_try[w] != UNTRIED or st.increment[w] > real(0.0):
+        return
+    if st.deep[w] == 0 and st.adhesive[w] == 0:
         st.moving[w] = 1
-        any_lost[0] = 1
+        any_failed[0] = 1
 
 
 @wp.kernel
-def start_at_rest(max_work: int, st: Worlds):
-    """Those that nothing touches at rest are all but in balance there: they try it next."""
+def begin_reference_try(max_work: int, st: Worlds):
+    """Starts a try from the reference configuration in the moving worlds, where nothing touches it."""
     w = wp.tid()
     if st.moving[w] == 1:
-        st.rests[w] = 1
+        st.reference_try[w] = TRYING
         st.failed[w] = 0
         set_viscosity(st, w, real(0.0))
-        begin_try(st, w, _SLOW, max_work)
+        begin_try(st, w, _VISCOUS_AFTER, max_work)
 
 
 @wp.kernel
-def choose_length(part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
-    """Looks for the length where the residual has (nearly) no component along the step, by regula falsi.
+def choose_length(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
+    """Line search: finds the length at which the residual has almost no component along the direction, by
+    regula falsi.
 
-    Liquid is so stiff that the curvature of its volume along a step makes megapascals, and no step would be
-    long. So the search takes the pressure that the linear solve leads to, which is Newton's method for skin
-    and pressure together, and of what is off from there a share: as if the liquid were not much stiffer than
-    the skin. What volume is wrong after a step, the next one corrects.
+    The curvature of the liquid's volume along a step causes megapascals, so that steps with the true pressure
+    would be short. The search uses the pressure that the linear solve predicts, as in Newton's method for
+    nodes and pressure, plus `bulk_fraction` of the deviation from it. The next step corrects the volume.
 
-    part: force . direction after the step, and before it where this is the first try; gradient . direction.
+    partial: force . direction after the step; before the step, in the first try; gradient . direction.
     """
     w, t = wp.tid()
     if st.moving[w] == 0:
         return
-    # as in `judge_balance`
+    # read before the sums, as in `check_convergence`
     alpha = st.alpha[w]
     viscous_work = st.viscous_work[w]
     done = st.work[w]
     tries = st.tries[w]
     inverted = st.inverted[w]
-    pulls = st.pulls[w]
+    adhesive = st.adhesive[w]
     viscosity = st.viscosity[w]
     error = st.error[w]
     highest = st.high[w]
-    total = totals_of(part, w, t)
+    total = totals_of(partial, w, t)
     if t > 0:
         return
     now = total[0]
     slope = total[1]
-    swell = total[2]
+    pressure_response = total[2]
     st.work[w] = done + 1
     if tries == 0:
-        bulk = real(0.0)  # the liquid's share of the slope
+        bulk = real(0.0)  # the liquid's part of the slope
         if st.kappa[w] > real(0.0):
-            change = st.foreseen[w] - st.before[w]
+            change = st.predicted_pressure[w] - st.start_pressure[w]
             bulk = change * change / st.kappa[w]
-        st.stiff[w] = st.give[w]
-        if not (bulk < real(0.99) * slope):  # without it there is no way down
-            st.stiff[w] = real(1.0)
-        slope -= (real(1.0) - st.stiff[w]) * bulk
-    now += (real(1.0) - st.stiff[w]) * (st.foreseen[w] - st.pressure[w]) * swell
+        st.bulk_fraction[w] = st.compliance_ratio[w]
+        if not (bulk < real(0.99) * slope):  # without the liquid the direction would not descend
+            st.bulk_fraction[w] = real(1.0)
+        slope -= (real(1.0) - st.bulk_fraction[w]) * bulk
+    now += (real(1.0) - st.bulk_fraction[w]) * (st.predicted_pressure[w] - st.pressure[w]) * pressure_response
     now -= alpha * viscous_work
     if tries == 0:
         st.slope[w] = slope
@@ -518,28 +535,29 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array
     else:
         slope = st.slope[w]
     valid = int(0)
-    if wp.isfinite(now) and inverted % 2 == 0:  # from inside out most laws find their way
+    if wp.isfinite(now) and inverted % 2 == 0:  # most laws recover from an inverted element
         valid = 1
-    if viscosity > real(0.0) or error < _NEAR:
-        pulls = 0
+    if viscosity > real(0.0) or error < _SMALL_ERROR:
+        adhesive = 0
     has_high = int(0)
     if highest >= real(0.0):
         has_high = 1
     enough = int(0)
     if valid == 1 and now >= real(-0.5) * slope:
-        if pulls == 1:
+        if adhesive == 1:
             if now <= real(0.2) * slope:
                 enough = 1
         elif has_high == 0 or now <= real(0.5) * slope:
             enough = 1
     st.tries[w] = tries + 1
-    if enough == 1 or tries + 1 == _TRIES:
+    if enough == 1 or tries + 1 == _MAX_TRIES:
         st.moving[w] = 0
-        st.borne[w] = st.borne[w] + wp.min(alpha, real(1.0)) * (st.foreseen[w] - st.borne[w])
+        change = st.predicted_pressure[w] - st.tangent_pressure[w]
+        st.tangent_pressure[w] = st.tangent_pressure[w] + wp.min(alpha, real(1.0)) * change
         return
     st.inverted[w] = 0
     if valid == 0 or now < real(0.0):
-        if st.side[w] == 1:  # Illinois: an end that stays twice loses half of its slope
+        if st.side[w] == 1:  # Illinois method: halve the slope of an end that stays twice
             st.slope_low[w] = st.slope_low[w] / real(2.0)
         st.side[w] = 1
         st.high[w] = st.alpha[w]
@@ -552,11 +570,11 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array
         st.side[w] = -1
         st.low[w] = st.alpha[w]
         st.slope_low[w] = now
-    if pulls == 1 and st.high[w] < real(0.0):
-        # a pull that falls as the gap opens is in no tangent: it is solved again
+    if adhesive == 1 and st.high[w] < real(0.0):
+        # the tangent has no adhesion that softens as the gap opens: lengthen the step
         further = wp.clamp(slope / wp.max(slope - now, slope / real(4.0)), real(1.25), real(4.0))
         st.alpha[w] = alpha * further
-        st.longer[w] = st.alpha[w] - alpha
+        st.alpha_change[w] = st.alpha[w] - alpha
         any_active[0] = 1
         return
     low = st.low[w]
@@ -566,14 +584,15 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array
         guess = low + (high - low) * st.slope_low[w] / (st.slope_low[w] - st.slope_high[w])
     margin = real(0.05) * (high - low)
     st.alpha[w] = wp.clamp(guess, low + margin, high - margin)
-    st.longer[w] = st.alpha[w] - alpha
+    st.alpha_change[w] = st.alpha[w] - alpha
     any_active[0] = 1
 
 
 @wp.kernel
 def end_worlds(st: Worlds):
+    """Ends the step of world w: counts it if it did not converge, and stores its pressure."""
     w = wp.tid()
-    # as in `judge_balance`
+    # all reads before the writes, as in `check_convergence`
     wanted = st.wanted[w]
     reason = st.reason[w]
     nonconverged = st.nonconverged[w]
@@ -584,11 +603,11 @@ def end_worlds(st: Worlds):
         return
     if reason != CONVERGED:
         st.nonconverged[w] = nonconverged + 1
-    # of a liquid that keeps its volume, what volume is off makes pressure once, not again in every step in
-    # which nothing moves
+    # an incompressible liquid turns the error of its volume into pressure once, and not again in each step
+    # without motion
     still = int(0)
     if st.iterations[w] == 0 and st.repeat[w] == real(0.0) and st.guessed[w] == 0:
-        still = st.holds[w]
+        still = st.keeps_volume[w]
     st.guessed[w] = 0
     if failed == 0 and still == 0:
         st.last_pressure[w] = pressure

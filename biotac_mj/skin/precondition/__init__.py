@@ -25,7 +25,7 @@ class Residual(NamedTuple):
       gradient: of the liquid's volume [nvert, nworld], or of length zero.
     """
 
-    worth: wp.array
+    norms: wp.array
     r: wp.array
     gradient: wp.array
 
@@ -49,8 +49,8 @@ class Preconditioner(Protocol):
         st: "Worlds",
         residual: Residual,
         z_out: wp.array,
-        part_out: wp.array,
-        beside: Callable[..., None],
+        partial_out: wp.array,
+        in_parallel: Callable[..., None],
     ) -> None:
         """Takes the tangents of contact and liquid, just evaluated, in the active worlds, and marks in
         `st.touched` where something touches; z is the approximate inverse of the new tangent times r.
@@ -66,13 +66,13 @@ class Preconditioner(Protocol):
         self,
         program: Launcher,
         st: "Worlds",
-        part: wp.array,
+        partial: wp.array,
         r: wp.array,
         gradient: wp.array,
         z_out: wp.array,
-        part_out: wp.array,
+        partial_out: wp.array,
     ) -> None:
-        """The same for another r in the running worlds; `part` holds the square of r by chunks."""
+        """The same for another r in the running worlds; `partial` holds the square of r by chunks."""
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve at x [nvert, nworld]: may take the factor of this shape."""

@@ -22,7 +22,7 @@ from .inverse import Inverse
 if typing.TYPE_CHECKING:
     from ..bodies import Bodies
     from ..geoms import GeomSet
-    from ..newton.bodies import Drag
+    from ..newton.bodies import BodyContact
 
 __all__ = ["FEW", "LANES_FEW", "THREADS_FEW", "DensePreconditioner"]
 
@@ -57,10 +57,10 @@ class DensePreconditioner:
         chunk: int,
         capacity: int,
         bodies: "Bodies | None" = None,
-        drag: "Drag | None" = None,
+        body_contact: "BodyContact | None" = None,
     ):
         nworld = st.softness.shape[0]
-        self._bodies, self._drag = bodies, drag
+        self._bodies, self._body_contact = bodies, body_contact
         self.m, self.nworld, self.chunk, self.capacity = model, nworld, chunk, capacity
         self.device = model.device
         self._launch = functools.partial(_launch, THREADS_FEW if nworld <= FEW else 256)
@@ -122,10 +122,10 @@ class DensePreconditioner:
         residual: Residual,
         z_out: wp.array,
         part_out: wp.array,
-        beside: Callable[..., None],
+        in_parallel: Callable[..., None],
     ) -> None:
         """See `precondition.Preconditioner`."""
-        worth, r, gradient = residual
+        norms, r, gradient = residual
         on, m, w = st.active, self.capacity, self.nworld
         outer, core = self._surfaces
         blocks = [self._link, self._spring]
@@ -141,7 +141,7 @@ class DensePreconditioner:
             program.launch_blocks(
                 touch.survey,
                 [w],
-                [m, worth, st, self._found],
+                [m, norms, st, self._found],
                 [self._found_count, self.slot, self.node, self.size, self._norm, self.full],
             )
 
@@ -167,8 +167,8 @@ class DensePreconditioner:
                 make()
 
         self._given = st, r, gradient
-        beside(find, carry) if self._body_block.carried else find()
-        beside(meet, prepare)
+        in_parallel(find, carry) if self._body_block.carried else find()
+        in_parallel(meet, prepare)
         if self.liquid:
             make()
         self._balance(program, st, on, r, gradient, z_out, part_out)
@@ -203,7 +203,7 @@ class DensePreconditioner:
         self._launch(program, small.small_compliance, (w, threads), given, [self._W])
         if bodies is not None:
             outer = self._surfaces[0]
-            touched = [self.liquid, *outer[1:4], self._drag.group, bodies, self._x]
+            touched = [self.liquid, *outer[1:4], self._body_contact.group, bodies, self._x]
             given = [*touched, self.node, self.size, st, on, threads]
             self._launch(program, small.add_bodies, (w, threads), given, [self._W])
         system = [self.liquid, self.size, self._link, self._spring, self._W, on, threads]

@@ -352,7 +352,7 @@ def kernels_up_to(capacity: int = _THREADS) -> list[tuple[wp.Kernel, int]]:
 
 def invert(
     program: "Launcher",
-    beside: Callable[..., None],
+    in_parallel: Callable[..., None],
     extra: int,
     size: wp.array,
     on: wp.array,
@@ -373,4 +373,4 @@ def invert(
         functools.partial(program.launch, kernel, (nworld, threads), given, [B], threads)
         for kernel, threads in kernels_up_to(capacity)
     ]
-    beside(*launches)
+    in_parallel(*launches)

@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from ...geometry.rigid import rigid_motions
 from ...threads import single_thread
-from ..newton.worlds import BALANCED, Worlds
+from ..newton.worlds import NEGLIGIBLE_RESIDUAL, Worlds
 from ..program import Launcher
 from ..types import DOUBLE
 from . import Residual
@@ -33,7 +33,7 @@ from .supernodal import Elimination, SupernodalFactor, elimination_of
 if typing.TYPE_CHECKING:
     from ..bodies import Bodies
     from ..geoms import GeomSet
-    from ..newton.bodies import Drag
+    from ..newton.bodies import BodyContact
 
 __all__ = ["SparseFactor", "SparsePreconditioner"]
 
@@ -114,9 +114,9 @@ class SparsePreconditioner:
         st: Worlds,
         chunk: int,
         bodies: "Bodies | None" = None,
-        drag: "Drag | None" = None,
+        body_contact: "BodyContact | None" = None,
     ):
-        self._bodies, self._drag = bodies, drag
+        self._bodies, self._body_contact = bodies, body_contact
         self._model, self._surfaces = model, [s for s in surfaces if s]
         self._rest = self.factor = model.factor
         # of the free nodes, with a zero behind them for the fixed ones
@@ -186,22 +186,22 @@ class SparsePreconditioner:
         st: Worlds,
         residual: Residual,
         z_out: wp.array,
-        part_out: wp.array,
-        beside: Callable[..., None],
+        partial_out: wp.array,
+        in_parallel: Callable[..., None],
     ) -> None:
         """See `precondition.Preconditioner`."""
-        worth, r, gradient = residual
-        on, square, r, z, part = (a.numpy() for a in (st.active, worth, r, z_out, part_out))
+        norms, r, gradient = residual
+        on, square, r, z, partial = (a.numpy() for a in (st.active, norms, r, z_out, partial_out))
         gradient = gradient.numpy() if len(gradient) else None
         touched, touching = self.any_touch.numpy(), [s.touching.numpy() for s in self._surfaces]
 
         def update():
             worlds = np.flatnonzero(on)
-            z[:, self._of(worlds)], part[:, :, self._of(worlds)] = 0, 0
+            z[:, self._of(worlds)], partial[:, :, self._of(worlds)] = 0, 0
             for w in worlds:
                 touched[w] = any(t[:, w].any() for t in touching)
                 self._small[w] = None
-            rest = (touched[worlds] == 0) & (square[0].sum(0)[worlds] < BALANCED**2)
+            rest = (touched[worlds] == 0) & (square[0].sum(0)[worlds] < NEGLIGIBLE_RESIDUAL**2)
             worlds = worlds[~rest]
             if not len(worlds):
                 return
@@ -221,7 +221,7 @@ class SparsePreconditioner:
                 small = self._small[w] = self._small_system(w, along, self._carried)
                 if small is not None:
                     self._work[w] += len(small[3]) ** 2 // _SYSTEM
-            self._correct(worlds, y, r, z, part)
+            self._correct(worlds, y, r, z, partial)
 
         program.call(update)
 
@@ -229,14 +229,14 @@ class SparsePreconditioner:
         self,
         program: Launcher,
         st: Worlds,
-        part: wp.array,
+        partial: wp.array,
         r: wp.array,
         gradient: wp.array,
         z_out: wp.array,
-        part_out: wp.array,
+        partial_out: wp.array,
     ) -> None:
         """See `precondition.Preconditioner`."""
-        on, r, z, out = (a.numpy() for a in (st.running, r, z_out, part_out))
+        on, r, z, out = (a.numpy() for a in (st.running, r, z_out, partial_out))
 
         def apply():
             worlds = np.flatnonzero(on)
@@ -292,7 +292,7 @@ class SparsePreconditioner:
         outer, n = self._surfaces[0], 3 * len(nodes)
         faces = np.flatnonzero(outer.touching.numpy()[:, w])
         group = np.full(len(self._is_free), -1)
-        np.maximum.at(group, outer.surface.face_np[faces], self._drag.group.numpy()[faces, w, None])
+        np.maximum.at(group, outer.surface.face_np[faces], self._body_contact.group.numpy()[faces, w, None])
         there, mine = np.unique(group[nodes], return_inverse=True)
         mine[group[nodes] < 0] = len(there)  # the core alone touches them
         rigid = np.zeros((len(nodes), 3, len(there) + 1, 6))
@@ -310,7 +310,7 @@ class SparsePreconditioner:
             self._rows[w] = key, rows, rows[:, self.factor.dof(nodes)].astype(float)
         return self._rows[w][1:]
 
-    def _correct(self, worlds, y, r, z, part):
+    def _correct(self, worlds, y, r, z, partial):
         """From A0^-1 r of some worlds to z, r . z and gradient . z."""
         for k, w in enumerate(worlds):
             soft, small = self._softness[w], self._small[w]
@@ -330,9 +330,9 @@ class SparsePreconditioner:
                 if self._gradient is not None:
                     v -= q[m] * self._along[:, w]
             z[:, w] = v
-            part[0, 0, w] = np.vdot(r[:, w], v)
+            partial[0, 0, w] = np.vdot(r[:, w], v)
             if self._gradient is not None:
-                part[1, 0, w] = np.vdot(self._gradient[:, w], v)
+                partial[1, 0, w] = np.vdot(self._gradient[:, w], v)
 
     # --- tangents of touching bodies ---
 

@@ -52,7 +52,7 @@ def find_touched(
 def survey(
     # In:
     capacity: int,
-    part: wp.array3d(dtype=real),
+    partial: wp.array3d(dtype=real),
     st: Worlds,
     found: wp.array2d(dtype=int),
     # In and out:
@@ -70,8 +70,8 @@ def survey(
     if st.active[w] == 0:
         return
     n = count[w]
-    rr = total_of(part, 0, w, t)
-    gg = total_of(part, 2, w, t)
+    rr = total_of(partial, 0, w, t)
+    gg = total_of(partial, 2, w, t)
     for k in range(t, n, wp.block_dim()):
         i = found[k, w]
         at = int(0)

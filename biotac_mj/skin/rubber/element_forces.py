@@ -37,7 +37,7 @@ class ElementForces:
 
     Attributes:
       start, slot: CSR lists of the corners of each node.
-      corner_force, corner: what `push_corners` and `multiply_corners` wrote last [slot, world] [N].
+      corner_force, corner: what `evaluate_corners` and `multiply_corners` wrote last [slot, world] [N].
     """
 
     def __init__(
@@ -64,14 +64,14 @@ class ElementForces:
             self.corner_force = wp.zeros(corners, dtype=vec3)
             self.corner = wp.zeros(corners, dtype=precision.vec)
 
-    def push_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
+    def evaluate_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
         """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds with a point
         that is inside out (2), flatter than its law bears (1), or both (3)."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
 
     def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
-        """Tangent at x, where `push_corners` was evaluated last, times p, by corners."""
+        """Tangent at x, where `evaluate_corners` was evaluated last, times p, by corners."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
 

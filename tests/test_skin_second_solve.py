@@ -1,4 +1,4 @@
-"""Worlds that find no balance among many, solved once more by themselves (`skin.alone`)."""
+"""Worlds that find no balance among many, solved once more by themselves (`skin.second_solve`)."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import warp as wp
 from test_skin_step import finger
 
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.alone import Twin
 from biotac_mj.skin.newton.worlds import NOT_CONVERGED
+from biotac_mj.skin.second_solve import SingleWorld
 
 DEPTHS = (-1e-4, 4e-4, 1.2e-3, 1.0e-3)  # [m]
 SHARE = np.array([0.3, 1.0, -1.0])  # of the depth, in each world; the last touches nothing
@@ -22,7 +22,7 @@ def model_of(material=None, device="cpu", **options):
     return SkinModel(ball.geometry, material or ball.material, SkinOptions(**options), device)
 
 
-def press(model, preconditioner, alone, monkeypatch, share=SHARE, load=None):
+def press(model, preconditioner, second_solve, monkeypatch, share=SHARE, load=None):
     """Presses of some worlds, of which the dense small system holds four touching nodes."""
     monkeypatch.setattr(SkinData, "contact_capacity", 4)
     data = SkinData(model, len(share), preconditioner=preconditioner)
@@ -31,7 +31,7 @@ def press(model, preconditioner, alone, monkeypatch, share=SHARE, load=None):
     steps = []
     for depth in DEPTHS:
         geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in share])
-        step(model, data, geoms, 0.01, alone=alone)
+        step(model, data, geoms, 0.01, second_solve=second_solve)
         now = [data.converged, data.load_factor, data.wrench[:, 0], data.tangent(geoms)[:, 0], data.vert_xpos]
         now.append(data.worlds.increment.numpy())
         steps.append([a.copy() for a in now])
@@ -75,12 +75,15 @@ def test_side_by_side(device, monkeypatch):
     load[:, model.free[::7], 2] = 1e-3 * np.arange(len(share))[:, None]
     found = []
     for threads in (1, 2, 3, 8):
-        monkeypatch.setattr("biotac_mj.skin.alone.cores", lambda threads=threads: threads)
+        monkeypatch.setattr("biotac_mj.skin.second_solve.cores", lambda threads=threads: threads)
         steps, data = press(model, "dense", True, monkeypatch, share, load)
         (one,) = data.steps.values()
         found.append(steps)
         # five worlds are lost at once on the CPU, four on CUDA, which sums in another order
-        assert min(threads, 4) <= len(one._alone._twins) <= min(threads, 5) and not data.nonconverged.any()
+        assert (
+            min(threads, 4) <= len(one._second_solve._single_worlds) <= min(threads, 5)
+            and not data.nonconverged.any()
+        )
     for steps in found[1:]:
         for a, b in zip(steps, found[0], strict=True):
             for value, expected in zip(a, b, strict=True):
@@ -95,7 +98,7 @@ def test_skin_that_sticks(monkeypatch):
     """Motion and increment of each step are those of all of it, and what sticks is remembered: asked for the
     same pose again, the skin bears the same."""
     monkeypatch.setattr(SkinData, "contact_capacity", 4)
-    model, begun, alone = model_of(), None, []
+    model, begun, second_solve = model_of(), None, []
     data = SkinData(model, preconditioner="dense")
     geoms = GeomSet(["sphere"], [(3.5e-3,)], friction=[0.8])
     for depth in DEPTHS:
@@ -107,11 +110,11 @@ def test_skin_that_sticks(monkeypatch):
         if begun is not None:
             np.testing.assert_allclose(data.motion[0, 0], pos - begun, atol=1e-12)
         begun, wrench = pos, data.wrench[0, 0]
-        alone.append(data.worlds.increment.numpy()[0])  # a step in parts, to gradients
+        second_solve.append(data.worlds.increment.numpy()[0])  # a step in parts, to gradients
         step(model, data, geoms)
         assert data.iterations[0] == 0
         np.testing.assert_allclose(data.wrench[0, 0], wrench, atol=1e-5)
-    assert np.count_nonzero(alone) > 1
+    assert np.count_nonzero(second_solve) > 1
     sideways, push = -wrench[0], wrench[2]
     assert 0.05 < sideways / push < 0.8
 
@@ -124,7 +127,7 @@ def test_not_for_ever(monkeypatch):
         tried.append(self.data.worlds.nonconverged.numpy()[0])
         self.data.worlds.reason.fill_(int(NOT_CONVERGED))
 
-    monkeypatch.setattr(Twin, "_run", find_nothing)
+    monkeypatch.setattr(SingleWorld, "_run", find_nothing)
     monkeypatch.setattr(SkinData, "contact_capacity", 4)
     model = model_of()
     data, geoms = SkinData(model, preconditioner="dense"), GeomSet(["sphere"], [(3.5e-3,)])
