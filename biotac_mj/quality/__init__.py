@@ -1,1 +1,1 @@
-"""What is wrong with a log as a log, whatever the sensor did: it takes arrays."""
+"""Faults of a log, whatever the sensor measured. Input: arrays."""

@@ -1,4 +1,4 @@
-"""All faults of a log, each once."""
+"""Finds all faults of a log, each once."""
 
 import typing
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from .still import dead, standing_still
 
 __all__ = ["Checked", "check", "lost_rows", "sample_faults"]
 
-_LEAST = 200  # rows: sixteen blocks of twelve, fewer tell nothing of noise
+_LEAST = 200  # rows: sixteen blocks of twelve; fewer do not show the noise
 
 
 class Checked(typing.NamedTuple):
-    """log: with upper bits put back where they were lost; faults: what is wrong; weak: what was seen and is
-    too little to be called a fault."""
+    """log: with lost upper bits restored. faults: what is wrong. weak: candidates with too little evidence to
+    be called a fault."""
 
     log: Log
     faults: list[Fault]
@@ -28,7 +28,7 @@ class Checked(typing.NamedTuple):
 
 
 def check(log: Log, named: float = NAMED) -> Checked:
-    """All faults of a log; named: confidence from which a fault is named."""
+    """Finds all faults of a log. named: smallest confidence of a reported fault."""
     checked = sample_faults(log, named)
     found = lost_rows(_less(checked.log, checked.faults), checked.faults)
     for fault in found:
@@ -41,11 +41,12 @@ def check(log: Log, named: float = NAMED) -> Checked:
 
 
 def sample_faults(log: Log, named: float = NAMED) -> Checked:
-    """Faults of samples: dead, coarse, held, stuck, clipped and spiked ones, words that overflow, and hum.
+    """Finds faults of samples: dead, coarse, repeated, stuck, clipped and spiked ones, words that overflow,
+    hum.
 
-    They are found in the order in which they have to be taken out: each is searched without the samples of
-    those before it."""
-    nothing = (log.counts == log.counts[0]).all()  # was measured: there is no fault of it
+    Each detector ignores the samples that the detectors before it rejected.
+    """
+    nothing = (log.counts == log.counts[0]).all()  # nothing was measured, so there is no fault
     if len(log) < _LEAST or not log.in_counts or nothing:
         return Checked(log, dead(log), [])
     log, faults = put_back(log)
@@ -54,7 +55,7 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
         for fault in find(_less(log, faults), faults):
             fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)
-    for fault in faults:  # beside all that was found after it
+    for fault in faults:  # before all that was found after it
         fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
     weak += [f for f in faults if not clear(f, named)]
     faults = [f for f in faults if clear(f, named)]
@@ -62,12 +63,12 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
 
 
 def lost_rows(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
-    """Rows that are missing, by the clock where it tells, else where all channels jump (`jumping`)."""
+    """Finds missing rows, by the clock if it is reliable, else by jumps of all channels (`jumping`)."""
     return dropped(log) or jumping(log, faults, begun)
 
 
 def _less(log, faults):
-    """A log without the faults that can be taken out, and with samples that are no measurement masked."""
+    """The log with correctable faults corrected and invalid samples masked."""
     for fault in faults:
         log = log.without(fault.mask, None if fault.correct is None else fault.correct(log.counts))
     return log

@@ -1,4 +1,4 @@
-"""Codes of the converter: some are never read, or the upper bits are lost."""
+"""Faults of the converter's codes: codes that never occur, and lost upper bits."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,42 +13,42 @@ from .noise import noise_level, sound_noise
 
 __all__ = ["coarse", "mostly_coarse", "put_back"]
 
-# visits of a code, of whose neighbours one in a hundred is then missed by chance
+# visits of a code after which one in a hundred of its neighbours is unvisited by chance
 _OFTEN = 5
-_CUT, _CODES = 4, 16  # step and codes at least of one channel that is coarse alone
-_LATER = 0.1  # of the rows, that are coarse at least where not all are
+_CUT, _CODES = 4, 16  # least step and number of codes if a single channel is coarse
+_LATER = 0.1  # least fraction of coarse rows if not all are
 _CHANCE = 12.0  # nats: one in 1e5
 
-_BITS = (7, 8, 9, 10, 11)  # that a word has left
-_SURE = 16.0  # nats: by chance changes are as near to the size and ends of the band once in 9e6 times
+_BITS = (7, 8, 9, 10, 11)  # number of bits that remain
+_SURE = 16.0  # nats: changes match the size and ends of the band by chance once in 9e6 times
 _NEAR = 1 / 16  # of the band
-_LOOSE = 1 / 4  # of the band, where others overflow: a load moves channels meanwhile
-_TIMES = 3  # in each: what leaves and comes back once may be a spike
-# of one that leaves and comes back once: of a band so large, for so many rows, from its one end to the other
+_LOOSE = 1 / 4  # of the band, if other channels overflow: the load moves channels meanwhile
+_TIMES = 3  # overflows in each direction: a single excursion may be a spike
+# for a single excursion: smallest band and shortest duration in rows
 _LARGE, _AWAY = 1024, 3
-_USUAL = 0.95  # of the channel's steps, of which the largest are the load's
-_FRACTION = 0.8  # of the changes beyond half of the band that are overflows
+_USUAL = 0.95  # quantile of the channel's steps; larger ones come from the load
+_FRACTION = 0.8  # least fraction of overflows among changes of more than half a band
 
 
 def coarse(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Channels that leave out some of the codes which their noise should visit, on a lattice or not."""
+    """Finds channels that omit some of the codes which their noise should visit, on a lattice or not."""
     if not log.whole:
         return []
     x = log.counts.astype(int)
     lattice = np.array([_lattice([c]) for c in x.T])
-    lattice = np.maximum(lattice, _lattice(x.T))  # where each takes too few values
+    lattice = np.maximum(lattice, _lattice(x.T))  # catches channels that each have too few values
     step = np.where(lattice > 1, lattice, [_spacing(c) for c in x.T])
     found, known = np.flatnonzero(step >= 2), np.isfinite(step)
-    # levels that lie far apart look alike, but are no multiples of anything
+    # levels far from each other look coarse, but are not multiples of anything
     if 1 < len(found) < 0.5 * known.sum():
         found = np.flatnonzero(lattice > 1)
-    if len(found) == 1:  # one converter reads all, but a channel's word may be cut
+    if len(found) == 1:  # all channels share one converter, but one channel's word may lose bits
         codes = len(np.unique(x[:, found[0]]))
         found = found[(lattice[found] >= _CUT) & (codes >= _CODES)]
     if not len(found):
         return _coarse_since(log, x)
     q = float(np.median(step[found]))
-    # of codes that noise takes it to by chance every q-th would be one of these
+    # one in q of the codes that noise visits would be a multiple by chance
     parts = np.array_split(x[:, found], BLOCKS)
     channels = range(log.channels) if len(found) > 0.75 * known.sum() else found
     message = (
@@ -59,8 +59,8 @@ def coarse(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _coarse_since(log, x):
-    """All channels or some that are coarse from some row on: the largest number that all differences from the
-    last row have in common, back to where they no longer have one."""
+    """Finds channels that become coarse at some row: the largest common divisor of all differences from the
+    last row, back to where it ends."""
     off = np.abs(x - x[-1])[::-1]
     long, q, sure = _common(np.gcd.reduce(off, axis=1), off)
     if sure and (np.ptp(off[:long], axis=0) > 0).sum() > log.some(4):
@@ -81,7 +81,7 @@ def _coarse_since(log, x):
 
 
 def _coarse(log, channels, q, since, message, parts, cut):
-    """A fault of channels whose codes are q apart; parts: their values, block by block."""
+    """Fault of channels with code distance q. parts: their values by block."""
     found = Fault(
         "quantise",
         tuple(int(k) for k in channels),
@@ -96,13 +96,13 @@ def _coarse(log, channels, q, since, message, parts, cut):
 
 
 def _common(numbers, off):
-    """Of numbers (n,) how many of the first have a divisor in common, which, and whether so many changes of
-    what they stand for, off (n, c), show that it is no chance, and begins at some row."""
+    """Length of the leading run of numbers (n,) with a common divisor, the divisor, and whether the changes
+    off (n, c) show that it is not chance and starts at some row."""
     common = np.gcd.accumulate(numbers)
-    steps = np.unique(common[common > 1])  # a row more may have a part of it in common by chance
+    steps = np.unique(common[common > 1])  # one row more may share a smaller divisor by chance
     if not len(steps):
         return 0, 0.0, False
-    rows = np.array([np.count_nonzero(common % step == 0) for step in steps])  # equal rows have all of it
+    rows = np.array([np.count_nonzero(common % step == 0) for step in steps])  # equal rows share any divisor
     best = int((rows * np.log(steps)).argmax())
     long, q = int(rows[best]), float(steps[best])
     if long == len(numbers) or long < max(_LATER * len(numbers), 2 * BLOCKS):
@@ -111,17 +111,17 @@ def _common(numbers, off):
 
 
 def _lattice(columns):
-    """Step of the lattice that all codes of columns of integers (n,) lie on; 1 where it may be chance."""
+    """Step of the lattice that contains all codes of columns of integers (n,); 1 if it may be chance."""
     gaps = np.concatenate([np.diff(np.unique(x)) for x in columns])
     step = int(np.gcd.reduce(gaps)) if len(gaps) else 1
-    # each further code would lie on the lattice by chance once in `step` times
+    # each further code lies on the lattice by chance once in `step` times
     return step if step > 1 and (len(gaps) - 1) * np.log(step) > _CHANCE else 1
 
 
 def _spacing(x):
-    """Typical distance of the codes that integers x (n,) visit, on a lattice or not; 1 where codes that are
-    visited often have neighbours, nan where too few are."""
-    value, count = np.unique(x[1:][np.diff(x) != 0], return_counts=True)  # one that stands still is no pile
+    """Typical distance of the codes that integers x (n,) visit, on a lattice or not. 1 if often-visited codes
+    have neighbours, nan if too few codes are visited often."""
+    value, count = np.unique(x[1:][np.diff(x) != 0], return_counts=True)  # ignore constant stretches
     often = count >= _OFTEN
     if often.sum() < 3:
         return np.nan
@@ -131,17 +131,17 @@ def _spacing(x):
 
 
 def mostly_coarse(log: Log, faults: Sequence[Fault]) -> bool:
-    """Whether most channels are so coarse that noise seldom takes them from one code to another."""
+    """Whether most channels are so coarse that noise rarely changes their code."""
     noise = sound_noise(np.median(log.counts, axis=0))
     return any(len(f.channels) > 0.5 * log.channels and f.step > 2 * np.median(noise) for f in faults)
 
 
 def put_back(log: Log) -> tuple[Log, list[Fault]]:
-    """A log with the upper bits that its words lost put back by going on from row to row, and that fault; the
-    same log and none where nothing overflows.
+    """Restores lost upper bits by continuity between rows. Returns the log and that fault; the same log and
+    none if nothing overflows.
 
-    What leaves a band of a power of two on one side comes back on the other. Which band a channel was in
-    before the first row nobody knows: the one nearest to the other channels is taken.
+    A value that leaves a band (a power of two) at one end returns at the other. The band before the first row
+    is unknown: the one closest to the other channels is used.
     """
     x = log.counts
     band, faulty = _overflowing(x) if log.converter else (0.0, ())
@@ -152,7 +152,7 @@ def put_back(log: Log) -> tuple[Log, list[Fault]]:
         step = np.diff(x[:, k])
         out[1:, k] = x[0, k] + np.cumsum(step - band * np.rint(step / band))
     sound = np.median(np.delete(out, faulty, axis=1)) if len(faulty) < x.shape[1] else np.median(out)
-    for k in faulty:  # a whole number of bands that keeps it within what a converter gives
+    for k in faulty:  # offset by whole bands, within the converter's range
         shift = band * np.rint((sound - np.median(out[:, k])) / band)
         if np.ptp(x[:, k]) < band and 0 <= out[:, k].min() + shift and out[:, k].max() + shift <= 4095:
             out[:, k] += shift
@@ -166,8 +166,8 @@ def put_back(log: Log) -> tuple[Log, list[Fault]]:
 
 
 def _overflowing(x):
-    """Counts after which channels x (n, c) begin again, a power of two, and which do: those that leave and
-    come back, and where some surely do, those that left for good, too."""
+    """Modulus (a power of two) at which channels x (n, c) wrap, and the channels that do: those that leave
+    and return, and, if some surely wrap, also those that do not return."""
     noise, x = noise_level(x), _less_ends(x)
     for band in 2.0 ** np.array(_BITS):
         both, once, nats = [], [], 0.0
@@ -188,10 +188,10 @@ def _overflowing(x):
             after = x[mine[0] + 1 :, k]
             inside = after[: mine[-1] - mine[0]]
             ends = np.where(step[mine] < 0, x[mine + 1, k], x[mine, k])  # on the lower side
-            same = np.unique(ends, return_counts=True)[1].max()  # what drops out does so to one count
-            # one bit of a word that fails leaves the band
+            same = np.unique(ends, return_counts=True)[1].max()  # a dropout always goes to the same count
+            # one faulty bit of a word moves it out of the band
             few = away or 2 * same <= len(ends)
-            # less a band an overflow is a step like the others; a spike of nearly that size is not
+            # minus one band, an overflow is an ordinary step; a spike of nearly that size is not
             usual = np.quantile(np.delete(np.abs(step), rows), _USUAL) + 1
             goes_on = away or np.median(remainder[remainder < _NEAR * band]) <= usual
             if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few and goes_on:
@@ -204,8 +204,8 @@ def _overflowing(x):
 
 
 def _less_ends(x):
-    """Counts x (n, c) with the value before where one at an end of the converter repeats: nothing is measured
-    there, while a word that overflows goes on with its noise."""
+    """Counts x (n, c); a value that repeats at an end of the converter is replaced by the one before. Nothing
+    is measured there, while a word that overflows keeps its noise."""
     same = np.diff(x, axis=0) == 0
     ends = np.isin(x, (0, FULL_SCALE))
     ends &= np.pad(same, ((1, 0), (0, 0))) | np.pad(same, ((0, 1), (0, 0)))
@@ -214,8 +214,8 @@ def _less_ends(x):
 
 
 def _once(x, rows, band):
-    """Whether what leaves x (n,) after the first and comes back after the second of two rows does so from one
-    end of a band to the other: neither a spike nor a wire that breaks begins and ends there."""
+    """Whether x (n,), which leaves after the first and returns after the second of two rows, goes from one
+    end of a band to the other. Spikes and broken wires do not start and end there."""
     ends = x[[rows[0], rows[0] + 1, rows[1], rows[1] + 1]] % band / band
     near = np.minimum(ends, 1 - ends) < _NEAR
     low = ends < 0.5

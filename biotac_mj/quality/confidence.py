@@ -1,4 +1,4 @@
-"""Probability that a fault of a log is what it is called: a logistic regression of its features."""
+"""Probability that a fault of a log is correctly named: logistic regression on its features."""
 
 import numpy as np
 
@@ -6,21 +6,21 @@ from .fault import Fault
 
 __all__ = ["PER_CANDIDATE", "NAMED", "WEIGHTS", "clear", "confidence", "probability"]
 
-# from which a fault, or an effect, is named, and taken out of the counts while others are looked for: of 12
-# between this and 0.65 nine were right, in 209 pieces of three authors
+# least confidence of a name; named faults are removed from the counts before further searches. In 209 logs
+# with faults by three authors 9 of 12 names between this and 0.65 were right
 NAMED = 0.6
-_CHANCE = 0.02  # p above which nothing is named, whatever its size
-# of the logit, fitted to 221 names of two authors who had no part in the weights: stated 0.74, 0.84, 0.92 and
-# 0.98, right were 72, 71, 88 and 94 %
+_CHANCE = 0.02  # largest p of a named fault
+# factor of the logit, fitted to 221 names from two authors whose data did not fit the weights: for stated
+# 0.74, 0.84, 0.92 and 0.98, 72, 71, 88 and 94 % were right
 _NEW = 0.73
-_MOST = 0.99  # so many of the surest were right
-# of the logit, for the logarithm of one more than there are other candidates by the same detector: what many
-# channels have, each by itself, has one cause more often than many
+_MOST = 0.99  # fraction of the most confident names that were right
+# weight of log(1 + other candidates of the same detector): several channels with one fault each more often
+# have a common cause
 PER_CANDIDATE = -1.2445
-# a fault of a connector or a cable comes to two: the other of a pair is no argument against either
+# a faulty connector or cable affects two channels, so one further candidate is no counter-evidence
 _PAIRS = {"still", "far"}
-# intercept and, of each feature, weight, least and most that practice had; fitted to the hidden effects of
-# eleven authors in recordings of real sensors. No recording without an effect has "gone" and "far"
+# intercept and, per feature, weight, lower and upper bound of the training data. Fitted to hidden effects of
+# eleven authors in recordings of real sensors; no recording without an effect has "gone" or "far"
 WEIGHTS = {
     "clock": (2.546, {}),
     "cut": (1.293, {}),
@@ -42,7 +42,7 @@ WEIGHTS = {
 
 
 def probability(detector: str, features: dict, others: int = 0, weights: dict = WEIGHTS) -> float:
-    """Of a detector's features, each no farther out than practice had it.
+    """Probability from a detector's features, each clipped to the range of the training data.
 
     Args:
       others: other candidates of the same detector in the log. weights: as WEIGHTS.
@@ -57,8 +57,8 @@ def probability(detector: str, features: dict, others: int = 0, weights: dict = 
 
 
 def confidence(fault: Fault, others: int = 0) -> float:
-    """Probability that the fault is what it is called; others: see `probability`. One that no detector has
-    weights for is certain."""
+    """Probability that the fault is correctly named. others: see `probability`. 1 for a detector without
+    weights."""
     return probability(fault.detector, fault.features, others) if fault.detector else _MOST
 
 

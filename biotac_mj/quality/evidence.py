@@ -1,4 +1,4 @@
-"""How much more often than by chance something happens, and in how many parts of a log."""
+"""Evidence that an event is more frequent than by chance, block by block."""
 
 import functools
 
@@ -7,15 +7,15 @@ from scipy.special import kl_div
 
 __all__ = ["BLOCKS", "NAN", "by_block", "evidence", "runs", "sign_flip", "stretch"]
 
-BLOCKS = 16  # of a log, each of which is evidence by itself
+BLOCKS = 16  # of a log; each counts as independent evidence
 NAN = float("nan")
 
-# scipy.stats.permutation_test draws new signs at each call and takes 40 to 350 times as long as `sign_flip`,
-# which a diagnosis of a log calls 267 times in 12 s
+# scipy.stats.permutation_test draws new signs in each call and takes 40 to 350 times as long as `sign_flip`,
+# which the diagnosis of one log calls 267 times in 12 s
 
 
 def evidence(strength: np.ndarray) -> dict:
-    """Fields `nats`, `p` and `features` of a Fault by its strength (blocks,) in nats."""
+    """Fields `nats`, `p` and `features` of a Fault from its evidence strength (blocks,) [nats]."""
     strength = np.asarray(strength, float)
     nats = float(strength.sum())
     features = {"nats": float(np.log1p(nats)), "blocks": float(np.mean(strength > 0))}
@@ -23,8 +23,7 @@ def evidence(strength: np.ndarray) -> dict:
 
 
 def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
-    """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of
-    them."""
+    """p of mean(gain) > 0 under random signs. gain: (n,), one per block or trajectory. Exact for n <= 12."""
     gain = np.asarray(gain, float)
     n = len(gain)
     return float(np.mean(_signs(n, draws, seed) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
@@ -32,29 +31,30 @@ def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
 
 @functools.lru_cache(maxsize=8)
 def _signs(n, draws, seed):
-    """(draws, n) of -1 and 1, all there are up to 12."""
+    """(draws, n) of -1 and 1; all combinations for n <= 12."""
     if n <= 12:
         return 1.0 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
     sign = np.random.default_rng(seed).choice([-1.0, 1.0], (draws, n))
-    sign[0] = 1  # the data themselves: p is never zero
+    sign[0] = 1  # the data themselves, so that p > 0
     return sign
 
 
 def by_block(flags: np.ndarray, chance: float) -> np.ndarray:
-    """(blocks,) nats by which flags (n,) are more frequent than chance, in each block, of a row at least."""
+    """(blocks,) log-likelihood ratio [nats] of the rate of flags (n,) in each block against chance; blocks
+    without a flag count one."""
     blocks = min(BLOCKS, len(flags))
     fraction = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
     return np.sign(fraction - chance) * len(flags) / blocks * kl_div(fraction, chance)
 
 
 def runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First rows and lengths of the runs in which flags (n,) are set."""
+    """First rows and lengths of the runs of set flags (n,)."""
     edge = np.flatnonzero(np.diff(np.pad(np.asarray(flags, np.int8), 1)))
     return edge[::2], edge[1::2] - edge[::2]
 
 
 def stretch(flags: np.ndarray) -> np.ndarray:
-    """Flags (n,) from the first to the last that is set, at least one row a block."""
+    """Flags (n,) set from the first to the last set one, at least one row per block."""
     on = np.flatnonzero(flags)
     first = max(min(on[0], len(flags) - BLOCKS), 0)
     return flags[first : max(on[-1] + 1, first + BLOCKS)]

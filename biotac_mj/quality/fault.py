@@ -15,17 +15,17 @@ class Fault:
     Attributes:
       id: "clock", "contact", "freeze", "hum", "jump", "lost_rows", "order", "overflow", "quantise",
         "saturate", "spikes" or "stuck".
-      channels: numbers from 0. start, end: [s] from the first row. message: one line.
-      parameters: name -> (value, low, high), nan where no interval is known.
-      mask: (n, c) bool, samples that are no measurement, or None.
-      correct: (counts (n, c)) -> counts without the fault, or None where that is not possible.
-      places: [s], where it happens at some times.
-      beyond: of masked samples, 1: the true value lies above the recorded one, -1: below, 0: unknown.
-      silent: whether its channels show one value whatever touches them. held: whether it is of rows that
-        repeat or tremble about the one before.
-      detector: key of `confidence.WEIGHTS`. features: numbers that its confidence is computed from.
-      nats: log likelihood ratio against chance. p: that chance alone is as strong. confidence: 0..1.
-      ties: ids of effects that look the same.
+        channels: from 0. start, end: [s] from the first row. message: one line.
+        parameters: name -> (value, low, high), nan if no interval is known.
+        mask: (n, c) bool, samples without a measurement, or None.
+        correct: counts (n, c) -> counts without the fault, or None if it cannot be corrected.
+        places: times of single events [s].
+        beyond: side of the true value of masked samples: 1 above the recorded one, -1 below, 0 unknown.
+        silent: whether its channels do not respond to contact. held: whether rows repeat or jitter about the
+          one before (sample and hold).
+        detector: key of `confidence.WEIGHTS`. features: inputs of its confidence.
+        nats: log-likelihood ratio against chance. p: probability by chance. confidence: 0..1.
+        ties: ids of effects that it cannot be distinguished from.
     """
 
     id: str
@@ -49,5 +49,5 @@ class Fault:
 
     @property
     def step(self) -> float:
-        """[counts] between the codes that are read where some are left out, else 0."""
+        """Distance between occurring codes [counts] if some are omitted, else 0."""
         return self.parameters.get("step", (0.0,))[0]

@@ -1,5 +1,5 @@
-"""Rows that are held: they repeat the one before, come slower than a bus brings them, or tremble between new
-values."""
+"""Sample-and-hold faults: rows that repeat the one before, arrive slower than the bus rate, or jitter between
+new values."""
 
 from collections.abc import Sequence
 
@@ -14,32 +14,33 @@ from .noise import sound_noise
 
 __all__ = ["held_rows"]
 
-_HAND = 10.0  # [Hz] below which a hand moves a load: a log has to follow that
-_WINDOW = 24  # rows in which the few differences that are new values stand out
-# median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
+_HAND = 10.0  # [Hz] bandwidth of a load moved by hand, which a log must resolve
+_WINDOW = 24  # rows of a window in which the few new values stand out
+# median difference over RMS difference within windows: 0.67 for noise, at least 0.5 for real sensors
 _UNEVEN = 0.36
-# fraction of rows, and of those that do, that repeat the one before by rounding alone
+# fraction of rows that repeat the one before by rounding alone, and its factor on the observed fraction
 _BY_CHANCE, _FEW = 1e-4, 0.05
-_OFTEN = 0.002  # fraction of rows that may be held by chance
-# of the rate that a bus brings new rows at; 0.78 at least in a sixteenth of real recordings
+_OFTEN = 0.002  # fraction of rows that may repeat by chance
+# of the bus rate; real recordings have at least 0.78 in any sixteenth
 _SLOW, _LASTING = 0.65, 0.25
-# of the rows, repeated more often than a bus does: 0.01 at most in real recordings, 0.03 and more where rows
-# are repeated at random
+# fraction of rows that repeat more often than a bus explains: at most 0.01 in real recordings, at least 0.03
+# if rows repeat at random
 _UNEVENLY = 0.02
-_HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
+_HEIGHT = 1.3  # of the noise: change at a new reading; sqrt(2) if nothing moves
 
 
 def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger explains;
-    or that move in steps with nothing but white noise between them."""
+    """Finds rows that repeat longer or less evenly than a slow bus explains, and steps with only white noise
+    between them."""
     n = len(log)
-    if mostly_coarse(log, faults):  # rows repeat by chance
+    if mostly_coarse(log, faults):  # then rows repeat by chance
         return []
     same = (np.diff(log.counts, axis=0) == 0).mean(1)
     held = np.concatenate([[False], same > 0.99]) & ~log.masked.all(1)
     start, length = runs(held)
     if len(start):
-        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs, at any time
+        # a bus that is slower by a factor r repeats floor(r) - 1 or floor(r) rows (the most frequent runs) at
+        # any time
         each = [length[start * BLOCKS // n == b] for b in range(BLOCKS)]
         usual = int(np.quantile([np.bincount(r).argmax() if len(r) else 0 for r in each], 0.25)) + 1
         long = length > usual
@@ -55,14 +56,14 @@ def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _slower(log, held):
-    """Rows held (n,) bool by what is no bus: a bus that is r times slower than the logger repeats a row
-    ceil(r) - 1 times at most, and brings a new one a hundred times a second."""
+    """Repeated rows (n,) bool that a bus does not explain. A bus that is slower by a factor r repeats a row
+    at most ceil(r) - 1 times and delivers a hundred new rows per second."""
     n = len(held)
     if not held.any():
         return []
     unchanged = (np.diff(log.counts, axis=0) == 0)[~held[1:]].mean(0)
     chance = np.prod(np.clip(unchanged, 1e-2, 1))
-    if chance > max(_BY_CHANCE, _FEW * held.mean()):  # equal rows are nobody's fault
+    if chance > max(_BY_CHANCE, _FEW * held.mean()):  # equal rows are no fault
         return []
     fresh = np.flatnonzero(~held)
     repeats = np.diff(fresh) - 1
@@ -70,7 +71,7 @@ def _slower(log, held):
     block = fresh[:-1] * BLOCKS // n
     uneven = np.bincount(block, repeats > often, BLOCKS) / np.maximum(np.bincount(block, minlength=BLOCKS), 1)
     rates = np.array([log.rate * (1 - part.mean()) for part in np.array_split(held, BLOCKS)])
-    # a rate that is only said may be another logger's: then the log's own fastest parts are the bus
+    # a stated rate may be that of another logger: the fastest segments of the log then give the bus rate
     bus = min(log.rate, BUS_RATE) if log.clocked else np.quantile(rates, 0.9)
     slow = rates < _SLOW * bus
     if slow.mean() >= _LASTING:
@@ -89,15 +90,15 @@ def _slower(log, held):
 
 
 def _frozen(log, mask, how):
-    """Rows held, mask (n,), in all channels."""
+    """Fault of rows that repeat in all channels. mask: (n,)."""
     seconds = float(mask.sum() / log.rate)
     message = f"{seconds:.1f} s of rows repeat the one before in all electrodes{how}"
-    # each part of the rows held, however few
+    # each block of repeated rows, however few
     return _fault(log, mask, seconds, message, by_block(mask[mask], _OFTEN))
 
 
 def _fault(log, mask, seconds, message, strength, known=True):
-    """Rows held, mask (n,) or None, for some seconds, whose interval may not be known."""
+    """Fault of repeated rows, mask (n,) or None. known: whether the interval of `seconds` is known."""
     rows = np.flatnonzero(mask) if mask is not None else [0, len(log) - 1]
     return Fault(
         "freeze",
@@ -114,11 +115,12 @@ def _fault(log, mask, seconds, message, strength, known=True):
 
 
 def _dithered(log):
-    """Values that are read now and then and tremble between: of the differences in a short window most are
-    small and a few as large as noise makes them, in most channels, at whatever rows.
+    """Finds values that are sampled now and then with jitter between: in a short window most differences are
+    small and a few as large as noise, in most channels, at any rows.
 
-    A log that is slower than twice the hand's band does not tell: touches come from one row to the next,
-    as new values do."""
+    Not applicable to logs slower than twice the bandwidth of a hand: there touches begin within one row, as
+    new values do.
+    """
     if log.rate <= 2 * _HAND:
         return []
     rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
@@ -129,7 +131,7 @@ def _dithered(log):
         return []
     cells = step[: k * _WINDOW].reshape(k, _WINDOW, -1)
     size = np.sqrt((cells**2).mean(1))
-    lively = size > 2.5  # rounding alone makes differences uneven below
+    lively = size > 2.5  # below it rounding alone makes differences uneven
     uneven = np.where(lively, np.maximum(np.median(cells, axis=1), 0.5) / np.maximum(size, 0.1), np.nan)
     known = np.flatnonzero(lively.mean(0) > 0.2)
     if len(known) < max(1, log.some(12)):
@@ -140,11 +142,11 @@ def _dithered(log):
         return []
     law = sound_noise(np.median(log.counts[rows], axis=0))
     height = [np.median(step[jump[:, e], e]) / law[e] for e in known if jump[:, e].any()]
-    # a median over rows jumps as well, by less than noise does
+    # the median over rows also jumps, by less than the noise
     if np.median(np.nanmedian(uneven[:, known], axis=0)) > _UNEVEN or np.median(height or [0.0]) < _HEIGHT:
         return []
     mask, together = None, jump.mean(1) > 0.25
-    if jump[together].sum() > 0.8 * jump.sum():  # all at once: the rows between are none
+    if jump[together].sum() > 0.8 * jump.sum():  # all channels at once: no jitter between
         mask = _between(log.counts, 3 * usual)
     seconds = float(1 / (log.rate * jump[:, known].mean()))
     message = f"all electrodes take a new value every {seconds:.3f} s, and tremble between"
@@ -154,9 +156,8 @@ def _dithered(log):
 
 
 def _goes_on(jump, change):
-    """Whether large changes (n, c), those with jump (n, c) bool, are a load's: on its way one follows another
-    in the same direction, of the shortest way every second. New values between held ones come by chance, with
-    either sign."""
+    """Whether large changes (n, c) at jump (n, c) bool come from a load: they then continue in the same
+    direction, at least every second one of them. New values after held ones have random signs."""
     first = jump[:-1]
     followed = np.count_nonzero(first & jump[1:] & (change[:-1] * change[1:] > 0))
     chance = max(jump.mean() / 2, 1 / jump.size)
@@ -165,6 +166,6 @@ def _goes_on(jump, change):
 
 
 def _between(x, usual):
-    """(n,) bool, rows of x (n, c) in which less than a quarter of the channels take a new value."""
+    """(n,) bool, rows of x (n, c) in which fewer than a quarter of the channels take a new value."""
     step = np.abs(np.diff(x, axis=0, prepend=x[:1]))
     return (step > usual).mean(1) <= 0.25

@@ -1,4 +1,4 @@
-"""Lines in the spectrum: hum, and the waves that go with it."""
+"""Spectral lines: hum and other periodic disturbances."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,20 +14,20 @@ from .noise import running_median
 
 __all__ = ["hum"]
 
-_WANDERS = 3.0  # [s] within which a line keeps its phase
+_WANDERS = 3.0  # [s] coherence time of a line's phase
 _LINES = 8
-_THERE = 0.15  # of the blocks, in which a line is to be at least
-_SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
-# times the spectrum around it; rhythms of the load itself stand out by 9 at most in real recordings
+_THERE = 0.15  # least fraction of the blocks that show the line
+_SLOWEST = 5.0  # [Hz]: lower frequencies may be a hand, a pulse or a pump
+# ratio to the surrounding spectrum; rhythms of the load reach at most 9 in real recordings
 _RHYTHM = 8.0
-_PLAIN = 4.0  # logarithm of times the spectrum around it, beyond which a line is none the more one
-_LEAST = 4.0  # times the spectrum around it that a line stands out by
-_SIZE = (128, 4096)  # rows of a spectrum, at least and at most
+_PLAIN = 4.0  # log of the ratio to the surrounding spectrum above which evidence saturates
+_LEAST = 4.0  # least ratio to the surrounding spectrum
+_SIZE = (128, 4096)  # fewest and most rows of a spectrum
 
 
 def hum(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """A disturbance made of lines in the spectrum, above the band in which the load moves: the strongest, and
-    those that are left once it is taken out (a wave that is no sine has several)."""
+    """Finds a disturbance made of spectral lines above the load's band: the strongest, and those that remain
+    after its removal (a wave that is not a sine has several)."""
     first = found = _line(log)
     for _ in range(_LINES - 1):
         if found is None:
@@ -40,7 +40,7 @@ def hum(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _with_line(fault, line):
-    """A disturbance and one more line of it."""
+    """The disturbance with one more line."""
     before, after = fault.correct, line.correct
     channels = tuple(sorted({*fault.channels, *line.channels}))
     return dataclasses.replace(
@@ -52,9 +52,8 @@ def _with_line(fault, line):
 
 
 def _line(log):
-    """The strongest line whose phase on blocks left out is that of the blocks around, by the logger's clock
-    or by the sensor's own: a logger that repeats rows now and then tears a wave that the sensor sampled
-    evenly, and the other way round."""
+    """Strongest line whose phase in a held-out block is predicted by its neighbours, by the logger's clock or
+    the sensor's own. Repeated rows break a wave that the sensor sampled evenly, and vice versa."""
     clocks = [_line_by(log, np.ones(len(log), bool))]
     if log.repeated.any():
         clocks.append(_line_by(log, ~log.repeated))
@@ -62,7 +61,7 @@ def _line(log):
 
 
 def _line_by(log, read):
-    """The strongest line of rows that were read (n,) bool, which lie evenly in time."""
+    """Strongest line in the rows with read (n,) bool, taken as evenly sampled."""
     x = _between(log.counts[read], log.masked[read].all(1))
     n, rate = len(x), log.rate * read.mean()
     size = int(min(n // 4, _SIZE[1]))
@@ -74,11 +73,11 @@ def _line_by(log, read):
     score, frequency, channels, band = peak
     y = np.diff(x[:, channels], axis=0)
     fine = frequency + np.linspace(-1.5, 1.5, 301) * rate / size
-    fine = fine[fine <= 0.5 * rate]  # beyond it lies a mirror image
+    fine = fine[fine <= 0.5 * rate]  # higher frequencies are aliases
     lines = (np.abs(zoom_fft(y, fine[[0, -1]], len(fine), fs=rate, endpoint=True, axis=0)) ** 2).sum(1)
     frequency = float(fine[int(np.argmax(lines))])
     gain, amplitude = _foretold(y, frequency, rate)
-    there = gain >= np.quantile(gain, 1 - _THERE)  # it may have been switched on late, or come and go
+    there = gain >= np.quantile(gain, 1 - _THERE)  # it may start late or be intermittent
     p = sign_flip(gain)
     if p > 0.01 or gain[there].min() < 1:
         return None
@@ -104,25 +103,24 @@ def _line_by(log, read):
 
 
 def _peak(x, size, rate):
-    """Of the spectra of x (n, c) by windows of some rows: times by which the strongest line stands out of
-    what is around it, its frequency [Hz], the channels that have it, and the end of the load's band [Hz].
-    None where none does."""
+    """Strongest line in the windowed spectra of x (n, c): ratio to the surrounding spectrum, frequency [Hz],
+    channels that show it, and end of the load's band [Hz]. None without a line. size: rows of a window."""
     starts = np.arange(0, len(x) - size + 1, size // 2)
     parts = np.stack([x[a : a + size] - x[a : a + size].mean(0) for a in starts])
     power = np.mean(np.abs(np.fft.rfft(parts * np.hanning(size)[:, None], axis=1)) ** 2, axis=0)  # (f, c)
     f = np.fft.rfftfreq(size, 1 / rate)
     floor = np.median(power[f > 0.3 * rate], axis=0)
-    # the load's band ends where the spectrum comes down to the floor
-    # mirrored at half of the rate, where a line may lie in the last place there is
+    # the load's band ends where the spectrum reaches its floor
+    # mirrored at the Nyquist frequency, since a line may lie in the last bin
     smooth = running_median(power, 2 * max(3, size // 100) + 1, "mirror")
-    wide = running_median(power, 2 * max(10, size // 40) + 1, "nearest")  # a line is no band
+    wide = running_median(power, 2 * max(10, size // 40) + 1, "nearest")  # wider than a line
     above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
     band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
     inside = f > max(_SLOWEST, 8 * rate / size)
     if inside.sum() < 20:
         return None
     ratio = power / np.maximum(smooth, 1e-9)
-    # where the load moves, a line has to stand out by far more than a movement's rhythm does
+    # within the load's band a line must exceed the rhythm of a movement by far
     ratio /= np.where(f > 1.15 * band, 1.0, _RHYTHM)[:, None]
     together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
     every = list(range(x.shape[1]))
@@ -142,19 +140,19 @@ def _peak(x, size, rate):
 
 
 def _foretold(y, frequency, rate):
-    """How well the phase of a line in the blocks beside a block foretells it there: gain (blocks,) [nats] of
-    differences y (n, c) of a channel, and amplitude (blocks, c)."""
+    """Prediction of a line's phase in each block from its neighbours: gain (blocks,) [nats] for differences y
+    (n, c) of channels, and amplitude (blocks, c)."""
     wave = np.exp(2j * np.pi * frequency * np.arange(len(y) + 1) / rate)
     step = np.diff(np.column_stack([wave.imag, wave.real]), axis=0)
-    # of at least four periods: a line may be there for a part of the time
+    # at least four periods: a line may be present for a part of the time
     blocks = int(np.clip(frequency * (len(y) + 1) / rate / 4, BLOCKS, 4 * BLOCKS))
     block = np.arange(len(y)) * blocks // len(y)
     gain, amplitude = np.empty(blocks), []
     noise = np.maximum(np.median(np.abs(y), axis=0) / 0.6745, 0.5)
     clipped = np.clip(y, -4 * noise, 4 * noise)
     for b in range(blocks):
-        # the phase of the neighbours: a line whose frequency wanders is still one; the weaker side's, for it
-        # may begin or end here
+        # phase of the neighbours, so that a wandering frequency is allowed; the weaker neighbour's amplitude,
+        # since the line may begin or end here
         sides = [(block >= b - 2) & (block < b), (block > b) & (block <= b + 2)]
         fits = [np.linalg.lstsq(step[near], clipped[near], rcond=None)[0] for near in sides if near.any()]
         w = min(fits, key=lambda w: np.sum((w / noise) ** 2))
@@ -166,7 +164,7 @@ def _foretold(y, frequency, rate):
 
 
 def _taken_out(counts, read, channels, frequency, rate):
-    """Counts (n, c) without what lies about a line: its phase and size may wander, slower than seconds."""
+    """Counts (n, c) minus a line whose phase and size may change within seconds."""
     turn = np.exp(-2j * np.pi * frequency * np.arange(read.sum()) / rate)[:, None]
     y = counts[np.ix_(read, channels)]
     y = y - _smooth(y, 0.25 * rate)
@@ -177,13 +175,13 @@ def _taken_out(counts, read, channels, frequency, rate):
 
 
 def _smooth(x, rows):
-    """x (n, c) averaged over some rows, twice."""
+    """x (n, c), smoothed twice by a moving average over some rows."""
     size = max(1, int(rows))
     return uniform_filter1d(uniform_filter1d(x, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")
 
 
 def _between(x, gone):
-    """x (n, c) with rows that are no measurement (n,) on the line between those beside them."""
+    """x (n, c) with invalid rows gone (n,) interpolated linearly."""
     if not gone.any() or gone.all():
         return x
     rows, known = np.arange(len(x)), np.flatnonzero(~gone)

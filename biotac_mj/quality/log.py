@@ -14,17 +14,17 @@ __all__ = ["Log"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Log:
-    """n rows of c channels that are evenly sampled but for rows that are missing.
+    """n rows of c channels, evenly sampled except for missing rows.
 
     Attributes:
-      counts: (n, c). rate: rows per second [Hz]; clocked: whether the file's own times say so.
-      masked: (n, c) bool, samples that are no measurement. repeated: (n,) bool, rows that only hold the one
-        before. Both are found or empty where they are not given.
-      missing: (n,) number of rows that are missing before each by the file's clock, None: it does not tell.
-      other_device: (n, k) what another device logged, as a force, or None.
-      read: (n, c) counts before a disturbance was taken out of them; `counts` where they are not given.
-      in_counts: whether values are counts, whose noise is known; converter: whether they are the converter's
-        own, 0..4095; signed: whether they say which way a channel goes.
+      counts: (n, c). rate: [Hz]; clocked: whether it comes from the file's times.
+      masked: (n, c) bool, samples without a measurement. repeated: (n,) bool, rows that equal the one before.
+        Default: none masked; repeats are detected.
+      missing: (n,) number of rows missing before each by the file's clock; None: unknown.
+      other_device: (n, k) signals logged by another device, such as force, or None.
+      read: (n, c) counts before a disturbance was removed; default `counts`.
+      in_counts: whether values are counts, whose noise is known. converter: whether they are the converter's
+        codes, 0..4095. signed: whether the sign of a channel's response is known.
     """
 
     counts: np.ndarray
@@ -64,16 +64,16 @@ class Log:
         return bool((self.counts == np.rint(self.counts)).all())
 
     def some(self, of_biotac: int) -> int:
-        """So many of c channels as of the electrodes of a BioTac."""
+        """Number of channels that corresponds to `of_biotac` of a BioTac's 19 electrodes."""
         return of_biotac * self.channels // NELECTRODE
 
     def without(self, mask: np.ndarray | None, counts: np.ndarray | None = None) -> "Log":
-        """The log less samples (n, c) bool that are no measurement, with other counts where given."""
+        """The log with further samples (n, c) bool masked and, if given, other counts."""
         masked = self.masked if mask is None else self.masked | mask
         return dataclasses.replace(self, masked=masked, counts=self.counts if counts is None else counts)
 
     def name(self, channels) -> str:
-        """Of channels, in words."""
+        """Names of channels, in words."""
         names, shown = [f"e{k + 1}" for k in channels], 4
         if len(names) == self.channels > 1:
             return "all electrodes"

@@ -1,5 +1,5 @@
-"""Rows that are missing: by the log's own clock, where all channels jump from one row to the next, or since
-nothing was measured in them."""
+"""Missing rows: by the log's clock, by jumps of all channels between two rows, or because nothing was
+measured."""
 
 from collections.abc import Sequence
 
@@ -16,27 +16,27 @@ from .noise import noise_level
 
 __all__ = ["dropped", "jumping", "unmeasured"]
 
-_MOST = 12  # channels of 19 that no load takes to an end of the converter at once
-_NEVER = 1e-5  # fraction of rows in which that is chance
-_FEW = 4  # channels of 19 that may jump for reasons of their own
-_BEGUN = 2.0  # [s] within which it is known when an effect on all channels begins
+_MOST = 12  # channels of 19; no load drives as many to an end of the converter at once
+_NEVER = 1e-5  # fraction of rows in which that happens by chance
+_FEW = 4  # channels of 19 that may jump for other reasons
+_BEGUN = 2.0  # [s] accuracy of the start of an effect on all channels
 _CHANCE = 12.0  # nats: one in 1e5
-_WINDOW = 12  # rows in which a channel without noise is told from one with it
+_WINDOW = 12  # rows of a window that shows whether a channel has noise
 _LEAST = 200  # rows
-# of places where rows may be lost, and times what else was logged does elsewhere that it does there: 5 and
-# more where a logger lost rows, 0.9 at most where electrodes alone jump
+# places to check; ratio of the other device's change there to its usual change: at least 5 where a logger
+# lost rows, at most 0.9 where only electrodes jump
 _PLAINEST, _LEAPS = 3, 2.5
-_END, _MEETS = 4, 2.0  # rows at either end, and their distance in noises where they meet
-_LINE = 4  # rows of the lines on either side
-# score of a jump, times those around it, and rows that jumps lie apart
+_END, _MEETS = 4, 2.0  # rows at either end, and their largest distance in noise units if they join
+_LINE = 4  # rows of the line fitted on either side
+# least score of a jump, least ratio to its neighbourhood, and least distance between jumps in rows
 _SCORE, _TIMES, _APART = 4.0, 3.0, 13
-# [s] of a bin and of a window; windows that are left out, since a step is no load; counts by which the six
-# liveliest of 19 change within windows where something is touched
+# [s] length of a bin and of a window; fraction of windows to ignore, since a step is no load; change [counts]
+# of the six most active of 19 channels within windows with contact
 _BIN, _SPAN, _LIVELIEST, _MOVED = 0.1, 3.0, 0.04, 6.0
 
 
 def dropped(log: Log) -> list[Fault]:
-    """Rows that the file's own clock says are missing."""
+    """Finds rows that are missing by the file's own clock."""
     if log.missing is None or not log.missing.any():
         return []
     at, lost = np.flatnonzero(log.missing), int(log.missing.sum())
@@ -54,8 +54,8 @@ def dropped(log: Log) -> list[Fault]:
 
 
 def unmeasured(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Rows in which most channels read an end of the converter: a sensor without power, a plug that is out,
-    a message that was not filled in."""
+    """Finds rows in which most channels read an end of the converter: no power, an unplugged connector or an
+    empty message."""
     gone = (np.isin(log.counts, (0, FULL_SCALE)) & ~log.masked).sum(1) >= max(2, log.some(_MOST))
     if not log.converter or not gone.any() or gone.all():
         return []
@@ -75,7 +75,7 @@ def unmeasured(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _lost(log, at, message, nats):
-    """Rows that are missing before rows at (k,), each by so many nats."""
+    """Fault of rows missing before rows at (k,), with evidence `nats` each."""
     strength = np.zeros(BLOCKS)
     np.add.at(strength, at * BLOCKS // len(log), nats)
     return Fault(
@@ -92,13 +92,13 @@ def _lost(log, at, message, nats):
 
 
 def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
-    """Places where all channels jump from one row to the next: straight lines on either side do not meet.
+    """Finds places where all channels jump between two rows: lines fitted on either side do not meet.
 
-    Rows are missing there ("lost_rows"), or were put together from elsewhere ("order"), or only the channels
-    jump ("jump").
+    There rows are missing ("lost_rows"), were joined from elsewhere ("order"), or only the channels jump
+    ("jump").
 
     Args:
-      begun: times [s] at which something else of all channels begins.
+        begun: start times [s] of other effects on all channels.
     """
     rows = np.flatnonzero(~log.repeated)
     good = log.masked[~log.masked.all(1)].mean(0) < 0.02
@@ -106,16 +106,16 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
         return []
     x, masked = log.counts[rows][:, good], log.masked[rows][:, good]
     before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
-    x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
+    x = np.take_along_axis(x, before, axis=0)  # masked samples take the last valid value
     noise = noise_level(x)
     if np.median(noise) < 0.7:
         return []
     before, after, spread = _ends(x)
     jump = (after - before) / noise / spread
-    # a few channels that jump are no loss: of all others a fifth has to
+    # a loss affects all channels: a fifth of the others must jump too
     others = np.sort(np.abs(jump), axis=1)[:, : max(_FEW, jump.shape[1] - log.some(_FEW))]
     score = np.sqrt((others**2).mean(1)) * ((others > 3).mean(1) >= 0.2)
-    # the load bends by as much on the rows around, a loss stands alone
+    # a load bends the rows around as well, a loss is a single event
     around = np.maximum(percentile_filter(score, 90, size=81), 1)
     places = [
         i
@@ -125,19 +125,19 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
     places = _in_order(_lively(log, x, rows, places), x, before, after)
     if not places:
         return []
-    # the same counts on every channel are a supply's, not a load's
+    # equal changes on all channels come from the supply, not from a load
     change = (after - before)[places]
     chosen = np.array(places)[np.abs(change.mean(1)) <= 2 * change.std(1)]
-    if not len(chosen) or not _moved(log):  # at rest nothing is missed
+    if not len(chosen) or not _moved(log):  # at rest a loss cannot be seen
         return []
     at = rows[chosen + _LINE]
     when = ", ".join(f"{row / log.rate:.2f}" for row in sorted(at)[:6])
     found = _lost(
         log, at, f"at {when} s all electrodes jump between two rows: rows were lost", 0.5 * score[chosen] ** 2
     )
-    found.p = len(chosen) / len(score)  # rows that stand alone as much
+    found.p = len(chosen) / len(score)  # fraction of rows that stand out as much
     found.features = {
-        # up to a dozen times what is around it a place or two of every log jumps
+        # every log has one or two places with up to a dozen times the score around them
         "times": float(np.clip(np.max(score[chosen] / around[chosen]), 12, 30)),
         "score": float(np.log(score[chosen].max())),
     }
@@ -145,8 +145,8 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
 
 
 def _ends(x):
-    """Ends of least-squares lines of the rows on the left and on the right of every gap between rows of
-    x (n, c), and the spread of their difference in noises."""
+    """Ends of least-squares lines on the left and right of every gap between rows of x (n, c), and the
+    standard deviation of their difference in noise units."""
     h, n = _LINE, len(x)
     line = np.vander(np.arange(h), 2)
     end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(line)
@@ -156,14 +156,14 @@ def _ends(x):
 
 
 def _alone(score, around):
-    """Places, the plainest first, whose score stands out of those around."""
+    """Places whose score exceeds those around, by decreasing ratio."""
     times = np.where(score > _SCORE, score / around, 0.0)
     places, _ = find_peaks(times, height=_TIMES, distance=_APART)
     return places[np.argsort(-times[places], kind="stable")].tolist()
 
 
 def _lively(log, x, rows, places):
-    """Places that do not follow rows that were held, trembling or not: after these the load has moved on."""
+    """Places that do not follow repeated or jittering rows, after which the load has moved on."""
     bend = np.abs(np.diff(x, n=3, axis=0))
     usual = np.maximum(np.median(bend, axis=0), 0.5)
     return [
@@ -175,8 +175,8 @@ def _lively(log, x, rows, places):
 
 
 def _in_order(places, x, before, after):
-    """Places at which rows are missing, and not those of rows that come again, or that were written last
-    first: from there it jumps back to what lies beside another place."""
+    """Places with missing rows, without those at repeated or reversed rows: from these the signal jumps back
+    to another place."""
     _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
     again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * _LINE) > 0.4
     out = []
@@ -193,7 +193,7 @@ def _in_order(places, x, before, after):
 
 
 def _moved(log):
-    """Whether channels move by tens of counts within seconds, as a load moves them."""
+    """Whether channels change by tens of counts within seconds, as under a load."""
     size = max(1, round(_BIN * log.rate))
     m = len(log) // size
     x = log.counts[: m * size].reshape(m, size, -1).mean(1)
@@ -207,9 +207,8 @@ def _moved(log):
 
 
 def _or_not(log, found, rows, at, noise, x):
-    """The fault, or another one where something speaks against rows that are missing before some of the rows
-    read x (n, c), the plainest first: what was logged beside the channels misses them as well, and what was
-    there before them comes before what is there after."""
+    """The fault, or another one if evidence is against missing rows: signals of the other device must jump
+    too, and the rows before must precede those after. x: rows (n, c) as read; rows: by decreasing score."""
     if log.other_device is not None:
         leaps = np.median([_leap(log.other_device, int(row)) for row in rows[at[:_PLAINEST]]])
         id_, why = ("lost_rows", "") if leaps > _LEAPS else ("jump", "and the force does not")
@@ -229,7 +228,7 @@ def _or_not(log, found, rows, at, noise, x):
 
 
 def _leap(signal, row):
-    """By how many times what it does elsewhere something (n, k) changes at a row, the liveliest component."""
+    """Change of signal (n, k) at a row over its usual change, for the most active component."""
     before, after = _END + 1, _END - 1
     at = np.clip(np.r_[row, np.arange(10, len(signal) - 10, 7)], before, len(signal) - after)
     size = np.abs([signal[i : i + after].mean(0) - signal[i - before : i - 1].mean(0) for i in at])

@@ -1,4 +1,4 @@
-"""White noise of a record, from its quietest parts, and what a sound electrode has."""
+"""White noise of a record, from its quietest segments, and the expected noise of a healthy electrode."""
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -11,13 +11,13 @@ ROUNDING = 0.29  # [counts] of a number rounded to whole ones: 1 / sqrt(12)
 
 
 def sound_noise(counts: np.ndarray) -> np.ndarray:
-    """Standard deviation of a sound electrode's noise at these counts [counts]: of rounding at least, which
-    is all that is left at the ends of what it can read, where a broken wire leaves it."""
+    """Standard deviation of a healthy electrode's noise [counts]. It is at least that of rounding, which
+    alone remains at the ends of the range."""
     return np.maximum(electrode_noise(counts), ROUNDING)
 
 
 def noise_level(counts: np.ndarray, repeated: np.ndarray | None = None, least: float = 0.05) -> np.ndarray:
-    """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the
+    """(c,) standard deviation of the white noise of samples (n, c) [counts], from second differences in the
     quietest quarter of the record."""
     x = counts if repeated is None else counts[~repeated]
     d = np.diff(x, n=2, axis=0) / np.sqrt(6)
@@ -28,6 +28,6 @@ def noise_level(counts: np.ndarray, repeated: np.ndarray | None = None, least: f
 
 
 def running_median(x: np.ndarray, size: int, mode: str) -> np.ndarray:
-    """Medians of `size` rows of x (n, c), column by column; mode: how it goes on beyond its ends, as
-    scipy.ndimage.median_filter has it. One column at a time takes scipy up to twenty times less."""
+    """Running median over `size` rows of x (n, c), per column. mode: boundary treatment as in
+    scipy.ndimage.median_filter, which is up to twenty times faster on single columns."""
     return np.stack([median_filter(column, size, mode=mode) for column in x.T], axis=1)

@@ -1,4 +1,4 @@
-"""Rows that repeat the one before: by a logger that is faster than the bus, or held."""
+"""Rows that repeat the one before, because the logger is faster than the bus or values were held."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ __all__ = ["repeated_rows"]
 
 
 def repeated_rows(counts: np.ndarray) -> np.ndarray:
-    """(n,) bool: rows of counts (n, c) that equal the one before, where that is no chance.
+    """(n,) bool: rows of counts (n, c) that equal the one before, unless by chance.
 
-    A few channels, 4 of a BioTac, may differ: something may have been added to single ones after the row
-    was held.
+    A few channels, 4 of a BioTac's, may differ: something may have been added to single channels after the
+    hold.
     """
     n, c = counts.shape
     if n < 2:

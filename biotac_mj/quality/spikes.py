@@ -1,4 +1,4 @@
-"""Samples and rows that leave the trace and come back at once."""
+"""Single samples and rows that leave the signal and return at once."""
 
 from collections.abc import Sequence
 
@@ -13,34 +13,34 @@ from .noise import ROUNDING, noise_level, running_median
 
 __all__ = ["off_rows", "spikes"]
 
-_FEW = 4  # channels of 19 that may leave at once for reasons of their own
-_TIMES = 4  # samples of a channel that are more than chance
-_ROWS = 7  # times the noise that all of these leave the trace by
-# times the noise and a count, that a sample leaves the trace by; fraction of samples of real recordings that
-# do
+_FEW = 4  # channels of 19 that may leave at once for other reasons
+_TIMES = 4  # samples of a channel, more than chance explains
+_ROWS = 7  # times the noise, distance of all of these from the signal
+# times the noise plus one count, distance of a sample from the signal; fraction of such samples in real
+# recordings
 _FAR, _BY_ITSELF = 20.0, 3e-6
-_RARE = 1e-5  # fraction of rows that leave the trace by chance
-# channels that a cable may carry, and times as often as others such a channel leaves its trace: where more
-# do, or others as often, their cause is one
+_RARE = 1e-5  # fraction of such rows by chance
+# channels that one cable may affect, and least ratio of their spikes to others': if more channels have as
+# many, the cause is a common one
 _CABLE, _MORE = 3, 1.4
-_TOGETHER = 0.5  # of the samples of each of two, in the same rows, from which on they have one cause
-_OFTEN_EACH = 3  # of these of one channel at most, where any has them
-_ADJACENT, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
-_GONE = 100  # counts that most channels leave for a row: no load comes and goes like that
-_MOST = 12  # channels of 19 that leave and come back at once: no touch is over after a row or two
-_SPAN = 7  # rows of the median that is the trace
+_TOGETHER = 0.5  # fraction of samples of two channels in the same rows above which they have one cause
+_OFTEN_EACH = 3  # most of these per channel
+_ADJACENT, _HELD = 0.1, 0.3  # fraction of outliers side by side, without and with repeated rows
+_GONE = 100  # [counts] by which most channels leave for a row: no load does that
+_MOST = 12  # channels of 19 that leave and return at once: no touch lasts one or two rows
+_SPAN = 7  # rows of the running median
 
 
 def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Finds spikes: single samples far from the trace of one channel, of several channels in the same row,
-    or of any channel now and then. Channels that often leave their trace for longer are "contact"."""
+    """Finds spikes: single samples far from the signal, in one channel, in several channels of the same row,
+    or in any channel now and then. Channels that often leave for longer have the fault "contact"."""
     x, coarse = log.counts, np.zeros(log.channels)
     for f in faults:
         if f.step:
             coarse[list(f.channels)] = f.step
     bad = _outliers(x, coarse) & ~log.masked
-    bad &= bad.sum(1, keepdims=True) <= max(1, log.some(_FEW))  # what all do at once is of no channel
-    number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
+    bad &= bad.sum(1, keepdims=True) <= max(1, log.some(_FEW))  # an event of all has another cause
+    number = bad.sum(0)  # compared with neighbouring samples only
     ordered = np.concatenate([np.zeros(_CABLE), np.sort(number)])
     off = np.abs(x - running_median(x, _SPAN, "mirror"))
     far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
@@ -72,7 +72,7 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _spikes(log, channels, mask, number, message, strength):
-    """Samples, mask (n, c), so many of each channel."""
+    """Fault of samples mask (n, c), number (c,) per channel."""
     rows = np.flatnonzero(mask.any(1))
     return Fault(
         "spikes",
@@ -88,7 +88,7 @@ def _spikes(log, channels, mask, number, message, strength):
 
 
 def _loose(log, k, bad):
-    """Channel k whose samples (n,) bool leave its trace for longer than a row."""
+    """Fault of channel k, whose samples bad (n,) leave the signal for more than one row."""
     rows = np.flatnonzero(bad)
     message = (
         f"{log.name([k])} leaves its trace {len(rows)} times, often for more than one row: no spikes are"
@@ -97,8 +97,8 @@ def _loose(log, k, bad):
 
 
 def _together(bad):
-    """Channels with a few samples bad (n, c) bool, each with those whose are in the same rows: no sound
-    sensor has such, so that these say nothing against each other. The most samples first."""
+    """Channels with a few outliers bad (n, c) bool, each with those that have them in the same rows. Healthy
+    sensors have none, so these are no evidence against each other. Most samples first."""
     number = bad.sum(0)
     near = maximum_filter1d(bad.astype(np.int8), 3, axis=0)
     fraction = bad.T.astype(float) @ near / np.maximum(number, 1)[:, None]
@@ -113,8 +113,8 @@ def _together(bad):
 
 
 def _in_a_row(log, bad):
-    """Whether samples (n,) bool often stand side by side: a loose contact, or a word that overflows, leaves
-    for longer than a sample. Rows that a logger repeats are one, where it does not repeat so many."""
+    """Whether outliers (n,) bool are often consecutive: a loose contact or an overflow lasts longer than a
+    sample. Rows that the logger repeats count as one, unless too many repeat."""
     rows = np.flatnonzero(bad)
     fresh = np.unique(np.cumsum(~log.repeated)[rows])
     return any(
@@ -124,17 +124,16 @@ def _in_a_row(log, bad):
 
 
 def _by_far(fault, far, log):
-    """Samples far (n, ...) bool that no channel has by itself."""
+    """Adds evidence of outliers far (n, ...) bool that no channel has by chance."""
     fault.p = min(fault.p, float(poisson.sf(far.sum() - 1, _BY_ITSELF * log.channels * len(far))))
     fault.detector = "far"
 
 
 def _anywhere(log, far):
-    """Samples far (n, c) bool of any channel, now and then: bits or words lost on the way, whosever they
-    are."""
+    """Finds rare outliers far (n, c) bool in any channel: bits or words lost in transmission."""
     number = far.sum(0)
     hit = np.flatnonzero(number)
-    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):  # more are a fault of their channel
+    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):  # more are a fault of the channel
         return []
     message = (
         f"{number.sum()} samples of {log.name(hit)} leave their neighbours by more than {_FAR:.0f} times the "
@@ -147,7 +146,7 @@ def _anywhere(log, far):
 
 
 def off_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Rows that most channels leave at once and come back to, however often."""
+    """Finds rows that most channels leave at once and return to, at any rate."""
     whole = _outliers(log.counts, np.zeros(log.channels), often=True).sum(1) >= max(2, log.some(_MOST))
     if not whole.any():
         return []
@@ -161,9 +160,9 @@ def off_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _outliers(x, coarse, often=False):
-    """(n, c) bool of one or two samples that leave the trace and come back; coarse: (c,) step of codes.
-    often: also where these are so frequent that they are most of what is around."""
-    middle = running_median(x, _SPAN, "mirror")  # the first and the last row are one of seven, too
+    """(n, c) bool, one or two samples that leave the signal and return. coarse: (c,) step of codes. often:
+    also finds those that are frequent in their neighbourhood."""
+    middle = running_median(x, _SPAN, "mirror")  # the first and the last row also have seven
     off = np.abs(x - middle)
     padded = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
     before, after = padded[:-12], padded[12:]
@@ -171,10 +170,10 @@ def _outliers(x, coarse, often=False):
     if often:
         noise = np.minimum(noise, np.maximum(1.6 * np.median(off, axis=0), ROUNDING))
     least = (_ROWS if often else 10) * noise + 4 * coarse
-    if often:  # those that stand alone are none of what is around
+    if often:  # exclude single outliers from the neighbourhood's scale
         next_to = np.pad(off, ((1, 1), (0, 0)), mode="edge")
         lively = np.where((off > least) & (np.maximum(next_to[:-2], next_to[2:]) < 0.3 * off), 0, lively)
     around = uniform_filter1d(lively, 101, axis=0, mode="mirror")
-    # lively stretches leave the median by more
+    # active segments deviate more from the median
     limit = np.maximum(least, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)

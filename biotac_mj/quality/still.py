@@ -1,4 +1,4 @@
-"""Single channels that stand still: dead, stuck, or clipped at an end of what they read."""
+"""Constant channels: dead, stuck, or clipped at a limit of their range."""
 
 from collections.abc import Sequence
 
@@ -13,23 +13,23 @@ from .noise import sound_noise
 
 __all__ = ["dead", "standing_still"]
 
-_WINDOW = 12  # rows in which a channel without noise is told from one with it
-_QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
+_WINDOW = 12  # rows of a window that shows whether a channel has noise
+_QUIET = 0.3  # of its usual noise: 3 of 1000 windows of a real sensor have less by chance
 _FRACTION = 0.01  # of the rows
 _BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
-# of the range that a channel moves in, the half of its middle; of the samples there, how many a filter makes
-# stand still: 0.45 to 0.61 in low-passes of three authors, none where there is a limit (34 channels of five)
+# middle half of the channel's range; fraction of samples there that a low-pass makes constant: 0.45 to 0.61
+# for low-passes of three authors, 0 at limits (34 channels of five authors)
 _INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
-# rows that are no spike; rows beside, and times their steps that one is by which a channel is thrown
+# least duration in rows (no spike); neighbouring rows, and ratio of a jump to their steps
 _STAY, _ADJACENT, _THROWN = 3, 4, 3.0
-_STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
+_STANDS = 8.0  # [counts] most jitter of a constant channel
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
-_ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
+_ALIVE = 1.2  # [counts] of noise, four times that of rounding
 
 
 def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Channels that never change, where others do, and not because their values are coarse."""
+    """Finds channels that never change while others do, unless their values are coarse."""
     low, high = log.counts.min(0), log.counts.max(0)
     same = np.flatnonzero(low == high)
     coarse = {k for f in faults if f.step for k in f.channels}
@@ -47,21 +47,21 @@ def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Channels that stand still for a time: a live one has noise in every row. At an end of what it reads, to
-    which it comes again and again, it is clipped, else stuck."""
+    """Finds channels that are constant for a time; a live one has noise in every row. A channel that returns
+    again and again to a limit of its range is clipped, others are stuck."""
     known = {k for f in faults if f.step or f.silent for k in f.channels}
     rows = np.flatnonzero(~log.masked.all(1) & ~log.repeated)
-    # values that are held all the time stand still by themselves
+    # repeated rows are constant anyway
     if len(rows) < 4 * _WINDOW or any(f.held and f.mask is None for f in faults):
         return []
     quiet = _quiet(log, rows)
     fraction = quiet.mean(0)
     fraction[[k for f in faults if f.silent for k in f.channels]] = 0.0
     ordered = np.concatenate([np.zeros(3), np.sort(fraction)])
-    # where several stand still at times it is nothing of one channel, but at an end of what each reads
+    # several constant channels at a time have a common cause, unless each is at its limit
     alone = fraction > np.maximum(_FRACTION, 6 * ordered[-3])
     limited = fraction > np.maximum(_FRACTION, 6 * ordered[-1 - max(1, log.some(8))])
-    # a row that repeats another is as that one
+    # a row that repeats another has the same state
     before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
     sure = _thrown_to_an_end(log) | _stays(log, log.read[rows])[before]
     found = []
@@ -70,11 +70,11 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
             continue
         at = np.zeros(len(rows), bool)
         at[1:-1] = quiet[:, k] & (alone | limited)[k]
-        at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of windows that touch one another
+        at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of consecutive windows
         still = at[before] | sure[:, k]
         if not still.any():
             continue
-        # of equal readings all are held or none: a window tells the middle of them alone
+        # equal readings are all constant or none: a window shows only the middle ones
         run = np.cumsum(np.diff(log.read[:, k], prepend=np.nan) != 0)
         still |= np.isin(run, run[still])
         found += [
@@ -84,9 +84,9 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
 
 
 def _stays(log, x):
-    """(n, c) bool: samples of x (n, c) that a channel repeats for longer than chance lets it. Where a step is
-    none with a probability of q, stays of m steps come with q^m, and the longest in n rows is about
-    log n / -log q: of its second stay and of those of all but one of the others q is known."""
+    """(n, c) bool: samples of x (n, c) that repeat longer than chance allows. If a step is zero with
+    probability q, runs of m steps have probability q^m, and the longest in n rows is about log n / -log q. q
+    comes from the channel's second longest run and those of all other channels but one."""
     out, found = np.zeros(x.shape, bool), [runs(c) for c in (np.diff(x, axis=0) == 0).T]
     longest = np.array([np.sort(np.r_[0, 0, length])[-2:] for _, length in found])
     for k, (start, length) in enumerate(found):
@@ -99,8 +99,8 @@ def _stays(log, x):
 
 
 def _thrown_to_an_end(log):
-    """(n, c) bool: samples that stay at an end of the converter, for longer than a spike does, and came there
-    or left by a step that no load makes: it is larger than those beside it."""
+    """(n, c) bool: samples at an end of the converter for longer than a spike, entered or left by a step
+    larger than those around it, which no load makes."""
     out = np.zeros(log.counts.shape, bool)
     ends = np.isin(log.read, (0, FULL_SCALE)) & ~log.masked & log.converter
     for k in np.flatnonzero(ends.any(0)):
@@ -115,36 +115,37 @@ def _thrown_to_an_end(log):
 
 
 def _quiet(log, rows):
-    """(n - 2, c) bool: windows of rows (n,) in which a channel has no noise. A hum is none of its noise, but
-    one that stands still has no hum either."""
+    """(n - 2, c) bool: windows of rows (n,) in which a channel has no noise. Hum does not count as noise, but
+    a constant channel has no hum either."""
     x, law, size = log.read[rows], *_noise(log.counts[rows])
     lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
     usual, loud = (_middle(values, lively) for values in (size, law))
     law, size = _noise(x)
     others = np.nanmedian(usual)
-    # spikes and bursts are not a channel's noise, nor is what is left to one that trembled from the start
+    # ignore spikes, bursts, and channels that jittered from the start
     usual = np.where(usual > _QUIET * others, np.minimum(usual, others), others)
-    # without noise a constant reading is no news
+    # without noise a constant reading is no evidence
     alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
-    # at an end of the converter nothing is measured, however little noise there was before
+    # at an end of the converter nothing is measured, with any noise
     railed = minimum_filter1d(np.isin(x, (0, FULL_SCALE)).astype(np.int8), _WINDOW, axis=0)[1:-1] > 0
     return (size < _QUIET * usual) & alive | railed & log.converter
 
 
 def _noise(x):
-    """Noise of a sound channel, and of windows of x (n, c) in units of it: (n - 2, c) each."""
+    """Noise of a healthy channel, and noise of windows of x (n, c) in units of it: (n - 2, c) each."""
     bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
     law = sound_noise(uniform_filter1d(x, _WINDOW, axis=0)[1:-1])
     return law, np.sqrt(np.maximum(uniform_filter1d(bend, _WINDOW, axis=0), 0)) / law
 
 
 def _middle(values, on):
-    """Median of values (n, c) over the samples that are `on`, NaN where none is."""
+    """Median of values (n, c) over the samples `on`, NaN if there is none."""
     return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
 
 
 def _stood(log, k, still, sure):
-    """Faults of channel k that stands still in some samples (n,) bool, and in some of them surely."""
+    """Faults of channel k that is constant in samples still (n,) bool, and certainly in samples sure (n,)
+    bool."""
     whole, found = log.read[:, k], []
     moving = ~still & ~log.masked.all(1)
     start, length = runs(still)
@@ -154,7 +155,7 @@ def _stood(log, k, still, sure):
     first = on[len(on) // 20]  # a limit may begin late, and a window may be quiet by chance
     if moving[first:].sum() > 0.2 * len(on):
         moving[:first] = False
-    # where the channel goes when it moves: next to nowhere beyond a limit
+    # range of the channel while it moves: hardly anything lies beyond a limit
     ever = _reach(whole[~still & ~log.masked.all(1)])
     ends = _reach(whole[moving])
     inner = np.abs(whole - ends.mean()) < _INNER * np.ptp(ends)
@@ -162,15 +163,15 @@ def _stood(log, k, still, sure):
     if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
         if still[inner].mean() > _FILTERED:
             return []
-    stays = still[on[0] : on[-1] + 1].mean() > 0.8  # a limit is left when the load goes back
+    stays = still[on[0] : on[-1] + 1].mean() > 0.8  # a limit is left when the load decreases
     low, high = _at_ends(values, ends)
     for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
-        if side < 0 and not log.signed:  # its rest
+        if side < 0 and not log.signed:  # its baseline
             continue
         if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
         if not side and np.median(ranges[mine]) > _STANDS:
-            continue  # it has no noise, but it goes somewhere: it is filtered, or answers less
+            continue  # no noise but movement: low-pass or smaller gain
         if not side and (found or length.max() < _BRIEF * log.rate and not sure.any()):
             continue
         one = _one(log, k, side, values[mine], start[mine], length[mine])
@@ -178,30 +179,30 @@ def _stood(log, k, still, sure):
             one.p = min(one.p, float(np.exp(-_CHANCE)))
         if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
             if any(at.all() for at in (low, high, *_at_ends(values, ever))):
-                one.ties = ("saturate",)  # of one stay at an end of what it reads
-        if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
+                one.ties = ("saturate",)  # a single stay at a limit
+        if mine.sum() > 8 and not stays:  # it moves in between: it does not respond there
             one.ties = ("gain",) if side else ("gain", "saturate")
-        if one.detector == "rail":  # an answer of the other sign takes levels to the converter's end, too
+        if one.detector == "rail":  # a response of the wrong sign also drives levels to the converter's end
             one.ties = (*one.ties, "flip")
         found.append(one)
     return found
 
 
 def _reach(moving):
-    """The ends of where a channel goes in samples (n,), but for a few."""
+    """Range of a channel's samples (n,), without a few outliers."""
     return np.quantile(moving, [0.03, 0.97]) if len(moving) else np.array([np.inf, -np.inf])
 
 
 def _at_ends(values, ends):
-    """Which values (k,) are at the lower and at the upper one of two ends, or beyond: a limit is reached by
-    going there; what lies far beyond where it moves is none."""
+    """Which values (k,) are at or beyond the lower and the upper of two ends. Values far beyond the range are
+    no limit."""
     near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
     return near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
 
 
 def _one(log, k, side, values, start, length):
-    """The fault of channel k that stands still at some values in runs: at its upper end (side 1), at its
-    lower one (-1), or anywhere (0)."""
+    """Fault of channel k, constant at some values in runs: side 1 at its upper limit, -1 at its lower, 0
+    anywhere."""
     mask = np.zeros(log.counts.shape, bool)
     for a, n in zip(start, length):
         mask[a : a + n, k] = True
