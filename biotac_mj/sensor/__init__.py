@@ -1,4 +1,5 @@
-"""The sensor beyond its skin: film, electrodes, pressure, heat, vibration; acquisition into counts."""
+"""The sensor's electronics and fluids: film, electrodes, pressure, heat, vibration, acquisition into
+counts."""
 
 import typing
 

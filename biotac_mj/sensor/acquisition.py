@@ -1,18 +1,17 @@
-"""From impedances, pressure and temperature to 12-bit counts, slot by slot, as the BioTac's multiplexer does
-it.
+"""Converts impedances, pressure and temperature to 12-bit counts, slot by slot as the BioTac's multiplexer
+does.
 
 One frame of a BioTac is 10 ms = 44 slots at 4.4 kHz, 0.227 ms apart. Even slots are PAC (22 per frame, 2.2
-kHz); the 22 odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Other designs have other
-frames (`Design.slots`). Source of rates: SynTouch manual; which
-channel has which slot is not published: CHOSEN as above.
+kHz). The 22 odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Other designs have other
+frames (`Design.slots`). The rates are from the SynTouch manual; the order of channels is not published:
+CHOSEN as above.
 
-Slot k = 1, 2, ... lies at time k / 4400 s: what is sampled when depends on the time alone, never on the
-time step, and what is read at a multiple of a frame is one whole frame, in the order in which it was taken.
-All memory lies in one state vector for each sensor, and noise is a function of (seed, slot), so a replay from
-a saved state is bit-equal.
+Slot k = 1, 2, ... is at time k / 4400 s, so sampling times do not depend on the time step, and a reading at a
+multiple of a frame is one whole frame in the order of its slots. One state vector per sensor holds all
+memory, and noise is a function of (seed, slot), so a replay from a saved state is bit-equal.
 
-`Acquisition` is one multiplexer whose state the caller owns, `BatchAcquisition` has those of many worlds on
-their device; both launch the kernels of `acquisition_kernels`."""
+`Acquisition` is one multiplexer whose state the caller owns. `BatchAcquisition` holds those of many worlds on
+their device. Both launch the kernels of `acquisition_kernels`."""
 
 import math
 import numbers
@@ -58,8 +57,8 @@ __all__ = [
 
 
 class Acquisition:
-    """The multiplexer, its filters, its noise and its converter. Constant after construction; the state
-    belongs to the caller.
+    """The multiplexer, its filters, its noise and its converter. Constant after construction; the caller owns
+    the state.
 
     Every channel samples, at its slots, the signal interpolated linearly over the step that contains them,
     and holds the count until its next slot. The filters are first-order sections (PDC: low-pass 1040 Hz; PAC:
@@ -67,16 +66,16 @@ class Acquisition:
     signal.
 
     Args:
-      seed: of the noise, 0 .. 2**64 - 1; give every sensor its own.
-      noise: False leaves quantisation only.
-      film_every_step: see `needs_impedance`.
-      sensor: whose own numbers `reset` writes.
-      film_rest: (n,) the impedances that it is given at rest [ohm]; None: this sensor's own.
-      heat: whether the temperatures that it is given warm it up (`sensor.heat`).
-      design: of the sensor, n its number of electrodes.
+        seed: of the noise, 0 .. 2**64 - 1; give every sensor its own.
+        noise: False keeps quantisation only.
+        film_every_step: see `needs_impedance`.
+        sensor: preset whose constants `reset` writes into the state.
+        film_rest: (n,) impedances of the film at rest [ohm]; None: this sensor's own.
+        heat: whether a heat model (`sensor.heat`) computes the warm-up.
+        design: of the sensor; n is its number of electrodes.
 
     Attributes:
-      nstate: length of the state vector. place: where its parts begin.
+        nstate: length of the state vector. place: offsets of its fields.
 
     Raises:
       ValueError: the seed is out of range.
@@ -101,7 +100,7 @@ class Acquisition:
         self._own = sensor.numbers(film_rest, heat)
 
     def of(self, sensor: Sensor) -> "Acquisition":
-        """The same multiplexer of another sensor."""
+        """The same multiplexer for another sensor."""
         more = self.film_every_step, sensor, self._film_rest, self._heat
         return Acquisition(self.seed, self.noise, *more, self.design)
 
@@ -118,8 +117,8 @@ class Acquisition:
 
         Args:
           state: (nstate,) float64, written in place.
-          impedance: (n,) [ohm]; pressure: above rest [Pa]; temperature: [C], None: the sensor's; time: now
-            [s]; liquid: how much warmer it is than at the impedances [C].
+            impedance: (n,) [ohm]; pressure: above rest [Pa]; temperature: [C], None: the sensor's; time: now
+              [s]; liquid: temperature above that of the impedances [C].
         """
         self._check_state(state)
         at, n = self.place, self.place.nelectrode
@@ -151,13 +150,13 @@ class Acquisition:
         state[at.sampled : at.began] = np.clip(np.rint(state[at.sampled : at.began]), 0, channels.FULL_SCALE)
 
     def needs_impedance(self, state: np.ndarray, time: float, dt: float) -> bool:
-        """Whether `advance` over (time, time + dt] wants a new impedance, so that the film need not be solved
-        otherwise.
+        """Whether `advance` over (time, time + dt] needs a new impedance; otherwise the film need not be
+        solved.
 
-        By default once per frame: in the step that holds the frame's first electrode slot. Until the next
-        solution the electrodes hold that impedance, so what the last electrode reads is up to one frame (10
-        ms) old, 5 ms on average: causal, and what makes a 0.1 ms step affordable. With `film_every_step`
-        whenever an electrode slot falls into the step.
+        By default once per frame: in the step that contains the frame's first electrode slot. The electrodes
+        keep that impedance until the next solution, so the last electrode's is up to one frame (10 ms) old, 5
+        ms on average. This is causal and makes a 0.1 ms step affordable. With `film_every_step`, every step
+        that contains an electrode slot.
         """
         return _one(self.design).find_due(time, dt, self.film_every_step)
 
@@ -180,9 +179,9 @@ class Acquisition:
           impedance: (n,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
           pressure: at the end of the step, above rest [Pa].
           temperature: of the core at the end of the step [C]; None keeps the last one.
-          shaken: (1, n) float64 on the CPU, what PAC feels besides at each of the slots [Pa], of its band
-            already (`vibration`).
-          liquid: how much warmer it is at the end of the step than at the impedances [C].
+            shaken: (1, n) float64 on the CPU, further band-passed pressure on PAC at each of the slots [Pa]
+              (`vibration`).
+            liquid: temperature at the end of the step above that of the impedances [C].
 
         Raises:
           ValueError: wrong shape, not finite, impedance not positive, or dt not positive. The state is
@@ -198,7 +197,7 @@ class Acquisition:
         _one(self.design).sample(self.seed, self.noise, state, time, dt, impedance, *signals, liquid, shaken)
 
     def readings(self, state: np.ndarray) -> dict:
-        """What the bus would report now.
+        """Counts that the bus would report now.
 
         Returns:
           dict of counts: electrodes (n,) int, pdc int, pac (npac,) int in the order of the frame's PAC slots,
@@ -253,8 +252,8 @@ class Acquisition:
 
 
 class _One:
-    """One world's arrays on the CPU and the kernels' recorded launches, a thread's own: what every
-    `Acquisition` fills in and reads back."""
+    """One world's CPU arrays and recorded launches, one set per thread; every `Acquisition` fills them and
+    reads them back."""
 
     def __init__(self, design):
         at = place_of(design)
@@ -312,7 +311,7 @@ _mine = threading.local()
 
 
 def _one(design):
-    """This thread's `_One` of a design, made when it is first used: that compiles the kernels."""
+    """This thread's `_One` for a design, made on first use, which compiles the kernels."""
     if not hasattr(_mine, "ones"):
         _mine.ones = {}
     if design not in _mine.ones:
@@ -321,19 +320,19 @@ def _one(design):
 
 
 class BatchAcquisition:
-    """The multiplexers of `nworld` sensors on one device, each with its own clock and seed: worlds get the
-    counts, noise included, of single ones with their seeds.
+    """The multiplexers of `nworld` sensors on one device, each with its own clock and seed. Each world's
+    counts, including noise, equal those of a single sensor with its seed.
 
     Args:
-      rest: (n,) impedance that the film gives at rest [ohm], at which every world begins.
+        rest: (n,) impedance of the film at rest [ohm], the initial state of every world.
       nworld: number of worlds.
-      seed: of world 0; world w has seed + w. Or (nworld,) of them, 0 .. 2**64 - 1.
-      noise: False leaves quantisation only.
+        seed: of world 0, world w has seed + w; or (nworld,) seeds, 0 .. 2**64 - 1.
+        noise: False keeps quantisation only.
       film_every_step: see `Acquisition.needs_impedance`.
-      temperature: of the core at rest [C]; None: each sensor's own. liquid: how much warmer the liquid is
-        then than at the impedances [C]. One, or one for each sensor.
-      sensor: Sensor of all worlds, or a list: one for each world, and (`redraw`) more that every later reset
-        of a world draws from, by seed and number of the reset.
+        temperature: of the core at rest [C]; None: each sensor's own. liquid: initial temperature of the
+          liquid above that of the impedances [C]. One, or one for each sensor.
+        sensor: of all worlds, or a list of one per world. With `redraw` the list may be longer, and every
+          later reset draws from it by seed and reset count.
       heat, design: see `Acquisition`.
       device: Warp device.
 
@@ -342,15 +341,15 @@ class BatchAcquisition:
       state: (nworld, nstate) wp.array float64, each row the state vector of an `Acquisition`.
       time: (nworld,) wp.array float64 [s], each sensor's clock, zero at its reset.
       temperature: (nworld,) wp.array float64, of the core at the end of the next step [C].
-      liquid: (nworld,) wp.array float64, how much warmer the liquid is than at the impedances [C].
+        liquid: (nworld,) wp.array float64, temperature of the liquid above that of the impedances [C].
       due: (nworld,) wp.array int, written by `find_due`.
-      row: (nworld,) wp.array int, which sensor of the list each world has. rest_states: (n, nstate) wp.array
-        float64, states at rest of the sensors of the list.
-      seed: (nworld,) wp.array uint64. drawn: (nworld,) wp.array int, resets that each world has had; redraws:
-        1 where these draw.
+        row: (nworld,) wp.array int, index of each world's sensor in the list. rest_states: (n, nstate)
+          wp.array float64, initial states of the sensors of the list.
+        seed: (nworld,) wp.array uint64. drawn: (nworld,) wp.array int, number of resets; redraws: 1 if resets
+          draw a sensor.
 
     Raises:
-      ValueError: a seed out of range or another number of seeds or sensors than worlds.
+        ValueError: a seed out of range, or a number of seeds or sensors that does not fit `nworld`.
     """
 
     def __init__(
@@ -403,16 +402,17 @@ class BatchAcquisition:
             self.due = wp.zeros(nworld, dtype=int)
             self._still = wp.zeros((nworld, 0), dtype=real)
             self.reset(wp.full(nworld, True, dtype=bool))
-            self.drawn.zero_()  # the first reset by whoever has it is the beginning, and draws nothing
+            self.drawn.zero_()  # the owner's first reset is the beginning and draws nothing
 
     def reset(self, mask: wp.array) -> None:
-        """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
+        """Resets the worlds of mask, (nworld,) wp.array of bool, to rest at time zero."""
         inputs = [self.place, mask, self.rest_states, self.redraws, self.seed, self.drawn]
         outputs = [self.row, self.time, self.temperature, self.state]
         wp.launch(kernels.reset_states, self.nworld, inputs, outputs, device=self.device)
 
     def find_due(self, dt: float) -> wp.array:
-        """Writes which worlds want a new impedance for the step of dt [s] from now; returns `due`."""
+        """Finds the worlds that need a new impedance for the next step of dt [s]; writes and returns
+        `due`."""
         inputs = [self.time, dt, self._every, self.place.nelectrode, self.place.slots]
         wp.launch(kernels.find_due, self.nworld, inputs, [self.due], device=self.device)
         return self.due
@@ -429,8 +429,8 @@ class BatchAcquisition:
 
         Args:
           dt: length of the step [s].
-          impedance: (nworld, n) wp.array float64 at the end of the step [ohm], looked at in the worlds that
-            are `due` and `valid`.
+            impedance: (nworld, n) wp.array float64 at the end of the step [ohm], used in worlds that are
+              `due` and `valid`.
           valid: (nworld,) wp.array int.
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
           shaken: (nworld, n) wp.array float64, see `Acquisition.advance`.

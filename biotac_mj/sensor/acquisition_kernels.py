@@ -1,7 +1,7 @@
-"""The multiplexer's state vector, and the kernels that sample a step's slots into it, of one sensor or many.
+"""The multiplexer's state vector, and the kernels that sample a step's slots, for one sensor or many.
 
-See `acquisition` for what the slots are. Noise is made of numpy's Philox 4x64 with one counter block for each
-slot: a function of (seed, slot)."""
+`acquisition` describes the slots. Noise is numpy's Philox 4x64 with one counter block for each slot: a
+function of (seed, slot)."""
 
 import functools
 import math
@@ -28,16 +28,16 @@ SLOT_RATE = 4400.0  # [Hz]
 
 # The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
 # temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; PAC's
-# last noise; counts; when the reset was [s], the pressure and temperature that the last step was given, what
-# of the pressure PDC still remembers [Pa]; of each electrode what a low-pass remembers, then its last frames;
-# the sensor's own numbers, so that a reset may change them.
+# last noise; counts; time of the reset [s], the last step's pressure and temperature, the state of PDC's
+# relaxation [Pa]; per electrode the state of its low-pass and its last frames; the sensor's own constants, so
+# that a reset may change them.
 _HEAD = ("pressure", "temperature", "impedance_time", "filter", "hiss")
 _BEGAN = ("began", "given_pressure", "given_temperature", "lag")
 
 
 @wp.struct
 class Place:
-    """Where the parts of a state vector begin (`place_of`), and what a frame is."""
+    """Offsets of the fields of a state vector (`place_of`), and the layout of a frame."""
 
     nelectrode: int
     slots: int
@@ -91,7 +91,7 @@ class Place:
 
 @functools.cache
 def place_of(design: Design) -> Place:
-    """Where the parts of the state of a sensor of this design begin."""
+    """Offsets of the fields of the state of a sensor of this design."""
     n, place = design.nelectrode, Place()
     place.nelectrode, place.slots = n, design.slots
     place.frames = round(MOST_LATENCY * SLOT_RATE / design.slots) + 2
@@ -110,15 +110,15 @@ def place_of(design: Design) -> Place:
 
 
 SLOTS_PER_FRAME = BIOTAC.slots
-# of a BioTac's state
+# for a BioTac's state
 _AT = place_of(BIOTAC)
 SAMPLED, SAMPLED_PDC, SAMPLED_TAC, SAMPLED_TDC, PAC, OWN, NSTATE = (
     getattr(_AT, name) for name in ("sampled", "pdc", "tac", "tdc", "pac", "own", "nstate")
 )
-_MOST_LOSS = 0.8  # of the liquid
+_MOST_LOSS = 0.8  # fraction of the liquid
 
-# [rad/s], manual. TAC is what passes 0.25 Hz upwards of the temperature: its rate, below 0.25 Hz. The manual
-# has 0.45 Hz as well; of recorded TACs that leaves 9.0 counts RMS unexplained, 0.25 Hz 7.0
+# [rad/s], from the manual. TAC is a band-pass: the temperature's rate, low-passed at 0.25 Hz. The manual also
+# says 0.45 Hz; recorded TACs then have an unexplained 9.0 counts RMS, at 0.25 Hz 7.0
 # (`benchmarks/thermal.py`).
 _LOW, _HIGH, _TAC = (2 * math.pi * hertz for hertz in (1040.0, 10.0, 0.25))
 _BAND = _LOW / (_LOW - _HIGH)  # s w2 / ((s + w1)(s + w2)) = band (w2 / (s + w2) - w1 / (s + w1))
@@ -138,14 +138,14 @@ _electrode_noise = for_kernels(channels.electrode_noise)
 
 @wp.func
 def slots_until(time: real):
-    """How many slots lie up to a time, slot 0 left out; the allowance keeps a slot on one side of a time that
-    was summed up with rounding."""
+    """Number of slots up to a time, without slot 0. The tolerance keeps a slot on one side of a time that was
+    summed with rounding errors."""
     return wp.int64(wp.floor(time * real(SLOT_RATE) + real(1.0e-6)))
 
 
 @wp.func
 def _position(slot: wp.int64, slots: int):
-    """Of a slot in its frame; time may be negative."""
+    """Position of a slot in its frame; time may be negative."""
     position = wp.int32((slot - wp.int64(1)) % wp.int64(slots))
     return wp.where(position < 0, position + slots, position)
 
@@ -192,10 +192,10 @@ def _high_product(a: wp.uint64, b: wp.uint64):
 
 @wp.func
 def philox(counter: wp.uint64, key: wp.uint64):
-    """Block `counter` of Philox 4x64-10 (Salmon et al., SC 2011) with this key, the upper words of which are
+    """Block `counter` of Philox 4x64-10 (Salmon et al., SC 2011) with this key, whose upper words are
     zero."""
     c0 = counter
-    c1 = wp.where(counter == wp.uint64(0), wp.uint64(1), wp.uint64(0))  # numpy's carries, before slot 0
+    c1 = wp.where(counter == wp.uint64(0), wp.uint64(1), wp.uint64(0))  # numpy's carry, before slot 0
     c2 = wp.uint64(0)
     c3 = wp.uint64(0)
     k0 = key
@@ -219,7 +219,7 @@ def philox(counter: wp.uint64, key: wp.uint64):
 @wp.func
 def draw_normal(slot: wp.int64, seed: wp.uint64):
     """Standard normal draw of a slot (Box-Muller: a fixed number of draws)."""
-    raw = philox(wp.uint64(slot) + wp.uint64(1), seed)  # numpy counts on before it draws
+    raw = philox(wp.uint64(slot) + wp.uint64(1), seed)  # numpy increments before it draws
     shift = wp.uint64(11)
     unit = real(1.0) / real(9007199254740992.0)
     u = (real(raw[0] >> shift) + real(0.5)) * unit
@@ -236,7 +236,7 @@ def _ramp(old: real, rise: real, memory: real, corner: real, t: real):
 
 @wp.func
 def _warmed(at: Place, state: wp.array2d(dtype=real), w: int, time: real):
-    """How much warmer than at the reset [C]."""
+    """Temperature above that of the reset [C]."""
     since = wp.max(time - state[w, at.began], real(0.0))
     return state[w, at.warm_up] * (real(1.0) - wp.exp(-since / state[w, at.warm_time]))
 
@@ -246,14 +246,14 @@ def _warm_impedance(
     at: Place, state: wp.array2d(dtype=real), impedance: wp.array2d(dtype=real), w: int, e: int, liquid: real,
     warmed: real, remaining: real,
 ):  # fmt: skip
-    """Of an electrode where the liquid is warmer, and less is left of it [ohm]."""
+    """Impedance of an electrode [ohm] for a warmer liquid and a lost fraction of it."""
     warmer = liquid + state[w, at.warm_share + e] * warmed
     return impedance[w, e] * state[w, at.scale + e] * wp.exp(-state[w, at.per_degree] * warmer) / remaining
 
 
 @wp.func
 def _electrode(at: Place, state: wp.array2d(dtype=real), w: int, e: int, fresh: int, new: real, weight: real):
-    """Counts without noise of an electrode, interpolated towards the new impedance by `weight`."""
+    """Noise-free counts of an electrode, interpolated towards the new impedance by `weight`."""
     z = state[w, at.impedance + e]
     if fresh == 1:
         z += (new - z) * weight
@@ -266,7 +266,7 @@ def _electrode(at: Place, state: wp.array2d(dtype=real), w: int, e: int, fresh: 
 
 @wp.func
 def _late(at: Place, state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int64, counts: real):
-    """Counts of an electrode after its low-pass and its latency: a frame is linear to the next."""
+    """Counts of an electrode after its low-pass and its latency, linear between frames."""
     past = at.past + e
     period = real(at.slots) / real(SLOT_RATE)  # [s] of a frame
     tau = state[w, at.lowpass]
@@ -309,7 +309,7 @@ def sample_slots(
     w = wp.tid()
     now = time[w]
     fresh = due[w] * valid[w]
-    # a clock that was set back does not extrapolate
+    # no extrapolation if the clock was set back
     span = now + dt - wp.min(state[w, at.impedance_time], now)
     keep = wp.exp(-dt / state[w, at.relax_time])
     lag = keep * state[w, at.lag] + (real(1.0) - keep) * state[w, at.relax_time] / dt * (
@@ -379,7 +379,7 @@ def sample_slots(
                 hiss += state[w, at.pac_colour] * state[w, at.hiss]
                 state[w, at.hiss] = hiss
             value += hiss
-        # a step longer than a frame meets a channel more than once: the last one stays
+        # in a step longer than a frame a channel is sampled more than once: the last sample counts
         state[w, address] = wp.clamp(wp.rint(value), real(0.0), real(channels.FULL_SCALE))
     state[w, at.filter] = _ramp(old, rise, low, real(_LOW), dt)
     state[w, at.filter + 1] = _ramp(old, rise, high, real(_HIGH), dt)
@@ -414,8 +414,8 @@ def reset_states(
     temperature_out: wp.array(dtype=real),
     state_out: wp.array2d(dtype=real),
 ):
-    """Rest states of worlds: row w of `rest`, with `redraw` after the first reset one that seed and number of
-    the reset tell."""
+    """Initial states of worlds: row w of `rest`, or, with `redraw` and after the first reset, a row drawn by
+    seed and reset count."""
     w = wp.tid()
     if not mask[w]:
         return

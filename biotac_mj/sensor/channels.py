@@ -1,10 +1,10 @@
 """Channels and the data sheet's formulas between counts and physical units.
 
 Source of the formulas and gains: SynTouch BioTac SP product manual (same electronics as the BioTac). Counts
-are 12 bit, 0..4095, and may be fractional here: rounding and clipping are the acquisition's job.
+are 12 bit, 0..4095, and may be fractional here: the acquisition rounds and clips.
 
-What the acquisition needs stands in numpy's names and in casts of numpy's, so that `acquisition.py` compiles
-the same text for the device: Warp takes np.exp for wp.exp and np.float64 for wp.float64.
+Formulas that the acquisition needs use numpy's names and casts, so that `acquisition.py` compiles the same
+text for the device: Warp takes np.exp for wp.exp and np.float64 for wp.float64.
 """
 
 import numpy as np
@@ -52,32 +52,32 @@ NELECTRODE, NPAC = BIOTAC.nelectrode, BIOTAC.npac  # sensing electrodes; PAC's s
 ELECTRODES, CHANNELS = BIOTAC.electrodes, BIOTAC.channels
 WIDTHS = BIOTAC.widths
 FULL_SCALE = 4095.0
-# [C] of the heated core by the manual's formula: 47 to 50 in four sensors (TDC 1890 to 2103 counts), 48.4 on
-# average in two
+# [C] of the heated core by the manual's formula: 47 to 50 in four sensors (TDC 1890 to 2103 counts), mean
+# 48.4 in two
 REST_TEMPERATURE = 48.4
 
 DIVIDER = 10e3  # [ohm]
 _PDC_GAIN = 36.5  # [Pa] per count
-# CHOSEN: the manual gives no offset. Leaves 76 kPa above rest; the offset of a real sensor depends on its
-# filling
+# CHOSEN: the manual gives no offset. Leaves a range of 76 kPa above rest; a real sensor's offset depends on
+# its filling
 PDC_REST = 2000.0
 _PAC_GAIN = 0.37  # [Pa] per count
 _MIDDLE = PAC_REST = TAC_REST = FULL_SCALE / 2
 _SERIES, _PARALLEL = 155183.0, 46555.0  # of the thermistor's divider
 _TDC_SCALE, _ZERO_CELSIUS = 4025.0, 273.15  # [K]
 _TAC_SCALE = -41.07  # [C/s]
-# MEASURED: recordings answer with this part of the formula's slope at mid-scale: 1537 counts per C/s, from
-# TAC and TDC of 30 traces of two sensors (PHAC-2, holds of steel, acrylic and sponge), against 6603.
+# MEASURED: fraction of the formula's slope at mid-scale that recordings show: 1537 counts per C/s, from TAC
+# and TDC of 30 traces of two sensors (PHAC-2, holds of steel, acrylic and sponge), instead of 6603.
 _TAC_SHARE = 0.233
-_HOTTEST = -0.1  # [C/s] of the manual's formula, beyond which TAC's circuit is saturated
-# MEASURED: what a resting PAC shows is n[i] = PAC_COLOUR n[i - 1] + PAC_NOISE white [counts]. Fitted to the
-# spectrum, 25 to 1000 Hz, of 7.6 s of a resting BioTac SP (native log); in 25 Hz bands 1.3 dB off at most,
-# 0.5 dB RMS. `benchmarks/vibration.py` does it again.
+_HOTTEST = -0.1  # [C/s] of the manual's formula at which TAC's circuit saturates
+# MEASURED: noise of a resting PAC, n[i] = PAC_COLOUR n[i - 1] + PAC_NOISE white [counts]. Fitted to the
+# spectrum, 25 to 1000 Hz, of 7.6 s of a resting BioTac SP (native log); error in 25 Hz bands at most 1.3 dB,
+# 0.5 dB RMS. `benchmarks/vibration.py` repeats the fit.
 PAC_COLOUR, PAC_NOISE = 0.238, 3.806
 _NOISE_SLOPE, _NOISE_LEVEL = 15.8, 6.6  # [counts]
 
-# Published rest counts of three sensors, e1..e19. They are data, not parameters: nothing is derived from them
-# but the cell constants.
+# Published rest counts of three sensors, e1..e19. They are data, not parameters: only the cell constants
+# derive from them.
 REST_COUNTS = {name: np.array(BIOTAC.of_sensor(name)["rest"], dtype=float) for name in BIOTAC.published}
 
 
@@ -94,19 +94,18 @@ def impedance_from_counts(counts: ArrayLike) -> np.ndarray:
 
 
 def log_impedance(counts: ArrayLike) -> np.ndarray:
-    """ln(Z / 10 kohm) = ln(4095 / E - 1) of counts, any shape; 0 and 4095 are taken as half a count away, so
-    that it stays finite."""
+    """ln(Z / 10 kohm) = ln(4095 / E - 1) of counts, any shape. 0 and 4095 are moved by half a count, so that
+    it stays finite."""
     return np.log(FULL_SCALE / np.clip(counts, 0.5, FULL_SCALE - 0.5) - 1)
 
 
 def counts_from_log_impedance(log_z: ArrayLike) -> np.ndarray:
-    """Counts (fractional) of ln(Z / 10 kohm), any shape: the inverse of `log_impedance`, held where 12 bits
-    end."""
+    """Counts (fractional) from ln(Z / 10 kohm), any shape: inverse of `log_impedance`, clipped to 12 bits."""
     return FULL_SCALE / (1 + np.exp(np.clip(log_z, -9.1, 9.1)))
 
 
 def counts_from_pressure(pressure: ArrayLike) -> np.ndarray:
-    """PDC counts: 36.5 Pa per count over a rest count that is chosen (2000). pressure: above rest [Pa]."""
+    """PDC counts: 36.5 Pa per count, with the chosen offset of 2000 counts. pressure: above rest [Pa]."""
     return np.float64(PDC_REST) + pressure / np.float64(_PDC_GAIN)
 
 
@@ -116,7 +115,7 @@ def pressure_from_counts(counts: ArrayLike) -> np.ndarray:
 
 
 def saturated(change: ArrayLike, fraction: ArrayLike, knee: ArrayLike) -> np.ndarray:
-    """A change of counts, of which a fraction of what goes beyond the knee [counts] is lost."""
+    """A change of counts that loses a fraction of its excess over the knee [counts]."""
     size = np.where(change < np.float64(0.0), -change, change)
     lost = np.where(size > knee, size - knee, np.float64(0.0)) * fraction
     return change - np.where(change < np.float64(0.0), -lost, lost)
@@ -146,7 +145,7 @@ def heating_exponent(rate: ArrayLike) -> np.ndarray:
     """The manual's logarithm for TAC at dT/dt [C/s] above the value at mid-scale (see
     `heating_from_counts`)."""
     total = np.float64(_TAC_SHARE) * rate + np.float64(_STEADY)
-    # As the total nears zero from below the counts vanish; beyond that the circuit is saturated.
+    # As the total approaches zero from below, the counts vanish; above zero the circuit is saturated.
     return np.float64(_TAC_SCALE) / np.where(total < np.float64(_HOTTEST), total, np.float64(_HOTTEST))
 
 
@@ -164,17 +163,17 @@ def heating_from_counts(counts: ArrayLike) -> np.ndarray:
     """dT/dt [C/s] of TAC counts, above the value at mid-scale.
 
     The manual's -41.07 / ln((155183 - 46555 r) / r), r = TAC / 4095, is never zero, so it cannot be an
-    absolute rate. The difference from its value at mid-scale, where TAC rests, is zero in the steady state;
-    divided by the part of it that recordings show it spans -1.1 to +3.4 C/s; cooling raises TAC."""
+    absolute rate. The difference from its value at mid-scale, where TAC rests, is zero in the steady state.
+    Divided by the measured fraction of the slope it spans -1.1 to +3.4 C/s; cooling raises TAC."""
     return (_TAC_SCALE / _thermistor_log(counts) - _STEADY) / _TAC_SHARE
 
 
 def electrode_noise(counts: ArrayLike) -> np.ndarray:
     """Standard deviation [counts] of an unloaded electrode that reads `counts`.
 
-    min(15.8 (1 - E / 4095), 6.6): in proportion to the voltage over the liquid, then level. Fitted to 22508
+    min(15.8 (1 - E / 4095), 6.6): proportional to the voltage over the liquid, then constant. Fitted to 22508
     rows of an unloaded sensor (EPFL flat press, high-passed at about 1 Hz), RMS error 0.34 counts over its 19
-    electrodes, E 2120-3250; below that nothing was measured. Rows that differ in time and electrodes are
+    electrodes, E 2120-3250; lower counts were not measured. Rows at different times and electrodes are
     uncorrelated there (below 0.02), so the noise is drawn white and independent."""
     slope = np.float64(_NOISE_SLOPE) * (np.float64(1.0) - counts / np.float64(FULL_SCALE))
     level = np.where(slope < np.float64(_NOISE_LEVEL), slope, np.float64(_NOISE_LEVEL))
@@ -187,17 +186,17 @@ def _thermistor_log(counts):
         return np.log((_SERIES - _PARALLEL * r) / r)
 
 
-_STEADY = float(_TAC_SCALE / _thermistor_log(_MIDDLE))  # what the manual's formula gives where TAC rests
+_STEADY = float(_TAC_SCALE / _thermistor_log(_MIDDLE))  # the manual's formula where TAC rests
 
 
-_LEAST, _MOST_FORCE = 8, 100.0  # a resting electrode shows thousands of counts; a BioTac bears 50 N
+_LEAST, _MOST_FORCE = 8, 100.0  # a resting electrode has thousands of counts; a BioTac bears 50 N
 
 
 def check_counts(counts: np.ndarray, where: str, first: int = 0) -> None:
-    """Refuses what are no raw counts of electrodes (ValueError).
+    """Raises ValueError for values that are not raw counts of electrodes.
 
     Args:
-      counts: (n, nelectrode). where: they come from, first: number of the first row, for the text.
+      counts: (n, nelectrode). where: name of their source, first: number of the first row, for the text.
     """
     bad = ~((counts >= 0) & (counts <= FULL_SCALE))
     if bad.any():
@@ -215,10 +214,10 @@ def check_counts(counts: np.ndarray, where: str, first: int = 0) -> None:
 
 
 def check_force(force: np.ndarray, where: str) -> None:
-    """Refuses what are no newtons (ValueError).
+    """Raises ValueError for values that cannot be forces in newtons.
 
     Args:
-      force: any shape, NaN where it was not measured. where: it comes from, for the text.
+      force: any shape, NaN if not measured. where: name of its source, for the text.
     """
     largest = np.nanmax(np.abs(force), initial=0)
     if not largest <= _MOST_FORCE:
@@ -229,7 +228,7 @@ def check_force(force: np.ndarray, where: str) -> None:
 
 
 def check_temperature(what: str, value: float, most: float, why: str) -> None:
-    """Raises ValueError for a temperature [C] that nothing can have, or more than `most`: say `why`."""
+    """Raises ValueError for an impossible temperature [C], or one above `most`, with the reason `why`."""
     if not -_ZERO_CELSIUS < value <= most:
         raise ValueError(
             f"{what} is {value} C: give a finite number above {-_ZERO_CELSIUS}, up to {most:.4g} ({why})"

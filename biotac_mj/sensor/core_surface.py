@@ -1,4 +1,5 @@
-"""Closest points on the rigid core: how thick the liquid film is under every node of the skin."""
+"""Closest points on the rigid core, which give the thickness of the liquid film under every node of the
+skin."""
 
 import numpy as np
 import warp as wp
@@ -22,15 +23,15 @@ __all__ = ["Core", "CoreSurface", "NearestTriangles", "nearest_listed_on_core", 
 
 wp.set_module_options({"enable_backward": False})
 
-_FARTHEST = 1.0e4  # [mm] from the core at which a point is still found
-_NEAREST = 16  # triangles that are kept for a point
-_ROOM = 0.2  # [mm] of motion that they are looked for
+_FARTHEST = 1.0e4  # [mm] largest distance of a query point from the core
+_NEAREST = 16  # most candidate triangles per point
+_ROOM = 0.2  # [mm] motion of a point for which its candidates suffice
 real, vec3 = wp.float64, wp.vec3d
 
 
 @wp.struct
 class Core:
-    """Triangles of the core, and which share a node with which."""
+    """Triangles of the core and their adjacency."""
 
     mesh: wp.uint64  # in mm, single precision
     corner: wp.array2d(dtype=vec3)  # (ntriangle, 3) [mm]
@@ -41,7 +42,7 @@ class Core:
 
 @wp.struct
 class NearestTriangles:
-    """Triangles near to points at rest."""
+    """Candidate triangles for each point, from the rest positions."""
 
     rest: wp.array(dtype=vec3)
     lists: TriangleLists
@@ -49,7 +50,7 @@ class NearestTriangles:
 
 @wp.func
 def _from_face(core: Core, face: int, q: vec3):
-    """From the closest point of a triangle to q [mm] the vector [m] and its length, negative inside."""
+    """Vector from the closest point of a triangle to q [m; q in mm] and its length, negative inside."""
     at, place = closest_on_face(core.corner, face, q)
     gap = real(1.0e-3) * (q - at)
     side = real(0.0)
@@ -67,7 +68,7 @@ def _from_face(core: Core, face: int, q: vec3):
 
 @wp.func
 def nearest_on_core(core: Core, p: vec3):
-    """Vector from the closest point to p [m], its length, negative inside the core, and the triangle; nan and
+    """Vector from the closest point to p [m], its length (negative inside the core) and the triangle; nan and
     -1 for a point that is not finite."""
     q = real(1.0e3) * p
     query = wp.mesh_query_point_no_sign(
@@ -91,8 +92,8 @@ def nearest_on_core(core: Core, p: vec3):
 
 @wp.func
 def nearest_listed_on_core(core: Core, nearest: NearestTriangles, i: int, p: vec3):
-    """As `nearest_on_core`, of point i: most points are settled by a few triangles that are near to them at
-    rest, others ask the tree."""
+    """`nearest_on_core` of point i: most points need only their candidate triangles, others query the
+    tree."""
     moved = real(1.0e3) * wp.length(p - nearest.rest[i])
     face = nearest_listed(nearest.lists, i, core.corner, 0, real(1.0e3) * p, moved)
     if face < 0:
@@ -120,17 +121,17 @@ def _closest(
 
 
 class CoreSurface:
-    """Exact distance to a closed triangulated surface: the tree of a Warp mesh proposes a triangle, and on
-    that one and its neighbours the distance is found in double precision.
+    """Exact distance to a closed triangulated surface: the tree of a Warp mesh proposes a triangle, and the
+    distance to it and its neighbours is computed in double precision.
 
     Args:
       vert: (n, 3) [m].
-      face: (m, 3), normals outwards; those without area are left out.
+        face: (m, 3), normals outwards; those without area are ignored.
       device: Warp device.
 
     Attributes:
       normal: (ntriangle, 3) outwards.
-      core: the struct that `nearest_on_core` takes.
+        core: argument of `nearest_on_core`.
     """
 
     def __init__(self, vert: ArrayLike, face: ArrayLike, device: str = "cpu"):
@@ -167,12 +168,12 @@ class CoreSurface:
         return distance.numpy(), point - gap.numpy(), triangle.numpy()
 
     def nearest(self, rest: ArrayLike) -> NearestTriangles:
-        """What `nearest_listed_on_core` takes for points that are at (n, 3) [m] at rest."""
+        """Candidates for `nearest_listed_on_core`, for points at (n, 3) [m] at rest."""
         rest = np.asarray(rest, dtype=float)
         lists = list_nearest(self._mesh, 1e3 * rest, 2.0 * _ROOM)
         end = np.cumsum(lists.count)
         place = np.arange(len(lists.face)) - np.repeat(end - lists.count, lists.count)
-        more = lists.count > _NEAREST  # behind those that are kept, the next is the first that is missing
+        more = lists.count > _NEAREST  # the entry after the kept ones is the first that is missing
         reach = lists.reach.copy()
         reach[more] = lists.away[(end - lists.count)[more] + _NEAREST]
         kept = place < _NEAREST

@@ -1,8 +1,8 @@
-"""Formulas that stand once, for arrays, for kernels and for tensors.
+"""Formulas written once for arrays, kernels and tensors.
 
-Such a formula is in numpy's names and casts (`np.exp`, `np.where`, `np.float64`), takes numbers alone, and
-calls no other: Warp compiles its text, as it takes np.exp for wp.exp, and PyTorch runs it with its own names
-in numpy's place."""
+Such a formula uses numpy's names and casts (`np.exp`, `np.where`, `np.float64`), takes scalars, and calls no
+other formula. Warp compiles its text, since it takes np.exp for wp.exp; PyTorch runs it with its own
+functions in numpy's place."""
 
 import inspect
 import types
@@ -13,7 +13,7 @@ import warp as wp
 
 __all__ = ["Number", "for_kernels", "formulas_by_name", "with_names"]
 
-Number = TypeVar("Number")  # float64 of a kernel, an array or a tensor, alike in all arguments
+Number = TypeVar("Number")  # float64 in a kernel, an array or a tensor; the same for all arguments
 
 
 def for_kernels(formula: Callable) -> wp.Function:
@@ -24,10 +24,10 @@ def for_kernels(formula: Callable) -> wp.Function:
 
 
 def with_names(formula: Callable, names: types.SimpleNamespace) -> Callable:
-    """The formula with another module in numpy's place."""
+    """The formula with another module's functions in numpy's place."""
     return types.FunctionType(formula.__code__, formula.__globals__ | {"np": names}, formula.__name__)
 
 
 def formulas_by_name(module: types.ModuleType, make: Callable) -> types.SimpleNamespace:
-    """All that the module gives out, each made into what `make` makes of a formula, under its own name."""
+    """Namespace of make(formula) for all formulas that the module exports, under their names."""
     return types.SimpleNamespace(**{name: make(getattr(module, name)) for name in module.__all__})

@@ -1,21 +1,21 @@
-"""Heat of a BioTac: one temperature state a sensor, stepped implicitly with the skin, many sensors at once.
+"""Heat of a BioTac: one thermal state per sensor, stepped implicitly with the skin, many sensors at once.
 
-    heater -> core -> liquid -> skin -> air              the skin that nothing touches
+    heater -> core -> liquid -> skin -> air              skin without contact
                |
            thermistor -> film -> skin -> contact -> body   one column of skin for each touching body
 
-What moves is heat through thin layers, so each path is one-dimensional: lumps for the core, the core's
+Heat flows through thin layers, so each path is one-dimensional: lumped capacities for the core, the core's
 part under the contact with the thermistor, and the liquid; `NCELL` finite volumes through the skin; and the
-touched body as a half-space known by its effusivity e = sqrt(k rho c) and temperature. The heat that a
-half-space takes through its surface is e sqrt(s) times the surface's temperature, a memory of all the past;
-here it is a sum of `NBRANCH` relaxing stores (`half_space`), so the state is short and a step is implicit
-(backward Euler: stable for every time step, first order).
+touched body as a half-space with effusivity e = sqrt(k rho c) and temperature. The heat flux into a
+half-space is e sqrt(s) times its surface temperature, which depends on all the past. It is approximated by a
+sum of `NBRANCH` relaxing stores (`half_space`), so the state is short and a step is implicit (backward Euler:
+stable for every step, first order).
 
-When a contact grows, skin goes from the free column to the body's with the heat that is in it, and the body's
-new part is at the body's own temperature. When it shrinks, skin and body that have parted stay in their
-columns, insulated, and are the first to touch again: a contact that trembles meets what it left and not fresh
-skin and a fresh body at every step. Parted skin goes back to the free column in the time in which the liquid
-warms it, what a parted body had taken spreads sideways in the body's own time and is forgotten.
+When a contact grows, skin moves from the free column to the body's column with its heat, and the body's new
+area has the body's own temperature. When it shrinks, the separated skin and body stay in their columns,
+insulated, and are the first to touch again: a contact of fluctuating area meets the skin and body that it
+left, not fresh ones at every step. Separated skin returns to the free column within the time in which the
+liquid warms it. Heat in a separated body spreads sideways within the body's own time constant and is dropped.
 
 `Heat` steps one sensor or the sensors of all worlds with the same kernel."""
 
@@ -49,12 +49,12 @@ wp.set_module_options({"enable_backward": False})
 
 NCELL = 8  # finite volumes through the skin
 NBRANCH = 10  # stores of a half-space
-# The state: temperatures [C] of the thermistor (and of the core about it), the core, the liquid; heat lost to
+# The state: temperatures [C] of the thermistor (and the core around it), the core, the liquid; heat lost to
 # the air and the mount and heat given to bodies since the reset [J]; the heater's power [W]; the liquid's
-# temperature at which the electrodes show their rest, and how much warmer it is [C]; cells of the free skin,
-# inside first; then for each body the area [m^2] of skin that touches or parted lately, its cells, the body's
-# surface, its stores, what it is of: effusivity [W s^0.5 / (m^2 K)], temperature [C], conductivity
-# [W/(m K)], so that a reset may change it; and the area [m^2] of the body that is touched or was lately.
+# temperature at which the electrodes show their rest counts, and its difference from it [C]; cells of the
+# free skin, inside first; then per body the area [m^2] of skin in contact or recently separated, its cells,
+# the body's surface, its stores, the body's effusivity [W s^0.5 / (m^2 K)], temperature [C] and conductivity
+# [W/(m K)], so that a reset may change them; and the area [m^2] of the body in contact or recently so.
 THERMISTOR, CORE, LIQUID, LOST, GIVEN, POWER, REFERENCE, ABOVE, FREE = range(9)
 BODIES = FREE + NCELL
 _SURFACE, _STORE = 1 + NCELL, 2 + NCELL
@@ -63,7 +63,7 @@ _EFFUSIVITY, _BODY_TEMPERATURE, _BODY_CONDUCTIVITY = MADE, MADE + 1, MADE + 2
 _TAKEN = MADE + 3
 BODY = MADE + 4
 
-_LN_RATIO = 2.0  # of neighbouring rates: 1.4 % of the impedance at the worst frequency, see `half_space`
+_LN_RATIO = 2.0  # ln of the ratio of neighbouring rates: error 1.4 % of the impedance at the worst frequency
 _SLOWEST = 1e-5  # [1/s]
 
 real = wp.float64
@@ -71,7 +71,7 @@ _CELL = 1.0 / NCELL
 
 
 def state_size(ngroup: int) -> int:
-    """Numbers in the state of a sensor that up to `ngroup` bodies touch."""
+    """Length of the state of a sensor that up to `ngroup` bodies touch."""
     return BODIES + BODY * ngroup
 
 
@@ -80,12 +80,12 @@ class HeatParameters:
     """Constants of one sensor. Sources and intervals: docs/lab/sensor.md.
 
     Attributes:
-      power: of the heater, which is the sensor's own electronics [W].
-      ambient: temperature of the air and of what the sensor is mounted on [C].
-      core: heat capacity of the whole core [J/K]; near: of its part about the thermistor and under the
-        contact; liquid: of the liquid.
-      mount: core to mount [W/K]; inside: core to liquid [W/K]; spread: core to the part near the thermistor
-        [W/K].
+        power: of the heater, which is the sensor's own electronics [W].
+        ambient: temperature of the air and of the mount [C].
+        core: heat capacity of the whole core [J/K]; near: of its part about the thermistor and under the
+          contact; liquid: of the liquid.
+        mount: core to mount [W/K]; inside: core to liquid [W/K]; spread: core to the part near the thermistor
+          [W/K].
       area: of the skin [m^2]; thickness: of the skin [m].
       conductivity: of the rubber [W/(m K)]; capacity: its density times specific heat [J/(m^3 K)].
       gap: liquid to skin at rest [W/(m^2 K)]; film: core to skin where the skin is pressed on it.
@@ -118,16 +118,16 @@ class HeatParameters:
             raise ValueError(f"heat parameters: {what}; capacities, conductances and lengths are positive")
 
     def loss(self) -> float:
-        """What the sensor loses per degree of its core above the ambient when nothing touches it [W/K]."""
+        """Heat loss without contact, per degree of the core above ambient [W/K]."""
         skin = self.area / (1 / self.gap + self.thickness / self.conductivity + 1 / self.air)
         return self.mount + 1 / (1 / self.inside + 1 / skin)
 
     def at_rest(self, temperature: float) -> "HeatParameters":
-        """The same sensor with the power that keeps its core at a temperature [C]."""
+        """The same sensor with the power that keeps its core at a temperature [C] without contact."""
         return dataclasses.replace(self, power=self.loss() * (temperature - self.ambient))
 
     def rest(self, bodies: Sequence[Material] = ()) -> np.ndarray:
-        """The steady state (nstate,) of a sensor that nothing touches, and that these bodies can."""
+        """The steady state (nstate,) without contact of a sensor that these bodies can touch."""
         layers = self.thickness / self.conductivity
         skin = self.area / (1 / self.gap + layers + 1 / self.air)
         above = self.power / self.loss()
@@ -147,9 +147,9 @@ class HeatParameters:
 def begin_heat(
     temperature: float, warm_up: float = 0.0, cold: bool = False, bodies: Sequence[Material] = ()
 ) -> np.ndarray:
-    """The state (nstate,) of a sensor whose core is at a temperature [C] at its reset and gets warmer by
-    `warm_up` [C]; `cold`: that is switched on at the reset and comes to that temperature. The heater's power
-    is in the state, so that sensors of one `Heat` may differ in it."""
+    """Initial state (nstate,) of a sensor whose core has a temperature [C] at the reset and warms up by
+    `warm_up` [C]. cold: it is switched on at the reset and approaches that temperature. The heater's power is
+    in the state, so sensors of one `Heat` may differ in it."""
     sensor = HeatParameters().at_rest(temperature)
     begin, reference = sensor.rest(bodies), sensor.rest()[LIQUID]
     if cold:
@@ -170,13 +170,13 @@ Parameters = wp.types.vector(len(_FIELDS), real)
 
 
 def half_space() -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Stores that answer as a half-space of unit effusivity does.
+    """Stores that approximate a half-space of unit effusivity.
 
-    1 / sqrt(s) = 1 / pi int dp / (sqrt(p) (s + p)), and the rule of trapezia in ln p with step h makes of
-    s / sqrt(s) = sqrt(s) the sum of c s / (s + p), c = h sqrt(p) / pi: stores of capacity c / p behind a
+    1 / sqrt(s) = 1 / pi int dp / (sqrt(p) (s + p)). The trapezoidal rule in ln p with step h turns
+    s / sqrt(s) = sqrt(s) into the sum of c s / (s + p), c = h sqrt(p) / pi: stores of capacity c / p behind a
     resistance 1 / c. The poles of the integrand bound the rule's error by 2 exp(-pi^2 / h) on the imaginary
-    axis. The terms that are left out are geometric series: those that are faster are a capacity at the
-    surface, those that are slower a conductance to the undisturbed body.
+    axis. The truncated terms are geometric series: the faster ones act as a capacity at the surface, the
+    slower ones as a conductance to the undisturbed body.
 
     Returns:
       rate p (NBRANCH,) [1/s]; conductance c (NBRANCH,) [s^-1/2]; surface's capacity [s^1/2]; conductance to
@@ -193,13 +193,13 @@ _RATE, _BRANCH, _FAST, _SLOW = half_space()
 _rates, _branches = (wp.constant(wp.types.vector(NBRANCH, real)(*row)) for row in (_RATE, _BRANCH))
 
 
-# equations that gradients have too
+# equations shared with the gradients
 _formulas = formulas_by_name(heat_formulas, for_kernels)
 
 
 @wp.func
 def _touch(q: Parameters, area: real, force: real, body: real):
-    """From the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)]."""
+    """Conductance from the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)]."""
     pressure = force / wp.max(area, real(1.0e-12))
     h = _formulas.contact_conductance(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
     return _formulas.between_cells(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
@@ -216,8 +216,9 @@ def step_heat(
     state: wp.array2d(dtype=real),
     scratch: wp.array2d(dtype=real),
 ):
-    """Every layer is eliminated into the one inside it, the core is solved for, and the layers follow from
-    it. `scratch` holds a layer's fraction of its inner neighbour, `state` meanwhile the rest."""
+    """Block elimination: every layer is eliminated into the one inside it, the core is solved, then the
+    layers are back-substituted. `scratch` holds a layer's factor on its inner neighbour, `state` meanwhile
+    the constant term."""
     w = wp.tid()
     q = parameters[w]
     one, half = real(1.0), real(0.5)
@@ -231,7 +232,7 @@ def step_heat(
         wanted += wp.max(area[w, g], real(0.0))
     fit = _formulas.fitting(q[_AREA], wanted)
 
-    # what parted stays for a while, as far as the pad has room for it
+    # separated areas stay for a while, as far as the pad has room for them
     late = _formulas.lingering(q[_CAPACITY], q[_THICKNESS], q[_GAP], q[_CONDUCTIVITY], dt)
     parted = real(0.0)
     for g in range(ngroup):
@@ -239,7 +240,7 @@ def step_heat(
     room = wp.max(half * q[_AREA] - fit * wanted, real(0.0))
     late = _formulas.roomed(late, room, parted)
 
-    # skin and bodies change hands: what columns leave, then what they take
+    # areas change columns: first what leaves, then what enters
     free = q[_AREA]
     for g in range(ngroup):
         free -= state[w, BODIES + BODY * g]
@@ -290,7 +291,7 @@ def step_heat(
     liquid_known = free * known
     liquid_pull = free * pull
 
-    # skin on bodies: what flows through the touching area is shared by all of a column
+    # skin on bodies: all of a column shares the flux through its touching area
     near_known = real(0.0)
     near_pull = real(0.0)
     press = _formulas.between_cells(layer, q[_FILM])
@@ -325,7 +326,7 @@ def step_heat(
             near_known += patch * known
             near_pull += patch * pull
 
-    # the core, its two neighbours eliminated
+    # the core, with its two neighbours eliminated
     core, near, liquid = _formulas.join_core(
         dt, q[_C_CORE], q[_C_NEAR], q[_C_LIQUID], q[_MOUNT], q[_INSIDE], q[_SPREAD], q[_AMBIENT],
         state[w, POWER], state[w, CORE], state[w, THERMISTOR], state[w, LIQUID],
@@ -336,7 +337,7 @@ def step_heat(
     state[w, LIQUID] = liquid
     state[w, ABOVE] = liquid - state[w, REFERENCE]
 
-    # and outwards again
+    # back-substitution outwards
     t = liquid
     for k in range(NCELL):
         state[w, FREE + k] += scratch[w, FREE + k] * t
@@ -373,12 +374,12 @@ class Heat:
 
     Attributes:
       state: (nworld, nstate) wp.array float64, laid out as this module's constants say; temperatures in [C].
-      area: (nworld, ngroup) wp.array float64, what each body touches [m^2]; write it before `advance`.
+        area: (nworld, ngroup) wp.array float64, contact area of each body [m^2]; write it before `advance`.
       force: (nworld, ngroup) wp.array float64, the normal force of each [N]; likewise.
       nstate: length of a sensor's state.
 
     Raises:
-      ValueError: another number of parameters than of sensors.
+        ValueError: the number of parameters differs from the number of sensors.
     """
 
     def __init__(
@@ -411,13 +412,13 @@ class Heat:
         )
 
     def read_from(self, area: wp.array, force: wp.array) -> None:
-        """From now on `area` and `force` are these (nworld, ngroup) arrays of the device."""
+        """Makes (nworld, ngroup) device arrays the source of `area` and `force`."""
         self.area, self.force = area, force
         self._step.set_param_at_index(2, area)
         self._step.set_param_at_index(3, force)
 
     def set_bodies(self, bodies: list[list[Material]]) -> None:
-        """Gives every world bodies of its own: (nworld, ngroup) materials."""
+        """Sets the bodies of each world: (nworld, ngroup) materials."""
         state = self.state.numpy()
         made = [[(b.effusivity, b.temperature, b.conductivity) for b in row] for row in bodies]
         patches = state[:, BODIES:].reshape(self.nworld, self.ngroup, BODY)
@@ -425,12 +426,12 @@ class Heat:
         self.state.assign(state)
 
     def advance(self, dt: float) -> None:
-        """One step of dt [s] with `area` and `force`. A launch only: may be captured in a CUDA graph."""
+        """Steps by dt [s] with `area` and `force`. A launch only: may be captured in a CUDA graph."""
         self._step.set_param_at_index_from_ctype(0, dt)
         self._step.launch()
 
     def energy(self) -> np.ndarray:
-        """(nworld,) heat in the sensors above 0 C [J]. With `LOST` and `GIVEN` it grows by the heater's."""
+        """(nworld,) heat in the sensors above 0 C [J]. Plus `LOST` and `GIVEN` it grows by the heater's."""
         out = []
         for p, s in zip(self._parameters, self.state.numpy(), strict=True):
             patches = s[BODIES:].reshape(self.ngroup, BODY)

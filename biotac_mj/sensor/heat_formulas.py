@@ -1,8 +1,8 @@
-"""The equations of a step of the sensor's heat, as numbers: `heat.step_heat` calls them for one body after
-another, in place, `differentiable.temperatures` on tensors of all bodies.
+"""Scalar equations of a step of the sensor's heat. `heat.step_heat` calls them for one body after another, in
+place, `differentiable.temperatures` on tensors of all bodies.
 
-Areas [m^2], temperatures [C], conductances [W/K], or by area [W/(m^2 K)]; stores are heat capacities over the
-time of a step."""
+Areas [m^2], temperatures [C], conductances [W/K], or per area [W/(m^2 K)]; stores are heat capacities over
+the time step."""
 
 import math
 
@@ -38,41 +38,41 @@ def contact_conductance(coefficient: Number, pressure: Number, rubber: Number, b
 
 
 def between_cells(layer: Number, other: Number) -> Number:
-    """From the middle of an outermost cell, whose neighbours are `layer` away, through a conductance behind
-    it."""
+    """Conductance from the middle of an outermost cell, whose neighbours are `layer` away, through a
+    conductance `other` in series."""
     return np.float64(1.0) / (np.float64(0.5) / layer + np.float64(1.0) / other)
 
 
 def fitting(skin: Number, wanted: Number) -> Number:
-    """Share of what bodies touch that the sensor has room for: nothing comes round to the nail's side."""
+    """Fraction of the bodies' contact area that fits on the sensor's skin: the nail's side stays free."""
     least = np.where(wanted > np.float64(_LEAST), wanted, np.float64(_LEAST))
     room = np.float64(0.5) * skin / least
     return np.where(room < np.float64(1.0), room, np.float64(1.0))
 
 
 def lingering(capacity: Number, thickness: Number, gap: Number, conductivity: Number, dt: Number) -> Number:
-    """Share of the skin that parted before a step and is still kept after it."""
+    """Fraction of the skin separated before a step that stays in its column after it."""
     warming = capacity * thickness * (np.float64(1.0) / gap + np.float64(0.5) * thickness / conductivity)
     return warming / (warming + dt)
 
 
 def roomed(late: Number, room: Number, parted: Number) -> Number:
-    """The fraction that lingers, as far as the pad has room for what parted."""
+    """The fraction that stays, limited by the pad's room for separated skin."""
     least = np.where(parted > np.float64(_LEAST), parted, np.float64(_LEAST))
     fraction = room / least
     return late * np.where(fraction < np.float64(1.0), fraction, np.float64(1.0))
 
 
 def mixed(old: Number, area: Number, new: Number, added: Number) -> Number:
-    """A temperature of an area to which some is added."""
+    """Temperature of an area after another one is added."""
     return (old * area + new * added) / (area + added)
 
 
 def spread_sideways(
     taken: Number, touched: Number, effusivity: Number, conductivity: Number, dt: Number
 ) -> Number:
-    """Area of a body that is touched or was lately: a spot of radius r spreads over a disc twice as large in
-    r^2 / 4 D, D = (k / e)^2."""
+    """Area of a body that is or was recently touched: a spot of radius r spreads over a disc twice as large
+    in r^2 / 4 D, D = (k / e)^2."""
     ratio = effusivity / conductivity
     time = taken * ratio * ratio / np.float64(_FOUR_PI)
     return touched + (taken - touched) * time / (time + dt)
@@ -81,9 +81,9 @@ def spread_sideways(
 def eliminate(
     store: Number, cell: Number, known: Number, pull: Number, inner: Number
 ) -> tuple[Number, Number, Number, Number]:
-    """A cell that stores heat and from outside knows and is pulled by that much, eliminated into the one
-    inside it, a conductance away: what it is without that one, its fraction of it, and what it leaves to know
-    and pulls."""
+    """Eliminates a cell into the one inside it, at a conductance `inner`. `store` is the cell's heat
+    capacity, `known` and `pull` the constant term and coefficient from outside. Returns the cell's constant
+    term, its factor on the inner cell, and the inner cell's `known` and `pull`."""
     total = store + pull + inner
     cell = (store * cell + known) / total
     fraction = inner / total
@@ -91,7 +91,7 @@ def eliminate(
 
 
 def branch_conductance(effusivity: Number, conductance: Number, rate: Number, dt: Number) -> Number:
-    """Of a relaxing store of a half-space in a step of implicit Euler's."""
+    """Conductance of a relaxing store of a half-space in a step of backward Euler."""
     return effusivity * conductance / (np.float64(1.0) + dt * rate)
 
 
@@ -119,8 +119,8 @@ def join_core(
     liquid_known: Number,
     liquid_pull: Number,
 ) -> tuple[Number, Number, Number]:
-    """The core with its two neighbours eliminated, then these: temperatures of the core, of its part near the
-    thermistor and of the liquid."""
+    """Solves the core with its two neighbours eliminated, then these: temperatures of the core, of its part
+    near the thermistor and of the liquid."""
     near_total = c_near / dt + spread + near_pull
     near = (c_near / dt * near + near_known) / near_total
     near_ratio = spread / near_total

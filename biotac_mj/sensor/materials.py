@@ -1,7 +1,7 @@
-"""Materials that a finger may touch as heat meets them: effusivity e = sqrt(k rho c) and temperature.
+"""Thermal properties of materials that a finger may touch: effusivity e = sqrt(k rho c) and temperature.
 
-`material_of` finds one by the words of a name ("car_sponge_101", "steel vase"); `read_thermal` reads what
-users say of a geom."""
+`material_of` finds a material by the words of a name ("car_sponge_101", "steel vase"). `read_thermal` reads a
+user's description of a geom."""
 
 import dataclasses
 import difflib
@@ -26,20 +26,20 @@ __all__ = [
     "read_thermal",
 ]
 
-ROOM, SKIN = 23.0, 33.0  # [C] of things that lie about, of a living hand
-# What `read_thermal` takes: from below gases (air has 5.5 and 0.026) to above diamond (6e4 and 2300)
+ROOM, SKIN = 23.0, 33.0  # [C] of objects in a room, of a living hand
+# Limits of `read_thermal`: from below gases (air has 5.5 and 0.026) to above diamond (6e4 and 2300)
 _EFFUSIVITY, _CONDUCTIVITY_RANGE = (1.0, 1e5), (1e-3, 1e4)
 _HOTTEST = 4000.0  # [C] above every solid: hafnium carbonitride melts last, at about that
 
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """What heat sees of a touched body.
+    """Thermal properties of a touched body.
 
     Attributes:
       name: of the material.
       conductivity: k [W/(m K)]; density: [kg/m^3]; heat: specific heat capacity [J/(kg K)].
-      source: the kind of handbook that has the three numbers (see the table's head).
+        source: the kind of handbook with the three numbers (see the table's head).
       temperature: before it is touched [C].
     """
 
@@ -185,7 +185,7 @@ def _read_table():
 
 
 MATERIALS, *_NAMES = _read_table()
-# Conductivity over effusivity in the table, in logarithms: for what is told by its effusivity alone.
+# Conductivity over effusivity in the table, in logarithms: for materials given by their effusivity only.
 _CONDUCTIVITY = statistics.linear_regression(
     *zip(*((math.log(m.effusivity), math.log(m.conductivity)) for m in MATERIALS.values()), strict=True)
 )
@@ -195,16 +195,16 @@ _NUMBERS = "dict(effusivity=, temperature=)"  # of heat, instead of a name
 
 
 def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
-    """The material that a name tells: the longest phrase in it that the table knows, of equals the last.
+    """The material in a name: the longest phrase that the table knows, among equals the last.
 
     Case, digits, underscores and plurals are ignored: "acrylic_211", "Steel Vase" and "car_sponges" are
-    found. A material's name goes before a thing's: a glass bottle is of glass, a bottle of polyethylene.
+    found. A material has precedence over an object: a glass bottle is of glass, a bottle of polyethylene.
 
     Args:
-      choices, numbers: what the error of an unknown name offers: names, and what to give instead of one.
+        choices, numbers: suggestions of the error for an unknown name: names, and what to give instead.
 
     Raises:
-      ValueError: no word of the name is known.
+        ValueError: the name has no known word.
     """
     words = re.findall(r"[a-z]+", name.lower())
     for table in _NAMES:
@@ -220,7 +220,7 @@ def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _N
 
 
 def material_named(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
-    """`material_of` what a user wrote: of a temperature in it nothing would be heard.
+    """`material_of` for a user's text, in which a temperature would be ignored.
 
     Raises:
       ValueError: no word is known, or the name has a number or an "at" ("acrylic_211" is a file's name).
@@ -233,13 +233,14 @@ def material_named(name: str, choices: Iterable[str] = MATERIALS, numbers: str =
 
 
 def check_choices(value: object, read: Callable) -> None:
-    """Raises ValueError for what of a value, or of one of a list of choices, `read` cannot read."""
+    """Raises ValueError if `read` rejects a value, or one of a list of choices."""
     for one in value if isinstance(value, (list, tuple)) and value else [value]:
         read(one)
 
 
 def check_geoms(what: str, given: object, read: Callable) -> None:
-    """Raises ValueError for anything but None or {geom's name: what `read` reads, or a list of choices}."""
+    """Raises ValueError for anything but None or {geom's name: value that `read` accepts, or a list of
+    choices}."""
     if not isinstance(given, dict | None) or not all(isinstance(name, str) for name in given or ()):
         raise ValueError(f"{what} is {short_repr(given)}: give a dict, of geoms' names")
     for value in (given or {}).values():
@@ -247,16 +248,16 @@ def check_geoms(what: str, given: object, read: Callable) -> None:
 
 
 def read_thermal(value: str | Material | Mapping) -> Material:
-    """A material of what a user says of a geom.
+    """A material from a user's description of a geom.
 
     Args:
       value: a name for `material_of`, "name at 40" for another temperature [C], a `Material`, or a dict with
         any of: material (such a name), effusivity [W s^0.5 / (m^2 K)], conductivity [W/(m K)], temperature
         [C].
-        An effusivity without a conductivity takes the one that materials of the table tend to have with it.
+            An effusivity without a conductivity gets the typical one of the table's materials.
 
     Raises:
-      ValueError: an unknown name or key, or a number that cannot be.
+        ValueError: an unknown name or key, or an impossible number.
     """
     if isinstance(value, Material):
         return _checked(value)
@@ -296,12 +297,12 @@ def read_thermal(value: str | Material | Mapping) -> Material:
     k = numbers.get("conductivity") or max(
         math.exp(slope * math.log(e) + intercept), MATERIALS["air"].conductivity
     )
-    # heat meets density and specific heat only as their product
+    # only the product of density and specific heat matters
     return _checked(Material("as given", k, 1000.0, e * e / k / 1000.0, "as given", temperature))
 
 
 def _checked(material):
-    """The material; refuses one that there is not."""
+    """The material, after a check of its numbers."""
     check_temperature("temperature of a body", material.temperature, _HOTTEST, "no solid is hotter")
     for name, (least, most) in (("effusivity", _EFFUSIVITY), ("conductivity", _CONDUCTIVITY_RANGE)):
         value = getattr(material, name)

@@ -1,4 +1,4 @@
-"""`biotac design new`: a folder with the design and the skin of a pad of one's own."""
+"""`biotac design new`: a folder with the design and the skin of a custom pad."""
 
 import dataclasses
 import json
@@ -20,25 +20,24 @@ from .film import FilmConduction
 
 __all__ = ["PadShape", "new_design", "pad_skin"]
 
-_BACKING = 1.0  # [mm] of the plate on which a pad is held
+_BACKING = 1.0  # [mm] thickness of the plate that carries a pad
 _CELL = 1.2  # [mm] edge of the tetrahedra unless another is given
 
 
 @dataclasses.dataclass(frozen=True)
 class PadShape:
-    """What a pad is made of; one of dome, block and mesh. Lengths in mm.
+    """Shape of a pad: one of dome, block and mesh. Lengths in mm.
 
     Attributes:
-      dome: semi axes (along the finger, across it, depth) of half an ellipsoid on a flat backing, a shell of
-        `thickness` with liquid over the `core`. core: its semi axes, or an .obj [m] in the BioTac
-        frame.
-      block: size (along, across, depth) of solid rubber on a flat backing.
-      mesh: .msh, .tet or .vtu [m] in the BioTac frame (tip at -x, pad at -y), its rim or back on the plane
-        y = 0; with a core a shell over liquid, without one solid.
-      edge: of the tetrahedra that are made.
+        dome: semi-axes (along the finger, across it, depth) of half an ellipsoid on a flat backing: a shell
+          of `thickness` with liquid over the `core`. core: its semi-axes, or an .obj [m] in the BioTac frame.
+        block: size (along, across, depth) of solid rubber on a flat backing.
+        mesh: .msh, .tet or .vtu [m] in the BioTac frame (tip at -x, pad at -y), its rim or back on the plane
+          y = 0. With a core it is a shell over liquid, else solid.
+        edge: of the generated tetrahedra.
 
     Raises:
-      ValueError: none of the three or several, or a size that cannot be.
+        ValueError: not exactly one shape, or an invalid size.
     """
 
     dome: tuple = ()
@@ -72,7 +71,7 @@ class PadShape:
 
     @property
     def liquid(self) -> bool:
-        """Whether there is liquid between core and skin, so that electrodes feel."""
+        """Whether there is liquid between core and skin, as electrodes need."""
         return self.core is not None
 
 
@@ -80,7 +79,7 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
     """The skin of a pad on a flat backing.
 
     Raises:
-      FileNotFoundError, ValueError: a file that cannot be read, or a mesh that cannot be simulated.
+        FileNotFoundError, ValueError: an unreadable file, or a mesh that cannot be simulated.
     """
     curved = None
     if shape.dome:
@@ -129,12 +128,12 @@ def new_design(
 
     Args:
       folder: its name is the design's.
-      electrodes_mm, excitation_mm: (n, 3), (k, 3) places near the core, x to the fingertip, z out of the
-        nail; both empty for a pad without electrodes, such as that of a camera.
-      title: what messages call it.
+        electrodes_mm, excitation_mm: (n, 3), (k, 3) points near the core, x to the fingertip, z out of the
+          nail; both empty for a pad without electrodes, such as that of a camera.
+        title: its name in messages.
 
     Raises:
-      FileNotFoundError, ValueError: what cannot be made or simulated.
+        FileNotFoundError, ValueError: an invalid shape, or one that cannot be simulated.
     """
     folder = pathlib.Path(folder)
     n = len(electrodes_mm)

@@ -1,9 +1,9 @@
-"""What one sensor has of its own: rest counts, noise, levels, warm-up, gains; those of real sensors, and
-draws from their spread.
+"""Constants of a single sensor: rest counts, noise, levels, warm-up, gains; measured ones of real sensors,
+and draws from their spread.
 
-The numbers of real sensors are read off recordings by `benchmarks/sensor_presets.py`; a recording without a
-channel leaves that channel's default. Whoever names a sensor says `sensor=` a name of SENSORS, "random", or a
-dict of fields of `Sensor` ("like": the name of another one); `read_sensor` reads it."""
+`benchmarks/sensor_presets.py` extracts the constants from recordings; a channel without a recording has its
+default. `sensor=` is a name of SENSORS, "random", or a dict of fields of `Sensor` ("like": name of another
+one), read by `read_sensor`."""
 
 import dataclasses
 import functools
@@ -46,39 +46,40 @@ __all__ = [
     "sensors_of",
 ]
 
-# [1/C] of ln Z: all electrodes answer the liquid's temperature by -6.4 to -7.8 % per degree in five sensors
+# [1/C] of ln Z: all electrodes change by -6.4 to -7.8 % per degree of the liquid in five sensors
 PER_DEGREE = 0.071
 MOST_LATENCY = 0.11  # [s] eleven frames
-_HUGE = 1e9  # of any number of a sensor: beyond it sums of counts are no longer numbers
-# Scatter of an electrode's gain: 3 to 15 % (`effects.sensing.Gain`); no recording has the state beside it.
+_HUGE = 1e9  # limit of any number of a sensor: above it sums of counts are no longer numbers
+# Scatter of an electrode's gain: 3 to 15 % (`effects.sensing.Gain`); no recording includes the skin's state.
 _GAIN = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """One sensor's own numbers, of n electrodes. All counts are of 12 bits; rests are untouched and at the
+    """Constants of one sensor with n electrodes. Counts have 12 bits; rest values are untouched, at the
     reset.
 
     Attributes:
-      rest: (n,) of the electrodes. noise: (n,) RMS of theirs at rest; None: the law of `electrode_noise`.
-      mixing: (n, n), what the electrodes' changes of counts from rest are multiplied with: gains, dead
-        taxels and cross-talk; () is one.
-      pdc_rest, pdc_noise: of PDC [counts]; pdc_gain: of its change.
-      pac_rest, pac_noise, pac_colour: level, and n[i] = colour n[i - 1] + noise white.
-      tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
-      per_degree: by how much ln Z falls when the liquid is warmer [1/C].
-      warm_up: how much warmer it gets after the reset [C], all electrodes with it; warm_time: of the
-        exponential [s]; warm_share: (n,) of it that each electrode takes, below 0 the other
-        way, () is all. A sensor with heat has
-        its own time.
-      relaxation: fraction and time [s] by which PDC answers pressure too much and comes back.
-      loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (n,).
-      power: of the change of ln Z from rest. saturation: fraction and knee [counts]: of a change beyond the
-        knee that fraction is lost. lowpass: time constant of the electrodes [s]. latency: theirs [s], to
-        MOST_LATENCY.
+        rest: (n,) of the electrodes. noise: (n,) RMS of the electrodes at rest; None: by `electrode_noise`.
+        mixing: (n, n) matrix on the electrodes' changes of counts from rest: gains, dead taxels and
+          cross-talk; () is the identity.
+        pdc_rest, pdc_noise: of PDC [counts]; pdc_gain: of its change.
+        pac_rest, pac_noise, pac_colour: level, and n[i] = colour n[i - 1] + noise white.
+        tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
+        per_degree: decrease of ln Z per degree of the liquid [1/C].
+        warm_up: warming of liquid and electrodes after the reset [C]; warm_time: time constant [s];
+          warm_share: (n,) fraction of it for each electrode, may be negative, () is all. With heat, the time
+            constant follows from
+          the heat model.
+        relaxation: fraction and time constant [s] of PDC's decaying excess response.
+        loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (n,).
+        power: exponent on the change of ln Z from rest. saturation: fraction and knee [counts]: that fraction
+          of a change beyond the knee is lost. lowpass: time constant of the electrodes [s]. latency: of the
+            electrodes
+          [s], up to MOST_LATENCY.
 
     Raises:
-      ValueError: a number that cannot be.
+        ValueError: an invalid number.
     """
 
     rest: tuple = tuple(BIOTAC.of_sensor("1")["rest"])
@@ -174,16 +175,16 @@ class Sensor:
 
     @property
     def temperature(self) -> float:
-        """Of its core at the reset [C]."""
+        """Temperature of the core at the reset [C]."""
         return float(temperature_from_counts(self.tdc_rest))
 
     @property
     def impedance(self) -> np.ndarray:
-        """(n,) at rest [ohm]."""
+        """(n,) impedance at rest [ohm]."""
         return impedance_from_counts(self.rest)
 
     def electrode_noise(self, counts: ArrayLike) -> np.ndarray:
-        """RMS [counts] of electrodes that read counts (..., n): the law, in proportion to this sensor's."""
+        """RMS noise [counts] of electrodes that read counts (..., n): the law, scaled to this sensor's."""
         return self._noise_factor() * electrode_noise(np.asarray(counts, float))
 
     def _noise_factor(self):
@@ -194,11 +195,11 @@ class Sensor:
         )
 
     def numbers(self, film_rest: ArrayLike | None = None, heat: bool = False) -> np.ndarray:
-        """(nnumber,) as they lie in an acquisition's state (`numbers_of` says where).
+        """(nnumber,) constants in the layout of an acquisition's state (`numbers_of` has the offsets).
 
         Args:
-          film_rest: (n,) what the film gives at rest [ohm]; None: this sensor's own.
-          heat: whether a model of heat warms it up.
+            film_rest: (n,) impedance of the film at rest [ohm]; None: this sensor's own.
+            heat: whether a heat model computes the warm-up.
         """
         values = {
             "scale": np.ones(self.nelectrode) if film_rest is None else self.impedance / film_rest,
@@ -227,8 +228,7 @@ _ORDER = (
 
 
 def numbers_of(nelectrode: int) -> tuple[dict[str, int], int]:
-    """{name: where it begins} among the numbers of a sensor with so many electrodes, and how many there
-    are."""
+    """{name: offset} of the constants of a sensor with so many electrodes, and their number."""
     wide = {**dict.fromkeys(_PER_ELECTRODE, nelectrode), "mixing": nelectrode**2}
     ends = np.cumsum([wide.get(name, 1) for name in _ORDER]).tolist()
     return dict(zip(_ORDER, [0, *ends], strict=False)), ends[-1]
@@ -241,7 +241,7 @@ def sensors_of(design: Design) -> dict[str, Sensor]:
 
 
 def sensor_names(design: Design) -> tuple[str, ...]:
-    """What `read_sensor` takes of a design."""
+    """Names that `read_sensor` accepts for a design."""
     return (*design.sensors, *(["random"] if len(design.patterns) > 1 else []))
 
 
@@ -250,9 +250,9 @@ SENSORS, NAMES = sensors_of(BIOTAC), sensor_names(BIOTAC)
 
 
 def draw_sensor(rng: np.random.Generator, design: Design = BIOTAC) -> Sensor:
-    """A sensor from the spread of the measured ones. Rest counts: their mean pattern in ln Z, moved all
-    together and each on its own as they differ; noise: that of one of them, times a factor up to 1.2; single
-    numbers: evenly between the least and the most that was measured; gains: 1 +- 0.1."""
+    """A sensor drawn from the spread of the measured ones. Rest counts: mean pattern in ln Z plus a common
+    and an individual deviation; noise: that of one of them, times a factor up to 1.2; scalars: uniform
+    between the measured extremes; gains: 1 +- 0.1."""
     n, known = design.nelectrode, sensors_of(design)
     measured = {name: fields for name, fields in design.sensors.items() if name not in design.published}
     log_z = np.array([log_impedance(known[name].rest) for name in design.patterns])
@@ -272,10 +272,10 @@ def draw_sensor(rng: np.random.Generator, design: Design = BIOTAC) -> Sensor:
 
 
 def generator(seed: ArrayLike, what: int) -> np.random.Generator:
-    """Draws `what` of a sensor: whole numbers up to 2^64 - 1, one or several, are its seed.
+    """Random generator for purpose `what` of a sensor; seed: one or several whole numbers up to 2^64 - 1.
 
     Raises:
-      ValueError: others.
+      ValueError: another seed.
     """
     words = np.ravel(np.asarray(seed, object))
     if not all(isinstance(word, (int, np.integer)) and 0 <= word < 2**64 for word in words):
@@ -284,15 +284,15 @@ def generator(seed: ArrayLike, what: int) -> np.random.Generator:
 
 
 def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, design: Design = BIOTAC) -> Sensor:
-    """A sensor of what a user says.
+    """A sensor from a user's description.
 
     Args:
-      value: a name of `sensor_names(design)`, or a dict of Sensor's fields, which change those of "like"
-        (default: the design's own); None is the design's own.
-      seed: of "random", whole numbers. design: which fingertip it is of.
+        value: a name of `sensor_names(design)`, or a dict of Sensor's fields, which override those of "like"
+          (default: the design's own); None is the design's own.
+        seed: of "random", whole numbers. design: of the fingertip.
 
     Raises:
-      ValueError: an unknown name or field, a number that cannot be, or another number of electrodes.
+        ValueError: an unknown name or field, an invalid number, or another number of electrodes.
     """
     if value is None:
         value = design.sensor
@@ -321,7 +321,7 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
 
 
 def _refuse_others(rest, design):
-    """A ValueError where rest counts are of another number of electrodes than a design's."""
+    """Raises ValueError if rest counts have another number of electrodes than the design."""
     if np.size(rest) != design.nelectrode:
         raise ValueError(
             f"rest of a sensor is {short_repr(rest)}, of {np.size(rest)} electrodes, and the design is "

@@ -1,4 +1,4 @@
-"""What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for
+"""Counts of a BioTac from the deformed skin: film conduction and acquisition combined, for a step and for
 stored motions."""
 
 import contextlib
@@ -28,25 +28,24 @@ _SETTINGS = {
 
 
 class PhysicsReadings:
-    """Counts of all channels from the deformed skin and the liquid's pressure. Constant: the state belongs to
-    the caller.
+    """Counts of all channels from the deformed skin and the liquid's pressure. Constant: the caller owns the
+    state.
 
     Args:
       geometry: the skin.
       seed: of the noise; give every sensor its own.
-      noise: False leaves quantisation only.
-      sensor: which one it is, see `presets.read_sensor`; "random" is drawn by the seed.
-      film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
-      `Acquisition.needs_impedance`).
-      temperature: of the core at the reset [C], None: the sensor's; without `bodies` nothing but the sensor's
-        own warm-up changes it.
-      bodies: of what is made what may touch, one of each body; the sensor then has a heat of its own
-        (`sensor.heat`), which moves TDC, TAC and, with the liquid's temperature, all electrodes. None: it has
-        none.
-      cold: the sensor is switched on at the reset: it begins at the temperature around it and warms up.
-      film: a FilmConduction to share between sensors of the same geometry; None builds one.
-      vibration: of one sensor on the CPU, for what PAC feels of taps, stick-slip and `textures` of the
-        bodies; None: it feels the pressure of whole steps alone.
+        noise: False keeps quantisation only.
+        sensor: see `presets.read_sensor`; "random" is drawn by the seed.
+        film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
+          `Acquisition.needs_impedance`).
+        temperature: of the core at the reset [C], None: the sensor's. Without `bodies` it changes only by the
+          sensor's own warm-up.
+        bodies: material of each body that may touch. The sensor then has a heat model (`sensor.heat`), which
+          changes TDC, TAC and, through the liquid's temperature, all electrodes. None: no heat model.
+        cold: the sensor is switched on at the reset: it starts at ambient temperature and warms up.
+        film: a FilmConduction to share between sensors of the same geometry; None builds one.
+        vibration: of one sensor on the CPU, for PAC's response to taps, stick-slip and `textures` of the
+          bodies; None: PAC has only the pressure of whole steps.
 
     Attributes:
       nstate: length of the state vector.
@@ -108,9 +107,9 @@ class PhysicsReadings:
         textures: list[Texture] | None = None,
         impedance: np.ndarray | None = None,
     ) -> None:
-        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], or of the film's impedance (n,)
-        [ohm], by default at rest, into state (nstate,). From now on the readings are those of `sensor`,
-        touched by what is made of `bodies` with `textures`; by default those of the settings."""
+        """Writes the steady readings into state (nstate,) for a skin at vert_xpos (nvert, 3) [m], or for the
+        film's impedance (n,) [ohm]; default: at rest. From now on the readings are those of `sensor`, touched
+        by `bodies` with `textures`; default: those of the settings."""
         if impedance is None:
             impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
         acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)
@@ -146,10 +145,9 @@ class PhysicsReadings:
           time: at the start of the step [s]; dt: its length [s].
           vert_xpos: (nvert, 3), nodes at the end of the step, BioTac frame [m].
           pressure: of the liquid at the end of the step, above rest [Pa].
-          area, force: (nbody,) what each body touches [m^2] and its force [N], for heat; None: nothing
-            touches.
-          shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
-          impedance: (n,) of the film at the end of the step [ohm], which is not solved then.
+            area, force: (nbody,) contact area [m^2] and force [N] of each body, for heat; None: no contact.
+            shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
+            impedance: (n,) of the film at the end of the step [ohm]; the film is not solved then.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
@@ -159,11 +157,11 @@ class PhysicsReadings:
         if heat is not None:
             temperature, liquid = heat[THERMISTOR], heat[ABOVE]
         if impedance is None and self.acquisition.needs_impedance(counts, time, dt):
-            # a skin that nothing touches need not be solved again
+            # without contact the film need not be solved again
             still = np.array_equal(vert_xpos, self._rest_vert)
             with contextlib.suppress(
                 NoFilmError
-            ):  # of a skin that was hit hard: electrodes hold, as in batches
+            ):  # the film of a skin after a hard hit: electrodes hold, as in batches
                 impedance = self._rest if still else self.film.impedance(vert_xpos)
         moved, shaken = self._vibrate(state, time, dt, shaking)
         self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken, liquid)
@@ -184,7 +182,8 @@ class PhysicsReadings:
         return own
 
     def _vibrate(self, state, time, dt, shaking):
-        """The vibration's state after the step and what PAC feels at its slots; None without one."""
+        """The vibration's state after the step and the pressure on PAC at its slots; None without
+        vibration."""
         if self._vibration is None:
             return None, None
         v = self._vibration
@@ -207,14 +206,14 @@ def check_settings(
     what: str = "options['readings']",
     design: Design = BIOTAC,
 ) -> dict:
-    """Settings of `PhysicsReadings`, given by name, as they are.
+    """Returns settings of `PhysicsReadings`, given by name, after a check.
 
     Args:
-      given: of noise, sensor, film_every_step, temperature. more: further names and their types.
-      what: they are, in errors. design: of the sensor.
+        given: of noise, sensor, film_every_step, temperature. more: further names and their types.
+        what: their name in errors. design: of the sensor.
 
     Raises:
-      ValueError: not a dict, another name, or a value that cannot be.
+        ValueError: not a dict, an unknown name, or an invalid value.
     """
     known = _SETTINGS | (more or {})
     check_entries(what, given, known, known)
@@ -233,8 +232,9 @@ def record(readings: PhysicsReadings, time: np.ndarray, vert_xpos: np.ndarray, p
       time: (nt,) increasing [s]; vert_xpos: (nt, nvert, 3) [m]; pressure: (nt,) above rest [Pa].
 
     Returns:
-      dict of int arrays, row i what the bus reports at time[i]: electrodes (nt, n), pdc (nt,), pac (nt,
-        npac), tac (nt,), tdc (nt,).
+        dict of int arrays, row i the bus report at time[i]: electrodes (nt, n), pdc (nt,), pac (nt, npac),
+        tac (nt,),
+          tdc (nt,).
 
     Raises:
       ValueError: lengths that differ, or time that does not increase.

@@ -1,4 +1,4 @@
-"""Where the impedances of the electrodes come from, by name."""
+"""Sources of the electrodes' impedances, by name."""
 
 import os
 

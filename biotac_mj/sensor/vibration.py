@@ -1,20 +1,21 @@
-"""Vibration of a BioTac: what PAC feels between the steps of the skin, many sensors at once.
+"""Vibration of a BioTac: PAC between the steps of the skin, many sensors at once.
 
     slip, texture -> height -> force \\
                                        -> modes of the skin -> pressure -> 10 to 1040 Hz -> PAC
     taps, stick-slip: force -----------/
 
 Everything is linear: a force on the skin drives its modes (`skin.modes`), each an oscillator of unit static
-gain, made a second-order section by the bilinear rule with its frequency kept. The steady pressure of the
-contact force is the skin's own (FEM); here only how the modes differ from it. What the texture adds is
-nobody else's, so it counts whole: modes, and the static part of those that are not there.
+gain, discretised as a second-order section by the bilinear rule with its frequency kept. The FEM skin
+supplies the steady pressure of the contact force; here only the modes' deviation from it counts. The pressure
+of the texture has no other source, so it counts whole: modes, and the static contribution of the truncated
+ones.
 
-A texture is a height under the contact that passes at the speed of slip: regular ridges, and roughness as
-the sum of waves (a second-order process along the way slid) and grain (a first-order one). Half a pitch of
-ridges takes back what the other half gives, so what counts of them is the mean over the touched area.
+A texture is a height under the contact that passes at the sliding speed: regular ridges, and roughness as the
+sum of waves (a second-order process over the distance slid) and grain (a first-order one). The two halves of
+a ridge's pitch cancel, so the mean over the touched area counts.
 
-Slots are those of `acquisition`, 4.4 kHz; the state is short and noise a function of seed and slot, so frames
-join and a replay is equal to the bit."""
+Slots are those of `acquisition`, 4.4 kHz. The state is short and noise a function of seed and slot, so frames
+join and a replay is bit-equal."""
 
 import dataclasses
 import math
@@ -44,11 +45,11 @@ wp.set_module_options({"enable_backward": False})
 
 real = wp.float64
 
-# Of the rubber: silicones have about 0.1 to 0.3 between 10 Hz and 3 kHz (typical, not fitted).
+# Loss factor of the rubber: silicones have about 0.1 to 0.3 between 10 Hz and 3 kHz (typical, not fitted).
 LOSS_FACTOR = 0.2
-# Roughness: length of the waves, of the grain [m], and the grain's fraction of the mean square. FITTED, as is
-# ROUGHNESS: RMS [m] under a BioTac at 20 mm/s, one slide of each, in three bands
-# (`benchmarks/vibration.py`). An effective number: what of it the contact averages out is not in it.
+# Roughness: length of the waves, of the grain [m], and the grain's fraction of the mean square. FITTED, like
+# ROUGHNESS: RMS [m] under a BioTac at 20 mm/s, one slide of each material, in three bands
+# (`benchmarks/vibration.py`). Effective values: the contact's averaging is not separated.
 _WAVE, _GRAIN = 4.15e-4, 2.0e-6
 _GRAIN_FRACTION = 1.13e-3
 ROUGHNESS = {
@@ -59,21 +60,21 @@ ROUGHNESS = {
     "steel": 0.55e-6,
 }
 _LOW, _HIGH = (math.tan(math.pi * hertz / SLOT_RATE) for hertz in (1040.0, 10.0))  # of the band-pass
-_FILTER = 4  # numbers of the band-pass, behind the modes in the state
-# of a body: phase; what makes the waves, waves and grain, over their RMS; speed; its texture: pitch, height,
+_FILTER = 4  # numbers of the band-pass, after the modes in the state
+# per body: phase; input of the waves, waves and grain, over their RMS; speed; its texture: pitch, height,
 # roughness [m], so that a reset may change it; then the gains
 _BODY, _SPEED, _TEXTURE = 8, 4, 5
-# [m] what the contact's tangent bears: what is higher or longer is shape, shorter pitches average out
+# [m] limits of the linearised contact: larger or longer features are shape, shorter pitches average out
 _RANGE = {"pitch": (1e-6, 0.1), "height": (0.0, 1e-3), "roughness": (0.0, 1e-3)}
-_KEY = 0x1E3779B97F4A7C15  # by which the seeds of the roughness differ from the noise's
+_KEY = 0x1E3779B97F4A7C15  # separates the seeds of the roughness from the noise's
 
 
 @dataclasses.dataclass(frozen=True)
 class Texture:
-    """Of a surface.
+    """Texture of a surface.
 
     Attributes:
-      pitch: of ridges across the way [m]; height: theirs, from bottom to top [m].
+        pitch: of ridges across the sliding direction [m]; height: of ridges, from bottom to top [m].
       roughness: RMS [m].
     """
 
@@ -83,14 +84,14 @@ class Texture:
 
 
 def read_texture(value: str | Texture | Mapping) -> Texture:
-    """A texture of what a user says of a geom.
+    """A texture from a user's description of a geom.
 
     Args:
       value: a material's name of `ROUGHNESS`, "smooth", or a dict with any of material, pitch, height,
         roughness [m].
 
     Raises:
-      ValueError: an unknown name or key, or a number that cannot be.
+        ValueError: an unknown name or key, or an invalid number.
     """
     if isinstance(value, Texture):
         return value
@@ -126,8 +127,8 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
 
 @dataclasses.dataclass(frozen=True)
 class Modes:
-    """What of `skin.modes.SkinModes` the sensor needs: angular frequencies (nmode,) [rad/s] and static
-    pressures of unit modal forces (nmode,) [Pa / (N kg^-1/2)]."""
+    """Modes of the skin for the sensor (from `skin.modes.SkinModes`): angular frequencies (nmode,) [rad/s]
+    and static pressures of unit modal forces (nmode,) [Pa / (N kg^-1/2)]."""
 
     rate: np.ndarray
     static_pressure: np.ndarray
@@ -143,7 +144,7 @@ def sections(rate: ArrayLike, loss: float = LOSS_FACTOR) -> np.ndarray:
       (nmode, 3): b0 = b1 / 2 = b2, a1 and a2; the poles lie inside the unit circle.
 
     Raises:
-      ValueError: a mode beyond the rate.
+        ValueError: a mode above the Nyquist frequency.
     """
     rate = np.asarray(rate, float)
     if not (rate < np.pi * SLOT_RATE).all():
@@ -154,14 +155,14 @@ def sections(rate: ArrayLike, loss: float = LOSS_FACTOR) -> np.ndarray:
 
 
 def state_size(nmode: int, nbody: int) -> int:
-    """Numbers in the state of a sensor with so many modes that up to `nbody` bodies touch."""
+    """Length of the state of a sensor with so many modes that up to `nbody` bodies touch."""
     return 3 * nmode + _FILTER + nbody * (_BODY + nmode + 1)
 
 
 @wp.func
 def _average(ka: real):
-    """Of a wave over a disc of radius a: a bound without zeros of 2 J1(ka) / ka, as contacts have no sharp
-    edge."""
+    """Average of a wave over a disc of radius a: a bound of 2 J1(ka) / ka without zeros, as contacts have no
+    sharp edge."""
     return real(1.0) / wp.sqrt(real(1.0) + real(math.pi / 8.0) * ka * ka * ka)
 
 
@@ -265,13 +266,14 @@ class Vibration:
       device: Warp device.
 
     Attributes:
-      state: (nworld, nstate) wp.array float64, as `rest` says where nothing moves.
+        state: (nworld, nstate) wp.array float64; `rest` gives the initial one.
       time: (nworld,) wp.array float64, at the start of the next step [s]; the caller's.
       drive: (nworld, nmode) wp.array float64, modal force of all contacts at the end of the step
-        [N kg^-1/2]. gain: (nworld, nbody, nmode + 1), modal forces that a height under each body makes
-        [N kg^-1/2 / m], and last its steady pressure [Pa/m]. slip: (nworld, nbody) speed [m/s]. area: touched
-        (nworld, nbody) [m^2]. Write them before `advance`.
-      pressure: (nworld, nslot) wp.array float64, what PAC feels at the step's slots [Pa], see `acquisition`.
+            [N kg^-1/2]. gain: (nworld, nbody, nmode + 1), modal forces per height under each body [N kg^-1/2
+            / m], and last its steady pressure [Pa/m]. slip: (nworld, nbody) speed [m/s]. area: touched
+            (nworld, nbody) [m^2]. Write them before `advance`.
+          pressure: (nworld, nslot) wp.array float64, pressure on PAC at the step's slots [Pa], see
+            `acquisition`.
       nstate: length of a sensor's state.
     """
 
@@ -297,7 +299,7 @@ class Vibration:
         self._dt, self.pressure = None, None
 
     def rest(self, textures: list[Texture]) -> np.ndarray:
-        """The state (nstate,) of a sensor that nothing moves, with textures of the bodies."""
+        """The state (nstate,) of a sensor at rest, with textures of the bodies."""
         state = np.zeros(self.nstate)
         bodies = state[3 * self.nmode + _FILTER :].reshape(self.nbody, _BODY + self.nmode + 1)
         made = [dataclasses.astuple(t) for t in textures]
@@ -307,14 +309,13 @@ class Vibration:
     def read_from(
         self, seed: wp.array, time: wp.array, drive: wp.array, gain: wp.array, slip: wp.array, area: wp.array
     ) -> None:
-        """From now on the seeds, `time`, `drive`, `gain`, `slip` and `area` are these arrays of the
-        device."""
+        """Makes these device arrays the source of the seeds, `time`, `drive`, `gain`, `slip` and `area`."""
         self._seed, self.time = seed, time
         self.drive, self.gain, self.slip, self.area = drive, gain, slip, area
         self._dt = None
 
     def prepare(self, dt: float) -> None:
-        """Makes room for steps of dt [s]."""
+        """Allocates for steps of dt [s]."""
         if dt != self._dt:
             self._dt = dt
             nslot = math.ceil(dt * SLOT_RATE) + 1
@@ -328,6 +329,7 @@ class Vibration:
             )
 
     def advance(self, dt: float) -> None:
-        """The slots of a step of dt [s]. A launch only, once prepared: may be captured in a CUDA graph."""
+        """Computes the slots of a step of dt [s]. A launch only, once prepared: may be captured in a CUDA
+        graph."""
         self.prepare(dt)
         self._step.launch()

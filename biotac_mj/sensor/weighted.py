@@ -19,16 +19,15 @@ _SCALE = (7.9e-4, 1.85e-3, 8.8e-4)
 
 @dataclasses.dataclass(frozen=True)
 class WeightedElectrodes:
-    """The place is the mean of the electrodes, weighted by a power of how far their counts fell, moved
-    outwards to the skin; the force is the sum of their normals, weighted by how far they fell, times a scale
-    for each axis. Counts fall where the film gets thinner; those that rise tell of liquid that went
-    elsewhere, and are left out.
+    """The position is the mean of the electrodes, weighted by a power of the fall of their counts, projected
+    outwards to the skin. The force is the sum of their normals, weighted by the fall, times a scale for each
+    axis. Counts fall where the film gets thinner; those that rise indicate displaced liquid and are ignored.
 
     Args:
       geometry: of the skin.
-      scale: (3,) [N/count] of the axes of the BioTac frame; None: of the shipped BioTac, fitted to synthetic
-        presses. `fitted` finds that of a sensor.
-      power: of the weights of the place; the paper's is 2.
+        scale: (3,) [N/count] of the axes of the BioTac frame; None: of the shipped BioTac, fitted to
+          synthetic presses. `fitted` computes that of a sensor.
+        power: of the position's weights; the paper's is 2.
     """
 
     geometry: SkinGeometry
@@ -36,8 +35,8 @@ class WeightedElectrodes:
     power: float = 2.0
 
     def place(self, change: ArrayLike) -> np.ndarray:
-        """(..., 3) where the skin is touched [m], BioTac frame, on the skin at rest; nan where no electrode
-        fell, or none below the skin.
+        """(..., 3) contact position [m], BioTac frame, on the skin at rest; nan if no electrode falls, or
+        none below the skin.
 
         Args:
           change: (..., nelectrode) of counts from rest.
@@ -57,7 +56,7 @@ class WeightedElectrodes:
         """(..., 3) on the BioTac [N], in its frame; change as for `place`.
 
         Raises:
-          ValueError: no scale is known of such a fingertip.
+            ValueError: no scale is known for this fingertip.
         """
         scale = self.scale
         if scale is None:
@@ -70,7 +69,7 @@ class WeightedElectrodes:
         return self._sum(change) * np.asarray(scale, float)
 
     def fitted(self, change: ArrayLike, force: ArrayLike) -> "WeightedElectrodes":
-        """With the scale that fits known forces best, axis by axis.
+        """A copy with the scale that fits known forces best, per axis.
 
         Args:
           change: (n, nelectrode) as for `place`. force: (n, 3) on the BioTac [N].
@@ -99,7 +98,7 @@ class WeightedElectrodes:
         return corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
 
     def _on_skin(self, start, out):
-        """Where the ray from inside leaves the skin at rest (Moeller and Trumbore)."""
+        """Exit point of a ray from inside through the skin at rest (Moeller and Trumbore)."""
         first, along, across = self._corners
         normal = np.cross(out, across)
         det = (along * normal).sum(1)

@@ -1,4 +1,4 @@
-"""The liquid film between core and skin, and the impedances of the electrodes that it gives."""
+"""The liquid film between core and skin, and the impedances of its electrodes."""
 
 from .conduction import (
     CONDUCTIVITY,

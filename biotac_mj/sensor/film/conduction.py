@@ -1,22 +1,22 @@
 """Impedance of the electrodes: quasi-static conduction in the thin liquid film between the rigid core and
 the skin.
 
-The film is a sheet of conductance sigma h, h the gap from the deformed skin to the core. It is triangulated
-by the inner surface of the skin, laid halfway between skin and core, and its P1 finite-element Laplacian L
-gives the potential of any current pattern. The four excitation electrodes are short-circuited and grounded,
-one sensing electrode injects the current, the others float (a pattern for each, one factorisation).
+The film is a sheet of conductance sigma h, where h is the gap from the deformed skin to the core. Its mesh is
+the inner surface of the skin, moved halfway to the core. The P1 finite-element Laplacian L gives the
+potential of any current pattern. The four excitation electrodes are short-circuited and grounded, one sensing
+electrode injects the current, the others float (one pattern per electrode, one factorisation).
 
-Electrodes are discs with uniform current density, so the result does not depend on how nodes fall under them.
-Two parts of the field near a disc are closed forms with the film's local thickness h: the mesh carries the
-current in over a disc of radius b that it resolves, and ln(b / a) / (2 pi sigma h) is the sheet between that
-and the electrode's radius a; and a sheet is exact only where it is thinner than the disc is wide, so what a
-slab of thickness h adds is `spreading_resistance`.
+Electrodes are discs with uniform current density, so the result does not depend on where nodes lie under
+them. Two contributions near a disc have closed forms in the local thickness h. The mesh injects the current
+over a disc of radius b that it resolves, and ln(b / a) / (2 pi sigma h) is the resistance of the sheet
+between b and the electrode's radius a. A sheet is exact only if it is thinner than the disc is wide;
+`spreading_resistance` is the additional resistance of a slab of thickness h.
 
-`FilmConduction` holds the constants of one skin and answers for one deformed skin at a time; `BatchFilm` has
-the impedances of many on one device. Both launch the kernels of `kernels.py`: distances from the core's
-triangles and the sheet Laplacian, whose Cholesky factor is stored as it suits the device (`systems.py`).
-The solution is direct: conjugate gradients would need tens of iterations, since a film pressed to a twentieth
-of its thickness is far from the one at rest."""
+`FilmConduction` holds the constants of one skin and evaluates one deformed skin at a time; `BatchFilm`
+evaluates many on one device. Both launch the kernels of `kernels.py`: distances from the core's triangles and
+the sheet Laplacian. Its Cholesky factor is stored as suits the device (`systems.py`). The solver is direct:
+conjugate gradients would need tens of iterations, since a film pressed to a twentieth of its thickness
+differs much from the one at rest."""
 
 import functools
 import threading
@@ -59,43 +59,42 @@ __all__ = [
     "spreading_table",
 ]
 
-# X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED: not published for
-# this sensor; the two pairs, symmetric about z = 0, that best explain the published rest counts
+# X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED, since not published
+# for this sensor: the two pairs, symmetric about z = 0, that best explain the published rest counts
 # (scripts/fit_excitation.py on the paper's mesh: ln Z correlates 0.978, RMS 0.054).
 EXCITATION = BIOTAC.excitation
-# [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at
-# 25 C
+# [S/m], from that fit: the mean ln of film and published impedances are equal; about 30 mmol/l NaBr in water
+# at 25 C
 CONDUCTIVITY = 0.367
-# [m], published cylinder about the x axis; only says where to look for the core's surface
+# [m], published cylinder about the x axis; only a start for the search of the core's surface
 _CORE_RADIUS = 5.325e-3
-_FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges
-# [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
+_FOOTPRINT = 0.8e-3  # [m], radius of the disc that injects into the sheet: resolved by 0.8 mm edges
+# [m], tangential motion of the skin over an electrode for which the candidate faces suffice
 _SLACK = 2.0e-3
 
 
 class NoFilmError(ValueError):
-    """The deformed skin leaves no film that conducts."""
+    """The deformed skin leaves no conducting film."""
 
 
 class FilmConduction:
-    """Impedances of the sensing electrodes from the deformed skin. Constant after construction, holds no
+    """Impedances of the sensing electrodes from the deformed skin. Constant after construction, without
     state.
 
     Args:
       geometry: the skin, its core and its electrodes.
       conductivity: of the liquid [S/m].
-      residual_film: thickness left where the skin lies on the core, held off by the asperities of its inner
-        face [m] (chosen; catalogue range 20-100 um).
-      electrode_radius: of all discs [m] (chosen: not published).
-      excitation: of X1, X2, ... where they are not the design's: (k, 2), position x [m] and angle about the x
-        axis from the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), places near the
-        core [m], both in the BioTac frame.
-      sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes the
-        skin at rest give its rest counts. "" is the design's own; None leaves the factors at one: physics
-        alone.
+        residual_film: thickness where the skin touches the core, kept by the asperities of its inner face [m]
+          (chosen; catalogue range 20-100 um).
+        electrode_radius: of all discs [m] (chosen: not published).
+        excitation: positions of X1, X2, ... if not the design's: (k, 2), x [m] and angle about the x axis
+          from the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), points near the core
+          [m]; BioTac frame.
+        sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes
+          the skin at rest give its rest counts. "" is the design's own. None: all factors one, pure physics.
 
     Attributes:
-      cell_constant: (n,), what the film's impedance is multiplied with.
+        cell_constant: (n,), factor on the film's impedance.
       rest: (n,) impedance of the skin at rest [ohm].
       excitation_pos: (k, 3), X1, X2, ... on the core [m].
 
@@ -103,7 +102,7 @@ class FilmConduction:
       ValueError: a parameter out of range, or an electrode that the film does not cover.
     """
 
-    _power = 1.0  # of the thickness, as which the conductance goes
+    _power = 1.0  # exponent of the conductance over thickness
 
     def __init__(
         self,
@@ -156,7 +155,7 @@ class FilmConduction:
 
         Raises:
           ValueError: wrong shape, or a position that is not finite.
-          NoFilmError: a skin so far off that it leaves an electrode uncovered, or folded.
+            NoFilmError: the skin is folded, or so far off that an electrode is uncovered.
         """
         vert_xpos = as_numbers("vert_xpos", vert_xpos)
         if vert_xpos.ndim not in (2, 3) or vert_xpos.shape[-2:] != (self.geometry.nvert, 3):
@@ -174,7 +173,7 @@ class FilmConduction:
             x[:, 0] = vert_xpos
             for launch in self._solve_alone:
                 launch()
-            if valid[0]:  # so all positions are finite
+            if valid[0]:  # then all positions are finite
                 return impedance[0].copy()
             local = local[:, 0].copy()
         self._check_finite(vert_xpos)
@@ -198,7 +197,7 @@ class FilmConduction:
         return SparseLayout(self.face, len(self.node), len(self._pos))
 
     def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """The film under the skin.
+        """Geometry of the film under the skin.
 
         Args:
           vert_xpos: (nvert, 3) [m].
@@ -224,7 +223,7 @@ class FilmConduction:
             )
 
     def _set_alone(self):
-        """The arrays of one world on the CPU, which one thread at a time may use."""
+        """Makes the arrays of one world on the CPU, for one thread at a time."""
         self._alone, self._lock = BatchFilm(self, 1), threading.Lock()
         self._x, self._now = (
             wp.zeros((self.geometry.nvert, 1), dtype=vec3, device="cpu"),
@@ -235,8 +234,8 @@ class FilmConduction:
         self._views = [array.numpy() for array in arrays]
 
     def _set_mesh(self):
-        """Film nodes in an order of small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed)
-        carry no liquid."""
+        """Film nodes, ordered for a small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed)
+        have no liquid."""
         fixed = np.zeros(self.geometry.nvert, dtype=bool)
         fixed[self.geometry.fixed] = True
         face = self.geometry.inner_face[~fixed[self.geometry.inner_face].all(axis=1)]
@@ -260,8 +259,7 @@ class FilmConduction:
         self._rest_thickness = np.maximum(distance, self.residual_film)
 
     def _set_discs(self):
-        """Points that stand for equal parts of a disc, and the faces that may come to lie over each
-        electrode."""
+        """Sample points of equal area on a disc, and the candidate faces over each electrode."""
         self._footprint = max(self.electrode_radius, _FOOTPRINT)
         radius = np.sqrt((np.arange(3) + 0.5) / 3)
         angle = 2 * np.pi * (np.arange(8)[None] + np.array([0, 0.5, 0])[:, None]) / 8
@@ -275,23 +273,23 @@ class FilmConduction:
         offset = centre[None] - self._pos[:, None]
         tangential = np.linalg.norm(np.einsum("efk,eak->efa", offset, self._tangent), axis=2)
         height = np.einsum("efk,ek->ef", offset, self._normal)
-        # A face on the far side of the finger projects onto the disc too: it lies several millimetres under
-        # it.
+        # A face on the far side of the finger projects onto the disc too: it is excluded by its distance of
+        # several millimetres.
         self._pair = np.nonzero((tangential < reach) & (np.abs(height) < _SLACK))
 
 
 def read_film(
     given: object, electrode_radius: float | None = None, geometry: SkinGeometry | None = None
 ) -> dict:
-    """What `options["film"]` says of the film, as settings of `FilmConduction`.
+    """Reads `options["film"]` into settings of `FilmConduction`.
 
     Args:
-      given: dict of residual_film, electrode_radius [m], excitation; None is empty.
-      electrode_radius: taken where it has none [m]; None: the film's own.
-      geometry: of the skin on which the film must be possible; None leaves that to `FilmConduction`.
+        given: dict of residual_film, electrode_radius [m], excitation; None is empty.
+        electrode_radius: default [m]; None: the film's own.
+        geometry: of the skin, to check the values against; None leaves that to `FilmConduction`.
 
     Raises:
-      ValueError: no dict, another name, or a value that cannot be.
+        ValueError: not a dict, an unknown name, or an invalid value.
     """
     kinds = {"residual_film": float, "electrode_radius": float, "excitation": list}
     out = dict(check_entries("options['film']", {} if given is None else given, kinds, kinds))
@@ -327,11 +325,11 @@ def _check_numbers(given, geometry):
 
 
 def excitation_places(given: ArrayLike, design: Design, published: bool = False) -> np.ndarray:
-    """(k, 3) near the core [m], BioTac frame, of excitation electrodes as `FilmConduction` takes them; with
-    `published`, as `Design` has them.
+    """(k, 3) points near the core [m], BioTac frame, from excitation positions in a form of `FilmConduction`,
+    or, with `published`, of `Design`.
 
     Raises:
-      ValueError: another number of them, or what are no places.
+      ValueError: wrong number or shape.
     """
     k = len(design.excitation)
     try:
@@ -350,21 +348,21 @@ def excitation_places(given: ArrayLike, design: Design, published: bool = False)
 
 
 class BatchFilm:
-    """The film of `nworld` sensors of one geometry on one device. Only worlds that are due compute anything,
-    so the same launches can be recorded in a CUDA graph and replayed every step.
+    """The film of `nworld` sensors of one geometry on one device. Worlds that are not due compute nothing, so
+    the same launches can be recorded in a CUDA graph and replayed every step.
 
     Args:
-      film: the `FilmConduction` whose constants it takes.
+        film: `FilmConduction` that supplies the constants.
       nworld: number of worlds.
       device: Warp device.
-      band: whether the Laplacian is solved as a band of tiles, else by its sparse factor, which CUDA has not;
-        None: on CUDA alone.
+        band: whether the Laplacian is solved as a band of tiles, else by its sparse factor (CPU only); None:
+          only on CUDA.
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
       valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
-        position that is not finite.
-      lasting: the arrays of them that outlive a step: these two.
+            position that is not finite.
+          lasting: the arrays that persist between steps: these two.
       rest: (n,) impedance at rest [ohm]. design: of the skin.
       middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
         world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
@@ -374,7 +372,7 @@ class BatchFilm:
     def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
         self.design = film.design
-        self._record = None  # launches that are kept instead of made
+        self._record = None  # list that collects launches instead of running them
         band = self.device.is_cuda if band is None else band
         layout, n = film._band if band else film._sparse, len(film.node)
         self._layout = layout
@@ -436,13 +434,13 @@ class BatchFilm:
         self.nbytes = sum(array.capacity for array in per_world)
 
     def calibrate(self, x: wp.array) -> None:
-        """Gives each world the cell constants with which its skin at rest reads as the film's does.
+        """Sets the cell constants of each world so that its skin at rest has the film's impedances.
 
         Args:
-          x: (nvert, nworld) wp.array of vec3d, where the worlds rest [m].
+            x: (nvert, nworld) wp.array of vec3d, rest positions [m].
 
         Raises:
-          NoFilmError: one of them leaves an electrode without film.
+            NoFilmError: an electrode of some world has no film.
         """
         self.solve_film(x, wp.ones(self.nworld, dtype=int, device=self.device))
         if not self.valid.numpy().all():
@@ -454,7 +452,7 @@ class BatchFilm:
             self.impedance.assign(np.tile(self.rest, (self.nworld, 1)))
 
     def lay(self, x: wp.array, due: wp.array) -> None:
-        """Writes `middle` and `thickness`; arguments and errors as `solve_film`."""
+        """Computes `middle` and `thickness`; arguments and errors as `solve_film`."""
         if x.device != self.device or due.device != self.device:
             raise ValueError(
                 f"the film is on {self.device}, x on {x.device} and due on {due.device}: make both where "
@@ -474,11 +472,11 @@ class BatchFilm:
         )
 
     def solve_film(self, x: wp.array, due: wp.array) -> None:
-        """New impedances of the worlds that are due. Launches only: may be captured in a CUDA graph.
+        """Computes new impedances of the worlds that are due. Launches only: may be captured in a CUDA graph.
 
         Args:
           x: (nvert, nworld) wp.array of vec3d, nodes in the BioTac frame [m].
-          due: (nworld,) wp.array of int, 0 where the last impedances stay.
+            due: (nworld,) wp.array of int, 0: keep the last impedances.
 
         Raises:
           ValueError: an array is on another device.
@@ -497,8 +495,8 @@ class BatchFilm:
         self._launch(kernels.driving_point, self.nworld, network, [self.impedance, self.valid])
 
     def recorded(self, x: wp.array, due: wp.array) -> list[Callable[[], None]]:
-        """The launches of `solve_film` with these arrays on the CPU, each a function: packing their arguments
-        takes a quarter of the time."""
+        """The launches of `solve_film` with these arrays as functions (CPU). Packing the arguments once saves
+        a quarter of the time."""
         self._record = []
         self.solve_film(x, due)
         made, self._record = self._record, None
@@ -538,11 +536,11 @@ def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike)
 
 
 def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
-    """Resistance near a disc that a thin sheet leaves out, times sigma a.
+    """Additional resistance near a disc, relative to a thin sheet, times sigma a.
 
     A disc of radius a injects uniformly into a slab of thickness h between insulating planes. Its mean
-    potential is a Hankel integral over coth(k h); the sheet keeps the part 1 / (k h) of it, the rest is
-    F(h/a) / (sigma a) with F(r) = 2/pi int J1(x)^2 / x^2 (coth(r x) - 1/(r x)) dx: F -> r / (3 pi) for thin
+    potential is a Hankel integral over coth(k h). The sheet accounts for the term 1 / (k h); the remainder is
+    F(h/a) / (sigma a) with F(r) = 2/pi int J1(x)^2 / x^2 (coth(r x) - 1/(r x)) dx. F -> r / (3 pi) for thin
     films.
 
     Args:
@@ -556,7 +554,7 @@ def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
     x = (np.arange(npoint) + 0.5) * width
     weight = 2 / np.pi * width * (j1(x) / x) ** 2
     y = ratio[..., None] * x
-    # J1^2 averages 1 / (pi x) and coth - 1/y is about one beyond the last point
+    # beyond the last point J1^2 averages 1 / (pi x) and coth - 1/y is about one
     tail = 1 / (np.pi**2 * 60.0**2)
     return (weight * (1 / np.tanh(y) - 1 / y)).sum(-1) + tail * np.where(
         ratio > 0.05, 1 - 1 / np.maximum(40 * ratio, 1), 0
@@ -564,8 +562,8 @@ def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
 
 
 def spreading_table() -> tuple[float, np.ndarray]:
-    """Step in r / (1 + r), r = h / a, and values of `spreading_resistance`, between which the kernels
-    interpolate."""
+    """Step in r / (1 + r), r = h / a, and values of `spreading_resistance`; the kernels interpolate in this
+    table."""
     s = np.linspace(0, 0.98, 200)
     return float(s[1]), np.concatenate([[0.0], spreading_resistance(s[1:] / (1 - s[1:]), 2000)])
 

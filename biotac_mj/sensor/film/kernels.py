@@ -1,8 +1,8 @@
-"""Kernels of `conduction.py`: core, sheet, discs, factorisation, network. Arrays over worlds are
-[item, world] unless they are tiles.
+"""Kernels of `conduction.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item,
+world], except tiles.
 
-A world's system is one array of rows of TILE numbers: its Laplacian as a layout of `systems.py` stores it,
-and after it the right-hand sides, a column for each disc."""
+A world's system is an array of rows of TILE numbers: its Laplacian in a layout of `systems.py`, followed by
+the right-hand sides, one column for each disc."""
 
 import warp as wp
 
@@ -24,9 +24,9 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-NSAMPLE = 24  # points that stand for equal parts of a disc
+NSAMPLE = 24  # sample points of equal area on a disc
 TILE = MOST_DISCS  # rows of a tile, and columns of right-hand sides: the discs, padded
-# barycentric coordinate of a sample on an edge: both faces take it, whichever way it is rounded
+# barycentric tolerance for a sample on an edge: both faces accept it under rounding
 _ON_EDGE = 1e-9
 real = wp.float64
 vec3 = wp.vec3d
@@ -51,14 +51,14 @@ def film_surface(
     middle_out: wp.array2d(dtype=vec3),
     thickness_out: wp.array2d(dtype=real),
 ):
-    """The surface halfway between skin and core, and the film's thickness [node, world]; `power` other than
-    one: that of a smooth film of the same conductance."""
+    """The surface halfway between skin and core, and the film's thickness [node, world]. For `power` other
+    than one, the thickness of a smooth film of the same conductance."""
     i, w = wp.tid()
     if due[w] == 0:
         return
     p = x[node[i], w]
     gap, distance, _face = nearest_listed_on_core(core, nearest, i, p)
-    thickness = wp.where(distance < residual_film, residual_film, distance)  # nan stays
+    thickness = wp.where(distance < residual_film, residual_film, distance)  # keeps nan
     if power != real(1.0):
         thickness = _formulas.rough_thickness(thickness, rest[i], power)
     middle_out[i, w] = p - real(0.5) * gap
@@ -85,7 +85,7 @@ def face_conductance(
     e1 = middle[t[0], w] - middle[t[2], w]
     e2 = middle[t[1], w] - middle[t[0], w]
     area = wp.length(wp.cross(e0, e1))
-    # a face squeezed to a line stays finite
+    # keeps a degenerate face finite
     area = wp.max(area, real(1.0e-6) * (wp.length_sq(e0) + wp.length_sq(e1) + wp.length_sq(e2)))
     scale = _formulas.sheet_scale(
         conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area
@@ -102,7 +102,7 @@ def clear_system(
     # Out:
     quads_out: wp.array2d(dtype=vec4),
 ):
-    """Zeros in the systems of the worlds that are due, four numbers a thread."""
+    """Clears the systems of the worlds that are due, four numbers per thread."""
     w, i = wp.tid()
     if due[w] != 0:
         quads_out[w, i] = vec4()
@@ -120,7 +120,7 @@ def assemble(
     # Out:
     system_out: wp.array3d(dtype=real),
 ):
-    """Gathers the Laplacian's entries from the faces' edges; padding gets a diagonal of one."""
+    """Sums the Laplacian's entries over the faces' edges; padding has a unit diagonal."""
     e, w = wp.tid()
     if due[w] == 0:
         return
@@ -131,7 +131,7 @@ def assemble(
     if start[e] == start[e + 1]:
         value = real(1.0)
     if e == 0:
-        # holds the free constant; no current flows through it, so the impedances do not depend on it
+        # fixes the free constant; no current flows through it, so the impedances do not depend on it
         value = real(2.0) * value
     system_out[w, entry[e][0], entry[e][1]] = value
 
@@ -160,14 +160,14 @@ def cover_discs(
     local_out: wp.array2d(dtype=real),
 ):
     """Mean over each disc as weights of nodal values (columns of the right-hand side, from row `rhs` on), and
-    the mean thickness [disc, world]."""
+    mean thickness [disc, world]."""
     e, w = wp.tid()
     if due[w] == 0:
         return
     hits = samples()
     covered = int(0)
     local = real(0.0)
-    for sweep in range(2):  # count how many faces lie over each sample, then share
+    for sweep in range(2):  # count the faces over each sample, then divide its weight
         for k in range(pair_start[e], pair_start[e + 1]):
             t = face[pair_face[k]]
             a = _where_on_disc(middle[t[0], w], pos[e], tangent[e, 0], tangent[e, 1])
@@ -201,7 +201,7 @@ def cover_discs(
                                 + v * thickness[t[2], w]
                             )
                             local += weight * mean
-    local_out[e, w] = local  # zero where no film is left over the disc
+    local_out[e, w] = local  # zero if no film is over the disc
 
 
 @wp.kernel
@@ -220,8 +220,8 @@ def driving_point(
     impedance_out: wp.array2d(dtype=real),
     valid_out: wp.array(dtype=int),
 ):
-    """Impedance of each sensing disc against the grounded ones, [world, electrode]; a film that cannot be
-    solved keeps the last ones."""
+    """Impedance of each sensing disc against the grounded ones, [world, electrode]. If the film cannot be
+    solved, the last values stay."""
     w = wp.tid()
     if due[w] == 0:
         return
@@ -276,14 +276,14 @@ def _near(
 
 @wp.func
 def _inverse(a: ground, m: int):
-    """Gauss-Jordan with row pivots of the first m + 1 rows: their last diagonal entry is zero."""
+    """Gauss-Jordan with row pivoting of the first m + 1 rows, whose last diagonal entry is zero."""
     scale = real(0.0)
     for i in range(m):
         scale = wp.max(scale, wp.abs(a[i, i]))
     b = ground()
     for i in range(m + 1):
         b[i, i] = real(1.0)
-    for i in range(m):  # resistances are some ten thousand ohm, the border is one
+    for i in range(m):  # resistances are of order 1e4 ohm, the border is one
         a[i, m] = scale
         a[m, i] = scale
     for k in range(m + 1):

@@ -1,10 +1,10 @@
-"""How the film's Laplacian is stored and solved: as a band of tiles, one thread block a world (CUDA), or by
-its sparse factor, one world after the other (CPU). Both are direct, in double precision, and give W' A^-1 W
-of the discs W.
+"""Storage and solution of the film's Laplacian: a band of tiles, one thread block per world (CUDA), or a
+sparse factor, one world after the other (CPU). Both are direct, in double precision, and give W' A^-1 W for
+the discs W.
 
-A layout says where in a world's system [row, TILE] the entries of A lie (`entry`), which edges of the faces
-add up to each of them (`slot`, `start`, `sign`), and where the right-hand sides begin, a row for each node
-and a column for each disc (`rhs`)."""
+A layout gives the row and column of each entry of A in a world's system [row, TILE] (`entry`), the edges of
+faces that each entry sums (`slot`, `start`, `sign`), and the first row of the right-hand sides, which have
+one row per node and one column per disc (`rhs`)."""
 
 from collections.abc import Callable
 
@@ -19,8 +19,8 @@ __all__ = ["BandLayout", "SparseLayout", "edges"]
 
 wp.set_module_options({"enable_backward": False})
 
-_LANES = 8  # numbers that are multiplied at once
-_THREADS = 128  # of a block that solves a band together
+_LANES = 8  # SIMD width in numbers
+_THREADS = 128  # of a block that solves a band
 
 
 def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -29,10 +29,11 @@ def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sums(face, n):
-    """Which edges each entry of A sums up: row <= column (nentry,), and a list of slots (3 face + corner)."""
+    """Entries of A: row <= column (nentry,) each, and for each the list of slots (3 face + corner) that it
+    sums."""
     i, j = edges(face)
     low, high = np.minimum(i, j), np.maximum(i, j)
-    # the diagonal takes every edge at its node
+    # a diagonal entry sums all edges at its node
     keys = np.concatenate([low * (n + 1), high * (n + 1), low * n + high])
     used, number = np.unique(keys, return_inverse=True)
     order = np.argsort(number, kind="stable")
@@ -41,15 +42,15 @@ def _sums(face, n):
 
 
 class BandLayout:
-    """Tiles of the band, the lower ones stored transposed under their column's diagonal.
+    """Tiles of the band; the lower ones are stored transposed under their column's diagonal.
 
     Args:
       face: (m, 3) of nodes in an order of small bandwidth. n: nodes.
 
     Attributes:
-      entry (nentry, 2): row and column in a world's system; entry 0 is the first diagonal. sign (nentry,),
-        start (nentry + 1,), slot: edges of faces (3 face + corner) that add up to it, none for padding.
-      rhs: row where the right-hand sides begin. rows: of the system in all.
+        entry (nentry, 2): row and column in a world's system; entry 0 is the first diagonal. sign (nentry,),
+          start (nentry + 1,), slot: edges of faces (3 face + corner) that each entry sums, none for padding.
+        rhs: first row of the right-hand sides. rows: of the system in all.
     """
 
     def __init__(self, face: np.ndarray, n: int):
@@ -59,7 +60,7 @@ class BandLayout:
         padding = np.arange(n, self._nblock * TILE)
         row, column = np.concatenate([row, padding]), np.concatenate([column, padding])
         slot += [np.zeros(0, int)] * len(padding)
-        # Cholesky's factor of a tile on the diagonal needs its lower triangle too
+        # Cholesky's factor of a diagonal tile also needs its lower triangle
         within = np.flatnonzero((column // TILE == row // TILE) & (row != column))
         row, column = np.concatenate([row, column[within]]), np.concatenate([column, row[within]])
         slot += [slot[k] for k in within]
@@ -77,13 +78,13 @@ class BandLayout:
 
 
 class SparseLayout:
-    """Columns of the sparse factor one after the other, in an order of minimum degree, which leaves a
-    twentieth of the band's operations.
+    """Columns of the sparse factor one after the other, in minimum-degree order, which needs a twentieth of
+    the band's operations.
 
     Args:
-      face, n: as of `BandLayout`. columns: of the right-hand sides that are worked on.
+        face, n: as for `BandLayout`. columns: number of right-hand sides.
 
-    Attributes: as of `BandLayout`.
+    Attributes: as for `BandLayout`.
     """
 
     def __init__(self, face: np.ndarray, n: int, columns: int):
@@ -101,7 +102,7 @@ class SparseLayout:
         self.entry = np.stack([at // TILE, at % TILE], axis=1)
         self.rhs = -(-len(self._row) // TILE)
         self.rows = self.rhs + n + -(-n // TILE)  # and a column of scratch
-        # entries left of the diagonal, row by row: where they are in their column, and where that ends
+        # entries left of the diagonal, row by row: their place in their column, and its end
         of = np.repeat(np.arange(n), np.diff(self._start))
         left = np.argsort(self._row, kind="stable")
         left = left[of[left] != self._row[left]]
@@ -110,7 +111,7 @@ class SparseLayout:
         self._kept = None
 
     def solve(self, launch: Callable, due: wp.array, system: wp.array, resistance: wp.array) -> None:
-        """As `BandLayout.solve`; CPU alone."""
+        """As `BandLayout.solve`, on the CPU."""
         if self._kept is None:
             lists = self._start, self._row, self._order[self._row], self._left_start
             with wp.ScopedDevice("cpu"):
@@ -121,7 +122,7 @@ class SparseLayout:
 
 
 def _minimum_degree(row, column, n):
-    """Nodes in the order of elimination that SuperLU chooses for a matrix of this pattern."""
+    """Elimination order of the nodes that SuperLU chooses for a matrix of this pattern."""
     both = np.concatenate([row, column]), np.concatenate([column, row])
     pattern = sp.coo_matrix((np.ones(len(both[0])), both), shape=(n, n)).tocsc()
     pattern.data[:] = -1.0
@@ -136,8 +137,8 @@ def _minimum_degree(row, column, n):
 
 
 def _fill(low, high, n):
-    """Where Cholesky's factor has entries, columns one after the other: start (n + 1,), row (nnz,) with the
-    diagonal first, of a matrix with entries at (high, low)."""
+    """Sparsity pattern of the Cholesky factor of a matrix with entries at (high, low), by columns: start (n +
+    1,), row (nnz,) with the diagonal first."""
     order = np.argsort(low, kind="stable")
     ends = np.searchsorted(low[order], np.arange(n + 1))
     columns, below = [], [[] for _ in range(n)]
@@ -150,12 +151,11 @@ def _fill(low, high, n):
     return np.cumsum([0, *map(len, columns)]), np.concatenate(columns)
 
 
-# Tile by tile along the diagonal: Cholesky's factor of the tile, the tiles right of it and its right-hand
-# sides divided by it, and what they take from the tiles further on. A thread block for each world on CUDA,
-# one thread elsewhere; Warp's own tiles do the same, but take CUDA over a minute to compile. A pivot that is
-# not positive leaves nan, and the film is told invalid.
-# On CUDA one warp factors a tile, a row of it in each lane's registers: a block that shares it waits at two
-# barriers for each column. Products are the tensor cores', which have double precision from sm_80 on.
+# For each tile along the diagonal: factor the tile, solve for the tiles right of it and its right-hand sides,
+# and update the tiles further on. One thread block per world on CUDA, one thread elsewhere. Warp's own tiles
+# do the same, but take CUDA over a minute to compile. A pivot that is not positive leaves nan, which marks
+# the film invalid. On CUDA one warp factors a tile, one row per lane in registers: a block would wait at two
+# barriers for each column. Products use tensor cores, which have double precision from sm_80 on.
 _SOLVE_BAND = (
     """
 #if defined(__CUDA_ARCH__)
@@ -299,7 +299,7 @@ def _eliminate_band(
 ): ...
 
 
-# launched with blocks of its own size: in this module it would have all kernels here compiled for both
+# launched with its own block size: in this module all kernels would be compiled for both sizes
 @wp.kernel(module="unique", enable_backward=False)
 def solve_band(
     # In:
@@ -311,15 +311,16 @@ def solve_band(
     # Out:
     resistance: wp.array3d(dtype=real),
 ):
-    """W' A^-1 W of the discs W by Cholesky's factor, a thread block for each world; A has `reach` tiles
-    beside the diagonal."""
+    """W' A^-1 W of the discs W by Cholesky's factor, one thread block per world; A has `reach` tiles beside
+    the diagonal."""
     w, _t = wp.tid()
     if due[w] != 0:
         _eliminate_band(w, nblock, reach, system, resistance)
 
 
-# Column by column: what the columns left of it take from it, then its pivot, then the right-hand sides of its
-# node, which are all known by then. A pivot that is not positive leaves nan, and the film is told invalid.
+# For each column: subtract the updates of the columns left of it, scale by its pivot, then solve the
+# right-hand sides of its node, which are complete by then. A pivot that is not positive leaves nan, which
+# marks the film invalid.
 _SOLVE = """
     const int width = WIDTH, parts = width / 8;
     double* value = system.data + (long long)world * system.shape[1] * tile;
@@ -364,7 +365,7 @@ _SOLVE = """
             for (int i = 0; i < parts; ++i) ((lanes*)(out + (a + b) * tile))[i] = sum[b][i];
     }
 """
-# the discs are columns of right-hand sides: each whole number of lanes of them has loops of its own
+# the discs are columns of right-hand sides: loops are compiled for each number of SIMD lanes
 _SOLVE = "\n".join(
     [
         f"typedef double lanes __attribute__((vector_size(64), aligned(8)));\nconst int tile = {TILE};",
@@ -409,7 +410,7 @@ def solve_sparse(
     # Out:
     resistance: wp.array3d(dtype=real),
 ):
-    """W' A^-1 W of the discs W by Cholesky's sparse factor, a thread for each world."""
+    """W' A^-1 W of the discs W by Cholesky's sparse factor, one thread per world."""
     w = wp.tid()
     if due[w] != 0:
         _eliminate(w, columns, n, rhs, start, row, node, left_start, left, system, resistance)
