@@ -205,39 +205,32 @@ def _touch(q: Parameters, area: real, force: real, body: real):
     return _formulas.between_cells(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
 
 
-@wp.kernel
-def step_heat(
-    # In:
-    dt: real,
-    parameters: wp.array(dtype=Parameters),
-    area: wp.array2d(dtype=real),
-    force: wp.array2d(dtype=real),
-    # Out:
-    state: wp.array2d(dtype=real),
-    scratch: wp.array2d(dtype=real),
-):
-    """Block elimination: every layer is eliminated into the one inside it, the core is solved, then the
-    layers are back-substituted. `scratch` holds a layer's factor on its inner neighbour, `state` meanwhile
-    the constant term."""
-    w = wp.tid()
-    q = parameters[w]
-    one, half = real(1.0), real(0.5)
-    ngroup = area.shape[1]
-    dx = q[_THICKNESS] * real(_CELL)
-    layer = q[_CONDUCTIVITY] / dx
-    store = q[_CAPACITY] * dx / dt
-
+@wp.func
+def _fit(q: Parameters, area: wp.array2d(dtype=real), w: int):
+    """Fraction of the bodies' contact area that fits on the skin."""
     wanted = real(0.0)
-    for g in range(ngroup):
+    for g in range(area.shape[1]):
         wanted += wp.max(area[w, g], real(0.0))
-    fit = _formulas.fitting(q[_AREA], wanted)
+    return _formulas.fitting(q[_AREA], wanted)
+
+
+@wp.func
+def _exchange_areas(
+    q: Parameters, dt: real, fit: real, area: wp.array2d(dtype=real), state: wp.array2d(dtype=real), w: int
+):
+    """Moves skin and bodies, with their heat, between the columns as contacts grow and shrink. Returns the
+    area of the free skin [m^2]."""
+    ngroup = area.shape[1]
+    one = real(1.0)
 
     # separated areas stay for a while, as far as the pad has room for them
     late = _formulas.lingering(q[_CAPACITY], q[_THICKNESS], q[_GAP], q[_CONDUCTIVITY], dt)
     parted = real(0.0)
+    wanted = real(0.0)
     for g in range(ngroup):
+        wanted += wp.max(area[w, g], real(0.0))
         parted += late * wp.max(state[w, BODIES + BODY * g] - fit * wp.max(area[w, g], real(0.0)), real(0.0))
-    room = wp.max(half * q[_AREA] - fit * wanted, real(0.0))
+    room = wp.max(real(0.5) * q[_AREA] - fit * wanted, real(0.0))
     late = _formulas.roomed(late, room, parted)
 
     # areas change columns: first what leaves, then what enters
@@ -276,6 +269,76 @@ def step_heat(
                     state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added
                 )
             state[w, b + _TAKEN] = touched
+    return free
+
+
+@wp.func
+def _eliminate_column(
+    q: Parameters,
+    dt: real,
+    b: int,
+    touched: real,
+    force: real,
+    state: wp.array2d(dtype=real),
+    scratch: wp.array2d(dtype=real),
+    w: int,
+):
+    """Eliminates the body and its column of skin, which begins at state b: `known` and `pull` of the core's
+    part near the thermistor, per area. All of a column shares the flux through its touching area."""
+    one = real(1.0)
+    dx = q[_THICKNESS] * real(_CELL)
+    layer = q[_CONDUCTIVITY] / dx
+    store = q[_CAPACITY] * dx / dt
+    press = _formulas.between_cells(layer, q[_FILM])
+    effusivity = state[w, b + _EFFUSIVITY]
+    coverage = wp.min(touched / state[w, b], one)
+    touch = _touch(q, touched, force, state[w, b + _BODY_CONDUCTIVITY])
+    onto = touch * touched / wp.max(state[w, b + _TAKEN], real(1.0e-30))
+    known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
+    pull = effusivity * real(_SLOW)
+    for i in range(NBRANCH):
+        c = _formulas.branch_conductance(effusivity, _branches[i], _rates[i], dt)
+        known += c * state[w, b + _STORE + i]
+        pull += c
+    at = b + _SURFACE
+    hold = effusivity * real(_FAST) / dt
+    cell, passed, known, pull = _formulas.eliminate(hold, state[w, at], known, pull, onto)
+    state[w, at] = cell
+    scratch[w, at] = passed
+    known = coverage * touch * cell
+    pull = coverage * touch * (one - passed)
+    for k in range(NCELL):
+        i = b + NCELL - k
+        inner = wp.where(k == NCELL - 1, coverage * press, layer)
+        cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
+        state[w, i] = cell
+        scratch[w, i] = passed
+    return known, pull
+
+
+@wp.kernel
+def step_heat(
+    # In:
+    dt: real,
+    parameters: wp.array(dtype=Parameters),
+    area: wp.array2d(dtype=real),
+    force: wp.array2d(dtype=real),
+    # Out:
+    state: wp.array2d(dtype=real),
+    scratch: wp.array2d(dtype=real),
+):
+    """Block elimination: every layer is eliminated into the one inside it, the core is solved, then the
+    layers are back-substituted. `scratch` holds a layer's factor on its inner neighbour, `state` meanwhile
+    the constant term."""
+    w = wp.tid()
+    q = parameters[w]
+    ngroup = area.shape[1]
+    dx = q[_THICKNESS] * real(_CELL)
+    layer = q[_CONDUCTIVITY] / dx
+    store = q[_CAPACITY] * dx / dt
+
+    fit = _fit(q, area, w)
+    free = _exchange_areas(q, dt, fit, area, state, w)
 
     # free skin, from the air inwards
     outside = _formulas.between_cells(layer, q[_AIR])
@@ -291,53 +354,35 @@ def step_heat(
     liquid_known = free * known
     liquid_pull = free * pull
 
-    # skin on bodies: all of a column shares the flux through its touching area
     near_known = real(0.0)
     near_pull = real(0.0)
-    press = _formulas.between_cells(layer, q[_FILM])
     for g in range(ngroup):
         b = BODIES + BODY * g
         patch = state[w, b]
         if patch > real(0.0):
-            effusivity = state[w, b + _EFFUSIVITY]
             touched = fit * wp.max(area[w, g], real(0.0))
-            coverage = wp.min(touched / patch, one)
-            touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
-            onto = touch * touched / wp.max(state[w, b + _TAKEN], real(1.0e-30))
-            known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
-            pull = effusivity * real(_SLOW)
-            for i in range(NBRANCH):
-                c = _formulas.branch_conductance(effusivity, _branches[i], _rates[i], dt)
-                known += c * state[w, b + _STORE + i]
-                pull += c
-            at = b + _SURFACE
-            hold = effusivity * real(_FAST) / dt
-            cell, passed, known, pull = _formulas.eliminate(hold, state[w, at], known, pull, onto)
-            state[w, at] = cell
-            scratch[w, at] = passed
-            known = coverage * touch * cell
-            pull = coverage * touch * (one - passed)
-            for k in range(NCELL):
-                i = b + NCELL - k
-                inner = wp.where(k == NCELL - 1, coverage * press, layer)
-                cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
-                state[w, i] = cell
-                scratch[w, i] = passed
+            known, pull = _eliminate_column(q, dt, b, touched, force[w, g], state, scratch, w)
             near_known += patch * known
             near_pull += patch * pull
 
-    # the core, with its two neighbours eliminated
-    core, near, liquid = _formulas.join_core(
-        dt, q[_C_CORE], q[_C_NEAR], q[_C_LIQUID], q[_MOUNT], q[_INSIDE], q[_SPREAD], q[_AMBIENT],
-        state[w, POWER], state[w, CORE], state[w, THERMISTOR], state[w, LIQUID],
-        near_known, near_pull, liquid_known, liquid_pull,
+    near_cell, near_passed, known, pull = _formulas.eliminate(
+        q[_C_NEAR] / dt, state[w, THERMISTOR], near_known, near_pull, q[_SPREAD]
+    )
+    liquid_cell, liquid_passed, liquid_known, liquid_pull = _formulas.eliminate(
+        q[_C_LIQUID] / dt, state[w, LIQUID], liquid_known, liquid_pull, q[_INSIDE]
+    )
+    core = _formulas.core_temperature(
+        (q[_C_CORE] - q[_C_NEAR]) / dt, state[w, CORE], state[w, POWER], q[_MOUNT], q[_AMBIENT],
+        known, pull, liquid_known, liquid_pull,
     )  # fmt: skip
+
+    # back-substitution outwards
+    near = near_cell + near_passed * core
+    liquid = liquid_cell + liquid_passed * core
     state[w, CORE] = core
     state[w, THERMISTOR] = near
     state[w, LIQUID] = liquid
     state[w, ABOVE] = liquid - state[w, REFERENCE]
-
-    # back-substitution outwards
     t = liquid
     for k in range(NCELL):
         state[w, FREE + k] += scratch[w, FREE + k] * t

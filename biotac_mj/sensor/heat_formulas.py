@@ -14,9 +14,9 @@ __all__ = [
     "between_cells",
     "branch_conductance",
     "contact_conductance",
+    "core_temperature",
     "eliminate",
     "fitting",
-    "join_core",
     "lingering",
     "mixed",
     "relaxed",
@@ -101,34 +101,19 @@ def relaxed(store: Number, surface: Number, rate: Number, dt: Number) -> Number:
     return (store + a * surface) / (np.float64(1.0) + a)
 
 
-def join_core(
-    dt: Number,
-    c_core: Number,
-    c_near: Number,
-    c_liquid: Number,
-    mount: Number,
-    inside: Number,
-    spread: Number,
-    ambient: Number,
-    power: Number,
+def core_temperature(
+    store: Number,
     core: Number,
-    near: Number,
-    liquid: Number,
+    power: Number,
+    mount: Number,
+    ambient: Number,
     near_known: Number,
     near_pull: Number,
     liquid_known: Number,
     liquid_pull: Number,
-) -> tuple[Number, Number, Number]:
-    """Solves the core with its two neighbours eliminated, then these: temperatures of the core, of its part
-    near the thermistor and of the liquid."""
-    near_total = c_near / dt + spread + near_pull
-    near = (c_near / dt * near + near_known) / near_total
-    near_ratio = spread / near_total
-    liquid_total = c_liquid / dt + inside + liquid_pull
-    liquid = (c_liquid / dt * liquid + liquid_known) / liquid_total
-    liquid_ratio = inside / liquid_total
-    rest = (c_core - c_near) / dt
-    core = (rest * core + power + mount * ambient + spread * near + inside * liquid) / (
-        rest + mount + spread * (np.float64(1.0) - near_ratio) + inside * (np.float64(1.0) - liquid_ratio)
+) -> Number:
+    """Temperature of the core after its two neighbours, the part near the thermistor and the liquid, were
+    eliminated into it."""
+    return (store * core + power + mount * ambient + near_known + liquid_known) / (
+        store + mount + near_pull + liquid_pull
     )
-    return core, near + near_ratio * core, liquid + liquid_ratio * core

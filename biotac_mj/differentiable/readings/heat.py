@@ -134,13 +134,20 @@ def _step(q, state, area, force, dt):
     )  # fmt: skip
     near_known, near_pull = (patch * known).sum(), (patch * pull).sum()
 
-    # the core, its two neighbours eliminated
-    names = "core", "near", "liquid", "mount", "inside", "spread", "ambient"
-    begun = state[[own.POWER, own.CORE, own.THERMISTOR, own.LIQUID]]
-    sums = near_known, near_pull, liquid_known, liquid_pull
-    core, near, liquid = _formulas.join_core(dt, *(q[name] for name in names), *begun, *sums)
+    near, near_fraction, near_known, near_pull = _formulas.eliminate(
+        q["near"] / dt, state[own.THERMISTOR], near_known, near_pull, q["spread"]
+    )
+    liquid, liquid_fraction, liquid_known, liquid_pull = _formulas.eliminate(
+        q["liquid"] / dt, state[own.LIQUID], liquid_known, liquid_pull, q["inside"]
+    )
+    core = _formulas.core_temperature(
+        (q["core"] - q["near"]) / dt, state[own.CORE], state[own.POWER], q["mount"], q["ambient"],
+        near_known, near_pull, liquid_known, liquid_pull,
+    )  # fmt: skip
 
-    # and outwards again
+    # back-substitution outwards
+    near = near + near_fraction * core
+    liquid = liquid + liquid_fraction * core
     free = _follow(free, free_fraction, liquid)
     column = _follow(column, column_fraction, near)
     surface = surface + surface_fraction * column[n - 1]
