@@ -1,4 +1,4 @@
-"""Recordings of real BioTacs: one format, importers that say what they found, a picture, live recording."""
+"""Recordings of real BioTacs: one format, importers, inspection, a picture, live recording."""
 
 import typing
 

@@ -1,4 +1,4 @@
-"""Files of any kind as recordings: each is recognised by what it holds."""
+"""Reads files of any kind as recordings; the kind is recognised by content."""
 
 import os
 import pathlib
@@ -29,8 +29,8 @@ __all__ = ["READERS", "Loaded", "choose", "load", "load_one"]
 _NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
-# a kind of file: whether content (bytes) is one, and (path, content, role) -> list[Part]; the first that
-# recognises a file reads it, and `read_text` what none does
+# kinds of files: test of the content (bytes), and reader (path, content, role) -> list[Part]. The first that
+# recognises a file reads it; `read_text` reads all others
 READERS: list[tuple[Callable, Callable]] = [
     (is_matlab, read_matlab),
     (is_btd, read_btd),
@@ -48,23 +48,22 @@ def load(
     object_name: str | None = None,
     objects: list[str] | None = None,
 ) -> list[Recording]:
-    """Recordings of files: our own HDF5, a press, text and CSV, MATLAB, NumPy, other HDF5, .btd, bags of ROS,
-    NVIDIA's HDF5, gzipped or not.
+    """Loads recordings from files: our own HDF5, a press, text and CSV, MATLAB, NumPy, other HDF5, .btd, ROS
+    bags, NVIDIA's HDF5, gzipped or not.
 
-    Files without electrodes (forces, poses) are put on the rows of those that have them: by their clocks,
-    or row by
-    row. Files that published sets keep beside one are read with it (`published`).
+    Files without electrodes (forces, poses) are aligned with the rows of those that have them, by clock or
+    row by row. Companion files of published data sets are read too (`published`).
 
     Args:
       paths: files, or folders of ROS 2 bags.
-      force, tdc: text files that must be forces [N], or raw counts of the thermistor, row by row.
-      rate: [Hz] of rows without times (None: guessed, `Recording.rate_source` says how).
-      scale: counts for one unit of the channels, 4095 where they are normalised.
-      object_name: what touched. objects: names of NVIDIA's indenter types.
+        force, tdc: text files of forces [N], or raw counts of the thermistor, row by row.
+        rate: [Hz] of rows without times (None: guessed; `Recording.rate_source` has the source).
+        scale: counts per unit of the channels, 4095 for normalised ones.
+        object_name: what touched. objects: names of NVIDIA's indenter types.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, or one that cannot be read; the text names file, place
-      and remedy.
+        FileNotFoundError, ValueError: a file that does not exist or cannot be read; the text has file, place
+          and remedy.
     """
     paths = [paths] if isinstance(paths, str | os.PathLike) else paths
     for what, given in (("paths", paths), ("force", [force or ""]), ("tdc", [tdc or ""])):
@@ -117,8 +116,8 @@ def load(
 
 
 def _with_electrodes(groups):
-    """Groups of parts: other channels' files are put to that of the electrodes, to that of the same number
-    where there are several, if they were logged together."""
+    """Groups of parts in which files of other channels are joined to the electrodes' file (to that of the
+    same number if there are several), if they were logged together."""
     have = [group for group in groups if any("electrodes" in part.fields for part in group)]
     out = list(have)
     for group in (group for group in groups if group not in have):
@@ -131,12 +130,12 @@ def _with_electrodes(groups):
 
 
 def _number(group):
-    """With which the name of a group's file ends."""
+    """Number at the end of the name of a group's file."""
     return re.search(r"\d*$", group[0].source.split(".")[0])[0]
 
 
 def _meet(part, other):
-    """Whether one sensor can have logged both at a time, each its own channels."""
+    """Whether one sensor can have logged both at a time, each with its own channels."""
     if part.sensor != other.sensor or set(part.fields) & set(other.fields):
         return False
     if part.time is None or other.time is None:
@@ -145,7 +144,7 @@ def _meet(part, other):
 
 
 def _together(groups):
-    """Groups of parts, those without times and of one length as one: sensors that were logged row by row."""
+    """Groups of parts; those without times and of equal length are merged: sensors logged row by row."""
     out = {}
     for k, group in enumerate(groups):
         rows = {len(part) for part in group}
@@ -156,11 +155,11 @@ def _together(groups):
 
 
 class Loaded(typing.NamedTuple):
-    """What `load_one` found: recording, notes = load_one(path).
+    """Result of `load_one`: recording, notes = load_one(path).
 
     Attributes:
       recording: Recording.
-      notes: where the file holds others, what makes it doubtful (`warnings`), one line each.
+      notes: other recordings in the file and reasons for doubt (`warnings`), one line each.
     """
 
     recording: Recording
@@ -168,11 +167,11 @@ class Loaded(typing.NamedTuple):
 
 
 def load_one(path: pathlib.Path | str, recording: str | None = None, **options: object) -> Loaded:
-    """One recording of a file, and notes on it.
+    """Loads one recording of a file, with notes.
 
     Args:
-      path: as for `load`, which has all recordings of it.
-      recording: its name, or how that ends; None: the first. options: of `load`.
+        path: as for `load`, which returns all its recordings.
+        recording: its name, or the end of it; None: the first. options: of `load`.
 
     Raises:
       FileNotFoundError, ValueError: see `load`; or no recording of that name.
@@ -184,8 +183,8 @@ def load_one(path: pathlib.Path | str, recording: str | None = None, **options: 
 def choose(
     found: Sequence[Recording], path: pathlib.Path | str, recording: str | None = None
 ) -> tuple[Recording, list[str]]:
-    """One of the recordings that `load` found in a file, and a note where none was asked for and there are
-    others; arguments as `load_one` has them.
+    """One of the recordings that `load` found in a file, and a note if none was requested and there are
+    others; arguments as for `load_one`.
 
     Raises:
       ValueError: no recording of that name.
@@ -208,7 +207,7 @@ def _read(path, role, rate, objects) -> list[Part] | list[Recording]:
     try:
         return _read_any(path, role, rate, objects)
     except OSError as error:
-        if error.errno and not error.filename:  # a read that fails does not say of what
+        if error.errno and not error.filename:  # a failed read does not name the file
             error.filename = str(path)
         raise
 
@@ -254,7 +253,7 @@ def _read_hdf5(path, rate, objects):
 
 
 def _holds(path):
-    """Names of an HDF5 file's parts, and its schema."""
+    """Names of an HDF5 file's groups, and its schema."""
     with reading(path, "recording", "copy it again"), h5py.File(path) as file:
         return set(file), str(file.attrs.get("schema", ""))
 

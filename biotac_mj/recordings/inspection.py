@@ -1,4 +1,4 @@
-"""What a recording shows of how it was logged: its clock, units, and what is wrong with it (`quality`)."""
+"""Inspects how a recording was logged: clock, units, and faults of the log (`quality`)."""
 
 import numpy as np
 
@@ -13,18 +13,18 @@ from .tared import on_a_rest
 
 __all__ = ["check_clock", "doubts", "faults", "findings", "warnings"]
 
-_REPEATED = 0.02  # fraction of repeated rows: fewer are chance
-_MOST_TRAVEL = 3.0  # [m] that a finger or an object moves at most: robots reach two
-_STILL = 20  # rows: fewer may be alike by chance in a channel that lives
+_REPEATED = 0.02  # fraction of repeated rows; fewer occur by chance
+_MOST_TRAVEL = 3.0  # [m] largest travel of a finger or an object; robots reach two
+_STILL = 20  # rows; fewer may be equal by chance in a working channel
 _ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or no liquid in the sensor"}
 
 
 def findings(recording: Recording) -> list[str]:
-    """One line each; the first says what there is, the last what its importer noted. Those that begin with
-    "warning: " are of `faults` and `doubts`.
+    """Findings, one line each: first the content, last the importer's notes. Lines that begin with "warning:
+    " come from `faults` and `doubts`.
 
     Raises:
-      TypeError: no Recording.
+      TypeError: not a Recording.
     """
     check_recording(recording)
     n, rate = len(recording), recording.rate
@@ -48,10 +48,10 @@ def findings(recording: Recording) -> list[str]:
 
 
 def faults(recording: Recording) -> list[Fault]:
-    """What is wrong with a recording as a log, as `biotac diagnose` says it, too.
+    """Faults of a recording as a log, as in `biotac diagnose`.
 
     Raises:
-      TypeError: no Recording.
+      TypeError: not a Recording.
     """
     check_recording(recording)
     log, of_the_clock = _log(recording)
@@ -59,10 +59,10 @@ def faults(recording: Recording) -> list[Fault]:
 
 
 def warnings(recording: Recording) -> list[str]:
-    """What makes a recording doubtful at first sight, one line each: electrodes that never change, `doubts`.
+    """Reasons to doubt a recording, one line each: electrodes that never change, and `doubts`.
 
     Raises:
-      TypeError: no Recording.
+      TypeError: not a Recording.
     """
     check_recording(recording)
     log, _ = _log(recording)
@@ -70,11 +70,11 @@ def warnings(recording: Recording) -> list[str]:
 
 
 def doubts(recording: Recording) -> list[str]:
-    """What makes a recording doubtful beside single electrodes, one line each: all of these, channels or a
-    force that stand still, a clock that ran back.
+    """Reasons for doubt other than single electrodes, one line each: no electrode changes, channels or a
+    force are constant, a clock ran back.
 
     Raises:
-      TypeError: no Recording.
+      TypeError: not a Recording.
     """
     check_recording(recording)
     return [
@@ -86,8 +86,8 @@ def doubts(recording: Recording) -> list[str]:
 
 
 def check_clock(recording: Recording, counts: np.ndarray | None) -> tuple[np.ndarray | None, list[Fault]]:
-    """Rows that are missing (n,) before each by the file's clock, None where it does not tell, and faults of
-    that clock. counts: (n, 19) of the electrodes, or None."""
+    """(n,) number of rows missing before each by the file's clock, None if unknown, and faults of that clock.
+    counts: (n, 19) of the electrodes, or None."""
     if recording.rate_source != CLOCKED:
         return None, []
     changed = any(note.startswith(CLOCK_FAULT) or "were left out" in note for note in recording.notes)
@@ -95,7 +95,7 @@ def check_clock(recording: Recording, counts: np.ndarray | None) -> tuple[np.nda
 
 
 def _log(recording):
-    """The rows that have all electrodes as a log, None where fewer than two have, and faults of the clock."""
+    """The rows with all electrodes as a log, None if fewer than two, and faults of the clock."""
     value, unit = recording.electrodes, recording.unit("electrodes")
     whole = np.zeros(len(recording), bool) if value is None else np.isfinite(value).all(1)
     if whole.sum() < 2:
@@ -170,7 +170,7 @@ def _stuck_others(recording):
         if name == "electrodes" or name not in (*CHANNELS, "force") or len(recording) < _STILL:
             continue
         value = getattr(recording, name).reshape(len(recording), -1)
-        value = value[:, np.isfinite(value).any(0)]  # drivers leave samples of PAC's frames out
+        value = value[:, np.isfinite(value).any(0)]  # drivers omit samples of PAC's frames
         low, high = np.nanmin(value, 0), np.nanmax(value, 0)
         # TDC and TAC of a sensor at rest may stay at one count; the others have noise
         lives = name in ("tdc", "tac") and float(low[0]) not in _ENDS
@@ -186,7 +186,7 @@ def _stuck_others(recording):
 
 
 def _far(recording):
-    """Places that are rather millimetres."""
+    """Warnings on positions that are probably in millimetres."""
     out = []
     for name in recording.fields:
         if name.endswith("_pos"):
@@ -206,7 +206,7 @@ def _levels(recording, wrong):
         return out
     if recording.unit("electrodes") == "counts" and not _dead(recording):
         ends, whole = (value <= 0) | (value >= FULL_SCALE), np.isfinite(value).all(1)
-        for fault in (one for one in wrong if one.mask is not None):  # said already
+        for fault in (one for one in wrong if one.mask is not None):  # reported above
             ends[whole] &= ~fault.mask
         fraction = ends.mean(0)
         full = [f"e{i + 1} {fraction[i]:.1%}" for i in np.flatnonzero(fraction > 0.001)]

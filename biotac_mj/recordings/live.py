@@ -18,7 +18,7 @@ def record_topics(topics: list[str], seconds: float, object_name: str | None = N
     """Recordings of running topics.
 
     Raises:
-      ValueError: neither ROS 1 nor ROS 2 is here, a topic that nobody publishes, or no message came.
+        ValueError: neither ROS 1 nor ROS 2 is available, a topic without a publisher, or no message arrived.
     """
     listen = _ros2 if _is_here("rclpy") else _ros1 if _is_here("rospy") else None
     if listen is None:
@@ -80,7 +80,7 @@ def _ros1(topics, seconds):
 
 
 class _Typed:
-    """Messages of ROS 1 come as bytes with the name of their type."""
+    """ROS 1 messages arrive as bytes with the name of their type."""
 
     def __init__(self, topic):
         self.topic = topic
@@ -95,15 +95,14 @@ class _Typed:
 def record_serial(
     port: str, baud: int, seconds: float, columns: list[str] | None = None, object_name: str | None = None
 ) -> list[Recording]:
-    """A recording of lines that a port sends, each a row of numbers.
+    """A recording from a serial port that sends lines, each a row of numbers.
 
     Args:
-      columns: their names (`names`); None: the first line names them, or they are e1..e19. Without a
-      column of
-        times, rows have the time at which they came.
+      columns: their names (`names`); None: from the first line, else e1..e19. Rows without a time column get
+        their time of arrival.
 
     Raises:
-      ValueError: pyserial is not installed, the port cannot be opened, or no whole line came.
+        ValueError: pyserial is not installed, the port cannot be opened, or no complete line arrived.
     """
     if not _is_here("serial"):
         raise ValueError("--serial needs pyserial: pip install 'biotac-mj[serial]'")
@@ -112,7 +111,7 @@ def record_serial(
     lines, times = [], []
     try:
         with serial.Serial(port, baud, timeout=0.2) as device:
-            device.readline()  # the first is cut off, as a rule
+            device.readline()  # the first line is usually incomplete
             end = clock.monotonic() + seconds
             while clock.monotonic() < end:
                 line = device.readline()
@@ -133,10 +132,10 @@ def record_serial(
 def parts_of_lines(
     port: str, lines: Iterable[bytes], times: Iterable[float], columns: list[str] | None
 ) -> list:
-    """Parts of lines that came at these times [s]; see `record_serial`.
+    """Parts from lines that arrived at these times [s]; see `record_serial`.
 
     Raises:
-      ValueError: lines that are no rows of numbers, or of another length.
+      ValueError: lines that are not rows of numbers, or differ in length.
     """
     source = pathlib.Path(pathlib.Path(port).name)
     table = parse_table(source, b"".join(lines))

@@ -1,4 +1,4 @@
-"""What one real sensor has of its own in a recording: rest, noise, warm-up (`sensor.presets.Sensor`)."""
+"""Constants of one real sensor from a recording: rest counts, noise, warm-up (`sensor.presets.Sensor`)."""
 
 import numpy as np
 
@@ -7,12 +7,12 @@ from ..sensor.presets import PER_DEGREE
 
 __all__ = ["colour", "noise", "rest_of"]
 
-_TIMES = np.geomspace(0.1, 1.1, 60)  # of warm-up that are tried, of the recording's length
-_LIGHT = 0.08  # of the rows of a loaded sensor that are looked at, those under least force
+_TIMES = np.geomspace(0.1, 1.1, 60)  # candidate time constants of warm-up, over the recording's length
+_LIGHT = 0.08  # fraction of rows of a loaded sensor that are used: those with least force
 
 
 def noise(counts: np.ndarray) -> np.ndarray:
-    """RMS (k,) of white noise [counts] in counts (n, k), without that of rounding."""
+    """RMS (k,) of white noise [counts] in counts (n, k), without rounding noise."""
     second = np.diff(counts, n=2, axis=0)
     quiet = np.abs(second) <= 6 * np.maximum(np.median(np.abs(second), axis=0), 1)
     square = np.array([np.mean(d[q] ** 2) for d, q in zip(second.T, quiet.T, strict=True)]) / 6
@@ -20,23 +20,23 @@ def noise(counts: np.ndarray) -> np.ndarray:
 
 
 def colour(pac: np.ndarray) -> tuple[float, float]:
-    """Lag-one correlation and RMS of the white noise behind samples (n, k) of PAC, blocks of k."""
+    """Lag-one correlation and white-noise RMS of samples (n, k) of PAC, blocks of k."""
     pac = pac - pac.mean()
     keep = float((pac[:, 1:] * pac[:, :-1]).mean() / (pac**2).mean())
     return keep, float(pac.std() * np.sqrt(1 - keep**2))
 
 
 def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
-    """What a sensor has of its own.
+    """Estimates constants of a sensor.
 
     Args:
       counts: (n, 19) of the electrodes, raw. rate: rows per second [Hz]. force: (n, 3) on them [N], or None:
-        nothing touches.
+        no contact.
 
     Returns:
-      rest: (19,) counts at no force and at the beginning; loaded: whether it was never untouched; noise:
-      (19,) RMS [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and
-      warm_share (19,) of it that each electrode takes.
+        rest: (19,) counts without force at the start; loaded: whether it was always touched; noise: (19,) RMS
+          [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and warm_share (19,),
+          the fraction of it for each electrode.
     """
     time, log_z = np.arange(len(counts)) / rate, log_impedance(counts)
     load, light = np.zeros((len(counts), 0)), np.ones(len(counts), bool)
@@ -51,7 +51,7 @@ def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
         if best is None or error < best[0]:
             best = error, tau, answer
     _, tau, answer = best
-    # of all electrodes; where they go apart, the size that they have
+    # common size of the warm-up; RMS if electrodes have different signs
     whole = float(answer[1].mean()) or 1e-9
     if abs(whole) < 0.1 * np.abs(answer[1]).max():
         whole = float(np.copysign(np.abs(answer[1]).max(), whole))

@@ -12,7 +12,7 @@ from .recording import Recording, check_recording
 
 __all__ = ["draw", "pac_spectrum"]
 
-_REST = 0.02  # of the rows, the first ones: their median is what changes are drawn against
+_REST = 0.02  # fraction of rows at the start whose median is the baseline
 _WINDOW = 8 * NPAC  # samples of a spectrum: 12.5 Hz apart
 _AXES = ("x", "y", "z")
 _SHORT = {
@@ -23,8 +23,8 @@ _SHORT = {
 
 
 def pac_spectrum(recording: Recording) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """(frequency [Hz], power density [unit^2/Hz], frames used) of PAC, averaged over stretches of new frames
-    without a gap; None where whole frames are missing."""
+    """(frequency [Hz], power density [unit^2/Hz], number of frames) of PAC, averaged over gap-free stretches
+    of new frames; None if there is no complete frame."""
     from scipy.signal import welch
 
     if recording.pac is None:
@@ -48,10 +48,10 @@ def pac_spectrum(recording: Recording) -> tuple[np.ndarray, np.ndarray, int] | N
 
 
 def draw(recording: Recording, path: pathlib.Path | str) -> None:
-    """Writes a picture: what was recorded, over time, and the spectrum of PAC.
+    """Draws the channels over time and the spectrum of PAC into a picture file.
 
     Raises:
-      TypeError: no Recording. ValueError: a path that cannot be written, or of no picture.
+      TypeError: not a Recording. ValueError: the path cannot be written, or is no picture.
     """
     check_recording(recording)
     check_output_file(path)
@@ -94,7 +94,7 @@ def _short(recording, name):
 
 
 def _change(recording, name):
-    """Of a channel from its rest; values that are tared already are themselves."""
+    """Change of a channel from its baseline; tared values are unchanged."""
     value = getattr(recording, name)
     if recording.unit(name).startswith("tared"):
         return value, f"[{_short(recording, name)}]"
@@ -105,7 +105,7 @@ def _change(recording, name):
 def _map(axis, time, recording):
     value, unit = _change(recording, "electrodes")
     step = np.median(np.diff(time)) if len(time) > 1 else 1.0
-    # a gap is a column of nothing
+    # a gap is an empty column
     gap = np.flatnonzero(np.diff(time) > 1.5 * step)
     edge = np.insert(time, gap + 1, time[gap] + step)
     edge = np.append(edge, time[-1] + step)
@@ -168,7 +168,7 @@ def _vector(name, label):
 
 
 def _broken_time(time):
-    """Times with one more row in every gap, for lines that break there."""
+    """Times with one more row in every gap, where lines break."""
     gap = _gaps(time)
     return np.insert(time, gap + 1, time[gap] + 1e-9)
 
@@ -182,7 +182,7 @@ def _gaps(time):
     return np.flatnonzero(step > 3 * np.median(step)) if len(step) else np.zeros(0, int)
 
 
-# what draws, its height, the fields that it needs one of
+# drawing function, its height, and the fields of which it needs one
 _PANELS = (
     (_map, 2.2, ("electrodes",)),
     (_lines, 2.0, ("electrodes",)),

@@ -1,6 +1,6 @@
-"""The protocol of a checkup: what is done with a sensor while it is recorded, and the timeline that keeps it.
+"""Protocol of a checkup: actions on a sensor during a recording, and their timeline.
 
-Each segment isolates some effects, so that a diagnosis may look for them where nothing else changes."""
+Each segment isolates some effects, so that a diagnosis can search for them while nothing else changes."""
 
 import dataclasses
 import math
@@ -20,13 +20,13 @@ from ..short_repr import short_repr
 __all__ = ["SCHEMA", "STEPS", "Prompter", "Protocol", "Segment", "Step", "read_protocol", "write_protocol"]
 
 SCHEMA = "biotac_mj.protocol/1"
-MOVE = 3.0  # [s] between two segments, to get ready
+MOVE = 3.0  # [s] pause between two segments
 _REMEDY = "`biotac checkup --out protocol.yaml` writes one"
 
 
 class Step(typing.NamedTuple):
-    """Of the protocol. seconds: it lasts; line: what a person does; tells: the effects that it isolates;
-    touched: whether something touches the sensor."""
+    """A step of the protocol. seconds: duration; line: instruction; tells: the effects that it isolates;
+    touched: whether there is contact."""
 
     seconds: float
     line: str
@@ -56,7 +56,7 @@ STEPS = {
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """kind: of STEPS; start, stop [s] since the first row; against: what touched it, "" where nobody said."""
+    """kind: of STEPS; start, stop [s] since the first row; against: what touched it, "" if unknown."""
 
     kind: str
     start: float
@@ -94,7 +94,7 @@ class Protocol:
 
     @classmethod
     def planned(cls, against: str = "") -> "Protocol":
-        """All STEPS, one after another."""
+        """All STEPS in sequence."""
         segments, start = [], 0.0
         for kind, step in STEPS.items():
             start += MOVE
@@ -107,8 +107,8 @@ class Protocol:
         return self.segments[-1].stop
 
     def rows(self, time: np.ndarray, *kinds: str) -> list[np.ndarray]:
-        """Row numbers at times (n,) [s] since the first row of each segment of these kinds; all kinds where
-        none is named. Segments without rows are left out."""
+        """Row numbers at times (n,) [s] since the first row, one array for each segment of these kinds
+        (default: all). Segments without rows are skipped."""
         found = [
             np.flatnonzero((time >= one.start) & (time < one.stop))
             for one in self.segments
@@ -121,7 +121,7 @@ def read_protocol(path: pathlib.Path | str) -> Protocol:
     """Reads a protocol.yaml.
 
     Raises:
-      FileNotFoundError, ValueError: no file, no YAML, another schema, segments that cannot be.
+        FileNotFoundError, ValueError: no file, no YAML, another schema, or invalid segments.
     """
     document = read_yaml(path, "protocol", _REMEDY)
     if document.get("schema") != SCHEMA:
@@ -152,10 +152,10 @@ def write_protocol(path: pathlib.Path | str, protocol: Protocol) -> None:
 
 
 class Prompter:
-    """Says each step of a plan when it is due, while something else records, and notes when it was said.
+    """Announces each step of a plan when it is due, during a recording, and notes the time.
 
     Args:
-      plan: the steps and how long each lasts. say: of a line.
+      plan: the steps and their durations. say: prints a line.
 
     Use as a context manager around the recording.
     """
@@ -190,10 +190,10 @@ class Prompter:
         self.say("done")
 
     def timeline(self, time: Sequence[float]) -> Protocol:
-        """The segments as they were, since the first of the recording's rows (n,) [s].
+        """The segments as announced, since the first of the recording's rows (n,) [s].
 
-        The rows' clock counts where it is this machine's; a clock of messages has another beginning, and its
-        first row is taken for the moment at which the recording began."""
+        The rows' clock is used if it is this machine's. A clock of messages has another origin, so its first
+        row is taken as the start of the recording."""
         here = self.begun - 1 <= time[0] <= self.ended
         first = time[0] if here else self.begun
         last = min(self.ended - first, time[-1] - time[0])

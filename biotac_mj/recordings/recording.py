@@ -1,4 +1,4 @@
-"""One recording of one sensor, and the file that keeps recordings."""
+"""A recording of one sensor, and the file format of recordings."""
 
 import collections
 import dataclasses
@@ -38,16 +38,16 @@ __all__ = [
 
 SCHEMA = "biotac_mj.recording/1"
 UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normalised")
-# correlation of the rest (`Recording.rest_correlation`) under which electrodes may be in another order: five
+# least correlation of the baseline (`Recording.rest_correlation`) for electrodes in the usual order: five
 # BioTacs in published recordings have 0.52 to 0.71, shuffled ones mostly less than this, a BioTac SP 0.02
 REST_LIKE = 0.3
 CLOCKED = "the file's times"  # `rate_source` of a recording whose file has times
-_REACH = 100.0  # [m] from its frame's origin: a pose further away is not in metres
+_REACH = 100.0  # [m] from its frame's origin: a more distant position is not in metres
 _REMEDY = "give a file that `biotac recording import` wrote"
 
 
 class Field(typing.NamedTuple):
-    """width: numbers of a row, 0 for a plain number. units: that it may have, the usual one first."""
+    """width: numbers per row, 0 for a scalar. units: allowed ones, the usual one first."""
 
     width: int
     units: tuple[str, ...]
@@ -74,21 +74,22 @@ _WORDS = ("object", "source", "frame", "rate_source")
 
 @dataclasses.dataclass(eq=False)
 class Recording:
-    """n rows of one sensor in order of time. What was not recorded is None; NaN: not in this row.
+    """n rows of one sensor in order of time. Fields that were not recorded are None; missing values are NaN.
 
     Attributes:
       time: (n,) increasing [s].
-      electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`, raw
-      counts if it says nothing.
-      force, torque: (n, 3) [N], [N m].
-      contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
-      name: of the recording, unique in its file. object: what touched, "" where nobody said.
-      source: files that it comes from. frame: of forces and poses. rate_source: where the rate comes from.
-      notes: what the importer did to the data.
-      units: field -> one of UNITS.
+        electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`,
+        default
+          raw counts.
+        force, torque: (n, 3) [N], [N m].
+        contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
+        name: unique in its file. object: what touched, "" if unknown.
+        source: files that it comes from. frame: of forces and poses. rate_source: origin of the rate.
+        notes: on changes by the importer.
+        units: field -> one of UNITS.
 
     Raises:
-      ValueError: shapes, units or values that cannot be; the text names them.
+        ValueError: invalid shapes, units or values; the text has their names.
     """
 
     time: np.ndarray
@@ -160,12 +161,12 @@ class Recording:
 
     @property
     def fields(self) -> list[str]:
-        """Names of what was recorded."""
+        """Names of the recorded fields."""
         return [name for name in FIELDS if getattr(self, name) is not None]
 
     @property
     def design(self) -> Design | None:
-        """The fingertip that has so many electrodes; None without electrodes."""
+        """The fingertip with this number of electrodes; None without electrodes."""
         return None if self.electrodes is None else design_of_channels(self.electrodes.shape[1])
 
     def unit(self, name: str) -> str:
@@ -174,12 +175,12 @@ class Recording:
 
     @property
     def rate(self) -> float:
-        """Rows per second [Hz], by the mean over the rows; gaps do not count."""
+        """Mean rate of rows [Hz], without gaps."""
         return 1 / usual_step(self.time)[0] if len(self) > 1 else BUS_RATE
 
     @property
     def repeated(self) -> np.ndarray:
-        """(n,) bool, rows that only hold the electrodes of the one before (`repeated_rows`)."""
+        """(n,) bool, rows that repeat the electrodes of the one before (`repeated_rows`)."""
         if self.electrodes is None:
             return np.zeros(len(self), bool)
         return repeated_rows(self.electrodes)
@@ -193,12 +194,12 @@ class Recording:
         return rest_correlation(self.electrodes)
 
     def counts(self) -> tuple[np.ndarray, list[str]]:
-        """(n, nelectrode) electrodes as raw counts, and what had to be assumed for it.
+        """(n, nelectrode) electrodes as raw counts, and the assumptions made.
 
-        Tared ones are put on the mean rest of the published sensors.
+        Tared ones are shifted to the mean rest counts of the published sensors.
 
         Raises:
-          ValueError: there are none, they have gaps, or they are volts or normalised.
+            ValueError: no electrodes, gaps, volts or normalised values.
         """
         if self.electrodes is None:
             raise ValueError(f"{self.name} has no electrodes: give a recording that has them")
@@ -221,13 +222,13 @@ class Recording:
         ]
 
     def rows(self, which: slice | np.ndarray) -> "Recording":
-        """Some of the rows.
+        """The recording with some of its rows.
 
         Args:
           which: a slice, numbers (k,) of rows in order, or (n,) bool.
 
         Raises:
-          ValueError: none of these, or no row that is there.
+            ValueError: another type, or no existing row.
         """
         which = self._which(which)
         taken = {}
@@ -257,7 +258,7 @@ class Recording:
 
 
 def check_recording(value: object) -> None:
-    """Raises TypeError for what is no Recording."""
+    """Raises TypeError if it is not a Recording."""
     if not isinstance(value, Recording):
         raise TypeError(
             f"recording is {type(value).__name__}: pass a Recording, as biotac_mj.recordings.load_one gives"
@@ -265,7 +266,7 @@ def check_recording(value: object) -> None:
 
 
 def designed(counts: np.ndarray) -> Design:
-    """The fingertip with so many electrodes as counts (n, nelectrode) have."""
+    """The fingertip whose number of electrodes is that of counts (n, nelectrode)."""
     return design_of_channels(counts.shape[1]) or BIOTAC
 
 
@@ -276,11 +277,11 @@ def rest_correlation(counts: np.ndarray) -> float:
 
 
 def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
-    """Writes recordings as one HDF5 file, whole or not at all (`files.hdf5`); layout:
+    """Writes recordings to one HDF5 file, completely or not at all (`files.hdf5`); layout:
     docs/howto/file_formats.md.
 
     Raises:
-      ValueError: none, or two of one name. OSError: it cannot be written.
+        ValueError: no recording, or two of one name. OSError: it cannot be written.
     """
     if not all(isinstance(one, Recording) for one in recordings):
         raise ValueError(f"recordings are {short_repr(recordings)}: give a list of Recordings")
@@ -303,12 +304,11 @@ def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
 
 
 def read(path: pathlib.Path | str) -> list[Recording]:
-    """The recordings of a file that `write` made.
+    """Reads the recordings of a file that `write` made.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, another schema, a missing or unknown name, a wrong
-      shape, type,
-        unit or value; the text names it.
+        FileNotFoundError, ValueError: no such file, another schema, a missing or unknown name, or a wrong
+          shape, type, unit or value; the text has the name.
     """
     import h5py
 
@@ -336,7 +336,7 @@ def _read_group(path, name, group):
     for field in (key for key in FIELDS if key in group):
         width = "nelectrode" if field == "electrodes" else FIELDS[field].width
         wanted[field] = Array(("n", width) if width else ("n",), "number")
-    check_arrays(where, group, wanted, _REMEDY)  # before anything is read
+    check_arrays(where, group, wanted, _REMEDY)  # before reading
     found = {field: group[field][()] for field in wanted}
     check_arrays(where, found, wanted, _REMEDY)
     notes = json.loads(group.attrs["notes"])

@@ -1,4 +1,4 @@
-"""What a simulated BioTac read, as a recording."""
+"""Readings of a simulated BioTac as a recording."""
 
 from collections.abc import Sequence
 
@@ -12,20 +12,20 @@ _NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
 
 
 def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **about: object) -> Recording:
-    """Readings of a loop of one's own as a recording, for `write`, `write_bag` and all that takes one.
+    """Makes a recording, for `write`, `write_bag` and other functions, of readings from the user's own loop.
 
-    A real sensor's rows are 10 ms apart, and PAC's 22 values are of the 10 ms before a row; older ones of a
-    BioTac SP's frame are left out.
+    A real sensor's rows are 10 ms apart, and PAC's 22 samples are those of the last 10 ms; earlier ones of a
+    BioTac SP's frame are dropped.
 
     Args:
-      time: (n,) of the rows [s]. reads: n answers of `Handle.read(data)`.
-      about: further fields of Recording, such as object_pos, object_quat or name.
+        time: (n,) of the rows [s]. reads: n results of `Handle.read(data)`.
+        about: further fields of Recording, such as object_pos, object_quat or name.
 
     Returns:
-      the recording; its force is that on what touches, in the BioTac frame.
+        the recording; force is on the touching object, in the BioTac frame.
 
-    Raises:
-      ValueError: rows without a channel, or as many times as rows are not there.
+      Raises:
+        ValueError: a row without a channel, or another number of times than rows.
     """
     reads = list(reads)
     for i, row in enumerate(reads):
@@ -44,5 +44,5 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
 
 
 def force_on_object(contact_force: np.ndarray) -> np.ndarray:
-    """Force (..., 3) [N] on what touches, of a BioTac's `contact_force` (..., 6)."""
+    """Force (..., 3) [N] on the touching object, from a BioTac's `contact_force` (..., 6)."""
     return -contact_force[..., :3]

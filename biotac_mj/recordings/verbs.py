@@ -1,5 +1,4 @@
-"""The verbs `biotac recording import`, `export`, `show` and `record`: their arguments here, their work
-beside it."""
+"""Arguments of the verbs `biotac recording import`, `export`, `show` and `record`."""
 
 import argparse
 import os
@@ -78,7 +77,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
 
 
 def add_which(verb: argparse.ArgumentParser) -> None:
-    """Which recording of a file, as `which`."""
+    """Adds the choice of a file's recording as `which`."""
     verb.add_argument(
         "--recording",
         dest="which",
@@ -90,7 +89,7 @@ def add_which(verb: argparse.ArgumentParser) -> None:
 def add_load_arguments(
     verb: argparse.ArgumentParser, touched: str = "what touched (default: what the files say)"
 ) -> None:
-    """What a file does not say itself; touched: help of --object."""
+    """Adds arguments for what files do not contain. touched: help of --object."""
     verb.add_argument(
         "--rate", type=real(0.5, 1e4), metavar="HZ", help="of rows without times (default: guessed)"
     )
@@ -176,7 +175,7 @@ def _recorded(args, seconds):
 
 
 def _prompted(args):
-    """Recordings while the steps of the protocol are said; their timeline is written."""
+    """Records while the steps of the protocol are announced; writes their timeline."""
     from .protocol import Prompter, Protocol, read_protocol, write_protocol
 
     there = os.path.exists(args.protocol)

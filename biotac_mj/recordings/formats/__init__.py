@@ -1,1 +1,1 @@
-"""What recordings come as: a reader for each kind of file or message, and what columns are called."""
+"""File formats of recordings: a reader for each kind of file or message, and the names of columns."""

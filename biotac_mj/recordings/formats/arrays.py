@@ -1,4 +1,4 @@
-"""NumPy's files: .npy as a table, without names or with those of its fields; .npz by names of its arrays."""
+"""NumPy files: .npy as a table, with or without field names; .npz by the names of its arrays."""
 
 import io
 import pathlib
@@ -17,15 +17,15 @@ _REMEDY = "save it again with numpy.save or numpy.savez, numbers alone"
 
 
 def is_numpy(content: bytes) -> bool:
-    """Whether a file's content is numpy.save's or numpy.savez's."""
+    """Whether a file's content comes from numpy.save or numpy.savez."""
     return content.startswith(_NPY) or (content.startswith(_ZIP) and b".npy" in content[:256])
 
 
 def read_numpy(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """Parts of it. role: as for `read_text`.
+    """Parts of a NumPy file. role: as for `read_text`.
 
     Raises:
-      ValueError: damaged, objects instead of numbers, or nothing in it is known.
+      ValueError: damaged, objects instead of numbers, or nothing recognised.
     """
     with reading(path, "NumPy file", _REMEDY):
         found = np.load(io.BytesIO(content), allow_pickle=False)

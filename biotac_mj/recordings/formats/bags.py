@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2, read and written without ROS by the library rosbags."""
+"""Reads and writes bags of ROS 1 and 2 without ROS, through the library rosbags."""
 
 import os
 import pathlib
@@ -14,7 +14,7 @@ __all__ = ["DEFINITIONS", "FORMS", "is_bag", "read_bag", "write_bag"]
 
 _MARKS = (b"#ROSBAG V", b"\x89MCAP", b"SQLite format 3")
 _REMEDY = "give a .bag of ROS 1, the folder of a ROS 2 bag, or its .mcap or .db3 file; copy a cut one again"
-# messages of biotac_sensors and tactile_msgs, which ROS does not bring
+# definitions of biotac_sensors and tactile_msgs, which ROS does not include
 DEFINITIONS = {
     "biotac_sensors/msg/BioTacData": "string bt_serial\nuint16 bt_position\nuint16 tdc_data\nuint16 "
     "tac_data\n"
@@ -40,12 +40,11 @@ def is_bag(path: pathlib.Path) -> bool:
 
 
 def read_bag(path: pathlib.Path) -> list[Part]:
-    """Parts of all topics that hold something known.
+    """Parts of all topics with recognised content.
 
     Raises:
-      ValueError: rosbags is not installed, a damaged bag, or nothing in it is known; the text says what
-      topics
-        there are.
+      ValueError: rosbags is not installed, the bag is damaged, or nothing is recognised; the text lists the
+        topics.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -90,22 +89,21 @@ def read_bag(path: pathlib.Path) -> list[Part]:
 def write_bag(
     path: pathlib.Path | str, recording: Recording, ros: int = 2, form: str = "biotac_sensors"
 ) -> list[str]:
-    """Writes a recording as a bag, such as a driver of the real sensor fills, a message for each row.
+    """Writes a recording as a bag like a driver of the real sensor does, one message per row.
 
-    Topics: biotac_pub (biotac_sensors/BioTacHand), or tactile_states (tactile_msgs/TactileState, one of its
-    channels for each of the sensor's); wrench (geometry_msgs/WrenchStamped) and object/pose
-    (geometry_msgs/PoseStamped) where the recording has them.
+    Topics: biotac_pub (biotac_sensors/BioTacHand), or tactile_states (tactile_msgs/TactileState, one channel
+    for each of the sensor's); wrench (geometry_msgs/WrenchStamped) and object/pose
+    (geometry_msgs/PoseStamped) if the recording has them.
 
     Args:
-      path: of the .bag, or of the folder of a ROS 2 bag (SQLite), which must not be there.
+        path: of the .bag, or of a new folder for a ROS 2 bag (SQLite).
       ros: 1 or 2. form: of FORMS.
 
     Returns:
       the topics.
 
     Raises:
-      ValueError: rosbags is not installed, the folder is there, or the recording has not all raw counts that
-        the sensor sends.
+        ValueError: rosbags is not installed, the folder exists, or a raw channel of the sensor is missing.
     """
     try:
         from rosbags.rosbag1 import Writer as Writer1

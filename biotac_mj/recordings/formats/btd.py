@@ -1,10 +1,9 @@
-"""SynTouch's native log (.btd): a header of text, then one line for each sample.
+"""SynTouch's native log (.btd): a text header, then one line per sample.
 
 A line has time [s], batch, frame, channel, and for each of three sensors on the bus its word and whether
-parity
-failed; a sensor that is not there has words of zero. A frame has 44 samples: PAC 22 times, every other
-channel once. SynTouch's library in C writes the same lines without a header, for three or five sensors, and
-with times only if it was built so.
+parity failed; words of an absent sensor are zero. A frame has 44 samples: PAC 22 times, every other channel
+once. SynTouch's C library writes the same lines without a header, for three or five sensors, with times only
+if compiled so.
 """
 
 import pathlib
@@ -25,7 +24,7 @@ _BEGIN = b"Begin File"
 
 
 def is_btd(content: bytes) -> bool:
-    """Whether a file begins as one."""
+    """Whether a file begins like a .btd log."""
     head = content[:4096]
     return _BEGIN in head or b"SampStruct" in head or _is_bare(head)
 
@@ -50,11 +49,11 @@ def _frame_of(design):
 
 
 def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """One part for each sensor on the bus; rows are frames, their times those of the first sample. Channels
-    have numbers, so that `role` says nothing.
+    """One part for each sensor on the bus. Rows are frames, timed at their first sample. Channels are
+    numbered in the file, so `role` has no effect.
 
     Raises:
-      ValueError: no header, no samples, lines of another form, or no whole frame.
+      ValueError: no header, no samples, malformed lines, or no complete frame.
     """
     bare = _is_bare(content[:4096])
     head, mark, body = (b"", b"", b"\n" + content) if bare else content.partition(_BEGIN)
@@ -107,7 +106,8 @@ def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> lis
 
 
 def _frames(path, table):
-    """(first line of each whole frame, (frames, samples) channels, (frames, samples) lines, electrodes)."""
+    """(first line of each complete frame, (frames, samples) channels, (frames, samples) lines,
+    electrodes)."""
     change = np.flatnonzero(np.diff(table[:, 2]) != 0) + 1
     begin, beyond = np.r_[0, change], np.r_[change, len(table)]
     for design in designs():

@@ -1,4 +1,4 @@
-"""Logs as text: columns of numbers, one row per sample, perhaps with names."""
+"""Text logs: columns of numbers, one row per sample, with or without names."""
 
 import csv
 import dataclasses
@@ -22,21 +22,21 @@ _TIME_OF_DAY = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{1,2}(?:\.\d*)?)\]?")
 _DAY = 86400.0  # [s]
 _CLOCKS = "seconds, a time of day as 12:34:56.7, or date and time in one word as 2026-01-31T12:34:56.7"
 _LIST = re.compile(r"[\[(](\s*[-+.\deE]+(?:[\s,]+[-+.\deE]+)+,?\s*)[\])]")
-_START = 4096  # characters in which a list would be seen
+_START = 4096  # characters to search for a list
 _KNOWN_UNITS = {"s", "sec", "ms", "us", "ns", "n", "mn", "nm", "nmm", "mnm", "m", "cm", "mm", "um"}
-_COUNTED = {"", "-", "count", "counts", "bit", "bits", "raw"}  # no unit, or the channels' own
-_MOST = 2**30  # bytes of a log that is read at once: 4 hours of a native log, and no bomb of zeros
+_COUNTED = {"", "-", "count", "counts", "bit", "bits", "raw"}  # no unit, or counts
+_MOST = 2**30  # bytes that are read at once: 4 hours of a native log; guards against decompression bombs
 
 
 @dataclasses.dataclass
 class Table:
-    """A log as it stands there.
+    """A log as text.
 
     Attributes:
-      path: it comes from, for the text of errors.
-      names: of the columns, as the header has them; None without a header.
-      lines: (n,) number of each row's line. cells: n rows of words, all of one length.
-      notes: what was left out or taken for something.
+        path: of the file, for errors.
+        names: of the columns, as in the header; None without a header.
+        lines: (n,) line number of each row. cells: n rows of words, all of one length.
+        notes: what was ignored or interpreted.
     """
 
     path: pathlib.Path
@@ -51,13 +51,13 @@ class Table:
         return len(self.cells[0])
 
     def numbers(self, columns: list[int], names: list[str], gaps: bool = False) -> np.ndarray:
-        """(n, len(columns)) of these columns, called `names` in errors.
+        """(n, len(columns)) numbers of these columns, called `names` in errors.
 
         Args:
-          gaps: cells that are empty or nan are NaN.
+          gaps: read empty cells and nan as NaN.
 
         Raises:
-          ValueError: a cell is no finite number; the text names line, column and remedy.
+            ValueError: a cell is not a finite number; the text has line, column and remedy.
         """
         cells = [[row[k] for k in columns] for row in self.cells]
         empty = ("", "nan", "-nan", "none", "null", "na", "n/a") if gaps else ()
@@ -78,11 +78,11 @@ class Table:
         return value
 
     def clock(self, column: int, name: str) -> np.ndarray:
-        """(n,) of this column [s]: numbers; dates (ISO 8601) since 1970, UTC where they do not say; or times
-        of day (12:34:56.7), which go on over midnight.
+        """(n,) times of this column [s]: numbers; dates (ISO 8601) since 1970, UTC unless stated; or times of
+        day (12:34:56.7), continued past midnight.
 
         Raises:
-          ValueError: as `numbers`; or one is none of what the first one is.
+          ValueError: as `numbers`; or a cell has another form than the first one.
         """
         first = self.cells[0][column]
         read = next((read for read in (_date, _time_of_day) if read(first) is not None), None)
@@ -102,7 +102,7 @@ class Table:
 
 
 def open_bytes(path: pathlib.Path | str) -> bytes:
-    """A file, gzipped or not.
+    """Content of a file, gzipped or not.
 
     Raises:
       FileNotFoundError: no such file. ValueError: it is damaged, or larger than 1 GB.
@@ -130,19 +130,19 @@ def read_table(path: pathlib.Path | str, needed: str = "columns of numbers") -> 
 
 
 def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns of numbers") -> Table:
-    """A text file of numbers, blanks, tabs, commas, semicolons or bars between them; lines that begin with #
-    or % are comments. Numbers may have decimal commas, between commas if they are quoted.
+    """Parses text with columns of numbers, separated by blanks, tabs, commas, semicolons or bars. Lines that
+    begin with # or % are comments. Numbers may have decimal commas, between commas if quoted.
 
-    A header is one line without any number, or the last comment before the numbers if it has a word for each.
-    A line of known units may follow it. Cells that are lists of numbers, as `"[1, 2, 3]"`, are columns of
-    their own. A last line that is too short is left out: a logger was stopped while it wrote.
+    A header is one line without any number, or the last comment before the numbers if it has one word per
+    column. A line of known units may follow it. Cells that are lists of numbers, like `"[1, 2, 3]"`, become
+    separate columns. An incomplete last line is ignored: the logger was stopped while it wrote.
 
     Args:
-      needed: what the file should hold, for the text of errors.
+        needed: description of the expected content, for errors.
 
     Raises:
-      ValueError: no text, no rows, rows of different length or of another one than the header's, or one
-        without any number.
+        ValueError: no text, no rows, rows of different length or of another one than the header's, or one
+          without any number.
     """
     path = pathlib.Path(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -180,7 +180,7 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
         if not split:
             raise ValueError(f"{path} is empty: it has a header and no rows; one for each sample is needed")
     elif [word for word in split[0][1] if word] in _numberings(len(split[0][1])) and len(split) > 1:
-        split.pop(0)  # a table that was saved with the numbers of its columns as their names
+        split.pop(0)  # a table saved with column numbers as names
     width = len(split[0][1])
     if names and width > len(names) and all(row[len(names) :] == [""] for _, row in split):
         width = len(names)  # a separator at the end of every row
@@ -221,15 +221,13 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
 def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
     """(n, len(names)) numbers of a text file, gzipped or not; see `parse_table`.
 
-    Without a header the file has these columns in this order and no others. A header that has all the
-    names, in
-    any order and among others, says which columns they are, upper or lower case; one of other words is passed
-    over.
+    A file without a header has exactly these columns in this order. A header with all the names, in any order
+    and among others, upper or lower case, selects the columns; another header is ignored.
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: no rows, another number of columns, a header without some of the names, or a cell that is no
-        finite number; the text names line, column and remedy.
+      ValueError: no rows, another number of columns, a header without some of the names, or a cell that is
+        not a finite number; the text has line, column and remedy.
     """
     range_ = f"{names[0]}..{names[-1]}" if len(names) > 3 else " ".join(names)
     if not pathlib.Path(path).is_file():
@@ -250,8 +248,8 @@ def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
 
 
 def _unpacked(text):
-    """(text, columns): cells that are lists of numbers, as "[1, 2, 3]" or (1 2 3), as cells of their own, and
-    how many there are of each such column; a table without any as it is, {}."""
+    """(text, columns): cells that are lists of numbers, like "[1, 2, 3]" or (1 2 3), split into cells, and
+    the number of elements of each such column; (text, {}) if there are none."""
     head, _, rest = text.partition("\n")
     mark = next((one for one in ";|\t," if one in head), ",")
     if "-" in head.split(mark):
@@ -261,7 +259,7 @@ def _unpacked(text):
         return text, {}
     try:
         rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
-    except csv.Error:  # a cell beyond the reader's limit: what is wrong is said where lines are looked at
+    except csv.Error:  # a cell beyond the reader's limit: the parser of lines reports the cause
         return text, {}
     found = [[_LIST.fullmatch(cell.strip()) for cell in row] for row in rows[1:]]
     many = {_name(name): len(one[1].replace(",", " ").split()) for name, one in zip(rows[0], found[0]) if one}
@@ -275,8 +273,8 @@ def _unpacked(text):
 
 
 def _of_elements(names):
-    """Names of a header in which a dash, that has no column, begins each element of a list, as tools that
-    write messages of ROS have it: tactiles, -, pdc, -, pdc are tactiles, tactiles_0_pdc, tactiles_1_pdc."""
+    """Column names for a header in which a dash without a column begins each element of a list, as tools for
+    ROS messages write it: tactiles, -, pdc, -, pdc are tactiles, tactiles_0_pdc, tactiles_1_pdc."""
     out, number, whose = [], -1, ""
     for name in names:
         if name == "-":
@@ -287,7 +285,7 @@ def _of_elements(names):
 
 
 def _units(row, names):
-    """Names with the units that a row under them gives, None if it gives none."""
+    """Names with the units in the row below them, None if it has none."""
     words = [re.sub(r"[\s()\[\]*.·]", "", word).lower() for word in row]
     if len(words) != len(names) or not any(words) or not set(words) <= _KNOWN_UNITS | _COUNTED:
         return None
@@ -295,14 +293,14 @@ def _units(row, names):
 
 
 def _numberings(width):
-    """What a row that counts the columns looks like; three at least, counts of electrodes do not."""
+    """Forms of a row that numbers at least three columns; electrode counts never match."""
     return [
         [str(k + base) for k in range(width - less)] for base in (0, 1) for less in (0, 1) if width - less > 2
     ]
 
 
 def _mark(line):
-    """What stands between the numbers of a line; None: blanks or tabs."""
+    """Separator of the numbers in a line; None: blanks or tabs."""
     line = re.sub('"[^"]*"', "", line)
     number = re.compile(r"[-+]?(\d+(,\d+)?|\d*\.\d+|\d+\.)(e[-+]?\d+)?|nan", re.I)
     decimals = all(map(number.fullmatch, line.split()))
@@ -321,7 +319,7 @@ def _name(word):
 
 
 def _remedy(cell, row=None):
-    """What to do about a cell that is no number; row: of the table, for the first may be one of units."""
+    """Remedy for a cell that is not a number. row: of the table; the first may contain units."""
     if _HEX.fullmatch(cell):
         return f"{cell} is hexadecimal: write decimal numbers, here {int(cell, 16)}"
     if _BARE_HEX.fullmatch(cell) and not _is_number(cell):

@@ -1,4 +1,5 @@
-"""Messages as a driver of the real sensor sends them, of any library's classes: bags and running topics."""
+"""Messages like those of a real sensor's driver, built from any library's classes: bags and running
+topics."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -25,7 +26,7 @@ _CHANNELS = ("electrodes", "pac", "pdc", "tac", "tdc")
 
 
 def check_form(form: str, design: Design) -> None:
-    """A ValueError where messages of a form have no room for a sensor's electrodes."""
+    """Raises ValueError if messages of a form cannot hold a sensor's electrodes."""
     if form == FORMS[0] and design.nelectrode != NELECTRODE:
         raise ValueError(
             f"messages of {FORMS[0]} hold {NELECTRODE} electrodes, and this is a {design.title}: "
@@ -34,24 +35,24 @@ def check_form(form: str, design: Design) -> None:
 
 
 def row_of(values: Mapping[str, np.ndarray], name: str = "") -> dict[str, object]:
-    """What `Messages.of` takes of one sensor: its channels as uint16, and its name.
+    """Argument of `Messages.of` for one sensor: its channels as uint16, and its name.
 
     Args:
-      values: electrodes (nelectrode,), pac (npac,), pdc, tac, tdc of one number; counts. name: with which
-        its channels begin in tactile_msgs.
+      values: electrodes (nelectrode,), pac (npac,), scalars pdc, tac, tdc; counts. name: prefix of its
+        channels in tactile_msgs.
     """
     counts = {channel: np.rint(values[channel]).astype(np.uint16) for channel in _CHANNELS}
     return {"name": name, **counts}
 
 
 def rows_of(recording: Recording, form: str) -> dict[str, list]:
-    """What `Messages.of` takes for each row of a recording: {topic: n values}.
+    """Arguments of `Messages.of` for each row of a recording: {topic: n values}.
 
     Args:
       form: of FORMS.
 
     Raises:
-      ValueError: a channel that is not there in raw counts in every row.
+        ValueError: a channel without raw counts in every row.
     """
     lacks = [
         channel
@@ -77,22 +78,22 @@ def rows_of(recording: Recording, form: str) -> dict[str, list]:
 
 
 class Messages:
-    """Makes the message of row `i` at `time` [s].
+    """Builds the message of row `i` at `time` [s].
 
     Args:
-      build: (name, such as std_msgs/msg/Header, fields by name) -> the message; a time's fields are `sec` and
-        `nanosec`.
-      ros: 1 or 2. array: (values, dtype) -> what such a message takes for an array.
+      build: (name, such as std_msgs/msg/Header, fields by name) -> message; the fields of a time are `sec`
+        and `nanosec`.
+      ros: 1 or 2. array: (values, dtype) -> array type of the message library.
     """
 
     def __init__(self, build: Callable[..., object], ros: int, array: Callable = np.asarray):
         self._of, self._ros, self._array = build, ros, array
 
     def of(self, topic: str, i: int, time: float, values: Sequence, frame: str = "biotac") -> object:
-        """That of a topic.
+        """The message of a topic.
 
         Args:
-          topic: of KINDS. values: a row of `rows_of`; on the sensors' own topic a list of `row_of` each.
+            topic: of KINDS. values: a row of `rows_of`; for the sensors' own topic a list of `row_of`.
         """
         numbered = {"seq": i} if self._ros == 1 else {}
         header = self._of("std_msgs/msg/Header", **numbered, stamp=self.stamp(time), frame_id=frame)

@@ -1,4 +1,4 @@
-"""MATLAB files and other HDF5: variables by their names, structs and groups looked into."""
+"""MATLAB files and other HDF5: variables by name, including those in structs and groups."""
 
 import io
 import pathlib
@@ -17,20 +17,20 @@ _WHAT, _REMEDY = (
     "MATLAB file",
     "save it again with `save -v7`, variables called electrodes, pdc, pac, force, time",
 )
-_DEEPEST = 8  # structs in structs
+_DEEPEST = 8  # nesting of structs
 
 
 def is_matlab(content: bytes) -> bool:
-    """Whether a file's content is MATLAB's, up to v7; later ones are HDF5."""
+    """Whether a file's content is MATLAB's, up to v7; later versions are HDF5."""
     return content.startswith(b"MATLAB 5.0 MAT-file")
 
 
 def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """Parts of a file up to v7. Of an array of structs each is a log of its own, as are the cells of arrays
-    that have as many. Variables have names, so that `role` says nothing.
+    """Parts of a file up to v7. Each struct of an array is a separate log, as are the cells of arrays of
+    equal length. Variables have names, so `role` has no effect.
 
     Raises:
-      ValueError: damaged, or nothing in it is known.
+      ValueError: damaged, or nothing recognised.
     """
     import scipy.io
 
@@ -38,7 +38,7 @@ def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> 
         found = scipy.io.loadmat(io.BytesIO(content), simplify_cells=True)
     found = {name: value for name, value in found.items() if not name.startswith("__")}
     while len(found) == 1 and isinstance(inner := next(iter(found.values())), dict):
-        found = inner  # one struct that holds all
+        found = inner  # a single struct that holds all
     parts, trials = [], _trials(found)
     for k, trial in enumerate(trials, 1):
         columns, words = {}, {}
@@ -50,11 +50,11 @@ def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> 
 
 
 def read_hdf5(path: pathlib.Path) -> list[Part]:
-    """Parts of a MATLAB file of v7.3, or of any HDF5 whose data sets have such names. Where groups have
-    electrodes and all else is in groups, each is a log of its own.
+    """Parts of a MATLAB file of v7.3, or of any HDF5 file whose data sets have such names. If all data are in
+    groups and these have electrodes, each group is a separate log.
 
     Raises:
-      ValueError: damaged, or nothing in it is known.
+      ValueError: damaged, or nothing recognised.
     """
     import h5py
 
@@ -86,7 +86,7 @@ def read_hdf5(path: pathlib.Path) -> list[Part]:
         try:
             parts = _parts(path, {inner.replace("/", "_"): value for inner, value in one.items()}, {})
             if name not in logs and any(part.time is None for part in parts):
-                raise ValueError  # nobody knows when it was
+                raise ValueError  # its time is unknown
         except ValueError:
             if name in logs:
                 raise
@@ -94,7 +94,7 @@ def read_hdf5(path: pathlib.Path) -> list[Part]:
             continue
         for part in parts:
             part.source = f"{path.stem}_{name}" if len(logs) > 1 or name not in logs else part.source
-            if len(logs) > 1:  # what is named after one of them is its
+            if len(logs) > 1:  # a data set named after one of them belongs to it
                 part.called = name if name in logs else ""
                 part.sensor = part.sensor if name in logs else f"{name}_{part.sensor}".strip("_")
             out.append(part)
@@ -104,7 +104,7 @@ def read_hdf5(path: pathlib.Path) -> list[Part]:
 
 
 def _in_our_unit(name, value, unit):
-    """(value, note) of a data set whose attribute says its unit; (None, note) of a unit nobody knows."""
+    """(value, note) of a data set with a unit attribute; (None, note) for an unknown unit."""
     place, unit = place_of(name.replace("/", "_")), unit.decode() if isinstance(unit, bytes) else str(unit)
     field = place.field if place else ""
     plain = re.sub(r"[\s,*.·]", "", unit)
@@ -131,7 +131,7 @@ def _is_electrodes(name):
 
 
 def _trials(found):
-    """The logs that a file holds: itself, the structs of its only array of these, or cell by cell."""
+    """Logs in a file: itself, the structs of its only struct array, or one per cell."""
     (only, *others) = [value for value in found.values() if not isinstance(value, str)] or [None]
     if not others and _each(only, dict):
         return list(only)
@@ -144,7 +144,7 @@ def _trials(found):
 
 
 def _each(value, kind):
-    """Whether it is a list, or an array of cells, of which each is of a kind."""
+    """Whether a value is a list or a cell array whose elements all are of a kind."""
     listed = isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object)
     return listed and len(value) > 0 and all(isinstance(one, kind) for one in value)
 
@@ -169,8 +169,8 @@ def _parts(path, columns, words):
 
 
 def _with_electrodes(source, columns):
-    """Columns, and a note, where no name tells the electrodes and one array alone has as many columns or
-    rows as a fingertip has electrodes."""
+    """Columns, and a note, if no name marks the electrodes and exactly one array has as many columns or rows
+    as a fingertip has electrodes."""
     if any(map(_is_electrodes, columns)):
         return columns, []
     counts = {design.nelectrode for design in designs()}

@@ -1,5 +1,4 @@
-"""Messages of ROS, of a bag or a running topic, whatever their package calls them: leaves by name, then
-columns."""
+"""ROS messages of any package, from a bag or a running topic: fields by name, then columns."""
 
 import numpy as np
 
@@ -10,12 +9,12 @@ from .parts import Part, make_parts
 __all__ = ["Topic"]
 
 _SKIPPED = ("header", "bt_time", "__msgtype__")
-# fields of messages whose positions and orientations are of no sensor: joints' and inertial units'
+# fields whose positions and orientations are not a sensor's: of joints and inertial units
 _OTHER_POSES = {"effort", "orientation_covariance"}
 
 
 class Topic:
-    """Messages of one topic as they come.
+    """Messages of one topic, collected.
 
     Args:
       name: of the topic; its words count: `/object/pose` is the object's.
@@ -24,15 +23,14 @@ class Topic:
     def __init__(self, name: str):
         self.name = name.strip("/").replace("/", "_")
         self.time, self._columns, self._kept = [], {}, 0
-        self._places = {}  # name of a list -> {which sensor its element is: number}
+        self._places = {}  # name of a list -> {sensor id of its element: number}
 
     def __len__(self):
         return self._kept
 
     def add(self, message: object, received: float) -> bool:
-        """Keeps a message, received then [s]; its header's stamp counts where it has one. False: it holds
-        nothing
-        that is known."""
+        """Stores a message, received at that time [s]; the stamp of its header has precedence. False: nothing
+        in it is recognised."""
         leaves = {}
         if _OTHER_POSES.isdisjoint(_fields(message)):
             self._leaves(message, self.name, leaves, 0)
@@ -49,10 +47,10 @@ class Topic:
         return True
 
     def parts(self) -> list[Part]:
-        """What was kept, in order of time.
+        """Collected data, in order of time.
 
         Raises:
-          ValueError: messages of one topic that differ in shape.
+          ValueError: messages of one topic differ in shape.
         """
         order = np.argsort(self.time, kind="stable")
         try:
@@ -69,11 +67,11 @@ class Topic:
 
     @property
     def has_channels(self) -> bool:
-        """Whether something in it is a sensor's."""
+        """Whether it has channels of a sensor."""
         return any(place_of(name).field in CHANNELS for name in self._columns)
 
     def _leaves(self, value, name, out, depth):
-        """Numbers of a message by their path."""
+        """Collects the numbers of a message by their path."""
         if depth > 8:
             return
         if isinstance(value, bool | int | float | np.number):
@@ -87,9 +85,9 @@ class Topic:
                 out[name] = np.asarray(value, float)
         elif isinstance(value, list | tuple):
             if len(value) > 1 and {"position", "orientation"} <= set(_fields(value[0])):
-                return  # many poses: whose the first is, nobody knows
+                return  # several poses: their objects are unknown
             for one, k in zip(value, self._numbers(name, value)):
-                if _fields(one) == ["name", "values"]:  # a channel of sensor_msgs, as tactile_msgs has them
+                if _fields(one) == ["name", "values"]:  # a channel of sensor_msgs, as in tactile_msgs
                     self._leaves(one.values, _joined(name, one.name), out, depth + 1)
                 else:
                     self._leaves(one, _joined(name, k), out, depth + 1)
@@ -101,8 +99,8 @@ class Topic:
                     self._leaves(getattr(value, field), _joined(name, field), out, depth + 1)
 
     def _numbers(self, name, value):
-        """Of a list's elements: one that says which sensor it is keeps its number, wherever it stands.
-        Drivers leave sensors out that do not answer."""
+        """Numbers of a list's elements. An element that names its sensor keeps its number at any index,
+        because drivers omit sensors that do not answer."""
         which = [(str(getattr(one, "bt_serial", "")), getattr(one, "bt_position", None)) for one in value]
         if (None in [position for _, position in which]) or len(set(which)) < len(which):
             return range(len(value))
@@ -115,7 +113,7 @@ def _joined(name, more):
 
 
 def _fields(message):
-    """Names of a message's fields: rosbags' are dataclasses, ROS 1 and 2 have slots."""
+    """Names of a message's fields: rosbags uses dataclasses, ROS 1 and 2 slots."""
     names = getattr(message, "__dataclass_fields__", None) or getattr(message, "__slots__", ())
     return [name.lstrip("_") for name in names if name not in _SKIPPED and not name.startswith("__")]
 

@@ -1,4 +1,4 @@
-"""What columns, variables and fields of messages are called in the wild, and what they are."""
+"""Names of columns, variables and message fields in existing logs, and their meanings."""
 
 import functools
 import re
@@ -8,10 +8,10 @@ __all__ = ["Place", "is_part_of_stamp", "is_stamp", "is_time", "place_of", "unit
 
 
 class Place(typing.NamedTuple):
-    """Where a column belongs.
+    """Meaning of a column.
 
-    sensor: what stands before its name, "" if nothing. field: of `recording.FIELDS`. column: its place in it,
-    None for the whole; numbers of electrodes and PAC samples as they are written, from 0 or from 1.
+    sensor: prefix of its name, "" if none. field: of `recording.FIELDS`. column: index in the field, None for
+    the whole field; electrodes and PAC samples are numbered as written, from 0 or from 1.
     """
 
     sensor: str
@@ -46,7 +46,7 @@ _PATTERNS = [
         r"|(?:.*_)?(?P<whole>quaternion|quat)",
     }.items()
 ]
-# of the units that columns of force, torque and position may have in their names: in N, Nm and m
+# units of force, torque and position in names of columns, in N, Nm and m
 _UNITS = {
     "n": ("N", 1.0),
     "mn": ("mN", 1e-3),
@@ -71,22 +71,21 @@ def is_time(name: str) -> bool:
 
 
 def is_stamp(name: str) -> bool:
-    """Whether a column is `field.header.stamp`, when a message was sent: the clock where no other is."""
+    """Whether a column is `field.header.stamp`, the sending time: used as the clock if there is no other."""
     return re.fullmatch(r"(.*_)?header_stamp", _plain(name)) is not None
 
 
 def is_part_of_stamp(name: str) -> bool:
-    """Whether a column is seconds, or nanoseconds beside them, as `header.stamp.nsecs`."""
+    """Whether a column is seconds, or nanoseconds, of a stamp, as in `header.stamp.nsecs`."""
     return re.fullmatch(r"(.*_)?(secs?|nsecs?|nanosecs?)", _plain(name)) is not None
 
 
 @functools.cache
 def place_of(name: str) -> Place | None:
-    """Where a column of this name belongs, None if nowhere.
+    """Meaning of a column of this name, None if unknown.
 
-    `e1`, `ele1`, `field.bt_data0.electrode_data0`, `F0Electrodes`, `pac22`, `Fx`, `wrench.force.x`,
-    `posx`, `ow`,
-    `object_pos_x`. Poses without a body are the sensor's; px py pz are where it touches.
+    `e1`, `ele1`, `field.bt_data0.electrode_data0`, `F0Electrodes`, `pac22`, `Fx`, `wrench.force.x`, `posx`,
+    `ow`, `object_pos_x`. Poses without a body are the sensor's; px py pz is the contact position.
     """
     plain = _plain(name)
     for pattern, field in _PATTERNS:
@@ -115,8 +114,8 @@ def place_of(name: str) -> Place | None:
 
 
 def unit_of(name: str) -> tuple[str, float]:
-    """Unit in the name of a column that `place_of` knows, "" if there is none, and its size in N, Nm or m:
-    ("mm", 1e-3) of `object_pos_x [mm]`."""
+    """Unit in the name of a column that `place_of` knows, "" if none, and its size in N, Nm or m: ("mm",
+    1e-3) for `object_pos_x [mm]`."""
     plain = _plain(name)
     found = next((f for pattern, _ in _PATTERNS if (f := pattern.fullmatch(plain))), None)
     unit = (found.groupdict().get("unit") if found else None) or ""
@@ -124,14 +123,14 @@ def unit_of(name: str) -> tuple[str, float]:
 
 
 def unit_named(unit: str) -> tuple[str, float]:
-    """A unit of force, torque or place as it is written, and its size in N, Nm or m; "", 1 of another."""
+    """A unit of force, torque or position as written, and its size in N, Nm or m; ("", 1) for others."""
     words = {"newton": "N", "newtons": "N", "meter": "m", "metre": "m", "meters": "m", "metres": "m"}
     unit = words.get(unit.lower(), unit)
     return next((known for known in _UNITS.values() if known[0] == unit), ("", 1.0))
 
 
 def _body(who):
-    """(body, what is left) of what stands before a force or pose."""
+    """(body, remainder) of the prefix of a force or pose."""
     who = re.sub(r"(^|_)(wrench|pose|data|transform)(?=_|$)", "", who).strip("_")
     for body, pattern in _BODIES.items():
         remainder = re.sub(rf"(^|_)({pattern})(?=_|$)", "", who)

@@ -18,14 +18,14 @@ _KEYS = {
     "contact_loc/data": Array(("n", 3)),
     "force_vec/data": Array(("n", 3)),
 }
-_REACH = 0.5  # [m] a contact further from the file's origin is not in metres
-_JUMP = 0.5e-3  # [m] between two samples of one trajectory
+_REACH = 0.5  # [m] a contact farther from the file's origin is not in metres
+_JUMP = 0.5e-3  # [m] largest step within one trajectory
 
 
 def read_nvidia(
     path: pathlib.Path, rate: float | None = None, objects: list[str] | None = None
 ) -> list[Recording]:
-    """A recording for each trajectory: it ends where contact_loc jumps by more than 0.5 mm or the indenter
+    """A recording for each trajectory, which ends where contact_loc jumps by more than 0.5 mm or the indenter
     changes.
 
     Keys electrode_vals/data (n, 19), contact_loc/data (n, 3) [m], force_vec/data (n, 3) [N],
@@ -36,7 +36,7 @@ def read_nvidia(
       objects: names of indenter types 0, 1, ...; None calls them indenter_0 and so on.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, or one of another layout; the text names the key.
+        FileNotFoundError, ValueError: no such file, or another layout; the text has the key.
     """
     remedy = f"give an HDF5 file with {', '.join(_KEYS)} and indenter_type/data, one row for each sample"
     data, _ = read_hdf5(path, "recording of NVIDIA's", remedy, _KEYS)

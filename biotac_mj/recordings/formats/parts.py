@@ -1,4 +1,4 @@
-"""From named columns of files and topics to recordings: whose they are, on whose clock, in which unit."""
+"""Combines named columns of files and topics into recordings: assigns sensor, clock and unit."""
 
 import dataclasses
 import os
@@ -15,33 +15,32 @@ from .names import is_stamp, is_time, place_of, unit_of
 __all__ = ["Part", "join", "make_parts"]
 
 _OF_ONE_SENSOR = {"force", "torque", "sensor_pos", "sensor_quat"}
-_HOLE = 0.25  # [s] between two rows of a force or pose log: nothing is interpolated across more
-# Raw counts of a resting electrode are thousands (four sensors: 2000 to 3500) and fall to 259 at 10 N;
-# tared ones
-# change by 500 at most.
+_HOLE = 0.25  # [s] longest gap of a force or pose log that is interpolated
+# Raw counts of a resting electrode are thousands (four sensors: 2000 to 3500) and fall to 259 at 10 N; tared
+# ones change by 500 at most.
 _RAW_MEDIAN = 400.0
 _RAW_OTHERS = 900.0  # PAC, TDC and TAC rest at about 2000, PDC at 1072 to 2100 in six sensors
-_LARGEST_TARED, _LARGEST_VOLTS = 8.0, 5.5  # counts that a touch surely exceeds; [V] of any converter
-_RESTART = 1.0  # [s] by which a clock that runs back has started anew; less is jitter
-_EPOCH = 1e11  # a clock beyond this counts parts of seconds since 1970 (1e11 s are the year 5138)
-# [Hz] rows of logs of a BioTac; outside, the clock is not in seconds
+_LARGEST_TARED, _LARGEST_VOLTS = 8.0, 5.5  # counts that any touch exceeds; [V] of any converter
+_RESTART = 1.0  # [s] least backward step of a restarted clock; less is jitter
+_EPOCH = 1e11  # larger clocks count fractions of seconds since 1970 (1e11 s are the year 5138)
+# [Hz] row rates of BioTac logs; outside, the clock is not in seconds
 _SLOWEST, _FASTEST = 0.5, 1e4
-_USUAL = (20.0, 5e3)  # and of most of them
+_USUAL = (20.0, 5e3)  # typical ones
 _PARTS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
-# shares of steps: one in five that begins anew is no clock that did so, nearly all that run back are a log
-# from its end
+# fractions of backward steps: one in five is not a restarted clock, and nearly all mean that the log is
+# reversed
 _SHUFFLED, _REVERSED = 0.2, 0.98
 
 
 @dataclasses.dataclass(eq=False)
 class Part:
-    """Columns of one file or topic that belong together, row by row.
+    """Columns of one file or topic with common rows.
 
     Attributes:
-      source: what it was read from. sensor: whose, "" for all. fields: name -> (n,) or (n, k).
-      called: what the sensor calls itself, as its serial number, "" if nothing.
-      time: (n,) [s], None where the rows are all there is.
-      rate: [Hz] that the format says, where there is no time. object, notes: see Recording.
+      source: file or topic. sensor: name, "" for all. fields: name -> (n,) or (n, k).
+      called: the sensor's own identification, such as its serial number, or "".
+      time: (n,) [s], None without times.
+      rate: [Hz] implied by the format, if there is no time. object, notes: see Recording.
     """
 
     source: str
@@ -55,7 +54,7 @@ class Part:
 
     @property
     def has_channels(self) -> bool:
-        """Whether it says what a sensor read."""
+        """Whether it has a sensor's channels."""
         return any(name in CHANNELS for name in self.fields)
 
     def __len__(self):
@@ -63,13 +62,14 @@ class Part:
 
 
 def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | None = None) -> list[Part]:
-    """Named columns, one part a sensor; what no name explains is left out, and the notes say so.
+    """Groups named columns by sensor. Unknown names are ignored with a note.
 
     Args:
-      source: for texts. columns: name -> (n,), or (n, k), (k, n) for whole fields; of other names, anything.
+      source: for texts. columns: name -> (n,), or (n, k), (k, n) for whole fields; anything for unknown
+        names.
 
     Raises:
-      ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
+      ValueError: electrodes, an axis or the clock are incomplete, or nothing is recognised.
     """
     notes, time, unused, found, called = list(notes or ()), None, [], {}, {}
     columns = _with_whole_stamps(columns)
@@ -129,8 +129,8 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
 
 
 def _without_gaps(part):
-    """A part without the rows that lack an electrode, as where logs of several clocks were merged by time. A
-    force or pose that is in few of the others is a part of its own, so that it is interpolated to them."""
+    """A part without the rows that lack an electrode, as in logs of several clocks merged by time. A force or
+    pose that is in few of the other rows becomes a separate part, so that it is interpolated to them."""
     electrodes = part.fields.get("electrodes")
     if electrodes is None or part.time is None:
         return [part]
@@ -158,8 +158,8 @@ def _without_gaps(part):
 
 
 def _connected(parts):
-    """Without the places of sensors that are not there: messages of a hand have one for each finger, and
-    zeros in those without a sensor."""
+    """Parts without absent sensors: messages of a hand have an entry for each finger, with zeros if there is
+    no sensor."""
     dumb = [p for p in parts if "electrodes" in p.fields and not p.fields["electrodes"].any()]
     rest = [part for part in parts if not any(part is one for one in dumb)]
     if not dumb or not any("electrodes" in part.fields for part in rest):
@@ -174,7 +174,8 @@ def _connected(parts):
 
 
 def _with_whole_stamps(columns):
-    """Columns, with `header.stamp` for `header.stamp.secs` and `.nsecs`, as ROS' tools write them."""
+    """Columns, with `header.stamp` computed from `header.stamp.secs` and `.nsecs`, as ROS tools write
+    them."""
     out = dict(columns)
     for name, value in columns.items():
         found = re.fullmatch(r"(.*?)(secs?)", name, re.I)
@@ -189,7 +190,7 @@ def _with_whole_stamps(columns):
 
 
 def _own_clocks(columns, sensors):
-    """{sensor: (name, (n,) [s])} of clocks that are named after their sensors, as `ff_time` beside
+    """{sensor: (name, (n,) [s])} of clocks named after their sensors, such as `ff_time` for
     `ff_electrodes`."""
     out = {}
     for name, value in columns.items():
@@ -202,8 +203,8 @@ def _own_clocks(columns, sensors):
 
 
 def _clock_name(columns):
-    """Name of the clock, None if there is none. Drivers may leave stamps of headers at zero: such one is
-    none."""
+    """Name of the clock column, None if there is none. Drivers may leave header stamps at zero; these are no
+    clock."""
     clocks = (name for name in columns if is_time(name) and place_of(name) is None)
     named = next((name for name in clocks if np.size(columns[name])), None)
     stamps = (name for name in columns if is_stamp(name) and _goes_on(columns[name]))
@@ -218,14 +219,14 @@ def _goes_on(value):
 
 
 def _whole(source, field, pieces):
-    """((n,) or (n, k), notes) of a field, None if it is not all there."""
+    """((n,) or (n, k), notes) of a field, None if it is incomplete."""
     width = FIELDS[field].width
     (first, value), *_ = pieces.items()
     if first.column is None and (len(pieces) == 1 or field == "pac"):
         return _oriented(source, field, value, width)
     place = {p.column: v.ravel() for p, v in pieces.items() if p.column is not None}
     base = 0 if 0 in place else 1
-    if field == "pac":  # drivers keep some samples of a frame; the last of them is the latest
+    if field == "pac":  # drivers keep some samples of a frame; the last is the latest
         out = np.full((len(value), NPAC), np.nan)
         order = sorted(place)[-NPAC:]
         for k, number in enumerate(order, NPAC - len(order)):
@@ -237,7 +238,7 @@ def _whole(source, field, pieces):
             raise ValueError(f"{source} has no columns {', '.join(missing)}: its header must name e1..e19")
         design = design_of_channels(len(place))
         if design is None or set(place) != set(range(base, base + len(place))):
-            # which of them the electrodes are cannot be guessed
+            # the electrodes cannot be identified among them
             raise ValueError(
                 f"{source} has {len(place)} columns of electrodes, e{min(place)} to e{max(place)}: "
                 f"{_known()}; rename or remove the others"
@@ -249,12 +250,12 @@ def _whole(source, field, pieces):
 
 
 def _known():
-    """What fingertips there are, in words."""
+    """Known fingertips, in words."""
     return " and ".join(f"a {d.title.replace('(', 'has ').rstrip(')')}" for d in designs())
 
 
 def _oriented(source, field, value, width):
-    """A whole field with rows of time."""
+    """A whole field with time along its rows."""
     value = np.squeeze(value) if value.ndim > 2 or width == 0 else value
     if not width or (field == "pac" and value.ndim == 1):
         if value.ndim > 1:
@@ -274,11 +275,11 @@ def _oriented(source, field, value, width):
         return value.T, [f"{source}: {field} is {width} x {value.shape[1]}, time along its rows: turned"]
     if field in CHANNELS:
         raise ValueError(f"{source}: {field} has shape {value.shape}: (n, {width}) or ({width}, n) is needed")
-    return None, [f"{source}: left out {field} of shape {value.shape}"]  # joints have positions, too
+    return None, [f"{source}: left out {field} of shape {value.shape}"]  # such as positions of joints
 
 
 def _normalise(source, fields):
-    """Has quaternions of length one, without those that are none; notes."""
+    """Scales quaternions to unit length and drops invalid ones; returns notes."""
     notes = []
     for name in [name for name in fields if name.endswith("quat")]:
         length = np.linalg.norm(fields[name], axis=1, keepdims=True)
@@ -293,7 +294,7 @@ def _normalise(source, fields):
 
 
 def _seconds(time, name):
-    """A clock in seconds: its unit is in its name, or it is an epoch that counts parts of seconds."""
+    """A clock in seconds: its unit is in its name, or it is an epoch in fractions of seconds."""
     factor = next(
         (f for unit, f in _PARTS.items() if re.sub("ecs?$", "", name.lower().rstrip("]) ")).endswith(unit)),
         1,
@@ -309,15 +310,16 @@ def join(
     object_name: str | None = None,
     scale: float | None = None,
 ) -> list[Recording]:
-    """Recordings of the parts with channels; forces and poses of the others are put on their rows.
+    """Makes recordings of the parts with channels and interpolates forces and poses of the others to their
+    rows.
 
     Args:
-      rate: [Hz] of rows without times; None: what the format says, else guessed from held rows, else 100.
-      object_name: what touched; None: what the files say.
-      scale: by which channels are multiplied, counts for one unit of theirs.
+      rate: [Hz] of rows without times; None: the format's, else guessed from repeated rows, else 100.
+      object_name: what touched; None: as in the files.
+      scale: factor on channels, counts per unit.
 
     Raises:
-      ValueError: there is no sensor, clocks and lengths that do not go together, or values that cannot be.
+      ValueError: no sensor, incompatible clocks or lengths, or invalid values.
     """
     sensors = [part for part in parts if "electrodes" in part.fields] or [p for p in parts if p.has_channels]
     others = [part for part in parts if part not in sensors]
@@ -349,7 +351,7 @@ def join(
 
 
 def _owners(one, sensors):
-    """Those of several sensors that a force or pose is named after: `ff_wrench` goes with `ff_biotac`."""
+    """Those of several sensors that a force or pose is named after: `ff_wrench` belongs to `ff_biotac`."""
     words = {id(s): set(f"{s.sensor}_{s.called}".lower().split("_")) for s in sensors}
     shared = set.intersection(*words.values()) if len(sensors) > 1 else set()
     own = {word for word in set(one.sensor.lower().split("_")) - shared if word and not word.isdigit()}
@@ -357,7 +359,7 @@ def _owners(one, sensors):
 
 
 def _doubtful(others):
-    """Fields of a sensor that several others have, whose names say for none of the sensors which is its."""
+    """Fields that several parts have for one sensor, with names that match no sensor."""
     names = {}
     for one in others:
         for field in _OF_ONE_SENSOR & set(one.fields):
@@ -366,7 +368,7 @@ def _doubtful(others):
 
 
 def _without(part, fields):
-    """A part without these fields, and the note that says so."""
+    """A part without these fields, and a note."""
     there = [field for field in part.fields if field in fields]
     if not there:
         return part
@@ -378,7 +380,7 @@ def _without(part, fields):
 def _recording(name, part, others, rows_clock, object_name, scale):
     notes, sources = list(part.notes), [part.source]
     clock = part.time
-    if clock is None:  # another file that was logged row by row with it may have one
+    if clock is None:  # a file logged row by row with it may have one
         clock = next((o.time for o in others if o.time is not None and len(o) == len(part)), None)
     if clock is None:
         (time, said), keep = rows_clock, slice(None)
@@ -401,7 +403,7 @@ def _recording(name, part, others, rows_clock, object_name, scale):
         fields |= {key: fields[key] * scale for key in there}
         notes.append(f"channels were multiplied by {scale:g}")
     unit = guess_unit(fields["electrodes"]) if "electrodes" in fields else "counts"
-    # tared, scaled: the other channels too, if they do not rest at the thousands of raw counts
+    # also treat the other channels as tared or scaled, unless they rest at thousands of raw counts
     units = {
         key: unit for key in there if key == "electrodes" or np.abs(np.nanmedian(fields[key])) < _RAW_OTHERS
     }
@@ -419,23 +421,22 @@ def _recording(name, part, others, rows_clock, object_name, scale):
 
 
 def guess_unit(electrodes: np.ndarray) -> str:
-    """Of (n, nelectrode) electrodes, one of `recording.UNITS`. What it takes for counts may still be refused
-    as such."""
+    """One of `recording.UNITS` for electrodes (n, nelectrode). Values taken for counts may still be rejected
+    later."""
     value = electrodes[np.isfinite(electrodes).all(1)]
     if not len(value):
         return "counts"
     largest, whole = np.abs(value).max(), (value == np.rint(value)).all()
     if largest <= _LARGEST_TARED and not whole:
         return "volts" if value.min() >= 0 and 1.5 < largest <= _LARGEST_VOLTS else "normalised"
-    about_rest = ((value < 0).any(0) & (value > 0).any(0)).mean() > 0.5  # however hard it is pressed
+    about_rest = ((value < 0).any(0) & (value > 0).any(0)).mean() > 0.5  # at any contact force
     if np.median(np.abs(np.median(value, 0))) >= _RAW_MEDIAN and not about_rest:
         return "counts"
     return "tared counts" if value.min() < 0 else "tared counts without sign"
 
 
 def _rows_clock(sensors, part, rate):
-    """((n,) [s], where the rate comes from) of rows without times: one for all sensors that were logged
-    together."""
+    """((n,) [s], source of the rate) for rows without times, common to all sensors logged together."""
     n = len(part)
     if rate is not None:
         return np.arange(n) / rate, "given"
@@ -447,7 +448,7 @@ def _rows_clock(sensors, part, rate):
 
 
 def _check_order(name, step):
-    """Raises ValueError where rows do not stand in the order of their times."""
+    """Raises ValueError if rows are not sorted by time."""
     if len(step) and (step < 0).mean() > _REVERSED:
         raise ValueError(f"{name}: the time runs back from row to row: turn the rows around")
     if len(step) and (back := (step < -_RESTART).mean()) > _SHUFFLED:
@@ -458,8 +459,8 @@ def _check_order(name, step):
 
 
 def _unnamed_unit(usual):
-    """Unit and seconds in it of a clock whose usual step is too long for a log of a BioTac in seconds, where
-    only one unit makes it a usual one; None, 1."""
+    """Unit and its seconds for a clock whose usual step is too long for a BioTac log in seconds, if exactly
+    one unit makes it plausible; (None, 1) otherwise."""
     fits = [
         (unit, f)
         for unit, f in _PARTS.items()
@@ -469,7 +470,7 @@ def _unnamed_unit(usual):
 
 
 def _clock(name, time):
-    """(increasing time, rows kept, notes)."""
+    """(increasing time, kept rows, notes)."""
     notes = []
     good = np.isfinite(time)
     if not good.all():
@@ -515,7 +516,7 @@ def _clock(name, time):
 
 
 def _placed(part, other, time, keep):
-    """Fields of another part on these times, and notes."""
+    """Fields of another part, interpolated to these times, and notes."""
     if other.time is None or part.time is None:
         if len(other) != len(part):
             raise ValueError(
@@ -547,12 +548,12 @@ def _placed(part, other, time, keep):
 
 
 def _interpolated(name, time, clock, value):
-    """(len(time), k) between the rows of value (n, k); NaN outside and in holes."""
+    """(len(time), k) interpolated between the rows of value (n, k); NaN outside and in long gaps."""
     good = np.isfinite(value).reshape(len(value), -1).all(1)
     clock, value = clock[good], value[good].reshape(good.sum(), -1)
     if len(clock) < 2:
         return np.full((len(time), value.shape[1]), np.nan)
-    if name.endswith("quat"):  # q and -q are one attitude: the nearer of the two goes on
+    if name.endswith("quat"):  # q and -q are one orientation: continue with the nearer one
         value = (
             value
             * np.cumprod(

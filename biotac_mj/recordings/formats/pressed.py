@@ -1,4 +1,4 @@
-"""skin.h5 of `biotac press` as a recording: what a simulated sensor read, with the indenter's poses."""
+"""skin.h5 of `biotac press` as a recording: a simulated sensor's counts and the indenter's poses."""
 
 import json
 import pathlib
@@ -26,7 +26,7 @@ def read_press(path: pathlib.Path) -> list[Recording]:
     """The press as one recording, in the BioTac frame; force is that on the indenter.
 
     Raises:
-      ValueError: another file, or one that an older version wrote, without PAC's values of a frame.
+        ValueError: another file, or one of an older version, without PAC's samples of a frame.
     """
     found, attributes = read_hdf5(path, "recorded press", _REMEDY, KEYS | _PAC, ("parameters",))
     n = found["counts"].shape[1] - len(SINGLES)
@@ -49,8 +49,8 @@ def read_press(path: pathlib.Path) -> list[Recording]:
 
 
 def settings_of(path: pathlib.Path | str, recording: Recording) -> dict | None:
-    """Keywords of the press that a recording is of, as `biotac press` wrote them into skin.h5: the file at
-    `path`, or beside readings.csv, where its counts are the same. None: it is of no press."""
+    """Keywords of the press behind a recording, as `biotac press` wrote them into skin.h5: the file at
+    `path`, or the one next to readings.csv if its counts are equal. None: no press."""
     there = pathlib.Path(path).parent / "skin.h5"
     if recording.electrodes is None or not there.is_file():
         return None

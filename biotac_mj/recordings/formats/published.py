@@ -1,11 +1,11 @@
-"""Published sets: which files belong together, and what their names say."""
+"""Published data sets: files that belong together, and the meaning of their names."""
 
 import pathlib
 import re
 
 __all__ = ["companions", "is_companion", "object_of", "rate_of"]
 
-# A file's name -> names of those that were logged with it.
+# File name -> names of files logged with it.
 _TOGETHER = (
     (re.compile(r"(.+)_bio(\.csv(?:\.gz)?)"), (r"\1_cp\2", r"\1_cw\2")),  # slides over materials
     (re.compile(r"sense_R_[LR]F(\.txt(?:\.gz)?)"), (r"position\1", r"orientation\1")),  # scraping
@@ -17,12 +17,12 @@ _NOT_READ = re.compile(r".+_cv\.csv(?:\.gz)?|sense_proprio\.txt(?:\.gz)?")
 
 
 def is_companion(path: pathlib.Path) -> bool:
-    """Whether a file of a set says nothing that a recording has a place for."""
+    """Whether a file of a data set has nothing that a recording can hold."""
     return _NOT_READ.fullmatch(path.name) is not None
 
 
 def companions(path: pathlib.Path) -> list[pathlib.Path]:
-    """Files beside one that belong to it."""
+    """Other files that belong to this one."""
     for pattern, others in _TOGETHER:
         found = pattern.fullmatch(path.name)
         if found:
@@ -32,7 +32,7 @@ def companions(path: pathlib.Path) -> list[pathlib.Path]:
 
 
 def object_of(path: pathlib.Path) -> str:
-    """What was touched, as the file's name says it; "" if it does not."""
+    """Touched object by the file's name, "" if unknown."""
     if found := _HOLD.fullmatch(path.name):
         return found[1]
     if found := _SLIDE.fullmatch(path.name):
@@ -43,5 +43,5 @@ def object_of(path: pathlib.Path) -> str:
 
 
 def rate_of(path: pathlib.Path) -> float | None:
-    """Rows per second [Hz] where a set without times was published with its rate."""
+    """Row rate [Hz] of a data set without times that was published with its rate."""
     return 100.0 if _HOLD.fullmatch(path.name) else None

@@ -1,4 +1,4 @@
-"""Text: matrices either way round, and tables with named columns."""
+"""Text: matrices in either orientation, and tables with named columns."""
 
 import pathlib
 import re
@@ -13,11 +13,11 @@ from .parts import Part, make_parts
 
 __all__ = ["RUPPEL", "read_matrix", "read_text"]
 
-# Ruppel et al. (IAS-15, 2019): a table that comes without a header, too
+# Ruppel et al. (IAS-15, 2019): a table that may come without a header
 RUPPEL = ("time", "px", "py", "pz", "fx", "fy", "fz", "pac0", "pac1", "pdc", "tac", "tdc", *ELECTRODES)
 _SINGLE = ("pdc", "tdc", "tac")
 _XYZ, _WXYZ = ("x", "y", "z"), ("x", "y", "z", "w")
-# What a matrix without names may be: role -> names of its columns, more columns may follow where `more`
+# Matrices without names: role -> names of their columns; further columns may follow if `more`
 _ROLES = {
     "electrodes": (ELECTRODES, False),
     "force": (("Fx", "Fy", "Fz"), False),
@@ -28,8 +28,8 @@ _ROLES = {
     "pac": (tuple(f"pac{k}" for k in range(1, NPAC + 1)), False),
     "ruppel": (RUPPEL, False),
 }
-_TURNED = ("electrodes", "force", "wrench")  # may lie with time along the rows
-# numbers in a row that no table of a BioTac has columns: few rows are a few samples where they are fewer
+_TURNED = ("electrodes", "force", "wrench")  # may have time along the columns
+# row length that no table of a BioTac reaches; a table with fewer rows and columns is a few samples
 _LONG = 40
 
 
@@ -38,10 +38,10 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
 
     Args:
       path: for names and errors. content: of the file, not packed.
-      role: electrodes, force or tdc, which it must have; None goes by names and shape.
+        role: electrodes, force or tdc, the required content; None: by names and shape.
 
     Raises:
-      ValueError: no table of numbers, or one that cannot be told; the text names line and remedy.
+        ValueError: no table of numbers, or an ambiguous one; the text has line and remedy.
     """
     names = _ROLES[role][0] if role else None
     needed = f"{len(names)} columns of numbers, {_range(names)}" if names else "columns of numbers"
@@ -53,8 +53,8 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
 
 
 def _named(table, role):
-    """A table with a header. Cells may be empty: not measured in this row. Those of electrodes may be so
-    where there is a clock, since rows without them are left out."""
+    """A table with a header. Empty cells are missing values. For electrodes they need a clock, since rows
+    without electrodes are dropped."""
     columns, known = {}, [name for name in table.names if place_of(name) or is_time(name)]
     clock = _clock(table)
     twice = [name for name in dict.fromkeys(known) if known.count(name) > 1]
@@ -80,7 +80,7 @@ def _named(table, role):
 
 
 def _clock(table):
-    """Name of the clock, None without: of several the first that can be read, the first where none can."""
+    """Name of the clock column, None without: the first that can be read, or the first if none can."""
     clocks = [(k, name) for k, name in enumerate(table.names) if is_time(name) and place_of(name) is None]
     for k, name in clocks:
         try:
@@ -92,7 +92,7 @@ def _clock(table):
 
 
 def _like_clocks(table, columns):
-    """What to say of a table without a clock that has a column like one."""
+    """Note on a table without a clock that has a column like one."""
     for k, name in enumerate(table.names):
         if name not in columns or len(columns[name]) or len(table.cells) < 3:
             continue  # known
@@ -100,13 +100,13 @@ def _like_clocks(table, columns):
             step = np.diff(table.clock(k, name))
         except ValueError:
             continue
-        if (step > 0).all() and not (step == 1).all():  # no count of the rows
+        if (step > 0).all() and not (step == 1).all():  # not a row counter
             return [f"{table.path.name}: {name} increases from row to row: call it time if it is the clock"]
     return []
 
 
 def _stamps(table, column, name):
-    """A clock of stamps, () of anything else: what is not asked for may be of any kind."""
+    """A clock of stamps, () of anything else: unused columns may have any content."""
     try:
         return table.clock(column, name) if is_stamp(name) or is_part_of_stamp(name) else ()
     except ValueError:
@@ -114,10 +114,10 @@ def _stamps(table, column, name):
 
 
 def read_matrix(table: Table, role: str | None = None) -> list[Part]:
-    """Parts of numbers without names; role: as for `read_text`.
+    """Parts of a matrix without names; role: as for `read_text`.
 
     Raises:
-      ValueError: a width that tells nothing, or cells that are no numbers.
+        ValueError: an ambiguous width, or cells that are not numbers.
     """
     path, width, n = table.path, table.width, len(table.cells)
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
@@ -136,7 +136,7 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
                 "name its columns in a header"
             )
         return make_parts(path.name, dict(zip(["time", *names] if clock else names, value.T)), notes)
-    clock = width == len(names) + 1 and not more  # stands before them
+    clock = width == len(names) + 1 and not more  # in the first column
     columns = ["time", *names] if clock else [*names, *(f"column {k + 1}" for k in range(len(names), width))]
     called = columns[:width] if len(columns) > width else columns
     if clock:
@@ -160,18 +160,18 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
 
 
 def _fits(count, names):
-    """Whether that many columns, or rows, are those names, with a clock before them or without."""
+    """Whether the number of columns or rows matches the names, with or without a clock in front."""
     return count in (len(names), len(names) + 1)
 
 
 def _across(n, width, names):
-    """Whether n rows of a width are those names with time along them: 19 rows always, others if long."""
+    """Whether n rows have those names with time along the columns: always for 19 rows, for others if long."""
     known = [design.nelectrode for design in designs()]
     return n == len(names) in known or (_fits(n, names) and width >= _LONG)
 
 
 def _electrodes(n, width):
-    """Names of the electrodes of a table: of the fingertip that has as many as it has columns, or rows."""
+    """Names of the electrodes of the fingertip whose number matches the table's columns or rows."""
     known = [design.electrodes for design in designs()]
     wide, long = ([names for names in known if _fits(count, names)] for count in (width, n))
     return next(iter([*wide, *(names for names in long if _across(n, width, names))]), ELECTRODES)
