@@ -1,4 +1,4 @@
-"""What real sensors have beyond the base model: one class an effect, each at its stage; the catalogue."""
+"""Effects of real sensors beyond the base model: one class per effect, its stage, and the catalogue."""
 
 import typing
 

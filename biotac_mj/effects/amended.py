@@ -1,5 +1,5 @@
-"""A sensor that runs with effects: what each becomes of the skin, its contact and liquid, and of the sensor's
-own numbers, so that every path that takes these has the effect."""
+"""A model with effects: each effect becomes a change of the skin, its contact, its liquid or the sensor's
+constants, so that every path that uses these has the effect."""
 
 import dataclasses
 import pathlib
@@ -23,19 +23,19 @@ from .sensors import with_effects
 
 __all__ = ["Effects", "Model", "amend", "amend_settings", "take_effects"]
 
-Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as `attach` takes them
+Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as in `attach`
 
 _AIR = 101325.0  # [Pa]
-# numbers that the diagnosis fits to what it sees, and no part of a running sensor has: a film, a pressure or
-# a skin that goes its own way, and a bus that is late with PDC
+# parameters that the diagnosis fits to residuals and that no running sensor has: independent changes of the
+# film, the pressure or the skin, and a bus delay of PDC
 _DIAGNOSIS_ALONE = ("film", "liquid", "more", "sink", "of_pdc")
 _ORDER = {effect.id: i for i, effect in enumerate(CATALOGUE)}
 
 
 @dataclasses.dataclass
 class Model:
-    """What a sensor is made with, as `attach` takes it: `skin`, `material`, `options` and `sensor` may be
-    None. `friction` is what the caller gave."""
+    """Settings of a sensor, as for `attach`: `skin`, `material`, `options` and `sensor` may be None.
+    `friction` is the caller's."""
 
     skin: str | pathlib.Path | SkinGeometry | None
     material: object
@@ -45,10 +45,10 @@ class Model:
 
 
 def take_effects(effects: Effects) -> tuple[SensorFile, str]:
-    """A sensor file, or [(Effect, theta)] with nothing said of the base model; and where they come from.
+    """A sensor file, or [(Effect, theta)] without a base model; and the source's name.
 
     Raises:
-      FileNotFoundError, ValueError: see `sensor_file.read_sensor_file`; no such list.
+      FileNotFoundError, ValueError: see `sensor_file.read_sensor_file`; not such a list.
     """
     if isinstance(effects, (str, pathlib.Path)):
         return read_sensor_file(effects), str(effects)
@@ -62,16 +62,16 @@ def take_effects(effects: Effects) -> tuple[SensorFile, str]:
 
 
 def amend(model: Model, effects: Effects) -> Model:
-    """The model with effects in it; where it leaves something open, the base model of their file is taken.
+    """The model with effects; settings that it leaves open come from the base model of their file.
 
-    The set-up's effects (misalignment, the tool's radius) belong to where the data was taken: they are left
-    out with a warning. So are numbers of effects that only the diagnosis has, such as a film's own lag.
+    Effects of the set-up (misalignment, the tool's radius) belong to the place of the data: they are ignored
+    with a warning, like parameters that only the diagnosis has, such as a film's own lag.
 
     Args:
       effects: a sensor file, such as `biotac diagnose` writes, or [(Effect, theta)].
 
     Raises:
-      FileNotFoundError, ValueError: see `take_effects`; an effect that no sensor can run with.
+        FileNotFoundError, ValueError: see `take_effects`; an effect that a running sensor cannot have.
     """
     file, where = take_effects(effects)
     base, omitted = file.base, []
@@ -118,8 +118,8 @@ def amend(model: Model, effects: Effects) -> Model:
 
 
 def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
-    """Settings of a dataclass, such as PressOptions, with effects in them; what is as `kind` has it by
-    default is left to the effects' file.
+    """Settings of a dataclass, such as PressOptions, with effects; default values of `kind` are replaced by
+    those of the effects' file.
 
     Raises:
       FileNotFoundError, ValueError: see `amend`.
@@ -133,7 +133,7 @@ def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
 
 
 def _joined(material, new):
-    """Terms of memory go beside those that are there."""
+    """The material with further terms of memory."""
     out = {k: v for k, v in new.items() if k not in ("prony", "hysteresis")}
     for name in ("prony", "hysteresis"):
         if new.get(name):
@@ -157,7 +157,7 @@ def _skin_options(given, contact, bulk, lost):
 
 
 def _modulus(given, function, skin):
-    """Factors on the elements' modulus, by those that are there."""
+    """Combined factors on the elements' modulus."""
     before, geometry = read_modulus(given), skin_reference(skin)[1]
     factors = np.array(plain(function, geometry))
     if before is not None:

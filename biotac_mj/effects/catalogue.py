@@ -1,4 +1,4 @@
-"""The catalogue: the one list of what a sensor may have, of the skin, its contact, the transduction, the
+"""The catalogue: all effects that a sensor may have, of the skin, its contact, the transduction, the
 acquisition, the set-up and the log."""
 
 from .contact import Adhesion, Friction, FrictionLoad
@@ -75,12 +75,12 @@ _SENSOR = (
 )
 
 
-# no search fits them: they are found beforehand, or drawn
+# not searched: found beforehand, or drawn
 _NOT_SEARCHED = (Noise(), DeadTaxels(), Modulus())
 
 
 def entries(fits: str | None = None) -> tuple[Effect, ...]:
-    """The effects that are looked for in "poses", in a "log" or on a "plate"; None: all there are."""
+    """The effects that are searched in "poses", in a "log" or on a "plate"; None: all."""
     plate = ()
     if fits in (None, "plate"):
         from .plate import PLATE as plate  # it imports the skin
@@ -91,13 +91,13 @@ CATALOGUE = entries("poses")
 
 
 def name_of(id_: str) -> str:
-    """Name of the effect of that id, as it shows in a log if it does; the id itself where none has it."""
+    """Name of the effect with that id, in its form for logs if it has one; the id if there is none."""
     found = [e for e in (*LOGGED, *_SENSOR, *_NOT_SEARCHED) if e.id == id_]
     return found[0].name if found else id_
 
 
 def by_id(name: str, extra: tuple | list = ()) -> Effect:
-    """The effect of that id, as a simulator has it.
+    """The effect with that id, in its form for simulators.
 
     Raises:
       ValueError: unknown; the text lists the ids.

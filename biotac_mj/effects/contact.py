@@ -1,5 +1,5 @@
-"""Effects of the contact between the skin and what it touches. Bounds and sources are those of the literature
-named."""
+"""Effects of the contact between the skin and what it touches. Bounds and sources are those of the cited
+literature."""
 
 import copy
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ __all__ = [
     "Adhesion",
 ]
 
-_PARTING = 3.0  # work of parting over that of joining, as of `Adhesion`
-# under a 7 mm sphere on the coarse skin the nodes' pressure [Pa] is the second times force^the first:
+_PARTING = 3.0  # ratio of the works of separation and adhesion, as in `Adhesion`
+# under a 7 mm sphere on the coarse skin the nodes' pressure [Pa] is the second times force^the first, so that
 # force^-n is pressure^(-n / the first), and at 1 N mu is the material's (measured by
 # benchmarks/discrepancy_in_skin_maps.py)
 _PRESSURE = 0.70, 1.65e5
-TACKY = "tacky_"  # a Run's answers to a contact that sticks: this and the work of joining [J/m2]
+TACKY = "tacky_"  # prefix of a Run's answers to adhesive contact, before the work of adhesion [J/m2]
 
 
 class Friction(Effect):
@@ -93,12 +93,12 @@ class FrictionLoad(Effect):
 
 
 class Adhesion(Effect):
-    """Its "W" acts on the force alone, where the skin was solved without it; "joining" is the work of the
-    contact itself, of which the skin was solved at some values (`Simulator.stick`)."""
+    """Its "W" acts on the force alone, if the skin was solved without adhesion. "joining" is the work of
+    adhesion of the contact itself; the skin was solved for some values of it (`Simulator.stick`)."""
 
     id, name, stage = "adhesion", "adhesion (JKR)", "K"
-    physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more on the way out"
-    params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 in, up to ten times that out", 0.05)}
+    physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more during retraction"
+    params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 approaching, up to ten times that retracting", 0.05)}
     law = LAW
     confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
 
@@ -119,7 +119,7 @@ class Adhesion(Effect):
         if work > 0:
             law = {"adhesion": work, "adhesion_hysteresis": _PARTING}
             inside.contact.setdefault("contact_law", {}).update(law)
-            inside.contact["tolerance"] = 1e-4  # it pulls with millinewtons
+            inside.contact["tolerance"] = 1e-4  # adhesive forces are millinewtons
         return True
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -139,8 +139,8 @@ class Adhesion(Effect):
 
 
 def _between(work, answers):
-    """[(weight, answer)] of the solutions with works on either side, straight lines in between; of the
-    largest one beyond it."""
+    """[(weight, answer)] for linear interpolation between the solutions with the nearest works; beyond the
+    largest one, that one."""
     solved = sorted((float(name.removeprefix(TACKY)), name) for name in answers if name.startswith(TACKY))
     above = next((k for k, (at, _) in enumerate(solved) if at >= work), len(solved) - 1)
     if not solved or work <= 0:

@@ -1,5 +1,4 @@
-"""Effects of single electrodes that are no gain: where they rest, how that drifts, and which one is read in
-whose place."""
+"""Effects of single electrodes other than gain: offset, drift, noise, and exchanged channels."""
 
 from collections.abc import Sequence
 
@@ -12,13 +11,13 @@ from .effect import LAW, Effect, Param, Run
 
 __all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
 
-SESSION = 100.0  # [s] after which a drift is as large as its parameter says
-_WHOLE = 0.25  # by which a fraction may differ from one and still be an exchange
+SESSION = 100.0  # [s] after which a drift has the size of its parameter
+_WHOLE = 0.25  # largest deviation of an exchange's fraction from one
 
 
 class Offset(Effect):
     id, name, stage = "offset", "offset of single electrodes", "A"
-    physics = "an electrode stands off by counts of its own, whatever touches (contact resistance, a leak)"
+    physics = "an electrode has an offset in counts that no contact changes (contact resistance, a leak)"
     each = Param("counts", -1500, 1500, "5-100 counts from sensor to sensor", 30.0)
     params = dict.fromkeys(BIOTAC.electrodes, each)
     per_channel = of_rest = True
@@ -50,7 +49,7 @@ class ElectrodeDrift(Effect):
 
     def rejection_reason(self, theta: dict) -> str | None:
         a = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
-        # what all electrodes do is a warm-up
+        # a common trend is a warm-up
         return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
 
     def trends(self, change: list, clock: list) -> list:
@@ -63,12 +62,12 @@ class ElectrodeDrift(Effect):
         return out
 
     def unsearched(self, theta: dict) -> list[int]:
-        """Those that drift where not all do: what a drift of another form leaves is no offset."""
+        """Those that drift, unless all do: the remainder of a drift of another form is no offset."""
         drifting = [k for k, e in enumerate(self.design.electrodes) if e in theta]
         return drifting if len(drifting) < self.design.nelectrode else []
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        # a straight line to there
+        # a straight line to the value at SESSION
         rates = np.array([theta.get(e, 0.0) for e in self.design.electrodes]) / SESSION
         return {"drift": tuple(np.full(sensor.nelectrode, sensor.drift) + rates)}
 
@@ -78,10 +77,10 @@ class ElectrodeDrift(Effect):
 
 
 class Noise(Effect):
-    """Not in the catalogue: no prediction has it; `diagnose` finds it in rows at rest."""
+    """Not in the catalogue, as it changes no prediction; `diagnose` finds it in rows at rest."""
 
     id, name, stage = "noise", "noise of single electrodes", "A"
-    physics = "an electrode scatters by more than the others: a bad contact, a leaking lead"
+    physics = "an electrode is noisier than the others: a bad contact, a leaking lead"
     fits = frozenset({"checkup"})
     per_channel = True
     each = Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)
@@ -93,12 +92,12 @@ class Noise(Effect):
         return {"noise": tuple(np.hypot(before, [theta[e] for e in self.params]))}
 
     def apply(self, run: Run, theta: dict) -> None:
-        """Nothing: its mean is none."""
+        """No change: its mean is zero."""
 
 
 class Exchange(Effect):
-    """Parameters "e3_reads_e5": fraction of e5 in what e3 shows, one for every electrode that may be
-    elsewhere; which these are is found before anything is fitted (`trajectories.base.pairs`)."""
+    """Parameters "e3_reads_e5": fraction of e5 in the reading of e3, for candidate electrodes that were found
+    before any fit (`trajectories.base.pairs`)."""
 
     id, name, stage = "swap", "exchanged electrodes", "A"
     physics = "a plug in another's place: an electrode shows the counts of another one"
@@ -106,7 +105,7 @@ class Exchange(Effect):
     confusable = {"gain": "press one electrode alone", "crosstalk": "drive one electrode alone"}
 
     def __init__(self, reads: Sequence[tuple[int, int]] = ((0, 1), (1, 0))):
-        """reads: (electrode, the one it shows), numbers from 0."""
+        """reads: (electrode, the one that it shows), numbers from 0."""
         of = Param("1", -0.3, 1.5, "1 is an exchange", 1.0)
         self.reads = tuple(reads)
         self.params = {f"e{i + 1}_reads_e{j + 1}": of for i, j in self.reads}
@@ -119,11 +118,12 @@ class Exchange(Effect):
         return "partly" if max(abs(v - 1) for v in theta.values()) > _WHOLE else None
 
     def unsearched(self, theta: dict) -> list[int]:
-        """What a fraction of another one's counts, fitted to their changes, leaves of a rest is no offset."""
+        """The remainder of a baseline, after a fraction of another electrode's counts was fitted, is no
+        offset."""
         return [i for i, _ in self.reads]
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        """Channels with their rests; a channel's counts by ln Z are those about the rest that it shows."""
+        """Channels with their baselines; a channel's counts from ln Z refer to the baseline that it shows."""
         before, read = np.array(sensor.rest), np.eye(sensor.nelectrode)
         same = read.copy()
         for (i, j), coupling in zip(self.reads, (theta[name] for name in self.params)):

@@ -1,5 +1,5 @@
-"""Loss of liquid and rough walls where they act: less liquid under the skin, a skin that has sunk, another
-law of the film's conductance."""
+"""Loss of liquid and rough walls as changes of the skin and the film: less liquid under the skin, a sunk
+skin, another law of the film's conductance."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,15 +9,15 @@ from ..skin import SkinData, SkinModel
 
 __all__ = ["RoughFilm", "SunkFilm", "drain", "remaining_liquid"]
 
-_MOST = 0.8  # of the liquid may be lost, as in `sensing.FluidLoss`
-_DRAINED_PER_STEP = 0.02  # of the liquid lost in one step of the skin
-_THINNEST = 0.3  # of the film at rest that a skin leaves which sinks
-_LONG = 1e6  # [s] rubber relaxes while the liquid goes
+_MOST = 0.8  # largest lost fraction of the liquid, as in `sensing.FluidLoss`
+_DRAINED_PER_STEP = 0.02  # fraction of the liquid lost in one step of the skin
+_THINNEST = 0.3  # fraction of the film at rest that remains under a sunk skin
+_LONG = 1e6  # [s] relaxation of the rubber while the liquid drains
 
 
 class RoughFilm(FilmConduction):
-    """A film whose conductance goes as a power of its thickness: sigma h0 (h / h0)^power, h0 at rest, so that
-    impedances at rest stay.
+    """A film whose conductance is a power of its thickness: sigma h0 (h / h0)^power with h0 at rest, so that
+    impedances at rest are unchanged.
 
     Args:
       film: FilmConduction; power: 1 is a smooth film.
@@ -30,10 +30,10 @@ class RoughFilm(FilmConduction):
 
 
 class SunkFilm(FilmConduction):
-    """A film whose skin lies nearer to the core than it does, by as much everywhere.
+    """A film whose skin is closer to the core than solved, by the same depth everywhere.
 
     Args:
-      film: FilmConduction; depth: [m], where the film at rest is so thick.
+        film: FilmConduction; depth: [m], where the film at rest is thick enough.
     """
 
     def __init__(self, film: FilmConduction, depth: float):
@@ -51,8 +51,8 @@ class SunkFilm(FilmConduction):
 
 
 def remaining_liquid(rate: float, clock: float, before: float = 0.0) -> float:
-    """Fraction of the liquid that remains at the session's clock [s] where `rate` is lost in an hour and the
-    fraction `before` was gone at its beginning."""
+    """Remaining fraction of the liquid at the session's clock [s], for a loss of `rate` per hour after the
+    fraction `before` was lost."""
     return 1 - min(before + rate * clock / 3600, _MOST)
 
 

@@ -1,5 +1,5 @@
-"""Constitutive effects inside the finite elements instead of on the forces that they bear: what each becomes
-of a skin's material, contact, model and film.
+"""Constitutive effects inside the finite elements instead of on the resulting forces: changes of a skin's
+material, contact, model and film.
 
 `docs/lab/discrepancy.md` says how much the reduced forms differ."""
 
@@ -10,8 +10,8 @@ import numpy as np
 __all__ = ["Inside", "friction_branch", "memory_of", "stiffening"]
 
 
-# what benchmarks/discrepancy_in_skin_maps.py measured on presses of the coarse skin (docs/lab/memory.md):
-# the c2 that the force of a stiffening c2 / c1 of the rubber looks like
+# measured by benchmarks/discrepancy_in_skin_maps.py on presses of the coarse skin (docs/lab/memory.md):
+# apparent c2 of the force over the stiffening c2 / c1 of the rubber,
 _STIFFENING = (-120, -40, -12, -4, -1, 0, 1, 4, 12, 40, 120, 400, 1000)
 
 
@@ -32,7 +32,7 @@ _C2 = (
 )
 
 
-# and for widths of the hysteresis [m] the strain at which a friction branch slips and its modulus over the
+# and, for widths of the hysteresis [m], the strain of slip of a friction branch and its modulus over the
 # fraction
 _WIDTH = (0.05e-3, 0.1e-3, 0.2e-3, 0.3e-3, 0.4e-3, 0.6e-3)
 
@@ -44,10 +44,9 @@ _BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
 
 
 class Inside(typing.NamedTuple):
-    """What effects become inside the skin: changes of its `Material`, of its `SkinOptions` (the contact),
-    arguments of its `SkinModel`, the liquid's `loss` [1/h], the fraction of it that is gone `before`, and the
-    `power` of its film's conductance; and the effects [(Effect, theta)] that are left to act as they do
-    without the skin."""
+    """Changes inside the skin: of its `Material`, of its `SkinOptions` (the contact), arguments of its
+    `SkinModel`, the liquid's `loss` [1/h], the fraction of it lost `before`, and the `power` of its film's
+    conductance; and `rest`, the effects [(Effect, theta)] that act outside the skin."""
 
     material: dict
     contact: dict
@@ -57,7 +56,7 @@ class Inside(typing.NamedTuple):
 
 
 def memory_of(effects: list) -> Inside:
-    """What effects [(Effect, theta)] change of a skin in which they act themselves."""
+    """Changes of a skin that models effects [(Effect, theta)] inside."""
     inside = Inside({"prony": ()}, {}, {}, {}, [])
     for effect, theta in effects:
         if not effect.in_skin(inside, theta):
@@ -66,12 +65,12 @@ def memory_of(effects: list) -> Inside:
 
 
 def stiffening(c2: float, already: float) -> float:
-    """c2 / c1 of the rubber whose force looks like `c2` beside what is there already."""
+    """c2 / c1 of the rubber whose force has an apparent `c2` in addition to the existing one."""
     return float(np.interp(c2 + np.interp(already, _STIFFENING, _C2), _C2, _STIFFENING))
 
 
 def friction_branch(fraction: float, width: float) -> tuple[float, float]:
-    """Modulus, as a fraction, and strain of slip of the friction branch that makes loops of a fraction over a
+    """Modulus, as a fraction, and strain of slip of the friction branch whose loops have a fraction over a
     width [m] of depth."""
     strain, ratio = (
         np.exp(np.interp(np.log(width), np.log(_WIDTH), np.log(table))) for table in (_STRAIN, _BRANCH)

@@ -1,7 +1,7 @@
-"""Effects of a log: faults of electrodes, of the converter, the bus and the logger, and the forms in which
-effects of the sensor show where nothing but counts was recorded.
+"""Effects of a log: faults of electrodes, converter, bus and logger, and the forms of the sensor's effects in
+logs of counts only.
 
-Each acts on some electrodes for some time of a Run, so that a fault can be put into a recording as it is."""
+Each acts on some electrodes for some time of a Run, so that a fault can be added to a recording."""
 
 import abc
 import dataclasses
@@ -19,15 +19,15 @@ __all__ = ["LOGGED", "SHARED", "Logged", "SharedLevel"]
 _COUNTS = Param("counts", -FULL_SCALE, FULL_SCALE, "12-bit range")
 _TIME = Param("s", 0, 1e6, "the record")
 _LOG = frozenset({"log"})
-_FAR = 300.0  # [counts] by which a spike leaves the trace
+_FAR = 300.0  # [counts] height of a spike
 
 
 class Logged(Effect):
-    """An effect of some electrodes, for some time.
+    """An effect on some electrodes for some time.
 
     Args:
-      channels: electrodes (from 0) that have it. start, end: [s] of the Run's time.
-      rng: of what is drawn; None draws the same every time.
+        channels: affected electrodes (from 0). start, end: [s] of the Run's time.
+        rng: for random values; None: the same values every time.
     """
 
     stage = "A"
@@ -44,14 +44,14 @@ class Logged(Effect):
         self.rng = np.random.default_rng(0) if rng is None else rng
 
     def apply(self, run: Run, theta: dict) -> None:
-        """Counts of its rows and electrodes as `changed` gives them."""
+        """Replaces the counts of its rows and electrodes by `changed`."""
         some = np.ix_((run.time >= self.start) & (run.time <= self.end), self.channels)
         counts = np.array(run.counts, float)
         counts[some] = self.changed(counts[some], run.time[some[0][:, 0]][:, None], run.rest[some[1]], theta)
         run.counts = counts
 
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
-        """(n, c) counts with the effect, of some without.
+        """(n, c) counts with the effect, from counts without.
 
         Args:
           counts: (n, c). time: (n, 1) [s]. rest: (1, c) counts at rest.
@@ -60,7 +60,7 @@ class Logged(Effect):
 
 
 class Trend(typing.Protocol):
-    """A trend over time: values (n,) at times (n,) [s], and the times between which it bends."""
+    """A trend: values (n,) at times (n,) [s], and its knots."""
 
     knots: np.ndarray
 
@@ -68,16 +68,16 @@ class Trend(typing.Protocol):
 
 
 class SharedLevel(Effect):
-    """A level that all electrodes have in common and that goes with the session's clock.
+    """A level common to all electrodes that changes with the session's clock.
 
     Attributes:
-      rises: whether it raises impedances alone.
+      rises: whether it only raises impedances.
     """
 
     rises = False
 
     def pattern(self, slope: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        """(c,) change of ln Z of each electrode by as much of it in all.
+        """(c,) relative change of ln Z of each electrode.
 
         Args:
           slope: (c,) d counts / d ln Z, positive; counts: (c,) at rest.
@@ -86,16 +86,16 @@ class SharedLevel(Effect):
 
     @abc.abstractmethod
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """Its parameters {name: (value, low, high)}, nan where no interval is known.
+        """Its parameters {name: (value, low, high)}, nan if no interval is known.
 
         Args:
-          trend: of the mean ln Z. change: of it from beginning to end. slope, counts: see `pattern`.
+          trend: of the mean ln Z. change: of it from start to end. slope, counts: see `pattern`.
         """
 
 
 class CountOffset(Logged, SharedLevel):
     id, name, detector = "count_offset", "common offset in counts", "supply"
-    physics = "reference or supply: the same counts on every electrode"
+    physics = "reference or supply: adds the same counts to every electrode"
     params = {"change": _COUNTS}
     confusable = {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}
 
@@ -111,7 +111,7 @@ class CountOffset(Logged, SharedLevel):
 
 class CountGain(Logged, SharedLevel):
     id, name, detector = "count_gain", "common gain in counts", "supply"
-    physics = "reference or supply: every count in proportion"
+    physics = "reference or supply: scales every count"
     params = {"change": Param("1", -0.9, 0.9, "supplies")}
     confusable = {"count_offset": "rest levels that differ more"}
 
@@ -126,7 +126,7 @@ class CountGain(Logged, SharedLevel):
 
 
 class Level(Logged):
-    """A step where it ends as it begins, a ramp otherwise; the level stays."""
+    """A step if it ends where it begins, else a ramp to a constant level."""
 
     id, name = "drift", "drift or jump of an electrode"
     drifts = True
@@ -135,7 +135,7 @@ class Level(Logged):
     confusable = {
         "gain": "load and unload",
         "warmup": "one electrode or all",
-        "crosstalk": "press beside the electrode that is heard",
+        "crosstalk": "press next to the electrode that couples in",
     }
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -147,16 +147,16 @@ class Level(Logged):
 
 class Flip(Logged):
     id, name = "flip", "sign of an electrode reversed"
-    physics = "an electrode answers the load with the other sign"
+    physics = "an electrode responds to the load with the opposite sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
-    confusable = {"gain": "press beside the electrode"}
+    confusable = {"gain": "press next to the electrode"}
 
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
         return rest + theta["factor"] * (counts - rest)
 
 
 class ExchangeInLog(Logged):
-    """Each of its electrodes shows the next one, from the onset on."""
+    """Each of its electrodes shows the next one, from the start on."""
 
     id, name = "swap", "exchanged channels"
     wiring = True
@@ -181,7 +181,7 @@ class Stuck(Logged):
 
 class Freeze(Logged):
     id, name = "freeze", "held rows"
-    physics = "rows are repeated or carried on by noise alone: bus or logger"
+    physics = "rows repeat, or only noise follows: bus or logger"
     params = {"seconds": Param("s", 0, 1e4, "longer than any bus period")}
     confusable = {"stuck": "one channel or all", "lowpass": "a tap: a filter has no steps"}
 
@@ -192,12 +192,12 @@ class Freeze(Logged):
 
 class LostRows(Logged):
     id, name = "lost_rows", "lost rows"
-    physics = "the record jumps: rows were dropped between two that follow each other"
+    physics = "the record jumps: rows were dropped"
     params = {"seconds": Param("s", 0, 1e4, "what the load did meanwhile")}
     confusable = {"freeze": "the clock of the logger"}
 
     def apply(self, run: Run, theta: dict) -> None:
-        """Every array of the run is shorter, but its time goes on as if nothing were gone."""
+        """Every array of the run gets shorter, but its times are evenly spaced as before."""
         n = len(run.time)
         kept = (run.time < self.start) | (run.time >= self.start + theta["seconds"])
         for field in dataclasses.fields(run):
@@ -212,8 +212,8 @@ class SaturationInLog(Saturation, Logged):
     params = {"level": _COUNTS}
     grid = ({},)
     confusable = Saturation.confusable | {
-        "stuck": "a clipped channel leaves the limit when the load goes back",
-        "flip": "press less, so that it stays off the limit",
+        "stuck": "a clipped channel leaves the limit when the load decreases",
+        "flip": "press less, below the limit",
     }
     apply = Logged.apply
 
@@ -224,7 +224,7 @@ class SaturationInLog(Saturation, Logged):
 
 class Quantise(Logged):
     id, name = "quantise", "coarse quantisation"
-    physics = "values lie on multiples of more than one count"
+    physics = "values are multiples of more than one count"
     params = {"step": Param("counts", 2, 512, "3 to 11 of 12 bits", start=1.0)}
     confusable = {"stuck": "a coarse channel takes several values"}
 
@@ -234,7 +234,7 @@ class Quantise(Logged):
 
 class Spikes(Logged):
     id, name = "spikes", "spikes or dropouts of single samples"
-    physics = "a few samples leave the trace and come back at once"
+    physics = "a few samples leave the signal and return at once"
     params = {"rate": Param("1/min", 0, 6000, "up to every tenth sample")}
     confusable = {"noise": "noise is in every sample"}
 
@@ -259,7 +259,7 @@ class Hum(Logged):
 
 
 class CommonNoise(Logged):
-    """No search names it."""
+    """Not searched."""
 
     id, name, fits = "common_noise", "noise common to all channels", frozenset()
     physics = "one noise is added to every channel: reference, supply"
@@ -273,7 +273,7 @@ class CommonNoise(Logged):
 
 
 _LEVELS = {
-    "count_offset": "load and unload: an offset keeps its counts",
+    "count_offset": "load and unload: an offset is the same in counts",
     "count_gain": "rest levels that differ more",
 }
 
@@ -287,7 +287,7 @@ class WarmUpInLog(WarmUp, SharedLevel):
     confusable = WarmUp.confusable | _LEVELS
 
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """a, tau of a (1 - exp(-t / tau)) that is next to the trend."""
+        """a, tau of the a (1 - exp(-t / tau)) closest to the trend."""
         time = np.linspace(trend.knots[0], trend.knots[-1], 200)
         y = trend(time) - trend(time[:1])
         fits = []

@@ -1,5 +1,5 @@
-"""Effects that a plate shows which is pressed flat on the skin: what the film, the contact or the rubber is
-made with, each with the states or readings of a skin that has it beside the base model's."""
+"""Effects on a press of a flat plate: properties of film, contact or rubber, each with the states or readings
+of a skin with and without it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,17 +18,17 @@ from .effect import Effect, Param, Run
 __all__ = ["PLATE", "RADIUS", "PlateEffect", "bonded", "moved"]
 
 RADIUS = PRESETS["calibrated"].electrode_radius  # [m] of the base model's electrodes
-_FADE = 2e-3  # [m] from what holds the skin over which a shift of its wall fades
-_TIP = -14e-3, -10e-3  # [m] between which a shift of the tip's wall fades
-_FAR = 3.0  # times the change that is solved, to which a straight line may go: CHOSEN
+_FADE = 2e-3  # [m] distance from fixed nodes over which a shift of the wall fades
+_TIP = -14e-3, -10e-3  # [m] range over which a shift of the tip's wall fades
+_FAR = 3.0  # times the solved change up to which it is extrapolated linearly: CHOSEN
 
 
 def moved(geometry: SkinGeometry, outer: float, inner: float, tip: bool = False) -> SkinGeometry:
-    """The skin with its outer and inner surface shifted outwards [m], at the tip alone or everywhere but
-    where it is held.
+    """The skin with its outer and inner surface shifted outwards [m], at the tip only or everywhere but where
+    it is fixed.
 
     Raises:
-      ValueError: a shift that turns a tetrahedron over.
+      ValueError: the shift inverts a tetrahedron.
     """
     vert, faces = geometry.vert, geometry.outer_face
     a, b, c = vert[faces].transpose(1, 0, 2)
@@ -55,8 +55,8 @@ def _smooth(x):
 
 
 def bonded(geometry: SkinGeometry, below: float) -> SkinGeometry:
-    """The skin held, too, where its inner side faces the core's upper half nearer than this [m]: no liquid
-    comes there."""
+    """The skin, also fixed where its inner side is closer to the core's upper half than this [m]: no liquid
+    gets there."""
     inside = np.unique(geometry.inner_face)
     gap = CoreSurface(geometry.core_vert, geometry.core_face).closest(geometry.vert[inside])[0]
     near = inside[(gap < below) & (geometry.vert[inside, 1] > -1e-3)]
@@ -68,11 +68,12 @@ class PlateEffect(Effect):
     """An effect of one parameter.
 
     Attributes:
-      id, name, stage, physics: as of an Effect.
-      parameter, unit: what is fitted; base, other: its value in the base model and where the change was taken
-        (an amount of 1).
-      film: settings of FilmConduction for a design. material, options, shape: of a skin that is solved anew.
-      attach: what `biotac_mj.attach` takes for a value of the parameter; None: no running sensor has it.
+        id, name, stage, physics: as of an Effect.
+        parameter, unit: fitted quantity; base, other: its value in the base model and at the solved change
+          (amount 1).
+        film: settings of FilmConduction for a design. material, options, shape: of a skin that must be
+          solved.
+        attach: arguments of `biotac_mj.attach` for a value of the parameter; None: no running sensor has it.
     """
 
     id: str
@@ -121,7 +122,7 @@ def _drawn_back(by):
 PLATE = (
     PlateEffect(
         "electrode_radius", "radius of the electrodes", "T",
-        "a wide disc feels the thick film at the tip more", "radius", "m", RADIUS, 1.2e-3,
+        "a wider disc includes more of the thick film at the tip", "radius", "m", RADIUS, 1.2e-3,
         film=lambda design: {"electrode_radius": 1.2e-3},
     ),
     PlateEffect(
@@ -129,7 +130,7 @@ PLATE = (
         "thickness", "m", 50e-6, 25e-6, film=lambda design: {"residual_film": 25e-6},
     ),
     PlateEffect(
-        "excitation_place", "place of X1 to X4", "T", "the current's way from the tip is longer",
+        "excitation_place", "place of X1 to X4", "T", "the current path from the tip is longer",
         "shift to the clamp", "m", 0.0, 2e-3, film=_drawn_back(2e-3),
     ),
     PlateEffect(
@@ -139,12 +140,12 @@ PLATE = (
     ),
     PlateEffect(
         "law_and_nu", "law and compressibility of the rubber", "C",
-        "Neo-Hookean rubber with nu 0.45 keeps its volume more", "fraction of it", "1", 0.0, 1.0,
+        "Neo-Hookean rubber with nu 0.45 is less compressible in effect", "fraction of it", "1", 0.0, 1.0,
         material=Material("neo_hookean", poissons_ratio=0.45),
     ),
     PlateEffect(
-        "soft_liquid", "liquid that gives way (a bubble)", "C",
-        "what is displaced is not all bulged elsewhere", "fraction of a bulk modulus of 0.64 E", "1", 0.0,
+        "soft_liquid", "compressible liquid (a bubble)", "C",
+        "not all displaced volume bulges elsewhere", "fraction of a bulk modulus of 0.64 E", "1", 0.0,
         1.0,
         options=SkinOptions(bulk_modulus=1e6),
     ),
@@ -160,7 +161,7 @@ PLATE = (
     ),
     PlateEffect(
         "film_thickness", "film between core and skin", "T",
-        "where the film is thicker at rest a bulge changes it less", "wall outwards", "m", 0.0, 0.2e-3,
+        "a film that is thicker at rest changes less by a bulge", "wall outwards", "m", 0.0, 0.2e-3,
         shape=lambda skin: moved(skin, 0.2e-3, 0.2e-3),
     ),
     PlateEffect(
@@ -168,7 +169,7 @@ PLATE = (
         "tip's wall outwards", "m", 0.0, -0.4e-3, shape=lambda skin: moved(skin, -0.4e-3, -0.4e-3, tip=True),
     ),
     PlateEffect(
-        "tip_rubber", "rubber at the tip", "C", "a thinner wall over E7 to E10 gives way more",
+        "tip_rubber", "rubber at the tip", "C", "a thinner wall over E7 to E10 is more compliant",
         "tip's outer surface", "m", 0.0, -0.4e-3, shape=lambda skin: moved(skin, -0.4e-3, 0.0, tip=True),
     ),
     PlateEffect(

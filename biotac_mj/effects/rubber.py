@@ -1,9 +1,9 @@
 """Effects of the skin's rubber.
 
-Bounds and sources are those of the literature named; "generic" marks silicone in general. They act on what
-the rubber bears: with a displacement-controlled object and an elastic field that keeps its form, a separable
-law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960; exact for
-linear materials while the contact grows)."""
+Bounds and sources are those of the cited literature; "generic" means silicone in general. The effects act on
+the rubber's load: for a displacement-controlled object and an elastic field of constant form, a separable law
+keeps the field and changes force and pressure (correspondence principle, Lee and Radok 1960; exact for linear
+materials while the contact grows)."""
 
 from collections.abc import Callable, Sequence
 
@@ -28,26 +28,24 @@ __all__ = [
     "Modulus",
 ]
 
-_SPOT = 4.0  # [mm] in which a spot's stiffness falls off
-# Of the film's change, what comes as late as the load goes: rubber that gives way slowly lets liquid pass as
+_SPOT = 4.0  # [mm] decay length of a spot's stiffness
+# Fraction of the film's change that is as delayed as the load: slowly yielding rubber lets liquid pass as
 # slowly. Inside the finite elements the film follows from the skin.
 _FILM = Param("1", 0.0, 0.5, "0-0.2: CHOSEN", 0.05)
-# The base model's film may be the one at once, the one in the end, or in between; of the load the modulus
-# says which.
-_MORE = Param("1", -0.5, 0.5, "what the film changes more, late or not: CHOSEN", 0.08)
-# The liquid bears what the rubber bears only where the skin stays as it is; a film that creeps on lets it go,
-# or keeps it up.
-_LIQUID = "what the liquid's pressure relaxes beyond that: CHOSEN"
-_LOOP_OF_LIQUID = Param(
-    "1", -0.4, 0.4, "what the liquid's pressure has of the loop beyond that: CHOSEN", 0.08
-)
-# [s] of the Prony series that stands for a power law: a factor of three apart, over three decades
+# The base model's film may be the instantaneous one, the final one, or in between; the modulus decides this
+# for the load.
+_MORE = Param("1", -0.5, 0.5, "further change of the film, delayed or not: CHOSEN", 0.08)
+# Liquid and rubber share the load in constant proportion only if the skin keeps its shape; a film that creeps
+# changes the liquid's part.
+_LIQUID = "further relaxation of the liquid's pressure: CHOSEN"
+_LOOP_OF_LIQUID = Param("1", -0.4, 0.4, "further loop of the liquid's pressure: CHOSEN", 0.08)
+# [s] of the Prony series that approximates a power law: a factor of three apart, over three decades
 _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
-_SLOPE = float(np.log(10**0.5))  # which each of them takes
-_LOOP = 0.2e-3  # [m] of depth in which the branch is changed, where the effect says it of the load
-# m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
+_SLOPE = float(np.log(10**0.5))  # of each of them
+_LOOP = 0.2e-3  # [m] of depth over which the branch changes, if the effect gives it for the load
+# m [J/m^3] and, if the effect has no width, beta of Ogden and Roxburgh: W_max is of order kJ/m^3
 _ENERGY, _WIDTH = (1.0, 0.6)
-_AS_MUCH = 1.25  # times what the rubber relaxes: a pressure that relaxes by itself is another matter
+_AS_MUCH = 1.25  # ratio to the rubber's relaxation: a larger one of the pressure has another cause
 
 
 class Relaxation(Effect):
@@ -75,7 +73,7 @@ class Relaxation(Effect):
         return _relaxing(inside, theta["g"], theta["tau"])
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        """Of a sensor alone PDC relaxes."""
+        """In a sensor alone, PDC relaxes."""
         return {"relaxation": (theta["g"], theta["tau"])}
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -115,7 +113,7 @@ class PowerCreep(Effect):
 
 
 def _relaxing(inside, g, tau):
-    """A branch of g that relaxes within tau inside the skin."""
+    """Adds a branch g that relaxes with tau inside the skin."""
     if g > 0:
         inside.material["prony"] += ((g, tau),)
     return True
@@ -124,14 +122,13 @@ def _relaxing(inside, g, tau):
 class Hysteresis(Effect):
     id, name, stage = "hyster", "rate-independent hysteresis", "C"
     physics = (
-        "Prandtl-Ishlinskii elements in depth: "
-        "loading and unloading differ at equal depth, whatever the speed"
+        "Prandtl-Ishlinskii elements in depth: loading and unloading differ at equal depth, at any speed"
     )
     params = {
         "fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1),
         "film": _FILM,
         "width": Param(
-            "m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
+            "m", 0.05e-3, 0.6e-3, "depth over which the branch changes, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
         ),
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
@@ -162,15 +159,13 @@ class Hysteresis(Effect):
 class LoadHysteresis(Effect):
     id, name, stage = "hyster_load", "hysteresis of the load", "C"
     physics = (
-        "a Prandtl-Ishlinskii element in load: on the way back it is less by a fraction of the press's peak, "
-        "whatever the speed; the film follows with as much play"
+        "a Prandtl-Ishlinskii element in load: unloading is lower by a fraction of the press's peak, "
+        "at any speed; the film follows with the same play"
     )
     params = {
         "fraction": Param("1", 0.0, 0.4, "loops of 13-24 % of full scale (Sensors 2023)", 0.08),
         "film": _FILM,
-        "width": Param(
-            "1", 0.05, 0.6, "fraction of the peak over which the branch is changed", 0.2, 0.2, True
-        ),
+        "width": Param("1", 0.05, 0.6, "fraction of the peak over which the branch changes", 0.2, 0.2, True),
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1}, {"width": 0.3})
@@ -204,7 +199,7 @@ class LoadHysteresis(Effect):
 
 
 def _looping(inside, fraction, width):
-    """A friction branch inside the skin."""
+    """Adds a friction branch inside the skin."""
     if fraction > 0:
         branches = inside.material.get("hysteresis", ())
         inside.material["hysteresis"] = (*branches, friction_branch(fraction, width))
@@ -212,22 +207,22 @@ def _looping(inside, fraction, width):
 
 
 def _loop_of_liquid(theta):
-    """Doubt about a loop that the liquid's pressure has and the force has not, or about its film."""
+    """Rejection reason of a loop of the liquid's pressure without one of the force, or of its film."""
     if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["fraction"] + 0.02:
         return "liquid"
     return _doubt_of_film(theta, theta["fraction"])
 
 
 def _doubt_of_film(theta, load):
-    """Doubt about a film that is late where the load is not (by its fraction `load`), or that changes by more
-    than what comes late: that is another effect."""
+    """Rejection reason of a film that is delayed while the load is not (by its fraction `load`), or that
+    changes by more than its delayed fraction: that is another effect."""
     late = theta.get("film", 0.0)
     strange = late > 2 * load + 0.03 or abs(theta.get("more", 0.0)) > 2 * late + 0.02
     return "film" if strange else None
 
 
 def _scaled_film(run, theta):
-    """The film's change as large as the effect says it is, late or not."""
+    """Scales the film's change, delayed or not."""
     if theta.get("more"):
         run.log_z = run.log_z + theta["more"] * (run.log_z - run.rest_log_z)
 
@@ -235,16 +230,17 @@ def _scaled_film(run, theta):
 class Mullins(Effect):
     id, name, stage = "mullins", "Mullins softening", "C"
     physics = (
-        "Ogden-Roxburgh, the work taken as depth^2: load times 1 - s erf((1 - W / Wmax) / width) "
-        "below the deepest press before, there and (a fraction of s) anywhere"
+        "Ogden-Roxburgh with work as depth^2: load times 1 - s erf((1 - W / Wmax) / width) "
+        "below the deepest earlier press, at its place and (a fraction of s) elsewhere"
     )
     params = {
         "softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15),
         "width": Param("1", 0.1, 3, "m + b Wmax over Wmax", 1.0, 1.0, True),
         "reach": Param("m", 1e-3, 10e-3, "radius of a contact", 3e-3, 3e-3, True),
-        # inside the finite elements a press of 1.5 mm takes 0.83 of the force a centimetre away, 0.62 there
+        # inside the finite elements a press of 1.5 mm takes 0.83 of the force a centimetre away, 0.62 at its
+        # own place
         "whole": Param(
-            "1", 0.01, 0.9, "the liquid stretches all of the skin, wherever it is pressed", 0.3, 0.01, True
+            "1", 0.01, 0.9, "the liquid stretches all of the skin under any press", 0.3, 0.01, True
         ),
     }
     grid = tuple(
@@ -256,7 +252,7 @@ class Mullins(Effect):
     confusable = {
         "hyster": "a third cycle to the same depth",
         "adhesion": "talc on the skin",
-        "damage": "a deeper press than any before: it is softer than the first ones, or it is not",
+        "damage": "a deeper press than any before: is it softer than the first ones?",
     }
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
@@ -277,7 +273,7 @@ class Mullins(Effect):
 class Damage(Effect):
     id, name, stage = "damage", "softening by work (continuous damage)", "C"
     physics = (
-        "all of the skin softens with the work that has been done on it, at every load, and stays so: "
+        "all of the skin softens permanently with the work done on it, at every load: "
         "load times 1 - d (1 - exp(-W / W0)) (Miehe 1995)"
     )
     params = {
@@ -287,13 +283,13 @@ class Damage(Effect):
     grid = ({"work": 5e-4}, {"work": 2e-3}, {"work": 8e-3})
     law, equivalents = LAW, ("mullins",)
     confusable = {
-        "mullins": "a deeper press than any before: it is softer than the first ones, or it is not",
-        "relax": "the same press again after minutes: what relaxes comes back",
+        "mullins": "a deeper press than any before: is it softer than the first ones?",
+        "relax": "the same press again after minutes: relaxation recovers",
         "modulus": "the same press at the beginning and the end of the session",
     }
 
     def in_whole(self, whole: Whole, theta: dict) -> None:
-        """The sensor begins as the session has left it."""
+        """The sensor starts in the session's final state."""
         whole.modulus *= 1 - theta["damage"]
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -304,7 +300,7 @@ class Damage(Effect):
 
 
 def _eased(strain, before, width):
-    """(n,) fraction of the softening at strains (n,) below the largest before, W as strain^2."""
+    """(n,) fraction of the softening at strains (n,) below the largest before, with W as strain^2."""
     largest = np.maximum(before, np.maximum.accumulate(strain))
     ratio = np.where(largest > 1e-6, strain / np.maximum(largest, 1e-6), 1.0)
     return erf(np.clip(1 - ratio**2, 0, 1) / width)
@@ -314,8 +310,8 @@ class Stiffening(Effect):
     id, name, stage = "stiffen", "hyperelastic stiffening", "C"
     physics = "the rubber's modulus rises with strain: Yeoh's second term in the mean strain depth / 1.5 mm"
     params = {"c2": Param("1", -0.5, 1.5, "c2/c1 0-1", 0.15)}
-    # With the skin's own answer: rubber that stiffens all through, not where it is strained most, keeps its
-    # form, and electrodes see little of it.
+    # With the skin's own solution: rubber that stiffens everywhere, not only where it is strained most, keeps
+    # its shape, and electrodes hardly change.
     rare = {"through": Param("1", -0.5, 2.0, "of the load at a mean strain of 1: CHOSEN", 0.3)}
     law, answers = LAW, ("stiffen",)
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
@@ -327,7 +323,7 @@ class Stiffening(Effect):
 
     def apply(self, run: Run, theta: dict) -> None:
         load = theta.get("through", 0.0)
-        if "stiffen" in run.answers:  # the skin was solved with rubber that stiffens
+        if "stiffen" in run.answers:  # the skin was solved with stiffening rubber
             slope = run.answers["stiffen"]
             run.force = run.force + theta["c2"] * run.modulus * slope["force"]
             run.pressure = run.pressure + theta["c2"] * run.modulus * slope["pressure"]
@@ -339,7 +335,7 @@ class Stiffening(Effect):
 
 class Inhomogeneity(Effect):
     id, name, stage = "inhomog", "modulus varies with place", "C"
-    physics = "stiffer towards the tip or the clamp, one side or the other"
+    physics = "stiffer towards the tip or the clamp, or towards one side"
     params = {
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
@@ -348,7 +344,7 @@ class Inhomogeneity(Effect):
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
         "sensor",
-        "gain": "force over depth from place to place: gains of electrodes leave it alone",
+        "gain": "force over depth from place to place: gains of electrodes do not change it",
         "spots": "a row of presses along the finger",
     }
 
@@ -362,22 +358,22 @@ class Inhomogeneity(Effect):
             run.scale_load(float(modulus_of(theta)(run.place[None])[0]))
             return
         for way, slope in ((w, run.answers[w]) for w in self.params if w in run.answers):
-            # the skin was solved with a modulus that varies
+            # the skin was solved with a varying modulus
             run.force = run.force + theta[way] * run.modulus * slope["force"]
             run.pressure = run.pressure + theta[way] * run.modulus * slope["pressure"]
             run.log_z = run.log_z + theta[way] * slope["log_z"]
 
 
 class Spots(Inhomogeneity):
-    """Parameters of their place in millimetres, as "at_-8.0_-6.5_1.0": the logarithm of the modulus there.
-    The simulator says where (`simulator.spots`)."""
+    """Parameters are named by positions in millimetres, such as "at_-8.0_-6.5_1.0": the logarithm of the
+    modulus there. The simulator chooses the positions (`simulator.spots`)."""
 
     id, name = "spots", "stiff or soft spots"
-    physics = "the rubber is stiffer or softer in spots of some millimetres: worn, cut, glued"
+    physics = "the rubber is stiffer or softer in spots of some millimetres: wear, cuts, glue"
     equivalents = ("gain", "inhomog")
     confusable = {
         "inhomog": "a row of presses along the finger",
-        "gain": "force over depth from place to place: gains of electrodes leave it alone",
+        "gain": "force over depth from place to place: gains of electrodes do not change it",
     }
 
     def __init__(self, places: Sequence[str] = ("at_-8.0_-6.5_0.0",)):
@@ -393,8 +389,8 @@ class Spots(Inhomogeneity):
 
 
 def modulus_of(theta: dict) -> Callable[[np.ndarray], np.ndarray]:
-    """Function of positions (n, 3) [m] that gives the factors (n,) on Young's modulus of `Inhomogeneity`
-    or `Spots`."""
+    """Function from positions (n, 3) [m] to factors (n,) on Young's modulus, for `Inhomogeneity` or
+    `Spots`."""
     along, across = theta.get("along", 0.0), theta.get("across", 0.0)
     spots = [(np.array([float(v) for v in name.split("_")[1:]]), name) for name in theta if name[:3] == "at_"]
 
@@ -409,14 +405,14 @@ def modulus_of(theta: dict) -> Callable[[np.ndarray], np.ndarray]:
 
 
 class Modulus(Effect):
-    """Not in the catalogue: `diagnose` calibrates the base model with it before it looks for effects, and
-    names it by itself."""
+    """Not in the catalogue: `diagnose` calibrates the base model with it before the search for effects, and
+    reports it separately."""
 
     id, name, stage = "modulus", "modulus of the rubber", "C"
     fits = frozenset()
-    physics = "all of the skin is stiffer or softer: force and pressure times a factor, impedances as before"
+    physics = "all of the skin is stiffer or softer: force and pressure are scaled, impedances are not"
     params = {"factor": Param("1", 0.2, 5.0, "10 % from batch to batch; 1.7 by the mesh", 0.3, 1.0)}
-    confusable = {"pdc_gain": "force over depth: a gain of PDC leaves it alone", "radius": "another tool"}
+    confusable = {"pdc_gain": "force over depth: a gain of PDC does not change it", "radius": "another tool"}
 
     def apply(self, run: Run, theta: dict) -> None:
         run.scale_load(theta["factor"])

@@ -1,5 +1,5 @@
-"""Effects of the transduction and the acquisition: what electrodes, pressure and force channels read of a
-given skin."""
+"""Effects of the transduction and the acquisition: readings of electrodes, pressure and force for a given
+skin."""
 
 from collections.abc import Sequence
 
@@ -30,18 +30,16 @@ __all__ = [
 ]
 
 
-_LOG_MODULUS = 0.1  # within what batches of rubber differ by
-_FILM = 0.5e-3  # [m] of liquid between skin and core, on average
+_LOG_MODULUS = 0.1  # scatter between batches of rubber
+_FILM = 0.5e-3  # [m] mean thickness of liquid between skin and core
 
 
-_FADE = Param(
-    "1/1000 counts", 0.01, 10.0, "a gain that bends with what it amplifies: CHOSEN", 1.0, 0.01, True
-)
+_FADE = Param("1/1000 counts", 0.01, 10.0, "a nonlinear gain: CHOSEN", 1.0, 0.01, True)
 
 
 class Linear(Effect):
-    """An effect of the counts that is linear in the electrodes' changes from rest: `apply` itself says what
-    a running sensor makes of them, one electrode at a time being moved by a count."""
+    """An effect on the counts that is linear in the electrodes' changes from rest. `apply` on unit changes of
+    one electrode at a time gives the matrix for a running sensor."""
 
     stage = "A"
 
@@ -57,7 +55,7 @@ class Linear(Effect):
 
 class Bubble(Effect):
     id, name, stage = "bubble", "air bubble in the liquid", "B"
-    physics = "p (V0 + dV) = const: the liquid gives way, the pressure and the far electrodes answer less"
+    physics = "p (V0 + dV) = const: the liquid is compressible; pressure and far electrodes respond less"
     params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
     confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
 
@@ -71,12 +69,12 @@ class Bubble(Effect):
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
     physics = (
-        "liquid goes with the session's clock: the film gets thinner, and the fingertip softer; "
-        "or the skin sinks to the core, everywhere alike"
+        "liquid is lost with the session's clock: the film gets thinner and the fingertip softer; "
+        "or the skin sinks to the core, equally everywhere"
     )
     params = {
         "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2),
-        "before": Param("1", 0.0, 0.3, "what was gone as the session began: CHOSEN", 0.03),
+        "before": Param("1", 0.0, 0.3, "loss before the session: CHOSEN", 0.03),
         "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
     rare = {"sink": Param("m/h", 0.0, 20e-3, "of the skin; 0.1 mm in a minute empties a fifth: CHOSEN", 1e-3)}
@@ -108,7 +106,7 @@ class FluidLoss(Effect):
         if "fill" not in run.answers:  # every impedance in proportion, all else as before
             run.log_z = run.log_z + lost[:, None]
             return
-        fill = run.answers["fill"]  # its pressure is above that at rest, which the skin draws on
+        fill = run.answers["fill"]  # its pressure is above that at rest, from which suction subtracts
         run.pressure = run.pressure - theta.get("suction", 0.0) * (lost + sunk / _FILM)
         run.force = run.force - run.modulus * lost[:, None] * fill["force"]
         run.pressure = run.pressure - run.modulus * lost * fill["pressure"]
@@ -154,7 +152,7 @@ class WarmUp(Effect):
     }
 
     def alias(self, theta: dict) -> tuple:
-        """Warmth lowers impedances; what raises them all is a sensor that cools, or liquid that goes."""
+        """Warmth lowers impedances; a common rise may also be a cooling sensor or lost liquid."""
         return ("fluidloss",) if theta["a"] > 0 else ()
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -186,24 +184,24 @@ class Asperities(Effect):
 
 
 class Gain(Linear):
-    """Of some electrodes only it has a "fade" as well: where data show which they are, they show how they
-    bend."""
+    """A gain of only some electrodes also has a "fade": data that identify the electrodes also show their
+    nonlinearity."""
 
     id, name, stage = "gain", "gain of single electrodes", "A"
-    physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
+    physics = "an electrode's change from rest has its own factor (manufacturing)"
     each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
     params = dict.fromkeys(BIOTAC.electrodes, each)
     fits = frozenset({"poses", "checkup"})
     equivalents, per_channel = ("inhomog",), True
-    # Electrodes lie 0.1 to 0.2 mm from where they are drawn, which looks like gains of so much. Gains that
-    # were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
+    # Electrodes are 0.1 to 0.2 mm from their drawn positions, which looks like such gains. Gains found for
+    # such positions were up to 4.2 % (docs/lab/discrepancy.md).
     sound = 0.05
     confusable = {
         "asper": "one electrode or all",
         "crosstalk": "drive one electrode alone",
         "saturate": "depth ladder",
     }
-    refit_with = tuple(confusable)  # one law that all electrodes have, against nineteen gains
+    refit_with = tuple(confusable)  # one law common to all electrodes, against nineteen gains
 
     def only(self, names: Sequence[str]) -> "Gain":
         other = super().only(names)
@@ -216,7 +214,7 @@ class Gain(Linear):
 
     def rejection_reason(self, theta: dict) -> str | None:
         g = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
-        # scatter of manufacturing has no mean
+        # manufacturing scatter has zero mean
         return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
 
     def trends(self, change: list, clock: list) -> list:
@@ -231,17 +229,17 @@ class Gain(Linear):
 
 
 class DeadTaxels(Linear):
-    """Not in the catalogue: `diagnose` finds stuck channels of recordings by themselves."""
+    """Not in the catalogue: `diagnose` finds stuck channels of recordings separately."""
 
-    id, name, stage = "dead", "electrodes that no longer answer", "A"
+    id, name, stage = "dead", "electrodes that no longer respond", "A"
     fits, per_channel = frozenset(), True
-    physics = "a broken lead or a corroded contact: the electrode shows its rest and its noise"
+    physics = "a broken lead or a corroded contact: the electrode shows only its baseline and noise"
     each = Param("1", 0.0, 1.0, "none to all; fraction of electrodes: CHOSEN", 0.02)
     params = dict.fromkeys(BIOTAC.electrodes, each)
-    confusable = {"gain": "a gain is smaller, not nothing"}
+    confusable = {"gain": "a gain is not zero"}
 
     def draw(self, rng: np.random.Generator, size: float = 1.0) -> dict:
-        """Each electrode is dead with the probability `size` times `scale`."""
+        """Each electrode is dead with probability `size` times `scale`."""
         return {k: float(rng.random() < size * p.scale) for k, p in self.params.items()}
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -250,19 +248,19 @@ class DeadTaxels(Linear):
 
 
 class CrossTalk(Linear):
-    """Parameters "e3_hears_e5": fraction of e5's change that e3 shows beside its own, for leads that lie side
-    by side; which these are is found before effects are looked for (`trajectories.base.pairs`)."""
+    """Parameters "e3_hears_e5": fraction of e5's change added to e3, for adjacent leads; the pairs are found
+    before the search for effects (`trajectories.base.pairs`)."""
 
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
     physics = (
         "V = (I + kappa K + scan S + common M + pairs) U: "
-        "K falls off with distance, S is the channel sampled before, M the mean of all"
+        "K decreases with distance, S is the channel sampled before, M the mean of all"
     )
     fits = frozenset({"poses", "checkup"})
     params = {
         "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
-        "scan": Param("1", -0.4, 0.4, "what a multiplexer holds: CHOSEN, as kappa", 0.05),
-        "common": Param("1", -0.6, 0.6, "a supply or reference that sags: CHOSEN, as kappa", 0.05),
+        "scan": Param("1", -0.4, 0.4, "charge held by a multiplexer: CHOSEN, like kappa", 0.05),
+        "common": Param("1", -0.6, 0.6, "a sagging supply or reference: CHOSEN, like kappa", 0.05),
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
@@ -274,8 +272,8 @@ class CrossTalk(Linear):
     }
 
     def __init__(self, hears: Sequence[tuple[int, int]] = ()):
-        """hears: (electrode, the one it hears), numbers from 0."""
-        of = Param("1", -0.6, 0.9, "leads side by side: CHOSEN", 0.1)
+        """hears: (electrode, the one that couples into it), numbers from 0."""
+        of = Param("1", -0.6, 0.9, "adjacent leads: CHOSEN", 0.1)
         self.hears = {f"e{i + 1}_hears_e{j + 1}": (i, j) for i, j in hears}
         self.params = CrossTalk.params | dict.fromkeys(self.hears, of)
 
@@ -295,7 +293,7 @@ class CrossTalk(Linear):
 
 class Saturation(Effect):
     id, name, stage = "saturate", "saturation of the change", "A"
-    physics = "changes from rest bend beyond a knee: soft clip"
+    physics = "changes from rest are compressed beyond a knee: soft clip"
     params = {
         "strength": Param("1", 0.0, 1.0, "none to hard", 0.3),
         "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True),
@@ -315,7 +313,7 @@ class Saturation(Effect):
 
 class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
-    physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
+    physics = "electrodes follow their input with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     fits = frozenset({"poses", "checkup"})
     law, equivalents, alike = LAW, ("latency",), True
@@ -333,18 +331,18 @@ class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
     fits = frozenset({"poses", "log"})
     alike, most = True, {"delay": MOST_LATENCY}
-    physics = "electrodes are read as they were some time before: V(t - delay)"
+    physics = "electrodes are read with a delay: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
     rare = {"of_pdc": Param("s", 0.0, 0.5, "one bus for all: CHOSEN", 0.03)}
     equivalents = ("lowpass",)
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
 
     def rejection_reason(self, theta: dict) -> str | None:
-        # a pressure that is late by itself is no latency of the electrodes
+        # a delay of the pressure alone is no latency of the electrodes
         return "pressure" if theta.get("of_pdc", 0.0) > 1.5 * theta["delay"] + 0.01 else None
 
     def of_setup(self, theta: dict) -> bool:
-        """A negative delay is of the other clock."""
+        """A negative delay belongs to the other device's clock."""
         return theta["delay"] < 0
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -380,8 +378,8 @@ class PressureGain(Linear):
         return None if any(t.pdc is not None for t in trajectories) else "no PDC"
 
     def undoes(self, theta: dict, log_modulus: float) -> bool:
-        """The modulus was fitted to the force: then pressure is as the base model says, and it is the force
-        that is not."""
+        """The modulus was fitted to the force: if the pressure then agrees with the base model, the force is
+        the one that does not."""
         taken = -log_modulus
         return abs(taken) > _LOG_MODULUS and abs(np.log1p(theta["gain"]) - taken) < 0.3 * abs(taken)
 
@@ -391,12 +389,12 @@ class PressureGain(Linear):
 
 class ForceZero(Effect):
     id, name, stage = "force_cross", "cross-axis sensitivity of the force sensor", "A"
-    physics = "part of the normal force shows in the tangential components"
+    physics = "a fraction of the normal force appears in the tangential components"
     params = {k: Param("1", -0.4, 0.4, "1-5 %", 0.04) for k in ("x", "z")}
     confusable = {
         "misalign": "turn the force sensor by 180 degrees",
         "friction": "press without slides",
-        "rocking": "turn the force sensor by 180 degrees; what is dragged sideways by the load pulls too",
+        "rocking": "turn the force sensor by 180 degrees; a sideways motion by the load also adds force",
     }
 
     def applicable(self, trajectories: list) -> str | None:

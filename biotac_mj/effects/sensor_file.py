@@ -1,7 +1,7 @@
-"""A sensor's YAML: its base model, and the effects that it has beyond it, stage by stage.
+"""A sensor's YAML file: its base model and its effects, stage by stage.
 
-`biotac diagnose` writes one of what it finds (sensor_amended.yaml); its simulator reads it, and so does
-whatever runs a sensor (`amended.py`)."""
+`biotac diagnose` writes its result as one (sensor_amended.yaml); its simulator and everything that runs a
+sensor read it (`amended.py`)."""
 
 import dataclasses
 import pathlib
@@ -37,12 +37,12 @@ _SLACK = 1e-6  # of the interval, for values rounded in the file
 
 @dataclasses.dataclass
 class SensorFile:
-    """What a sensor file holds.
+    """Content of a sensor file.
 
     Attributes:
-      base: of skin, tier, material, options, sensor (as for `attach`), constitutive ("reduced" | "in_skin")
-        and modulus_factor, on the material's Young's modulus, what the file says.
-      effects: [(Effect, theta)]. intervals: {effect id: {parameter: (low, high)}}, of 95 %.
+        base: settings in the file among skin, tier, material, options, sensor (as for `attach`), constitutive
+          ("reduced" | "in_skin") and modulus_factor, on the material's Young's modulus.
+        effects: [(Effect, theta)]. intervals: {effect id: {parameter: (low, high)}}, 95 %.
     """
 
     base: dict
@@ -51,7 +51,7 @@ class SensorFile:
 
 
 def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFile:
-    """Reads a YAML; `extra` are your own effects.
+    """Reads a YAML file; `extra`: custom effects.
 
     Raises:
       FileNotFoundError, ValueError: no file, no YAML, another schema, unknown effect or parameter.
@@ -65,7 +65,7 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
         )
     refuse_unknown(document, _KEYS, str(path))
     check_entries(str(path), document, _KEYS, _KEYS)
-    for name, known in _CHOICES.items():  # also where the one who reads it has a choice of his own
+    for name, known in _CHOICES.items():  # also if the reader has a choice of its own
         if document.get(name, known[0]) not in known:
             raise ValueError(f"{name} of {path} is {document[name]!r}: choose one of {', '.join(known)}")
     effects, intervals = [], {}
@@ -81,7 +81,7 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
 
 
 def write_sensor_file(path: pathlib.Path | str, file: SensorFile) -> None:
-    """Writes a YAML; what `base` holds must be plain."""
+    """Writes a YAML file; `base` must have plain values."""
     import yaml
 
     stages = {stage: [] for stage in STAGES.values()}
@@ -99,7 +99,7 @@ def write_sensor_file(path: pathlib.Path | str, file: SensorFile) -> None:
 
 
 def _effect(where, stage, item, extra, design):
-    """Effect, values of its parameters, and the intervals of those that have one."""
+    """Effect, values of its parameters, and their intervals if given."""
     check_entries(f"an effect of {where}", item, _EFFECT, ("name",))
     refuse_unknown(item, _EFFECT, f"an effect of {where}")
     effect = by_id(item["effect"], extra).on(design).given(list(item["parameters"]))

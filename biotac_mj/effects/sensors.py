@@ -1,4 +1,4 @@
-"""Effects that a simulated sensor can have while it runs, and draws of them: named physical randomisation.
+"""Effects of a running simulated sensor, and random draws of them: domain randomisation with physical names.
 
 The classes are those that `biotac diagnose` fits to data."""
 
@@ -33,17 +33,17 @@ RANDOM = {
 
 
 def with_effects(sensor: Sensor, effects: list[tuple[Effect, dict]]) -> Sensor:
-    """The sensor with effects [(Effect, theta)] that a running sensor can have (`Effect.in_sensor`)."""
+    """The sensor with effects [(Effect, theta)] that act in a running sensor (`Effect.in_sensor`)."""
     for effect, theta in effects:
         sensor = dataclasses.replace(sensor, **effect.in_sensor(sensor, theta))
     return sensor
 
 
 def read_randomise(value: object) -> dict[str, float]:
-    """{name of RANDOM: size} of names, or of such a dict; size 1 is a real sensor's.
+    """{name of RANDOM: size} from names or such a dict; size 1 is a real sensor's.
 
     Raises:
-      ValueError: an unknown name, or a size that is no number >= 0.
+      ValueError: an unknown name, or a size that is not a number >= 0.
     """
     if isinstance(value, (list, tuple)):
         value = dict.fromkeys(map(str, value), 1.0)
@@ -71,17 +71,17 @@ def draw_effects(
 
 
 def take_sensor(settings: dict, seed: ArrayLike = 0, design: Design = BIOTAC) -> tuple[Sensor, dict, bool]:
-    """What settings of readings say of the sensor.
+    """Sensor from the settings of readings.
 
     Args:
       settings: with "sensor" (see `presets.read_sensor`) and "randomise" (see `read_randomise`), or without.
-      seed: of what is drawn, whole numbers. design: of the sensor.
+        seed: of random draws, whole numbers. design: of the sensor.
 
     Returns:
-      the sensor, the other settings, and whether another seed would give another sensor.
+        the sensor, the other settings, and whether the sensor depends on the seed.
 
-    Raises:
-      ValueError: a name or number that cannot be.
+      Raises:
+        ValueError: an invalid name or number.
     """
     rest = {name: value for name, value in settings.items() if name not in ("sensor", "randomise")}
     choice, randomise = settings.get("sensor"), settings.get("randomise", {})

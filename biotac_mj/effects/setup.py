@@ -1,4 +1,4 @@
-"""Effects of the set-up: the tool, where the sensor sits, and what carries it."""
+"""Effects of the set-up: the tool, the sensor's pose, and its mount."""
 
 from collections.abc import Sequence
 
@@ -17,10 +17,10 @@ __all__ = [
 
 
 class Radius(Effect):
-    """Of each spherical tool among the trajectories that are compared, else of all alike."""
+    """One parameter for each spherical tool among the trajectories, else one for all."""
 
     id, name, stage = "radius", "radius of the tool", "S"
-    physics = "the sphere is larger or smaller than it says"
+    physics = "the sphere is larger or smaller than stated"
     confusable = {"mount": "light load", "stiffen": "another tool"}
 
     def __init__(self, tools: tuple = ()):
@@ -44,7 +44,7 @@ class Radius(Effect):
 class Misalignment(Effect):
     id, name, stage = "misalign", "constant misalignment of the sensor", "S"
     moves_object = pose_offset = True
-    physics = "all poses are shifted and turned alike, by a small rotation about the sensor's axes"
+    physics = "all poses have the same small shift and rotation about the sensor's axes"
     params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in "xyz"} | {
         k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
     }
@@ -63,28 +63,28 @@ class Misalignment(Effect):
 class DepthZero(Effect):
     id, name, stage = "depth0", "zero of the depth", "S"
     moves_object = pose_offset = True
-    physics = "the object touches earlier or later than its pose says, everywhere alike"
+    physics = "the object touches earlier or later than by its pose, equally everywhere"
     params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
-    confusable = {"mount": "light load: an offset stays, a compliance vanishes", "radius": "another tool"}
+    confusable = {"mount": "light load: an offset remains, a compliance vanishes", "radius": "another tool"}
 
     def apply(self, run: Run, theta: dict) -> None:
         run.offset = run.offset + theta["dz"] * run.heading
 
 
 def _until(unit: str, low: float, high: float, start: float) -> dict:
-    """A rare parameter: the load at which what gives way is half as far as it would be in proportion."""
+    """A rare parameter: the load at which the displacement is half the proportional one."""
     return {"until": Param(unit, low, high, "play that is used up, a stop: CHOSEN", start, start, True)}
 
 
 def _compliance_fraction(load: np.ndarray, theta: dict) -> np.ndarray:
-    """(n,) fraction of the proportional displacement under a load (n,) that is reached before the stop."""
+    """(n,) fraction of the proportional displacement under a load (n,), limited by the stop."""
     return 1 / (1 + load / theta["until"]) if "until" in theta else np.ones(len(load))
 
 
 class Mount(Effect):
     id, name, stage = "mount", "compliance of mount or robot", "B"
     moves_object = True
-    physics = "the object gives way in proportion to the force: d - F / k"
+    physics = "the object moves back in proportion to the force: d - F / k"
     params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
     rare = _until("N", 0.3, 30.0, 2.0)
     confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
@@ -107,7 +107,7 @@ class Rocking(Effect):
     confusable = {
         "misalign": "light load",
         "mount": "camera on the clamp",
-        "rocking_torque": "presses from two sides at one place: what tilts by torque tilts to both",
+        "rocking_torque": "presses from two sides at one place: a tilt by torque goes both ways",
         "stiffen": "push on a rigid block",
     }
 
@@ -125,8 +125,8 @@ class Rocking(Effect):
 
 
 def _load_feedback(run, moved):
-    """(n,) fraction of the load that remains where it moves the object by `moved` (n, 3) [m/N]: what moves
-    along the press loads and unloads what it is moved by."""
+    """(n,) fraction of the load that remains if it moves the object by `moved` (n, 3) [m/N]: a motion along
+    the press changes its own load."""
     stiffness = 0.0 if run.stiffness is None else run.stiffness
     return 1 / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
 
@@ -134,17 +134,17 @@ def _load_feedback(run, moved):
 class RockingTorque(Effect):
     id, name, stage = "rocking_torque", "rocking of the fingertip by its torque", "B"
     moves_object = True
-    physics = "a clamp behind the fingertip gives way by the torque about it, each axis by its own fraction"
+    physics = "a clamp behind the fingertip rotates by the torque about it, with a compliance per axis"
     params = {
         k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)
         for k in ("roll", "yaw", "pitch")
     }
-    params |= {"behind": Param("m", 2e-3, 60e-3, "of the sensor's origin: the clamp", 10e-3, 10e-3, True)}
+    params |= {"behind": Param("m", 2e-3, 60e-3, "clamp behind the sensor's origin", 10e-3, 10e-3, True)}
     rare = _until("N m", 3e-3, 0.3, 20e-3)
     grid = ({"behind": 5e-3}, {"behind": 25e-3})
     equivalents = ("rocking",)
     confusable = {
-        "rocking": "presses from two sides at one place: what tilts by torque tilts to both",
+        "rocking": "presses from two sides at one place: a tilt by torque goes both ways",
         "mount": "camera on the clamp",
         "misalign": "light load",
         "stiffen": "push on a rigid block",
@@ -153,7 +153,7 @@ class RockingTorque(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         place = np.broadcast_to(run.place if run.pos is None else run.pos, run.offset.shape)
         lever = place - np.array([theta["behind"], 0.0, 0.0])
-        # the object, seen from a sensor that is tilted by its torque, is turned the other way
+        # seen from a sensor that is tilted by its torque, the object is rotated the opposite way
         tilt = np.array([theta[k] for k in ("roll", "yaw", "pitch")])
         torque = np.cross(lever, run.force)
         turn = tilt * torque * _compliance_fraction(np.linalg.norm(torque, axis=1), theta)[:, None]
