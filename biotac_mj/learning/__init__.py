@@ -1,2 +1,2 @@
-"""Learned models between the deformed skin and the electrodes: training, evaluation, use. torch is loaded
-when a model is."""
+"""Learned models between the deformed skin and the electrodes: training, evaluation, use. torch is imported
+with the first model."""

@@ -1,6 +1,5 @@
 """`biotac learn predict inverse`: deformation and contact patch of a BioTac from its electrodes, drawn from
-below as
-in the paper's figure."""
+below like the paper's figure."""
 
 import json
 import pathlib
@@ -25,18 +24,19 @@ if typing.TYPE_CHECKING:
 __all__ = ["Estimate", "contact_patch", "draw_skin", "estimate"]
 
 _UNTOUCHED = 0.05  # [N]
-# what is called drift: in so many rows, so correlated with TDC, and more counts than noise and a light touch
+# thresholds of a drift note: number of rows, correlation with TDC, and counts above noise and a light touch
 _ROWS, _GOES_WITH, _FEW_COUNTS = 20, 0.9, 20
 
 
 class Estimate(typing.NamedTuple):
-    """What electrodes say of the skin.
+    """Estimate of the skin from electrodes.
 
     Attributes:
       displacement: (n, nvert, 3) [m].
-      contact: (n, nouter) on the nodes of the outer surface, sorted: contact force [N], or, of a latent
-        projection, which knows no force, how far they are pushed in [m].
-      is_force: which of both. patch: of the largest contact, above which a node is in the patch.
+      contact: (n, nouter) on the nodes of the outer surface, sorted: contact force [N] or, for a latent
+        projection, which has no force, indentation [m].
+      is_force: whether it is a force. patch: fraction of the largest contact above which a node is in the
+        patch.
     """
 
     displacement: np.ndarray
@@ -51,11 +51,11 @@ def estimate(
     """Displacements and contact of raw counts.
 
     Args:
-      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin. weights: file, a name of
-        `weights.SHIPPED`; None is "inverse", which belongs to the default skin.
+        counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin. weights: file, a name of
+          `weights.SHIPPED`; None is "inverse", for the default skin.
 
     Raises:
-      ValueError: not 19 channels, values that are not finite or no raw counts, or weights of another skin.
+        ValueError: not 19 channels, values that are not finite or not raw counts, or weights of another skin.
     """
     change = log_change_of(counts, tare)
     head = load_inverse(find_weights(weights, "inverse"), geometry)
@@ -75,17 +75,17 @@ def contact_patch(
     skin: str = "default",
     weights: pathlib.Path | str | None = None,
 ) -> dict:
-    """Estimates every row of a recording, draws one; writes contact.png and contact.json into `out`.
+    """Estimates every row of a recording and draws one; writes contact.png and contact.json into `out`.
 
     Args:
-      source: a recording, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor
-        at rest.
-      row: which row is drawn and returned; None is the one with the largest force or, where no force was
-        recorded, the one that differs most from rest.
+        source: a recording, or readings.csv of `biotac press`. tare: number of first rows whose mean is the
+          sensor at rest.
+        row: row to draw and return; None: the one with the largest force or, without recorded force, the
+          largest change from rest.
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: a bad table, or a tare or row that the recording does not have.
+        ValueError: an invalid table, or a tare or row outside the recording.
     """
     recording, notes = load_one(source)
     counts, assumed = recording.counts()
@@ -146,12 +146,12 @@ def contact_patch(
 
 
 def _recorded(recording):
-    """(n,) size of the recorded force [N], NaN in rows without; None where no force was recorded."""
+    """(n,) norm of the recorded force [N], NaN in rows without; None if no force was recorded."""
     return None if recording.force is None else np.linalg.norm(recording.force, axis=1)
 
 
 def _drift(tdc, change, force):
-    """A note where electrodes go with TDC while nothing touches, or in all rows where no force says so."""
+    """A note if electrodes correlate with TDC without contact, or, if there is no force, in all rows."""
     if tdc is None:
         return []
     free = np.isfinite(tdc)
@@ -170,7 +170,7 @@ def _drift(tdc, change, force):
 
 
 def _node_area(geometry, outer):
-    """(nouter,) [m2]: a third of each adjacent face."""
+    """(nouter,) area per node [m2]: a third of each adjacent face."""
     corner = geometry.vert[geometry.outer_face]
     third = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 6
     return np.bincount(np.searchsorted(outer, geometry.outer_face).ravel(), np.repeat(third, 3), len(outer))
@@ -185,14 +185,14 @@ def draw_skin(
     title: str,
     cmap: str = "viridis",
 ) -> "ScalarMappable":
-    """Draws a surface seen from the pad's side (along +y): faces coloured by the mean of nodal values,
+    """Draws a surface as seen from the pad's side (along +y): faces coloured by the mean of nodal values,
     shaded, far ones first.
 
     Args:
       axis: of matplotlib. vert: (n, 3) [m]; face: (m, 3); value: (n,); limit: of the colours.
 
     Returns:
-      the collection, for a colour bar.
+        the collection, for a colour bar.
     """
     import matplotlib
     from matplotlib.collections import PolyCollection

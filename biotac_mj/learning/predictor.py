@@ -1,4 +1,4 @@
-"""The forward model as it is used: deformed skin -> d ln Z -> impedances and counts, one sensor or many."""
+"""The trained forward model: deformed skin -> d ln Z -> impedances and counts, one sensor or many."""
 
 import typing
 
@@ -22,7 +22,7 @@ __all__ = ["ForwardModel", "PointsModel"]
 
 
 class _Served(nn.Module):
-    """What reads a deformed skin of `nvert` nodes in the film's place."""
+    """Base of models that read a deformed skin of `nvert` nodes in place of the film."""
 
     nvert: int
 
@@ -38,22 +38,21 @@ class _Served(nn.Module):
             )
 
     def counts(self, displacement: torch.Tensor, tare: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """(n, 19) counts, fractional, for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
+        """(n, 19) fractional counts for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
         (n, 19)."""
         tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
         return counts_change(self.log_change(displacement)[0], tare) + tare
 
 
 class PointsModel(_Served):
-    """A network that reads the skin at fixed points, on one skin; made by `weights.load_forward` and
-    `load_inverse`.
+    """A network that reads one skin at fixed points; made by `weights.load_forward` and `load_inverse`.
 
     Args:
       net: LatentProjection, or PointNet. points: SkinPoints. geometry: the skin that it reads.
-      config: of the training. meta: what the weights' file says.
+        config: of the training. meta: description in the weights' file.
 
     Attributes:
-      window: (), it remembers nothing.
+        window: (), without memory.
     """
 
     window: tuple[float, ...] = ()
@@ -87,33 +86,33 @@ class PointsModel(_Served):
         average: torch.Tensor | None = None,
         dt: float | torch.Tensor = 0.0,
     ) -> tuple[torch.Tensor, None]:
-        """d ln Z (n, 19) against the rest, of displacements (n, nvert, 3) [mm]; average and dt: as
-        `ForwardModel` has them, not used."""
+        """d ln Z (n, 19) relative to rest, for displacements (n, nvert, 3) [mm]; average and dt: unused, for
+        compatibility with `ForwardModel`."""
         self._check(displacement)
         return self.electrodes(self.unit * _between(self.to_points, displacement)), None
 
     def target(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) what the network makes of rows of a set, if it makes no error."""
+        """(k, 19) the network's target in rows of a set."""
         return arrays.log_change(rows) if self.config.logarithm else arrays.change(rows) / self.config.scale
 
     def change_of(self, output: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
-        """(k, 19) change of counts of the network's output, with counts `tare` (k, 19) at rest."""
+        """(k, 19) change of counts from the network's output, for counts `tare` (k, 19) at rest."""
         return counts_change(output, tare) if self.config.logarithm else self.config.scale * output
 
     def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) predicted change of counts of rows of a set."""
+        """(k, 19) predicted change of counts in rows of a set."""
         return self.change_of(self.log_change(arrays.field[rows].float())[0], arrays.tare[rows])
 
     @torch.no_grad()
     def through_code(self, displacement: torch.Tensor) -> torch.Tensor:
-        """Displacements (n, nvert, 3) [mm] after the points and the mesh VAE's code."""
+        """Displacements (n, nvert, 3) [mm] reconstructed from the points and the mesh VAE's code."""
         u = self.unit * _between(self.to_points, displacement)
         return _between(self.to_nodes, self.net.mesh.decode(self.net.mesh.encode(u)[0])) / self.unit
 
     @torch.no_grad()
     def forward(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Displacements (n, nvert, 3) [mm] of d ln Z (n, 19), and how far the outer nodes are pushed in
-        (n, nouter) [mm], at least 0."""
+        """Displacements (n, nvert, 3) [mm] for d ln Z (n, 19), and indentation of the outer nodes (n, nouter)
+        [mm], at least 0."""
         field = _between(self.to_nodes, self.field(log_change)) / self.unit
         return field, (field[:, self.outer] * self.inward).sum(2).clamp(min=0)
 
@@ -134,10 +133,10 @@ def _normals(geometry):
 
 
 class ForwardModel(_Served):
-    """Ensemble of heads on film features and components of the mesh; made by `weights.load_forward`.
+    """Ensemble of heads on film features and mesh components; made by `weights.load_forward`.
 
     Args:
-      geometry: SkinGeometry that it was trained on. meta: what the weights' file says. modes: components.
+        geometry: SkinGeometry of the training. meta: description in the weights' file. modes: components.
 
     Attributes:
       window: time constants [s] of the causal averages; () for a model without memory.
@@ -160,20 +159,20 @@ class ForwardModel(_Served):
 
     @property
     def memory(self) -> tuple[int, int, int]:
-        """Shape of what a window remembers for one sensor: (len(window), 19, features)."""
+        """Shape of a window's state for one sensor: (len(window), 19, features)."""
         return (len(self.window), NELECTRODE, FilmFeatures.count)
 
     @torch.no_grad()
     def log_change(
         self, displacement: torch.Tensor, average: torch.Tensor | None = None, dt: float | torch.Tensor = 0.0
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """d ln Z against the rest.
+        """d ln Z relative to rest.
 
         Args:
           displacement: (n, nvert, 3) tensor [mm].
-          average: (n, *memory) causal averages before this step, or None: a skin that has been as it is for
-            long.
-          dt: since the last call [s].
+            average: (n, *memory) causal averages before this step; None: a skin that has been constant for
+              long.
+            dt: since the last call [s].
 
         Returns:
           (n, 19) and the averages after the step.

@@ -1,5 +1,5 @@
-"""How models are judged: errors per interaction, coverage, paired tests, intervals. In raw counts; the
-paper's unit is counts / 2048."""
+"""Evaluation of models: errors per interaction, coverage, paired tests, intervals. Unit: raw counts; the
+paper's is counts / 2048."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ __all__ = ["conformal_width", "coverage_curve", "interaction_errors", "paired_te
 def interaction_errors(
     predicted: ArrayLike, truth: ArrayLike, owner: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
-    """RMS over the electrodes of each row, its mean over the rows of each interaction.
+    """RMS over the electrodes of each row, averaged over the rows of each interaction.
 
     Args:
       predicted, truth: (n, 19) tared counts. owner: (n,) interaction of each row.
@@ -54,7 +54,7 @@ def quartiles(values: ArrayLike) -> tuple[float, float, float]:
 
 
 def coverage_curve(predicted: ArrayLike, truth: ArrayLike, levels: ArrayLike) -> np.ndarray:
-    """(len(levels),) share of all (row, electrode) pairs whose absolute error is at most each level
+    """(len(levels),) fraction of all (row, electrode) pairs with an absolute error of at most each level
     [counts]."""
     error = np.sort(np.abs(np.asarray(predicted, float) - truth).ravel())
     return np.searchsorted(error, levels, side="right") / len(error)
@@ -64,7 +64,7 @@ def paired_test(a: ArrayLike, b: ArrayLike) -> dict:
     """Wilcoxon's signed-rank test of paired errors a, b (k,) of the same interactions, two-sided.
 
     Returns:
-      dict: n, median of a - b [counts], share of interactions where a is better, p (1 where nothing differs).
+        dict: n, median of a - b [counts], fraction of interactions with smaller a, p (1 if nothing differs).
     """
     a, b = np.asarray(a, float), np.asarray(b, float)
     if a.shape != b.shape or a.ndim != 1 or len(a) < 5:
@@ -82,18 +82,18 @@ def paired_test(a: ArrayLike, b: ArrayLike) -> dict:
 
 
 def conformal_width(error: np.ndarray, owner: ArrayLike, alpha: float = 0.1) -> np.ndarray:
-    """Half widths (19,) [counts] of intervals that cover a new interaction's rows with probability 1 - alpha
-    on average.
+    """Half widths (19,) [counts] of intervals that cover a new interaction's rows with mean probability 1 -
+    alpha.
 
-    Rows of one interaction are alike, so interactions are what is exchangeable: the distribution functions of
-    their absolute errors are averaged, with one more interaction of infinite error (pooling of distribution
-    functions, Dunn, Wasserman and Ramdas, 2022).
+    Rows of one interaction are similar, so the interactions are the exchangeable units: the distribution
+    functions of their absolute errors are averaged, with one more interaction of infinite error (pooling of
+    distribution functions, Dunn, Wasserman and Ramdas, 2022).
 
     Args:
       error: (n, 19) predicted - truth on the validation interactions. owner: (n,).
 
     Returns:
-      (19,); infinite where there are too few interactions for alpha.
+        (19,); infinite if there are too few interactions for alpha.
     """
     error, owner = np.abs(np.asarray(error, float)), np.asarray(owner)
     which, index = np.unique(owner, return_inverse=True)

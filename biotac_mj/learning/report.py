@@ -1,6 +1,5 @@
-"""`biotac learn judge FOLDER`: what `biotac learn train` predicted, over all seeds, beside the paper's
-numbers; JSON,
-a table and figures."""
+"""`biotac learn judge FOLDER`: predictions of `biotac learn train` over all seeds, with the paper's numbers;
+JSON, a table and figures."""
 
 import json
 import pathlib
@@ -28,9 +27,9 @@ _LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None = None) -> dict:
     """Reads a folder of `biotac learn train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures
-    beside it.
+    next to it.
 
-    Errors of an interaction are averaged over the seeds whose test part has it; medians and tests are over
+    Errors of an interaction are averaged over the seeds whose test split has it; medians and tests are over
     interactions.
 
     Raises:
@@ -96,7 +95,7 @@ _PREDICTIONS = {
 
 
 def report_of(path: pathlib.Path) -> dict:
-    """What `biotac learn train` says of one split and seed."""
+    """Result of `biotac learn train` for one split and seed."""
     report = check_entries(str(path), read_json(path, "result of `biotac learn train`", _AGAIN), _REPORT)
     for code, found in report["mesh"].items():
         check_entries(f"mesh {code} of {path}", found, _MESH)
@@ -120,7 +119,7 @@ def predictions_of(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def table(result: dict) -> str:
-    """What `evaluate_models` found, as text."""
+    """Result of `evaluate_models` as text."""
     lines = []
     for split, found in result["splits"].items():
         kind = "trajectory" if split == "trajectory" else "object"
@@ -167,7 +166,7 @@ def table(result: dict) -> str:
 
 
 def _choice(result):
-    """Which model to take, on what that rests, and whether something simpler is better."""
+    """Recommended model, its basis, and whether a simpler one is better."""
     judged = _judging(result["splits"])
     medians = {
         name: np.mean([result["splits"][split]["models"][name]["median"] for split in judged])
@@ -184,12 +183,12 @@ def _choice(result):
 
 
 def _judging(splits):
-    """The splits by which the default is chosen: unseen objects, where there are any."""
+    """Splits that decide the recommendation: unseen objects if there are any."""
     return [name for name in splits if name != "trajectory"] or list(splits)
 
 
 def _objects(codes):
-    """Lines of the mesh codes' mean node error by object, where there are several."""
+    """Lines with the mesh codes' mean node error by object, if there are several."""
     names = sorted(set().union(*(error["objects"] for error in codes.values())))
     if len(names) < 2:
         return []
@@ -274,7 +273,7 @@ def _tests(errors, default):
 
 
 def _average(reports):
-    """Means of equal trees of numbers."""
+    """Means over equal trees of numbers."""
     first = reports[0]
     if isinstance(first, dict):
         return {k: _average([r[k] for r in reports if k in r]) for k in first}
@@ -285,8 +284,8 @@ def draw_errors(result: dict, path: pathlib.Path | str) -> None:
     """A picture of medians and quartiles over interactions: a row for each model, a column for each split.
 
     Args:
-      result: of `evaluate_models`; used are data, default, and of each split noise_floor and the models'
-        median and quartiles [counts].
+        result: of `evaluate_models`; used: data, default, and per split noise_floor and the models' median
+          and quartiles [counts].
     """
     from matplotlib.figure import Figure
 

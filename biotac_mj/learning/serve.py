@@ -1,5 +1,4 @@
-"""The network in the film's place: what a step of MuJoCo, of dm-control or of a batch asks for the
-electrodes."""
+"""Learned film: electrodes from a network for a step of MuJoCo, of dm-control or of a batch."""
 
 import functools
 import pathlib
@@ -24,16 +23,16 @@ __all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkFilm", "NetworkReading
 
 
 class NetworkFilm:
-    """Stands where `sensor.film.FilmConduction` stands, for stored motions: a network without memory.
+    """Replacement of `sensor.film.FilmConduction` for stored motions: a network without memory.
 
     Args:
       geometry, weights: as for `NetworkReadings`.
 
     Attributes:
-      geometry: the skin. rest: (n,) of it at rest [ohm].
+        geometry: the skin. rest: (n,) impedance at rest [ohm].
 
     Raises:
-      ValueError: a network with a window.
+        ValueError: a network with a window.
     """
 
     def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
@@ -50,18 +49,17 @@ class NetworkFilm:
 
 
 class NetworkReadings:
-    """Counts of all channels: electrodes from a network, the rest as `sensor.readings.PhysicsReadings` has
-    it. The state is the caller's.
+    """Counts of all channels: electrodes from a network, the others like `sensor.readings.PhysicsReadings`.
+    The caller owns the state.
 
     Args:
-      geometry: the skin that is read.
-      weights: file, or a name of `weights.SHIPPED`; None is "forward" (all are trained on synthetic data).
-      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
-        rest of `sensor`.
+        geometry: the skin.
+        weights: file, or a name of `weights.SHIPPED`; None is "forward" (all are trained on synthetic data).
+        seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
+          baseline of `sensor`.
 
     Attributes:
-      nstate: length of the state: the acquisition's, the time of the last film, and what the network's window
-        remembers.
+        nstate: length of the state: the acquisition's, the time of the last film, and the network's window.
     """
 
     def __init__(
@@ -94,7 +92,7 @@ class NetworkReadings:
     def reset(
         self, state: np.ndarray, pressure: float = 0.0, time: float = 0.0, sensor: Sensor | None = None
     ) -> None:
-        """Writes the skin at rest into state (nstate,), from now on of `sensor`."""
+        """Writes the skin at rest into state (nstate,); from now on the sensor is `sensor`."""
         counts, last, memory = self._parts(state)
         acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)
         acquisition.reset(counts, self._rest, pressure, self.temperature, time)
@@ -132,8 +130,8 @@ class NetworkReadings:
 
 
 class LearnedReadings:
-    """`NetworkReadings` behind the coupling's `Readings` protocol; `config.options["readings"]` goes to
-    it."""
+    """`NetworkReadings` with the coupling's `Readings` protocol; `config.options["readings"]` are its
+    settings."""
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
         if "film" in config.options:
@@ -156,7 +154,7 @@ class LearnedReadings:
         self._network.reset(state)
 
     def draw(self, state: np.ndarray, seed: int) -> Sensor:
-        """Resets to another sensor, where the settings leave it open."""
+        """Resets to a randomly drawn sensor, if the settings are random."""
         sensor = take_sensor(self._settings, self._config.own_seed(seed), self._design)[0]
         self._network.reset(state, sensor=sensor)
         return sensor
@@ -169,18 +167,18 @@ class LearnedReadings:
 
 
 class LearnedBatchFilm:
-    """Stands where `sensor.film.BatchFilm` stands: impedances of `nworld` skins, on their device.
+    """Replacement of `sensor.film.BatchFilm`: impedances of `nworld` skins, on their device.
 
-    All worlds are computed whenever one may be due, in single precision. Do not capture it in a CUDA graph:
-    torch launches are not Warp's.
+    Computes all worlds whenever one may be due, in single precision. Not capturable in a CUDA graph: torch
+    launches are not Warp's.
 
     Args:
-      geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: between
-        two solves, for the window [s].
+        geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: time
+          between two solves, for the window [s].
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
-        design. lasting: the arrays that outlive a step.
+            design. lasting: the arrays that persist between steps.
     """
 
     def __init__(
@@ -214,14 +212,14 @@ class LearnedBatchFilm:
 
     @torch.no_grad()
     def solve_film(self, x: "wp.array", due: "wp.array") -> None:
-        """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,)
-        wp.array of int."""
+        """Computes new impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due
+        (nworld,) wp.array of int."""
         import contextlib
 
         import warp as wp
 
         cuda = self.device.is_cuda
-        # on Warp's stream: what it has launched before must be done, and what it launches next must wait
+        # synchronise with Warp's stream before and after
         with (
             torch.cuda.stream(wp.stream_to_torch(wp.get_stream(self.device)))
             if cuda

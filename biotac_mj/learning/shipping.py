@@ -1,4 +1,4 @@
-"""Weights with a card that says what they are: `biotac learn judge DIR --ship FOLDER`."""
+"""Weights with a model card: `biotac learn judge DIR --ship FOLDER`."""
 
 import json
 import pathlib
@@ -21,7 +21,7 @@ def check_shippable(folder: pathlib.Path | str) -> dict[str, pathlib.Path]:
     """Direction -> weights of the trajectory split in a folder of `biotac learn train`.
 
     Raises:
-      FileNotFoundError: seed 0 of that split was not trained, or by `--only` without our models.
+        FileNotFoundError: seed 0 of that split was not trained, or only without our models (`--only`).
     """
     folder = pathlib.Path(folder)
     sources = {name: folder / f"{name}-trajectory.safetensors" for name in ("forward", "inverse")}
@@ -32,11 +32,11 @@ def check_shippable(folder: pathlib.Path | str) -> dict[str, pathlib.Path]:
 
 
 def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -> list[pathlib.Path]:
-    """Copies the weights of the trajectory split (all objects seen) and writes a card beside each.
+    """Copies the weights of the trajectory split (all objects seen) and writes a card for each.
 
     Args:
-      folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder, as
-        biotac_mj/assets/weights.
+        folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder, such as
+          biotac_mj/assets/weights.
 
     Raises:
       FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: more than 16 MB.

@@ -1,4 +1,4 @@
-"""The verbs `biotac learn train`, `judge` and `predict`: their arguments here, their work beside it."""
+"""Arguments of the verbs `biotac learn train`, `judge` and `predict`."""
 
 import argparse
 import os
@@ -81,7 +81,7 @@ def _add_train(verbs, verb):
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
-# what a CPU trains in minutes, where nothing else is said: the best head, and one without film features
+# default on a CPU, minutes of training: the best head, and one without film features
 _ON_CPU = {"seeds": [0], "splits": ["trajectory"], "only": ["pod_taught", "local_taught"], "paper": False}
 _ON_GPU = {"seeds": [0, 1, 2, 3, 4], "splits": ["trajectory", "ring_7mm"], "only": None, "paper": True}
 
@@ -106,7 +106,7 @@ def _train(args):
 
 
 def _train_one(args):
-    """One model, as one file."""
+    """Trains one model and writes it to one file."""
     source = pathlib.Path(args.source)
     if any(source.glob("shard-*.h5")):
         from .instants.examples import from_set

@@ -1,4 +1,4 @@
-"""Weights of trained models as safetensors files that say what they are: mesh, channels, settings."""
+"""Weights of trained models as safetensors files with a description: mesh, channels, settings."""
 
 import dataclasses
 import hashlib
@@ -46,7 +46,7 @@ __all__ = [
 _DAMAGED = "it is damaged: train again, or copy it again"
 FORMAT = "biotac_mj.learning.weights/1"
 SHIPPED = ("forward", "inverse", "latent_projection")
-# what a file says of itself
+# entries of a file's description
 _SAID = {"channels": list}
 _SAID_OF = {
     "forward": {
@@ -62,7 +62,7 @@ _SAID_OF = {
     "inverse": {"mesh": str, "skin": str, "nvert": int, "nouter": int},
     "points": {"kind": dict, "config": dict, "reference": str},
 }
-# kinds that read the skin at `SkinPoints`, and which directions they know
+# kinds that read the skin at `SkinPoints`, and their directions
 _AT_POINTS = {"latent_projection": ("forward", "inverse"), "pointnet": ("forward",)}
 
 
@@ -72,7 +72,7 @@ def mesh_key(geometry: "SkinGeometry") -> str:
 
 
 def shipped(name: str = "forward") -> pathlib.Path:
-    """Path of weights that come with the package, one of SHIPPED.
+    """Path of weights in the package, one of SHIPPED.
 
     Raises:
       FileNotFoundError: there are none of that name.
@@ -90,7 +90,7 @@ def shipped(name: str = "forward") -> pathlib.Path:
 
 
 def find_weights(weights: pathlib.Path | str | None, direction: str = "forward") -> pathlib.Path:
-    """Path of weights: of a file, of a name in SHIPPED, or, None, of the direction's own."""
+    """Path of weights: a file, a name in SHIPPED, or None for the direction's default."""
     if weights is None or str(weights) in SHIPPED:
         return shipped(str(weights or direction))
     return pathlib.Path(weights)
@@ -105,12 +105,12 @@ def save_forward(
     geometry: "SkinGeometry",
     about: dict,
 ) -> None:
-    """Writes an ensemble of `local.train_head`'s results (half precision; buffers that follow from the mesh
-    are not in it)."""
+    """Writes an ensemble of results of `local.train_head` (half precision, without buffers that follow from
+    the mesh)."""
     tensors = {"pod.basis": pod.basis, "pod.scale": pod.scale}
     for k, member in enumerate(members):
         tensors |= {f"member{k}.{name}": value for name, value in member.head.state_dict().items()}
-    if kind["kind"] == "local":  # the residual sees the first components only
+    if kind["kind"] == "local":  # the residual uses the first components only
         tensors["pod.basis"], tensors["pod.scale"] = pod.basis[:, :32], pod.scale[:32]
     meta = about | {
         "direction": "forward",
@@ -164,7 +164,7 @@ def _save(path, tensors, geometry, meta, graph=()):
 
 
 def checksum(tensors: dict[str, torch.Tensor]) -> str:
-    """Of names, shapes, types and numbers: what is turned about or exchanged may have the same shape."""
+    """Of names, shapes, types and numbers: permuted or exchanged tensors may have the same shape."""
     found = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name].contiguous().numpy()
@@ -174,7 +174,7 @@ def checksum(tensors: dict[str, torch.Tensor]) -> str:
 
 
 def is_inverse(weights: pathlib.Path | str) -> bool:
-    """Whether weights, a file or a name in SHIPPED, say of electrodes how the skin is deformed.
+    """Whether weights, a file or a name in SHIPPED, map electrodes to the deformation of the skin.
 
     Raises:
       FileNotFoundError, ValueError: as `read_tensors`.
@@ -183,7 +183,7 @@ def is_inverse(weights: pathlib.Path | str) -> bool:
 
 
 def describe(path: pathlib.Path | str) -> dict:
-    """What a file of weights says about itself: direction, skin, nvert, channels, kind ..."""
+    """Description in a file of weights: direction, skin, nvert, channels, kind ..."""
     return read_tensors(path, ())[0]
 
 
@@ -191,8 +191,8 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
     """Description and tensors (all, or of these names) of a file.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite or not those
-        that were written.
+        FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite or differ
+          from the checksum.
     """
     from safetensors import safe_open
 
@@ -244,7 +244,7 @@ def _refuse_other(meta, path, geometry, direction):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
         )
-    if said == "points":  # they lie in every skin of the shape, or say so when they are read there
+    if said == "points":  # they fit any skin of the shape, which is checked on first use
         if not meta["config"].get("logarithm"):
             raise ValueError(
                 f"{path} was trained on counts and serves no sensor: train with logarithm true in the config"
@@ -264,7 +264,7 @@ def _refuse_other(meta, path, geometry, direction):
 
 
 def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) -> None:
-    """Copies a file of weights and says more of it; more: JSON's types."""
+    """Copies a file of weights with further entries in its description; more: JSON types."""
     from safetensors.torch import load, save
 
     meta = describe(source) | more
@@ -274,7 +274,7 @@ def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) ->
 
 
 def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel | PointsModel":
-    """A `predictor.ForwardModel`, or of a network that reads `SkinPoints` a `predictor.PointsModel`.
+    """A `predictor.ForwardModel`, or, for a network that reads `SkinPoints`, a `predictor.PointsModel`.
 
     Raises:
       FileNotFoundError: no such file.
@@ -296,8 +296,8 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
 
 
 def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
-    """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has
-    none; raises as `load_forward` where it is not for this skin."""
+    """Shape of a forward model's window state, from the file's header: (0,) without a window. Raises like
+    `load_forward` if it does not fit this skin."""
     from .training.features import FilmFeatures
 
     meta = describe(path)
@@ -322,7 +322,7 @@ def _points_model(path, meta, tensors, geometry):
 
 
 def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "InverseHead | PointsModel":
-    """An `inverse.InverseHead` of weights, or a latent projection's `predictor.PointsModel`; raises as
+    """An `inverse.InverseHead`, or a latent projection's `predictor.PointsModel`, from weights; raises like
     `load_forward`."""
     from .training.features import Pod
     from .training.inverse import InverseHead

@@ -1,1 +1,2 @@
-"""What the electrodes tell instant by instant, from recordings or data sets: force, place, code."""
+"""Models of single rows: force, contact position and a code from the electrodes of recordings or data
+sets."""

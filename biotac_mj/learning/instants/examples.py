@@ -1,4 +1,4 @@
-"""Rows of electrodes with what is to be told from them, from a recording or from a data set."""
+"""Rows of electrodes with their targets, from a recording or from a data set."""
 
 import dataclasses
 import pathlib
@@ -11,7 +11,7 @@ from ...sensor.channels import log_impedance
 
 __all__ = ["Examples", "from_recording", "from_set"]
 
-_BLOCKS = 56  # trajectories of a recording: its rows are alike in time (docs/lab/learning.md)
+_BLOCKS = 56  # trajectories of a recording: its rows are correlated in time (docs/lab/learning.md)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -19,10 +19,10 @@ class Examples:
     """n rows.
 
     Attributes:
-      counts: (n, nelectrode) raw; tare: (n, nelectrode) at rest. owner: (n,) number of the trajectory.
-      targets: "force" (n, 3) [N], "place" (n, 3) [m], as far as they are known; NaN: not in this row.
-      pdc: (n,) change of PDC from rest [counts], None where it is not known.
-      tared: whether the tare is measured; else ln Z is taken as it is. synthetic: no real sensor.
+        counts: (n, nelectrode) raw; tare: (n, nelectrode) at rest. owner: (n,) number of the trajectory.
+        targets: "force" (n, 3) [N], "place" (n, 3) [m], if known; NaN in rows without.
+        pdc: (n,) change of PDC from rest [counts], None if unknown.
+        tared: whether the tare was measured; else absolute ln Z is used. synthetic: not a real sensor.
     """
 
     counts: np.ndarray
@@ -41,10 +41,10 @@ class Examples:
 
 
 def from_recording(recording: Recording) -> Examples:
-    """A recording as 56 pieces in order of time: force, and the place of the contact, where it has them.
+    """A recording as 56 blocks in order of time, with force and contact position if it has them.
 
     Raises:
-      ValueError: no raw counts, or neither force nor contact place.
+      ValueError: no raw counts, or neither force nor contact position.
     """
     counts, _ = recording.counts()
     found = {"force": recording.force, "place": recording.contact_pos}
@@ -59,8 +59,8 @@ def from_recording(recording: Recording) -> Examples:
 
 
 def from_set(path: pathlib.Path | str) -> Examples:
-    """A data set: measured counts of labelled interactions, or, where none is labelled, simulated ones; the
-    first row of each is its tare. The force is that of the object on the skin, measured where it is known.
+    """A data set: measured counts of labelled interactions or, without labels, simulated ones. The first row
+    of each is its tare. The force is the object's on the skin, from a measurement if known.
 
     Raises:
       FileNotFoundError, ValueError: no set, or one without counts.
@@ -84,14 +84,14 @@ def from_set(path: pathlib.Path | str) -> Examples:
             force = data[known[0]][rows][:, :3].astype(float)
             for other in known[1:]:
                 force = np.where(np.isfinite(force), force, data[other][rows][:, :3])
-            targets["force"] = -force  # the store has that of the skin on the object
+            targets["force"] = -force  # the store has the skin's force on the object
         if "contact_pos" in data.columns:
             targets["place"] = data["contact_pos"][rows].astype(float)
         if not targets:
             raise ValueError(
                 f"{path} has neither forces nor contacts: make a set with `biotac data generate`"
             )
-        keep = good & (rows != first)  # a tare is no reading
+        keep = good & (rows != first)  # exclude tare rows
         now = counts[rows][:, : -len(SINGLES)].astype(float)
         pdc = SINGLES.index("pdc") - len(SINGLES)
         pressed = (counts[rows][:, pdc] - counts[first][:, pdc]).astype(float)[keep]

@@ -1,12 +1,12 @@
-"""Force from electrodes, causal: nothing later than the row that is predicted, and nothing of the test part,
-is ever used.
+"""Causal force estimation from electrodes: a prediction uses neither later rows nor the test rows.
 
-ln Z of the 19 electrodes, causal averages of it and products of its first principal components go into ridge
-regressions. The sensor's warm-up, which a recording cannot tell from slow creep, goes in as 1 - exp(-t /
-tau): with its own weight for each force component, or as one gain shared by all electrodes and removed from
-ln Z. Which of these, and how strong the ridge, is chosen for every component by walk- forward trials inside
-the training part. Beside them stand regressions without the mean over the electrodes, which warm-up moves,
-and on random waves. A small network then learns what the ridge leaves, where it helps in those trials."""
+ln Z of the 19 electrodes, its causal averages and products of its first principal components are features of
+ridge regressions. A recording cannot separate the sensor's warm-up from slow creep, so warm-up is a further
+feature 1 - exp(-t / tau): with a weight for each force component, or as one gain common to all electrodes
+that is removed from ln Z. Features and ridge are selected for each component by walk-forward validation
+inside the training rows. Further candidates are regressions without the mean over the electrodes, which
+warm-up changes, and on random Fourier features. A small network then learns the residual of the ridge, and is
+used if it helps in validation."""
 
 import dataclasses
 import itertools
@@ -21,30 +21,31 @@ from .terms import Terms
 
 __all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "shared_gain", "walk_forward"]
 
-_WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training part
-_PRODUCTS = (0, 3, 5)  # principal components whose products are features
+_WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training rows
+_PRODUCTS = (0, 3, 5)  # number of principal components whose products are features
 _RIDGE = (1e-5, 1e-4, 1e-3, 1e-2)
-_EXACT = 1e-9  # [N]: an error below is none, as of a component that does not change
+_EXACT = 1e-9  # [N]: smaller errors are zero, as for a constant component
 _WINDOWS = ((), (3, 10))  # time constants of the causal averages [rows]
-_WAVES = ((0.5, 1.0, 2.0), (1e-3, 1e-2, 1e-1))  # lengths and ridges of `Terms` with waves
+_WAVES = ((0.5, 1.0, 2.0), (1e-3, 1e-2, 1e-1))  # length scales and ridges of `Terms` with random features
 
 
 def causal_average(x: np.ndarray, tau: float) -> np.ndarray:
-    """Exponential average of x (n, k) over the past, time constant tau [rows]; it starts at the first row."""
+    """Exponential average of x (n, k) over the past with time constant tau [rows], starting at the first
+    row."""
     a = 1 - np.exp(-1 / tau)
     return lfilter([a], [1, a - 1], x, axis=0, zi=x[:1] * (1 - a))[0]
 
 
 def walk_forward(n: int, folds: int = 4, first: float = 0.4) -> list[tuple[slice, slice]]:
-    """(train, test) slices of 0..n-1: each test piece lies right after all the rows that train for it."""
-    # as scikit-learn's TimeSeriesSplit; slices of the rows, unlike its numbers of rows, copy nothing
+    """(train, test) slices of 0..n-1: each test block follows all the rows that train for it."""
+    # like scikit-learn's TimeSeriesSplit, but slices of rows copy nothing
     edge = np.rint(np.linspace(first, 1, folds + 1) * n).astype(int)
     return [(slice(0, int(a)), slice(int(a), int(b))) for a, b in zip(edge[:-1], edge[1:])]
 
 
 def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
-    """Amplitude a of the gain a (1 - exp(-t / tau)) that all electrodes have in common in ln Z besides what
-    the force explains.
+    """Amplitude a of the gain a (1 - exp(-t / tau)) common to all electrodes in ln Z, in addition to the
+    force's contribution.
 
     Args:
       log_z: (n, 19); force: (n, 3) [N]; tau: [rows].
@@ -98,7 +99,7 @@ def _candidates():
         yield _Candidate((), None, False, 0, strength, common=common, waves=waves)
 
 
-# groups of candidates that differ in their ridge alone: what `progress` of `fit_force` is called for
+# groups of candidates that differ only in their ridge: `fit_force` calls `progress` once per group
 TRIALS = len({dataclasses.replace(c, strength=0.0) for c in _candidates()})
 
 
@@ -114,8 +115,7 @@ def _kinds(candidates):
 
 
 def _features(log_z, force, part, candidate):
-    """All rows' features; what has to be fitted is fitted on the rows of `part`. tau is relative to the
-    length of `part`."""
+    """Features of all rows, fitted on the rows of `part`. tau is relative to the length of `part`."""
     n = len(log_z)
     rise = None
     if candidate.warm_up:
@@ -133,13 +133,13 @@ def _features(log_z, force, part, candidate):
 
 
 class ForceModel:
-    """Predicts force from the counts up to each row; made by `fit_force`.
+    """Predicts force from the counts up to each row; result of `fit_force`.
 
     Attributes:
-      chosen: for x, y, z, descriptions of the candidates whose weighted mean predicts.
-      trust: (3,) share of the ridge's departure from the mean that was kept, see `_trust`.
-      network: whether the network's correction was kept, for x, y, z.
-      trials: walk-forward RMSE [N] of the ridge and of ridge and network, each (3,).
+        chosen: for x, y, z, descriptions of the averaged candidates.
+        trust: (3,) retained fraction of the ridge's deviation from the mean, see `_trust`.
+        network: whether the network's correction is used, for x, y, z.
+        trials: walk-forward RMSE [N] of the ridge and of ridge plus network, each (3,).
     """
 
     def __init__(
@@ -166,7 +166,7 @@ def fit_force(
     """Fits on rows 0..ntrain-1 and predicts every row.
 
     Args:
-      counts: (n, 19); force: (n, 3) [N], of which only the first ntrain rows are read.
+        counts: (n, 19); force: (n, 3) [N], of which only the first ntrain rows are used.
 
     Returns:
       ForceModel whose `prediction` is (n, 3) [N].
@@ -205,7 +205,7 @@ def fit_force(
             correction = _network(log_z[: test.stop], force[train] - b[train], train, seed)
             old, new = (np.sqrt(((p[test] - force[test]) ** 2).mean(0)) for p in (b, b + correction))
             helped.append(new / np.maximum(old, _EXACT))
-        kept = (np.max(helped, axis=0) < 1).tolist()  # in both trials, or not at all
+        kept = (np.max(helped, axis=0) < 1).tolist()  # only if it helps in both trials
         trials["network_over_ridge"] = np.mean(helped, axis=0).tolist()
         if any(kept):
             correction = _network(log_z, force - prediction[:ntrain], slice(0, ntrain), seed)
@@ -215,8 +215,8 @@ def fit_force(
 
 
 def _trust(base, centre, force, folds):
-    """(3,) how much of each component's departure from the mean of what trained holds in the trials, in least
-    squares: 0 leaves the mean, 1 all of it."""
+    """(3,) least-squares factor on each component's deviation from the training mean in the trials: 0 is the
+    mean, 1 the full deviation."""
     found, true = (
         np.concatenate([(y - c)[test] for y, c, (_, test) in zip(ys, centre, folds)])
         for ys in (base, [force] * len(folds))
@@ -227,8 +227,8 @@ def _trust(base, centre, force, folds):
 def _best(candidates, error):
     """{candidate: weight} for one component of the force.
 
-    One of each degree of flexibility: their mean is steadier than any of them where something new comes. Each
-    counts as the inverse of its mean square in the trials; warm-up takes part where it helped there."""
+    One of each degree of flexibility, since their average generalises better than any of them. Weights are
+    inverse mean squares in the trials; candidates with warm-up are included if it helped."""
     winners = {kind: min(kin, key=error.get) for kind, kin in _kinds(candidates).items()}
     cold = {kind: error[c] for kind, c in winners.items() if not c.warm_up}
     kept = [
@@ -241,9 +241,9 @@ def _best(candidates, error):
 
 
 def _mean_of(best, log_z, force, part):
-    """(n, 3): weighted mean of each component's chosen candidates, fitted on the rows of `part`."""
+    """(n, 3): weighted mean of each component's candidates, fitted on the rows of `part`."""
     out = np.zeros((len(log_z), 3))
-    for c in dict.fromkeys(c for chosen in best for c in chosen):  # in an order that does not change
+    for c in dict.fromkeys(c for chosen in best for c in chosen):  # in a fixed order
         x = _features(log_z, force, part, c)
         w, b = ridge(x[part], force[part], c.strength)
         out += (x @ w + b) * [chosen.get(c, 0.0) for chosen in best]
@@ -251,8 +251,8 @@ def _mean_of(best, log_z, force, part):
 
 
 def _network(log_z, target, part, seed, members=6, epochs=8, width=64, batch=256):
-    """(n, 3): what small networks on ln Z make of `target` (rows of `part`); inputs are shaken, also by a
-    common gain, against drift."""
+    """(n, 3): mean prediction of `target` by small networks on ln Z, trained on the rows of `part`. Inputs
+    are augmented by noise and a common gain, for robustness to drift."""
     import torch
 
     from ..training.fitting import cycle

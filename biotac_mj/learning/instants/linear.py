@@ -1,4 +1,4 @@
-"""Principal components, and ridge regressions whose strength is chosen on whole groups left out."""
+"""Principal components, and ridge regression with its strength chosen by group cross-validation."""
 
 from collections.abc import Sequence
 
@@ -6,23 +6,23 @@ import numpy as np
 
 __all__ = ["best_ridge", "errors_left_out", "principal_components", "ridge", "ridges"]
 
-# scikit-learn is imported where something is fitted: it takes two seconds, and a saved model needs none of it
+# scikit-learn is imported only for fitting: it takes two seconds, and saved models do not need it
 
 
 def principal_components(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean (k,), axes (k, k) in columns, the largest first, and variances (k,) of rows x (n, k).
 
-    scikit-learn's PCA has no more axes than rows. Few rows, as the rests of a dozen touches, do not span all
-    channels, and novelty looks at what lies outside of their span."""
+    scikit-learn's PCA has at most as many axes as rows. Few rows, such as the rests of a dozen touches, do
+    not span all channels, and novelty is measured outside of their span."""
     mean = x.mean(0)
     variance, axes = np.linalg.eigh((x - mean).T @ (x - mean) / len(x))
     return mean, axes[:, ::-1].copy(), np.maximum(variance[::-1], 0)
 
 
 def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
-    |std(x) w|^2; x (n, k), y (n, m). The products of x, most of the work, are made once for all. Infinitely
-    strong, w is 0 and b the mean."""
+    """For each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
+    |std(x) w|^2; x (n, k), y (n, m). The Gram matrix of x, most of the work, is shared. For infinite
+    strength, w is 0 and b the mean."""
     from sklearn.linear_model import ridge_regression
     from sklearn.preprocessing import StandardScaler
 
@@ -38,21 +38,22 @@ def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tup
 
 
 def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """`ridges` of one strength."""
+    """`ridges` for one strength."""
     return ridges(x, y, [strength])[0]
 
 
 def errors_left_out(
     x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
 ) -> np.ndarray:
-    """(len(strengths), m) mean squares of the errors of `ridges` on groups that did not train.
+    """(len(strengths), m) mean squared errors of `ridges` on held-out groups.
 
     Args:
-      x: (n, k); y: (n, m). groups: (n,) of at least two kinds, which stay whole. folds: at most.
+      x: (n, k); y: (n, m). groups: (n,) at least two groups, which are not split. folds: at most.
     """
     from sklearn.model_selection import LeaveOneGroupOut
 
-    # in turn: groups are in order of time, and each fold should see the whole drift; GroupKFold goes by size
+    # cyclic folds: groups are in order of time, and each fold should cover the whole drift; GroupKFold sorts
+    # by size
     fold = np.unique(groups, return_inverse=True)[1] % folds
     error = np.zeros((len(strengths), y.shape[1]))
     for train, test in LeaveOneGroupOut().split(x, groups=fold):
@@ -64,8 +65,7 @@ def errors_left_out(
 def best_ridge(
     x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (k, m) and offset (m,), of each target by the strength with the smallest of
-    `errors_left_out`."""
+    """Weights (k, m) and offset (m,), with the strength that minimises `held_out_errors` for each target."""
     best = errors_left_out(x, y, groups, strengths, folds).argmin(0)
     fits, column = ridges(x, y, strengths), np.arange(y.shape[1])
     weights, offsets = (np.array(part) for part in zip(*fits))

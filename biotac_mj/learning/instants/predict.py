@@ -1,4 +1,4 @@
-"""`biotac learn predict`: a kept model on a recording, or on a data set's deformations."""
+"""`biotac learn predict`: runs a saved model on a recording, or on a data set's deformations."""
 
 import pathlib
 
@@ -19,7 +19,7 @@ __all__ = ["SUFFIXES", "predict", "save_forward_model", "write_prediction"]
 
 SUFFIXES = (".csv", ".h5", ".hdf5")
 _LEVEL = 0.9
-_KIND = "ensemble"  # what `biotac learn train` keeps
+_KIND = "ensemble"  # of models saved by `biotac learn train`
 
 
 def predict(
@@ -32,16 +32,17 @@ def predict(
     """Runs a model on all rows.
 
     Args:
-      model: that reads electrodes, or, of "forward" direction, a skin's deformation.
-      source: file of a recording; for a forward model a data set. recording, load: of `recordings.load_one`.
-      tare: first rows of a recording, whose mean is the sensor at rest.
+        model: reads electrodes, or, for direction "forward", a skin's deformation.
+        source: file of a recording; for a forward model a data set. recording, load: of
+          `recordings.load_one`.
+        tare: number of first rows of a recording whose mean is the sensor at rest.
 
     Returns:
-      columns that say which row it is ("time" [s], of a set "interaction"), Prediction, and the model's
-      description, with "notes" on the recording.
+        columns that identify the row ("time" [s], for a set "interaction"), Prediction, and the model's
+        description, with "notes" on the recording.
 
-    Raises:
-      FileNotFoundError, ValueError: no such file, a model that does not fit, or no tare where one is needed.
+      Raises:
+        FileNotFoundError, ValueError: no such file, a model that does not fit, or a missing tare.
     """
     meta = describe(model)
     if meta.get("direction") == "forward":
@@ -55,7 +56,7 @@ def predict(
             raise ValueError(f"--tare {tare}: {found.name} has {len(counts)} rows, some must be left")
         rest = counts[:tare].mean(0)
         if found.pdc is not None and np.isfinite(found.pdc).all():
-            pdc = found.pdc - found.pdc[:tare].mean()  # of any unit that counts counts
+            pdc = found.pdc - found.pdc[:tare].mean()  # tared or raw counts
     meta = reader.meta | {"notes": notes + assumed}
     return {"time": found.time}, reader.predict(counts, rest, pdc), meta
 
@@ -85,13 +86,13 @@ def _forward(model, source, meta):
 
 
 def _beyond(pod, u):
-    """(n,) RMS [mm] of what displacements (n, nvert, 3) [mm] have beyond a model's components."""
+    """(n,) RMS [mm] of the residual of displacements (n, nvert, 3) [mm] outside a model's components."""
     return (pod.decode(pod(u)) - u).square().mean((1, 2)).sqrt().numpy()
 
 
 def save_forward_model(folder: pathlib.Path | str, out: pathlib.Path | str) -> None:
-    """Writes the forward model of the trajectory split with intervals of 90 % from its validation part, by
-    interaction; `attach(signal=FILE)` takes it.
+    """Writes the forward model of the trajectory split, with 90 % intervals from its validation interactions;
+    `attach(signal=FILE)` takes it.
 
     Args:
       folder: of `biotac learn train`.
@@ -123,7 +124,7 @@ def save_forward_model(folder: pathlib.Path | str, out: pathlib.Path | str) -> N
 def write_prediction(
     path: pathlib.Path | str, where: dict[str, np.ndarray], found: Prediction, meta: dict
 ) -> None:
-    """A table (.csv: a column for each number and its half width) or arrays (.h5).
+    """Writes a table (.csv: a column for each number and its half width) or arrays (.h5).
 
     Raises:
       ValueError: another suffix.

@@ -1,5 +1,5 @@
-"""What the electrodes tell, instant by instant: force, contact place, and themselves through a code; each
-with an interval, and a score of how far a row is from what was trained on. Kept as one file."""
+"""Estimates force, contact position and, through a code, the electrodes from single rows, each with an
+interval, and a novelty score against the training rows. Saved as one file."""
 
 import dataclasses
 import functools
@@ -33,9 +33,9 @@ __all__ = [
 TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": ()}  # names of columns
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _CODE = 8
-_SPACES = ("rows", "level")  # of electrodes, of rests
-_FOLDS = 4  # of whole trajectories, to choose how strong a ridge is
-_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, np.inf)  # the last is the mean
+_SPACES = ("rows", "level")  # novelty of electrodes, and of baselines
+_FOLDS = 4  # of whole trajectories, for the choice of a ridge
+_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, np.inf)  # the last gives the mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Prediction:
     Attributes:
       value: target -> (n, k), of TARGETS: force [N], place [m], electrodes [counts]. half: target -> (n, k),
         half widths of the intervals.
-      novelty: (n,) 1 where one ordinary row in twenty is as strange, more where a row, or the tare that it
-        was read against, is stranger, or where an electrode does not move as the others say.
+        novelty: (n,) 1 at the 95 % quantile of ordinary rows; larger for a row or tare farther from the
+          training data, or if an electrode does not move as predicted by the others.
     """
 
     value: dict[str, np.ndarray]
@@ -56,11 +56,11 @@ class Prediction:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reader:
-    """A model; made by `fit_reader`, kept by `save`.
+    """A model; made by `fit_reader`, stored by `save`.
 
     Attributes:
-      meta: what it is: "tared" (whether ln Z is taken against a tare), "level" of the intervals, "source".
-      tensors: its numbers.
+      meta: description: "tared" (whether ln Z is relative to a tare), "level" of the intervals, "source".
+      tensors: its parameters.
     """
 
     meta: dict
@@ -68,26 +68,25 @@ class Reader:
 
     @property
     def targets(self) -> list[str]:
-        """Names of what it predicts, of TARGETS."""
+        """Names of its outputs, of TARGETS."""
         return [name for name in TARGETS if f"{name}.half" in self.tensors]
 
     @property
     def electrodes(self) -> tuple[str, ...]:
-        """Names of those that it reads."""
+        """Names of its electrodes."""
         return tuple(f"e{i + 1}" for i in range(len(self.tensors["mean"])))
 
     def predict(
         self, counts: np.ndarray, tare: np.ndarray | None = None, pdc: np.ndarray | None = None
     ) -> Prediction:
-        """Predictions of raw counts (n, nelectrode), each of its row alone; novelty takes rows to be in
-        order.
+        """Predictions for raw counts (n, nelectrode), each from its row only; novelty assumes rows in order.
 
         Args:
-          tare: (nelectrode,) or (n, nelectrode) counts at rest, of a model that is tared. pdc: (n,) change
-            of PDC from its rest [counts]; novelty, and nothing else, takes it where training had it.
+          tare: (nelectrode,) or (n, nelectrode) counts at rest, for a tared model. pdc: (n,) change of PDC
+            from rest [counts], only for novelty, if it was in the training data.
 
         Raises:
-          ValueError: no tare where one is needed, or another number of electrodes.
+            ValueError: a missing tare, or another number of electrodes.
         """
         n = len(self.electrodes)
         if np.shape(counts)[-1] != n:
@@ -106,7 +105,7 @@ class Reader:
             value[name] = counts_from_log_impedance(out + rest) if name == "electrodes" else out
             half[name] = self.tensors[f"{name}.half"] * _scale(strange)[:, None]
         novelty = strange
-        if self.meta["tared"]:  # ordinary rests say nothing, strange ones make every row strange
+        if self.meta["tared"]:  # an unusual baseline makes every row unusual
             level = self._known["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
             novelty = np.where(level > 1, np.maximum(level, strange), strange)
         stuck = self._moving(x)
@@ -139,7 +138,7 @@ class Reader:
         return {space: Known(*(self.tensors[f"{space}.{name}"] for name in names)) for space in spaces}
 
     def _strange(self, x, pdc):
-        """(n,) novelty of rows, whatever their rest."""
+        """(n,) novelty of rows, without that of their baseline."""
         seen = even(x - self.tensors["centre"])
         if pdc is None or "pressed.usual" not in self.tensors:
             return self._known["rows"](seen) / self.tensors["rows.usual"]
@@ -186,7 +185,7 @@ class Reader:
 
 
 def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type]) -> None:
-    """Raises ValueError where a model's description lacks the level of its intervals, or an entry of `also`,
+    """Raises ValueError if a model's description has no level of its intervals, or lacks an entry of `also`
     or has one of another type."""
     check_entries(f"the description of {path}", meta, {"level": float} | also)
     if not 0 < meta["level"] < 1:
@@ -197,17 +196,17 @@ def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type])
 
 
 def _scale(strange):
-    """Intervals widen with novelty; among ordinary rows they hardly differ."""
+    """Factor on intervals: it grows with novelty and hardly varies among ordinary rows."""
     return 1 + strange
 
 
 def fit_reader(
     data: Examples, train: np.ndarray, kept: np.ndarray, level: float = 0.9, seed: int = 0
 ) -> Reader:
-    """Fits to trajectories `train` and sizes the intervals on others, `kept` (numbers of `data.owner`).
+    """Fits to trajectories `train` and calibrates the intervals on others, `kept` (numbers of `data.owner`).
 
     Args:
-      level: of the intervals. seed: of the random waves and of the rows that are remembered.
+      level: of the intervals. seed: of the random features and the subsample of rows.
 
     Raises:
       ValueError: too few trajectories.
@@ -230,7 +229,7 @@ def fit_reader(
     usual = {"rows": np.quantile(known["rows"](seen[aside]), 0.95)}
     if pressed:
         usual["pressed"] = np.quantile(known["rows"](seen[aside], data.pdc[aside]), 0.95)
-    if data.tared:  # one rest of each trajectory
+    if data.tared:  # one baseline per trajectory
         first = np.isin(np.arange(len(x)), np.unique(data.owner, return_index=True)[1])
         rest = log_impedance(data.tare)
         known["level"] = Known.fit(rest[fit & first], data.owner[fit & first], seed=seed)
@@ -271,8 +270,8 @@ def fit_reader(
 
 
 def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
-    """A model of a set and how good it is: 72 % of the trajectories train, 18 % size the intervals, 10 % are
-    looked at once.
+    """A model of a set and its test errors: 72 % of the trajectories train, 18 % calibrate the intervals, 10
+    % test.
 
     Raises:
       ValueError: too few trajectories.
@@ -285,8 +284,8 @@ def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
 
 
 def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple[Reader, dict]:
-    """The same of a recording: the first rows train, the pieces after them size the intervals and show the
-    errors, which they had no part in; how often the intervals hold is not known from them."""
+    """`judge` for a recording: the first rows train; the blocks after them calibrate the intervals and give
+    the errors. The intervals' coverage is therefore unknown."""
     names = np.unique(data.owner)
     cut = int(fraction * len(names))
     reader = fit_reader(data, names[:cut], names[cut:], seed=seed)
@@ -297,7 +296,7 @@ def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple
 
 
 def _scores(reader, data, test, train):
-    """Errors on the trajectories `test`, beside those of the mean of `train`."""
+    """Errors on the trajectories `test`, and those of the mean of `train`."""
     known = np.isin(data.owner, train)
     rows = np.isin(data.owner, test)
     found = reader.predict(data.counts[rows], data.tare[rows], None if data.pdc is None else data.pdc[rows])

@@ -1,5 +1,5 @@
-"""`biotac learn judge` of a recording: reconstruction and force on a real recording, first 70 % of the time
-against the last 30 %."""
+"""`biotac learn judge` of a recording: reconstruction and force on a real recording, trained on the first 70
+% of the time, tested on the last 30 %."""
 
 import json
 import pathlib
@@ -17,11 +17,11 @@ from .transfer import TOUCHES, label, touches_of_force, transfer_force
 __all__ = ["evaluate_recording"]
 
 _CODE = 8
-_BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # steps: at least, at most
+_BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # fewest and most steps
 _KL = 1e-4
-# of ln Z: how much the common gain is shaken in training, as large as the drift of a few minutes of warm-up
+# of ln Z: augmentation by a common gain, as large as the drift of a few minutes of warm-up
 _GAIN = 0.05
-_SHORTEST = 400  # rows: fewer leave too little for a time split with walk-forward choices
+_SHORTEST = 400  # rows: fewer are too few for a split in time with walk-forward selection
 
 
 def evaluate_recording(
@@ -34,22 +34,22 @@ def evaluate_recording(
     known: Recording | None = None,
     touches: int = TOUCHES,
 ) -> dict:
-    """Evaluates one recording; writes `out` (JSON, described in docs/lab/learning.md) and a plot beside it.
+    """Evaluates one recording; writes `out` (JSON, described in docs/lab/learning.md) and a plot next to it.
 
     Args:
-      recording: without force only the reconstruction is judged.
-      fraction: of the rows, in time, that train; everything is fitted on them alone.
-      seed: of the networks.
-      network: False leaves the networks out (seconds, for tests): PCA and ridge only.
-      known: another sensor with force: what it teaches, amended by so many `touches` of this one's first
-        part, is judged beside what this one's whole first part teaches.
+        recording: without force only the reconstruction is evaluated.
+        fraction: of the rows, in time, for training; everything is fitted on them only.
+        seed: of the networks.
+        network: False: PCA and ridge only (seconds, for tests).
+        known: another sensor with force: its transfer, adapted with `touches` of this sensor's training rows,
+          is compared with a model of all these rows.
 
     Returns:
-      what is written.
+        the written content.
 
-    Raises:
-      ValueError: electrodes that cannot be made raw counts, too few rows, electrodes or a force that never
-        change.
+      Raises:
+        ValueError: electrodes that cannot be converted to raw counts, too few rows, constant electrodes or
+          force.
     """
     from tqdm import tqdm
 
@@ -60,7 +60,7 @@ def evaluate_recording(
             f"{known.name} and {recording.name}: both need forces; give them at `biotac recording import`"
         )
     if known is not None:
-        _usable(known)  # refused before the work
+        _usable(known)  # fail before the work
     if not 0.2 <= fraction <= 0.95:
         raise ValueError(f"fraction {fraction} leaves too little on one side: take 0.2 to 0.95, as 0.7")
     n = len(counts)
@@ -87,7 +87,7 @@ def evaluate_recording(
     }
     predicted = None
     if recording.force is not None:
-        # a bar of its own: a step of the networks is no measure of how long a trial takes
+        # separate progress bar: steps of networks and trials take different times
         with tqdm(total=TRIALS, desc="evaluate: force", disable=not progress or None, leave=False) as bar:
             result["force_regression"], predicted = _force(
                 counts, recording.force, ntrain, seed, network, bar
@@ -112,7 +112,7 @@ def evaluate_recording(
 
 
 def _usable(recording):
-    """(recording, (n, 19) counts, notes): rows that have what is judged."""
+    """(recording, (n, 19) counts, notes): the rows with all evaluated quantities."""
     notes = []
     if recording.force is not None:
         there = np.isfinite(recording.force).all(1)
@@ -160,8 +160,8 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
         name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])}
         for name, y in rows.items()
     }
-    # White noise of a channel shows in differences of neighbouring rows; slow rows of a moving press make
-    # this an upper bound.
+    # Differences of neighbouring rows contain a channel's white noise and the slow motion of a press: an
+    # upper bound.
     noise = np.diff(counts[ntrain:], axis=0)
     noise = 1.4826 * np.median(np.abs(noise - np.median(noise, axis=0)), axis=0) / np.sqrt(2)
     best = min(
@@ -177,18 +177,18 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
 
 
 def _through_code(counts, ntrain, vae, seed, steps, bar):
-    """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows in so many steps.
+    """(n, 19) counts through a code of 8; the network is trained on the first ntrain rows for so many steps.
 
-    vae: the paper's, on counts. Otherwise the code is no sample, and ln Z goes in and comes out, where
-    warm-up is a straight line, beginning as principal components; its error is that of the counts."""
+    vae: the paper's, on counts. Otherwise an autoencoder without sampling on ln Z, in which warm-up is a
+    straight line, initialised as principal components; its loss is on counts."""
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
     from ..training.fitting import Watch, cycle
 
     torch.manual_seed(seed)
-    size = counts[:ntrain].std()  # one scale for all: an error counts alike in every channel
-    steep = -counts * (1 - counts / FULL_SCALE) / size  # what a common change of ln Z does to counts
+    size = counts[:ntrain].std()  # one scale for all channels: errors weigh equally
+    steep = -counts * (1 - counts / FULL_SCALE) / size  # change of counts with a common change of ln Z
     tensor = lambda value: torch.tensor(value, dtype=torch.float32)  # noqa: E731
     if vae:
         net, x, common = ElectrodeVAE(), tensor((counts - counts[:ntrain].mean(0)) / size), tensor(steep)
@@ -253,7 +253,7 @@ def _transferred(known, counts, force, ntrain, touches):
 
 
 def _errors(predicted, truth):
-    """RMSE [N] and R2 on the unseen rows; R2 is null of a component that does not change there."""
+    """RMSE [N] and R2 on the test rows; R2 is null for a component that is constant there."""
     square = ((predicted - truth) ** 2).mean(0)
     r2 = 1 - square / np.maximum(truth.var(0), 1e-12)
     changes = np.ptp(truth, axis=0) > 0
@@ -264,7 +264,7 @@ def _errors(predicted, truth):
 
 
 def _unjudged(models, force, ntrain):
-    """Notes on components of the force that do not change; one that never does has no error (None)."""
+    """Notes on constant components of the force; one that is constant everywhere has no error (None)."""
     notes = []
     for k, axis in enumerate("xyz"):
         changes = [bool(np.ptp(part[:, k])) for part in (force, force[:ntrain], force[ntrain:])]
@@ -281,7 +281,7 @@ def _unjudged(models, force, ntrain):
 
 
 def _useless(models):
-    """A note where the model is no better than the mean."""
+    """A note if the model is no better than the mean."""
     own, mean = models["drift_aware"]["rmse"], models["predict_mean"]["rmse"]
     axes = [f"F{axis}" for axis, a, b in zip("xyz", own, mean) if a is not None and a >= b]
     if not axes:

@@ -1,4 +1,4 @@
-"""Terms of a regression on ln Z of the electrodes, instant by instant: what can be kept in a file."""
+"""Features of a regression on ln Z of the electrodes, row by row, that can be saved in a file."""
 
 import dataclasses
 
@@ -8,8 +8,8 @@ from .linear import principal_components
 
 __all__ = ["KINDS", "Terms"]
 
-_WAVES = 200  # random waves: more changed nothing on two recordings
-# arguments of `Terms.fit`; predictions are the mean over these: none alone is safe where something new comes
+_WAVES = 200  # random Fourier features: more changed nothing on two recordings
+# arguments of `Terms.fit`; predictions are the mean over these, since none is reliable on new data
 KINDS = [
     {"common": common, **more}
     for common in (False, True)
@@ -19,14 +19,13 @@ KINDS = [
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Terms:
-    """ln Z (n, 19), products of its first components, and random waves over them (the features of a Gaussian
+    """Features: ln Z (n, 19), products of its first components, and random Fourier features (of a Gaussian
     kernel).
 
     Attributes:
-      common: 1.0 takes the mean over the electrodes out first: warm-up changes all of them alike.
-      mean (nelectrode,), axes (nelectrode, k): of the components that products are made of, within low and
-      high (k,).
-      wave: (nelectrode, m) of the waves, over all components.
+      common: 1.0 subtracts the mean over the electrodes, which warm-up changes.
+      mean (nelectrode,), axes (nelectrode, k): of the components in products, clipped to low and high (k,).
+      wave: (nelectrode, m) frequencies, over all components.
     """
 
     common: np.ndarray
@@ -43,8 +42,9 @@ class Terms:
         """Fits to rows (n, nelectrode).
 
         Args:
-          products: components whose products are terms. common: without the mean over the electrodes.
-          length: of the waves, in median distances between rows; 0: no waves. seed: of the waves.
+            products: number of components with products. common: without the mean over the electrodes.
+              length: scale of the random features, in median distances between rows; 0: none. seed: of the
+                random features.
         """
         x = log_z - log_z.mean(1, keepdims=True) if common else log_z
         mean, axes, _ = principal_components(x)
@@ -61,7 +61,7 @@ class Terms:
         """(n, terms) of rows (n, nelectrode)."""
         x = log_z - self.common * log_z.mean(1, keepdims=True)
         columns = [x]
-        if self.axes.shape[1]:  # products must not run away beyond what was seen
+        if self.axes.shape[1]:  # products must not extrapolate
             main = np.clip((x - self.mean) @ self.axes, self.low, self.high)
             i, j = np.triu_indices(main.shape[1])
             columns.append(main[:, i] * main[:, j])

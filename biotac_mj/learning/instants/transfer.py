@@ -1,5 +1,4 @@
-"""Force of a sensor of which few touches are labelled, with another sensor's recording as what is believed
-before."""
+"""Force of a sensor with few labelled touches, with another sensor's recording as a prior."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -12,29 +11,30 @@ from .terms import KINDS, Terms
 
 __all__ = ["TOUCHES", "label", "touches_of_force", "transfer_force"]
 
-TOUCHES = 20  # that are labelled of a new sensor
-_SMOOTH, _RELEASE = 10, 0.5  # [rows], [N]: a touch ends where the force, smoothed, has fallen by this much
+TOUCHES = 20  # labelled touches of a new sensor
+_SMOOTH, _RELEASE = 10, 0.5  # [rows], [N]: a touch ends when the smoothed force has fallen by this much
 _WINDOW = 10  # time constant of the causal average [rows]
 _KNOWN_RIDGE = 1e-3  # of the other sensor's regressions
-_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of what the new one is believed to differ by
+_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the new sensor's difference
 _FOLDS = 5
 
 
 def touches_of_force(force: np.ndarray) -> np.ndarray:
-    """(n,) number of the touch that each row of force (n, 3) [N] belongs to: from one minimum of its size to
-    the next, so that a press that is never quite released is many touches."""
+    """(n,) number of the touch of each row of force (n, 3) [N], between minima of its size, so that a press
+    without full release is split into touches."""
     size = gaussian_filter1d(np.linalg.norm(force, axis=1), _SMOOTH)
     lowest, _ = find_peaks(-size, prominence=_RELEASE)
     return np.searchsorted(lowest, np.arange(len(force)), "right")
 
 
 def label(force: np.ndarray, touch: np.ndarray, count: int = TOUCHES) -> np.ndarray:
-    """Force (n, 3) with NaN but in so many whole touches, spread over the time; touch: (n,) of each row.
+    """Force (n, 3), NaN except in `count` whole touches, evenly spread over the time; touch: (n,) of each
+    row.
 
     Raises:
-      ValueError: too few touches to learn from.
+      ValueError: too few touches.
     """
-    whole = np.unique(touch)[:-1]  # the last one may be cut
+    whole = np.unique(touch)[:-1]  # the last one may be incomplete
     count = min(count, len(whole))
     if count < _FOLDS:
         raise ValueError(
@@ -52,17 +52,17 @@ def transfer_force(
     force: np.ndarray,
     touch: np.ndarray,
 ) -> np.ndarray:
-    """(n, 3) [N], the force of every row of a new sensor.
+    """(n, 3) [N], force of a new sensor in every row.
 
-    Every kind of regression is fitted to the known sensor; the new one's labels say, for each component,
-    whether that is where to begin, and what to add: a ridge on what is left. Touches left out choose, and
-    weigh the kinds. Each sensor's ln Z is taken from its mean: rests differ.
+    Each kind of regression is fitted to the known sensor. Labelled touches of the new sensor decide, per
+    component, whether it is the starting point, and fit a ridge to the residual. Held-out touches select and
+    weigh the kinds. Each sensor's ln Z is centred, because baselines differ.
 
     Args:
       known_counts: (m, nelectrode), known_force: (m, 3) [N], of the other sensor.
-      counts: (n, nelectrode) of the new one; its rows up to the last that is labelled say where its mean is.
-      force: (n, 3) [N], NaN where it is not known. touch: number of each row's touch, at least up to the
-        last that is labelled.
+      counts: (n, nelectrode) of the new one; rows up to the last labelled one give its mean.
+      force: (n, 3) [N], NaN if unknown. touch: number of each row's touch, at least up to the last labelled
+        row.
     """
     rows = np.flatnonzero(np.isfinite(force).all(1))
     from_known, log_z = log_impedance(known_counts), log_impedance(counts)
@@ -84,7 +84,7 @@ def _columns(terms, log_z):
 
 
 def _amended(columns, believed, force, rows, touch):
-    """Prediction of all rows (n, 3), and its mean square on touches left out (3,)."""
+    """Prediction for all rows (n, 3), and its mean square on held-out touches (3,)."""
     starts = (np.zeros_like(believed), believed)
     left = [force - start[rows] for start in starts]
     error = np.concatenate([errors_left_out(columns[rows], y, touch, _RIDGE, _FOLDS) for y in left])

@@ -1,1 +1,1 @@
-"""The networks: VAEs of skin and electrodes, PointNet++, heads on features of the skin."""
+"""Networks: VAEs of skin and electrodes, PointNet++, heads on features of the skin."""

@@ -1,5 +1,5 @@
-"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored, and a variant that starts as
-principal components."""
+"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored, and a variant initialised
+with principal components."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ __all__ = ["ElectrodeVAE", "mlp"]
 
 
 def mlp(widths: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
-    """Fully connected layers with ELU between them (none after the last); dropout after each hidden layer."""
+    """Fully connected layers with ELU between them (not after the last); dropout after each hidden layer."""
     layers = []
     for i, (a, b) in enumerate(zip(widths, widths[1:])):
         layers.append(nn.Linear(a, b))
@@ -24,14 +24,14 @@ def mlp(widths: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
 
 
 class ElectrodeVAE(nn.Module):
-    """Code of the 19 electrodes. "64, 8" of the paper is read as a hidden layer of 64 and heads of 8 for mean
+    """Code of the 19 electrodes. The paper's "64, 8" is read as a hidden layer of 64 and heads of 8 for mean
     and log variance.
 
     Args:
       channels: 19. hidden: widths of the encoder. latent: size of the code.
-      linear: the variant: (latent, channels) orthonormal rows, principal components of the inputs. The code
-        is then the components plus what the network adds, and so is the decoder, so training starts near
-        PCA's error. None is the paper's network.
+      linear: for the variant: (latent, channels) orthonormal rows, principal components of the inputs. Code
+        and decoder are then the components plus a correction by the network, so training starts near PCA's
+        error. None: the paper's network.
     """
 
     def __init__(

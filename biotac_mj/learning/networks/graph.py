@@ -1,4 +1,4 @@
-"""Chebyshev graph convolutions and level changes on torch's sparse matrices."""
+"""Chebyshev graph convolutions and changes of level with torch's sparse matrices."""
 
 import math
 import warnings
@@ -13,8 +13,7 @@ __all__ = ["ChebConv", "SparseMatrix", "sparse_product"]
 
 
 class _Product(torch.autograd.Function):
-    """matrix (n, m) @ x (m, c), with the transpose given, so that the gradient is a product of the same
-    kind."""
+    """matrix (n, m) @ x (m, c) with a given transpose, so that the gradient is a sparse product too."""
 
     @staticmethod
     def forward(ctx, x, matrix, transpose):
@@ -28,7 +27,7 @@ class _Product(torch.autograd.Function):
 
 
 class SparseMatrix(nn.Module):
-    """A constant sparse matrix that moves with its module; not among the parameters or the saved weights: it
+    """A constant sparse matrix that moves with its module. It is neither a parameter nor saved, since it
     follows from the mesh."""
 
     def __init__(self, matrix: spmatrix, symmetric: bool = False):
@@ -62,7 +61,7 @@ class SparseMatrix(nn.Module):
 
 
 def sparse_product(pair: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """matrix @ x for pair = (matrix, its transpose), x (m, ...); the leading axis is the graph's."""
+    """matrix @ x for pair = (matrix, its transpose), x (m, ...); the first axis is that of the graph."""
     flat = x.reshape(x.shape[0], -1)
     return _Product.apply(flat, *pair).reshape(-1, *x.shape[1:])
 
@@ -71,16 +70,17 @@ class ChebConv(nn.Module):
     """y = sum over k < K of T_k(L) x W_k + b on a graph; L the scaled Laplacian, T_k Chebyshev polynomials
     (Defferrard et al., 2016).
 
-    On the CPU the recurrence runs on whichever is narrower, inputs or outputs (Clenshaw's scheme for the
-    latter): the sparse products are what costs. On a GPU, where the graph becomes coarser or finer, all T_k
-    stand as one dense matrix, cut to the nodes that are wanted: one product instead of K - 1 sparse ones,
-    which take five times as long there.
+    On the CPU the recurrence runs on the narrower of inputs and outputs (Clenshaw's scheme for the latter),
+    since the sparse products dominate. On a GPU, where the graph becomes coarser or finer, all T_k form one
+    dense matrix, cut to the wanted nodes: one product instead of K - 1 sparse ones, which take five times as
+    long there.
 
     Args:
       laplacian: SparseMatrix, symmetric. inputs, outputs: channels. order: K. bias: COMA's last layer has
         none.
-      keep: (m,) nodes at which the result is wanted; None: all.
-      up: SparseMatrix (n, m) that brings the input from a coarser graph; None: it is given on this one.
+      keep: (m,) nodes of the result; None: all.
+      up: SparseMatrix (n, m) that interpolates the input from a coarser graph; None: the input is on this
+        one.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class ChebConv(nn.Module):
         return y if self.bias is None else y + self.bias
 
     def dense(self, x: torch.Tensor) -> torch.Tensor:
-        """The same, less the bias, by the dense matrices."""
+        """The result without the bias, by the dense matrices."""
         order, inputs, outputs = self.weight.shape
         matrix = self._matrix(x)
         if self.up is None:  # (K m, n)

@@ -1,4 +1,4 @@
-"""Networks from features of the deformed skin to d ln Z of the electrodes, all of them exactly zero for a
+"""Networks from features of the deformed skin to d ln Z of the electrodes; their output is exactly zero for a
 skin at rest."""
 
 import torch
@@ -11,10 +11,10 @@ __all__ = ["FromRest", "LocalHead", "PodHead", "averages", "next_average", "stea
 
 
 class FromRest(nn.Module):
-    """A network's output less that for zero, the skin at rest.
+    """A network's output minus that for zero input, the skin at rest.
 
     Args:
-      net: module. work: method of it that is called; by default the module itself.
+      net: module. work: method to call; default: the module itself.
     """
 
     def __init__(self, net: nn.Module, work: str = "__call__"):
@@ -43,7 +43,7 @@ class PodHead(nn.Module):
       modes: components. width: of the two hidden layers. dropout: behind each.
 
     Attributes:
-      damp: (modes,) factors of the components: of unit variance all, the last ones are mostly noise.
+        damp: (modes,) factors on the components: at unit variance, the last ones would be mostly noise.
     """
 
     def __init__(self, modes: int, width: int = 128, dropout: float = 0.1):
@@ -57,13 +57,13 @@ class PodHead(nn.Module):
 
 
 class LocalHead(nn.Module):
-    """One head for all electrodes on what lies over each, a linear part for each electrode, and a small
-    residual that sees the whole mesh.
+    """One head for all electrodes on the features over each, a linear layer for each electrode, and a small
+    residual on the whole mesh.
 
-    The head has 19 times the data that a head for each would have, and has no way to recognise an indenter.
+    The shared head has 19 times the data of separate heads, and cannot recognise an indenter.
 
     Args:
-      features: per electrode. modes: components of the mesh that the residual sees. width: of its layers.
+      features: per electrode. modes: components of the mesh for the residual. width: of its layers.
     """
 
     def __init__(self, features: int, modes: int, width: int = 128, dropout: float = 0.1):
@@ -97,7 +97,7 @@ def _plain(net, x):
 
 
 def steady(net: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
-    """The network without its dropout: what a head gives at rest must not shake while it is trained."""
+    """The network without dropout: a head's output at rest must not be random in training."""
     for layer in net:
         x = x if isinstance(layer, nn.Dropout) else layer(x)
     return x
@@ -109,7 +109,7 @@ def next_average(
     """Causal exponential average after one more step of dt [s]; time constants tau, a tuple [s].
 
     Args:
-      average: (len(tau), ...) before; value: (...) now. dt: float, or a tensor that fits value.
+      average: (len(tau), ...) before; value: (...) now. dt: float, or a tensor that broadcasts with value.
     """
     return torch.stack(
         [
@@ -123,10 +123,10 @@ def averages(
     value: torch.Tensor, first: torch.Tensor, time: torch.Tensor, tau: tuple[float, ...]
 ) -> torch.Tensor:
     """(n, ..., len(tau) * k) of values (n, ..., k) at rows of many interactions: value minus its causal
-    averages, which begin at zero.
+    averages, which start at zero.
 
     Args:
-      first: (n,) row of each row's interaction's start. time: (n,) [s] within it. tau: time constants [s].
+      first: (n,) first row of each row's interaction. time: (n,) [s] within it. tau: time constants [s].
     """
     position = torch.arange(len(value), device=value.device) - first
     out = []

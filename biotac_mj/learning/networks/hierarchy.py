@@ -1,10 +1,10 @@
-"""Coarser and coarser graphs of a tetrahedral mesh, with the matrices that take a field down and up.
+"""Hierarchy of coarser graphs of a tetrahedral mesh, with the matrices that restrict and interpolate fields.
 
-Nodes of a level are chosen by farthest-point sampling in geodesic distance along the edges, which keeps the
-two faces of the thin skin apart; the coarse graph is the dual of their Voronoi cells. Down is the selection
-of those nodes. Up is affine-exact moving least squares over the nearest kept nodes: fields that are linear in
-space pass unchanged. (Quadric simplification, as COMA uses it, measures a surface's flatness and has no
-meaning inside a volume.)
+Nodes of a level are chosen by farthest-point sampling in geodesic distance along the edges, which separates
+the two faces of the thin skin. The coarse graph is the dual of their Voronoi cells. Restriction selects those
+nodes. Interpolation is by affine-exact moving least squares over the nearest kept nodes, so that linear
+fields are exact. (COMA's quadric simplification measures a surface's flatness and has no meaning inside a
+volume.)
 """
 
 import dataclasses
@@ -21,12 +21,12 @@ _NEIGHBOURS = 8
 
 @dataclasses.dataclass(frozen=True)
 class Level:
-    """One graph and the way to the next coarser one.
+    """One graph, and the matrices to and from the next coarser one.
 
     Attributes:
       laplacian: (n, n) CSR, symmetric, eigenvalues in [-1, 1].
-      keep: (m,) nodes of this level that the next one has; None at the last.
-      up: (n, m) CSR from the next level's fields to this one's; rows add up to one; None at the last.
+        keep: (m,) nodes of this level in the next one; None at the last.
+        up: (n, m) CSR from the next level's fields to this one's; rows sum to one; None at the last.
     """
 
     laplacian: csr_matrix
@@ -41,8 +41,8 @@ def edges_of(elem: np.ndarray) -> np.ndarray:
 
 
 def scaled_laplacian(adjacency: csr_matrix) -> csr_matrix:
-    """L - 1, the argument of the Chebyshev polynomials: L = 1 - D^-1/2 A D^-1/2, and 2 is taken as its
-    largest eigenvalue."""
+    """L - 1, the argument of the Chebyshev polynomials, with L = 1 - D^-1/2 A D^-1/2 and an assumed largest
+    eigenvalue of 2."""
     degree = np.asarray(adjacency.sum(1)).ravel()
     inverse = 1 / np.sqrt(np.maximum(degree, 1e-12))
     scaled = adjacency.multiply(inverse[:, None]).multiply(inverse[None]).tocsr()
@@ -52,14 +52,14 @@ def scaled_laplacian(adjacency: csr_matrix) -> csr_matrix:
 def build_hierarchy(
     vert: np.ndarray, elem: np.ndarray, factors: Sequence[float] = (4, 4, 4, 2)
 ) -> list[Level]:
-    """Levels of a mesh, the finest first; len(factors) + 1 of them.
+    """Levels of a mesh, the finest first, len(factors) + 1 of them.
 
     Args:
       vert: (n, 3); elem: (m, 4).
-      factors: how many times fewer nodes each next level has.
+        factors: ratio of the numbers of nodes of successive levels.
 
     Raises:
-      ValueError: a mesh of several pieces, or too few nodes for the factors.
+        ValueError: a disconnected mesh, or too few nodes for the factors.
     """
     vert = np.asarray(vert, float)
     n = len(vert)
@@ -97,14 +97,13 @@ def _binary(graph):
 
 
 def _farthest(graph, count):
-    """Nodes (count,) chosen one after another, each the farthest from those before, and of all nodes the
-    nearest chosen one."""
+    """Nodes (count,) of a farthest-point sampling, and the nearest sampled node of each node."""
     nearest = np.full(graph.shape[0], np.inf)
     owner = np.zeros(graph.shape[0], int)
     keep, new = [], 0
     for k in range(count):
         keep.append(new)
-        # farther than this no node can become nearer to the new one
+        # nodes farther than this cannot get closer to the new one
         reach = nearest.max() if k else np.inf
         d = dijkstra(graph, indices=new, limit=reach)
         closer = d < nearest
@@ -121,7 +120,7 @@ def _dual(graph, owner, vert):
 
 
 def _interpolation(graph, vert, keep):
-    """(n, m) weights of moving least squares on the nearest kept nodes; identity at the kept ones."""
+    """(n, m) weights of moving least squares on the nearest kept nodes; identity at kept ones."""
     n, m = len(vert), len(keep)
     k = min(_NEIGHBOURS, m)
     distance = dijkstra(graph, indices=keep)  # (m, n)
@@ -131,8 +130,8 @@ def _interpolation(graph, vert, keep):
     offset = vert[keep[near]] - vert[:, None]  # (n, k, 3)
     scale = np.sqrt((offset**2).sum(2).mean(1))[:, None, None]
     p = np.concatenate([np.ones((n, k, 1)), offset / scale], axis=2)
-    # Minimise sum |c|^2 / w subject to P^T c = e1: c = W P (P^T W P)^-1 e1. The small ridge acts where the
-    # neighbours lie in a plane.
+    # Minimise sum |c|^2 / w subject to P^T c = e1: c = W P (P^T W P)^-1 e1. The small ridge matters for
+    # coplanar neighbours.
     gram = np.einsum("nka,nk,nkb->nab", p, weight, p)
     ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.diag([0.0, 1, 1, 1])
     c = np.linalg.solve(gram + ridge, np.broadcast_to(np.eye(4)[0], (n, 4))[..., None])[..., 0]

@@ -1,5 +1,5 @@
-"""The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, down to a
-code of 128."""
+"""The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, with a code
+of 128."""
 
 import typing
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ __all__ = ["MeshVAE"]
 class MeshVAE(nn.Module):
     """Code of a displacement field.
 
-    Encoder: convolution to `channels[0]` ("conv 128"), then for every factor a convolution and a selection of
-    nodes, a last convolution, fully connected layers to mean and log variance. The decoder mirrors it,
-    interpolating up before each convolution.
+    Encoder: convolution to `channels[0]` ("conv 128"), a convolution and a selection of nodes for each
+    factor, a last convolution, fully connected layers to mean and log variance. The decoder mirrors it, with
+    interpolation before each convolution.
 
     Args:
-      levels: of `build_hierarchy`, one more than there are entries in `channels`.
+      levels: of `build_hierarchy`, one more than entries in `channels`.
       first: channels of the first convolution. channels: of those before each downsampling. last: of the one
-        behind them.
+        after them.
       hidden: width of the fully connected layer. latent: size of the code. order: K of the convolutions.
     """
 

@@ -1,7 +1,7 @@
 """PointNet++ on 128 nodes of the skin: the fully supervised baseline of Narang et al. (ICRA 2021).
 
-The points keep their neighbours (the skin bends by a few millimetres, no more), so sampling and grouping are
-done once on the rest shape (Qi et al., 2017, choose them for every cloud)."""
+The points' neighbours are constant (the skin bends by a few millimetres), so sampling and grouping are done
+once on the rest shape (Qi et al., 2017, repeat them for every cloud)."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ __all__ = ["PointNet", "farthest_points"]
 
 
 def farthest_points(point: np.ndarray, count: int) -> np.ndarray:
-    """(count,) of points (n, 3), each the farthest from those before; the first is 0."""
+    """(count,) indices of a farthest-point sampling of points (n, 3) that starts at 0."""
     keep = [0]
     nearest = np.linalg.norm(point - point[0], axis=1)
     for _ in range(count - 1):

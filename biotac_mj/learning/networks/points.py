@@ -1,7 +1,8 @@
-"""Fixed points of a BioTac's skin, at which networks read the displacements of any mesh of it.
+"""Fixed points of a BioTac's skin, at which networks read the displacements of any mesh.
 
-The points are nodes of a reference skin, chosen by geodesic farthest points. A mesh's displacements come to
-them by the shape functions of its tetrahedra, and go from them to its nodes by way of the reference skin."""
+The points are nodes of a reference skin, chosen by geodesic farthest-point sampling. A mesh's displacements
+are interpolated to them by the shape functions of its tetrahedra, and from them to its nodes through the
+reference skin."""
 
 import dataclasses
 import typing
@@ -18,12 +19,12 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["SkinPoints", "shape_values"]
 
-_OFF = 0.5e-3  # [m] half the thickness of the skin: farther away the points lie in another skin, or in none
+_OFF = 0.5e-3  # [m] half the thickness of the skin: at a larger distance the points belong to another skin
 
 
 def shape_values(vert: np.ndarray, tets: np.ndarray, target: np.ndarray) -> csr_matrix:
     """(n, nvert) CSR: values of a nodal field at targets (n, 3), by the shape functions of the tetrahedra
-    (nelem, 4) there; outside of them those of a near one, clipped."""
+    (nelem, 4); for targets outside of them by clipped ones of a near tetrahedron."""
     corner = vert[tets]
     inverse = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
     near = cKDTree(corner.mean(1)).query(target, min(24, len(tets)))[1]  # (n, k)
@@ -39,7 +40,7 @@ def shape_values(vert: np.ndarray, tets: np.ndarray, target: np.ndarray) -> csr_
 
 @dataclasses.dataclass(frozen=True)
 class SkinPoints:
-    """Points, their graph, and the way to and from them.
+    """Points, their graph, and the interpolation to and from them.
 
     Attributes:
       place: (n, 3) at rest [m].
@@ -55,7 +56,7 @@ class SkinPoints:
 
     @classmethod
     def choose(cls, count: int, factors: Sequence[float], reference: str = "coarse") -> "SkinPoints":
-        """Chooses `count` nodes of a reference skin; factors: of `build_hierarchy` from the points on."""
+        """Samples `count` nodes of a reference skin; factors: of `build_hierarchy` from the points on."""
         from ...geometry import load_skin
 
         skin = load_skin(reference)
@@ -63,10 +64,10 @@ class SkinPoints:
         return cls(skin.vert[whole.keep], levels, whole.up, reference)
 
     def reading(self, geometry: "SkinGeometry") -> csr_matrix:
-        """(n, nvert) CSR: values at the points from those at the nodes of a skin.
+        """(n, nvert) CSR: interpolation from the nodes of a skin to the points.
 
         Raises:
-          ValueError: the points do not lie in that skin.
+            ValueError: the points are not in that skin.
         """
         out = shape_values(geometry.vert, geometry.tets, self.place)
         off = np.linalg.norm(out @ geometry.vert - self.place, axis=1)
@@ -79,14 +80,14 @@ class SkinPoints:
         return out
 
     def spreading(self, geometry: "SkinGeometry") -> csr_matrix:
-        """(nvert, n) CSR: values at the nodes of a skin from those at the points."""
+        """(nvert, n) CSR: interpolation from the points to the nodes of a skin."""
         from ...geometry import load_skin
 
         skin = load_skin(self.reference)
         return csr_matrix(shape_values(skin.vert, skin.tets, geometry.vert) @ self.spread)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What a file of weights keeps, for `of_arrays`."""
+        """Arrays for a file of weights, inverse of `of_arrays`."""
         out = {"place": self.place, **_taken_apart("spread", self.spread)}
         for k, level in enumerate(self.levels):
             out |= _taken_apart(f"laplacian{k}", level.laplacian)
@@ -96,7 +97,7 @@ class SkinPoints:
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], reference: str) -> "SkinPoints":
-        """The points that `arrays` describes."""
+        """The points that `arrays` describe."""
         levels = []
         while f"laplacian{len(levels)}.shape" in arrays:
             k, keep, up = len(levels), None, None

@@ -1,1 +1,1 @@
-"""Training on data sets: tensors, features, the loop, every model on every split and seed."""
+"""Training on data sets: tensors, features, the training loop, all models on all splits and seeds."""

@@ -1,4 +1,4 @@
-"""A data set as the tensors that training works on."""
+"""A data set as tensors for training."""
 
 import dataclasses
 import pathlib
@@ -20,7 +20,7 @@ __all__ = ["Arrays", "check_columns", "join", "load_arrays"]
 
 @dataclasses.dataclass
 class Arrays:
-    """All time steps of a set that converged, n of them, on one device.
+    """All converged time steps of a set, n of them, on one device.
 
     Attributes:
       field: (n, nvert, 3) float16 displacements [mm]; (n, npoint, 3) of `at_points`.
@@ -28,10 +28,10 @@ class Arrays:
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
       counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the
         interaction's first row.
-      simulated: (n, 19) counts of the simulation's own film, without noise where the set has its impedances.
-      force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
-      geometry: SkinGeometry. path: of the set. sensor: "real" where resimulated recordings have the measured
-        counts, else "synthetic".
+        simulated: (n, 19) counts of the simulation's own film, without noise if the set has its impedances.
+        force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
+        geometry: SkinGeometry. path: of the set. sensor: "real" if resimulated recordings have the measured
+          counts, else "synthetic".
     """
 
     field: torch.Tensor
@@ -81,7 +81,7 @@ class Arrays:
         return self.counts[rows] - self.tare[rows]
 
     def log_change(self, rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) d ln Z of rows against their tare."""
+        """(k, 19) d ln Z of rows relative to their tare."""
         value = log_impedance(self.counts[rows].double().cpu().numpy()) - log_impedance(
             self.tare[rows].double().cpu().numpy()
         )
@@ -89,15 +89,15 @@ class Arrays:
 
     @torch.no_grad()
     def at_points(self, points: "SkinPoints") -> "Arrays":
-        """The same set with the displacements at the points."""
+        """The set with displacements at the points."""
         matrix = SparseMatrix(points.reading(self.geometry)).to(self.device)
         parts = [matrix(u.float().transpose(0, 1).contiguous()) for u in self.field.split(512)]
         return dataclasses.replace(self, field=torch.cat([u.transpose(0, 1).half() for u in parts]))
 
 
 def join(sets: list[Arrays]) -> Arrays:
-    """Several sets as one, with the geometry of the first; their fields are of one shape. The contact forces
-    are left out where the outer nodes differ."""
+    """Several sets as one, with the geometry of the first; their fields have the same shape. Contact forces
+    are dropped if the outer nodes differ."""
     shift, parts = 0, []
     for a in sets:
         begin = sum(len(p.owner) for p in parts)
@@ -112,7 +112,7 @@ def join(sets: list[Arrays]) -> Arrays:
 
 
 def check_columns(data: "TactileSet") -> None:
-    """Raises ValueError where a set lacks what is learned from."""
+    """Raises ValueError if a set lacks a column for training."""
     for name in ("displacement", "counts", "measured_counts", "contact_force"):
         if name not in data.columns:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""What the paper leaves open, and what is chosen here: one place, saved with every result."""
+"""Choices that the paper leaves open, in one place, saved with every result."""
 
 import dataclasses
 
@@ -8,48 +8,51 @@ from ...fields import check_types
 
 __all__ = ["LearningConfig", "without_gone"]
 
-# what files of earlier versions have besides: there was one choice of each
+# fields in files of earlier versions that had a single value
 _GONE = {"hierarchy": "geodesic", "tare": "row 0"}
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
 @dataclasses.dataclass(frozen=True)
 class LearningConfig:
-    """Choices of models and training. The numbers in brackets are those of the ambiguities in
-    docs/lab/learning.md.
+    """Choices of models and training. Numbers in brackets refer to the ambiguities in docs/lab/learning.md.
 
     Attributes:
-      mesh_order: K of the Chebyshev convolutions: 6, as COMA and ACROSS take it [1].
-      mesh_scale: displacements are divided by this length [m], not z-scored node by node: fixed nodes would
+        mesh_order: K of the Chebyshev convolutions: 6, as in COMA and ACROSS [1].
+        mesh_scale: displacements are divided by this length [m] instead of node-wise z-scores, which would
+          amplify solver noise at fixed nodes [2].
         amplify solver noise [2].
-      reconstruction: "mse" or "l1" of the VAEs: MSE matches the RMS metric [3].
-      mesh_kl, electrode_kl: weight of the divergence, summed over the code, against squared error summed over
-        the field (in units of its scale), without annealing [4].
-      mesh_points: of the coarse skin, where the paper's networks read the displacements of any skin [18].
-      mesh_channels, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for mean and log
-        variance follow the hidden layer [5]; no normalisation layers, no activation at the output, no bias
-        in the last convolution [11]. mesh_factors: how many times fewer points each next level has [12].
+        reconstruction: "mse" or "l1" for the VAEs: MSE matches the RMS metric [3].
+        mesh_kl, electrode_kl: weight of the divergence, summed over the code, relative to the squared error
+          summed over the field (in units of its scale), without annealing [4].
+        mesh_points: number of points of the coarse skin at which the paper's networks read any skin [18].
+        mesh_channels, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for mean and log
+          variance follow the hidden layer [5]; no normalisation layers, no activation at the output, no bias
+          in the last convolution [11]. mesh_factors: ratios of the numbers of points of successive levels
+          [12].
       electrode_hidden, electrode_latent: of the paper.
-      forward_hidden, inverse_hidden: the paper's widths are read as hidden, with a linear layer to the code
-        behind them [6].
-      sample_codes: train projections on samples of the codes, not their means; evaluated with means [7].
-      projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes) [8].
-      logarithm: the paper's networks and PointNet++ learn d ln Z, so that they serve sensors with other
-        counts at rest; False: tared counts, the paper's, which are compared and serve no sensor [17].
-      dropout: of the projections, the paper's.
-      learning_rate, decay: Adam's, and the factor per epoch; 20 epochs' worth of decay is spread over a
-        training whatever its length [9].
-      batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and PointNet++,
-        with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best
-        state on the validation interactions is kept.
-      scale: counts are divided by it, 2048 for the paper's unit, after row 0 of each interaction, before
-        touch, is subtracted [17].
-      pod: modes of the principal components of the mesh. width: of our networks. mirror: what learns from the
-        simulation also sees every touch mirrored in z; no sensor is as symmetric, so what learns from one
-        does not (but `local_mirror`).
-      window: time constants [s] of the causal averages of their features.
+        forward_hidden, inverse_hidden: the paper's widths are read as hidden layers, followed by a linear
+          layer to the code [6].
+        sample_codes: train projections on samples of the codes instead of their means; evaluation uses means
+          [7].
+        projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes) [8].
+        logarithm: the paper's networks and PointNet++ learn d ln Z, so that they work for sensors with other
+          counts at rest; False: tared counts, the paper's, for comparison only [17].
+        dropout: of the projections, the paper's.
+        learning_rate, decay: Adam's, and its factor per epoch; the decay of 20 epochs is spread over any
+          training length [9].
+        batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and
+          PointNet++, with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10].
+          The best state on the validation interactions is kept.
+        scale: unit of counts, 2048 for the paper's, after subtraction of row 0 of each interaction, before
+          touch [17].
+        pod: number of principal components of the mesh. width: of our networks. mirror: training on the
+          simulation also uses every touch mirrored in z; training on a sensor does not, since none is that
+          symmetric (except `local_mirror`).
+        window: time constants [s] of the causal averages of features.
+        members: number of networks in the best model's ensemble.
       members: networks that are averaged in the best model.
-      graphs: on a GPU training steps are replayed as CUDA graphs.
+        graphs: on a GPU, replay training steps as CUDA graphs.
     """
 
     mesh_order: int = 6
@@ -118,5 +121,5 @@ class LearningConfig:
 
 
 def without_gone(settings: dict) -> dict:
-    """Fields of a LearningConfig as a file has them, without those of earlier versions that said nothing."""
+    """Fields of a LearningConfig from a file, without obsolete ones of earlier versions."""
     return {name: value for name, value in settings.items() if _GONE.get(name, ()) != value}

@@ -1,5 +1,5 @@
-"""`biotac learn train`: every model on every split and seed of a data set; predictions, errors and the
-weights of all models go to a folder."""
+"""`biotac learn train`: all models on all splits and seeds of a data set; writes predictions, errors and
+weights to a folder."""
 
 import contextlib
 import dataclasses
@@ -33,8 +33,8 @@ from .paper import train_latent_projection, train_pointnet
 
 __all__ = ["FORWARD", "division_of", "train_all", "train_split"]
 
-# name -> arguments of `local.train_head`; from simple to full, each line adds one thing, local_mirror what
-# local_taught does without
+# name -> arguments of `local.train_head`, an ablation: each line adds one thing; local_mirror adds mirrored
+# touches to local_taught
 FORWARD = {
     "pod_mlp": dict(kind="pod", log=False, teach=False, mirror=False, window=False),
     "pod_log": dict(kind="pod", log=True, teach=False, mirror=False, window=False),
@@ -59,21 +59,20 @@ def train_all(
     progress: bool = True,
     ray: str | None = None,
 ) -> None:
-    """Trains and predicts for all splits and seeds. What is there already is kept, so an interrupted run goes
-    on, within a network's training too (on Ray: with the split and seed).
+    """Trains and predicts for all splits and seeds. Existing results are kept, so an interrupted run
+    continues, also within a network's training (on Ray: at a split and seed).
 
-    On the CPU each training takes one core: the same bits however many there are.
+    On the CPU each training uses one core: the results do not depend on the number of cores.
 
     Args:
       path: data set. out: folder.
-      seeds: of divisions, weights and batches. splits: "trajectory" (72/18/10 % of the interactions), or the
-        object (or objects, with +) that only the test sees.
-      config: LearningConfig. device: of torch. paper: False leaves out what is slow without a GPU: latent
-        projection and PointNet++.
-      only: names of our models to train; None takes all of FORWARD. limit: interactions to read.
-      progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for
-        each split and seed, of one core, and one GPU where the device is one. All nodes read the set at its
-        path.
+        seeds: of splits, weights and batches. splits: "trajectory" (72/18/10 % of the interactions), or the
+          object (or objects, with +) that is held out for the test.
+        config: LearningConfig. device: of torch. paper: False skips what is slow without a GPU: latent
+          projection and PointNet++.
+        only: names of our models to train; None: all of FORWARD. limit: number of interactions to read.
+        progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for each split and
+          seed, with one core, and one GPU if the device is one. All nodes read the set at its path.
     """
     config = config or LearningConfig()
     out = pathlib.Path(out)
@@ -100,8 +99,8 @@ def train_all(
         check_columns(data)
         count = min(len(data), limit or len(data))
     for split in splits:
-        division_of(path, split, 0, count)  # refuses what cannot be divided
-    # steps are timed for whoever reads it
+        division_of(path, split, 0, count)  # raises if it cannot be split
+    # time the steps for the estimate
     ahead = size * len(tasks) if progress and ray is None and str(device) == "cpu" else 0
     work = _Train(settings, str(device), size, ahead)
     for _ in run_tasks(
@@ -111,7 +110,7 @@ def train_all(
 
 
 def _steps_of(config, names, paper):
-    """Steps of all networks of a split and seed, at most."""
+    """Most steps of all networks of a split and seed."""
     head = {
         name: config.steps * (2 if kind["teach"] and kind["log"] else 1) for name, kind in FORWARD.items()
     }
@@ -126,7 +125,8 @@ class _Train:
     """Work of `shards.run_tasks`: all models of a split and seed; size: their steps.
 
     Attributes:
-      settings: of the whole training. device: of torch. ahead: steps to say the time of, 0: say nothing.
+        settings: of the whole training. device: of torch. timed_steps: steps to time for an estimate, 0:
+          none.
     """
 
     settings: dict
@@ -143,7 +143,7 @@ class _Train:
                 name = hashlib.sha256(json.dumps([given, self.device, split, seed]).encode()).hexdigest()[:16]
                 watch = Watch(folder / f"unfinished-{name}", say)
                 train_split(self._features, split, seed, folder, given, watch)
-                say(self.size - watch.steps)  # where a network of fewer steps was the best
+                say(self.size - watch.steps)  # if a network with fewer steps was the best
                 shutil.rmtree(watch.folder, ignore_errors=True)
                 yield split, seed
 
@@ -162,8 +162,8 @@ class _Train:
 
 
 def _step_time(features, names, paper, steps=4):
-    """[s] of a step, in the mean over all networks, of a training a few steps long; components, whose values
-    take no time, are left at zero."""
+    """[s] per step, mean over all networks, from a short training. Components are zero, since their values do
+    not affect the time."""
     arrays, config = features.arrays, features.config
     labelled = np.flatnonzero(arrays.labelled)
     rows = arrays.rows(labelled)
@@ -175,7 +175,7 @@ def _step_time(features, names, paper, steps=4):
     }
     short = dataclasses.replace(config, steps=steps, **papers)
     parts = labelled, labelled[:8], short
-    for watch in (Watch(), Watch()):  # what is called first is slow at first
+    for watch in (Watch(), Watch()):  # the first calls are slow
         for name in names:
             train_head(features, *parts, pod=pod, watch=watch, **FORWARD[name])
         for teach in (False, True):
@@ -189,8 +189,8 @@ def _step_time(features, names, paper, steps=4):
 
 @contextlib.contextmanager
 def _one_thread():
-    """On a CPU the last bits of sums depend on the number of threads, and these networks gain little by
-    more."""
+    """Limits the CPU to one thread: the last bits of sums depend on the number of threads, and these small
+    networks hardly gain by more."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -200,7 +200,7 @@ def _one_thread():
 
 
 def _refuse_others(out, settings):
-    """Refuses a folder that holds results of other settings (ValueError)."""
+    """Raises ValueError if a folder holds results of other settings."""
     for path in sorted(out.glob("*-*.json")):
         found = read_json(
             path, "result of `biotac learn train`", f"remove it, or choose another folder than {out}"
@@ -224,8 +224,8 @@ def train_split(
     settings: dict,
     watch: Watch | None = None,
 ) -> None:
-    """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0,
-    and last SPLIT-SEED.json, which keeps the settings of the whole training. watch: of all networks."""
+    """Trains one split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of
+    seed 0, and last SPLIT-SEED.json with the settings of the whole training. watch: of all networks."""
     arrays, config = features.arrays, features.config
     path, names, watch = settings["set"], settings["models"], watch or Watch()
     division = division_of(path, split, seed, len(arrays.objects))
@@ -263,8 +263,8 @@ def train_split(
         )
         predictions[name] = models[name](both)
     if names:
-        # what the validation interactions like best, several times over. Windows stay out: interactions of a
-        # second do not teach what a long hold is, and a simulation may hold for as long as it likes
+        # ensemble of the best model on validation. Windows are excluded: interactions of a second do not
+        # represent long holds, which occur in simulations
         steady = [name for name in names if not FORWARD[name]["window"]] or names
         errors = {
             name: _median(predictions[name][: len(check)], truth[: len(check)], arrays.owner[check])
@@ -367,7 +367,7 @@ def train_split(
 
 
 def division_of(path: pathlib.Path | str, split: str, seed: int, count: int) -> Split:
-    """How a set was divided in a training: see `train_all`; count: interactions that were read."""
+    """Split of a set in a training, see `train_all`; count: interactions that were read."""
     with TactileSet(path) as data:
         whole = (
             split_by_interaction(data, seed)
@@ -412,7 +412,7 @@ def _mesh_errors(arrays, code, rows, most=3000):
 
 
 def _inverse_summary(errors):
-    """Means of the field's errors [mm], median of the patch's centre [mm] and its overlap, of
+    """Means of the field's errors [mm], and medians of the patch's centre error [mm] and overlap, from
     `inverse_errors`."""
     out = {k: float(np.mean(errors[k])) for k in ("mean", "moved", "largest")}
     known = np.isfinite(errors["centre"])
@@ -437,7 +437,7 @@ def _write(out, name, arrays, check, rows, both, truth, predictions, report):
         "test": np.arange(len(both)) >= len(check),
     }
     tare = arrays.tare[both]
-    # no reading lies outside 0..4095, whatever a model says
+    # clip to 0..4095
     content |= {
         f"predicted_{k}": torch.minimum(torch.maximum(v, -tare), FULL_SCALE - tare).half()
         for k, v in predictions.items()

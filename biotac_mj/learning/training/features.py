@@ -1,5 +1,5 @@
-"""What a field of displacements says about the electrodes: principal components, film and strain over each
-electrode, the mirror image."""
+"""Features of a displacement field for the electrodes: principal components, film and strain over each
+electrode, and the mirror image."""
 
 import typing
 
@@ -17,14 +17,14 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix", "orthogonal_modes"]
 
-ELECTRODE_MIRROR = BIOTAC.mirror  # e1..e6 lie opposite e11..e16 and e8 opposite e9; the others on the midline
+ELECTRODE_MIRROR = BIOTAC.mirror  # e1..e6 are opposite e11..e16 and e8 opposite e9; the others on the midline
 _RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
-_FILM = 50e-6  # [m] left where the skin lies on the core, as in sensor.film
+_FILM = 50e-6  # [m] residual film where the skin touches the core, as in sensor.film
 
 
 def orthogonal_modes(x: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The `count` strongest right singular vectors (k, count) of x (n, k), on its device, and the root mean
-    square (count,) of x along each; randomised, drawn from torch's generator. Fewer where x is smaller."""
+    square (count,) of x along each, by a randomised method with torch's generator. Fewer for a smaller x."""
     count = min(count, *x.shape)
     _, s, v = torch.svd_lowrank(x, q=min(count + 32, *x.shape), niter=3)
     return v[:, :count], s[:count] / len(x) ** 0.5 + 1e-9
@@ -51,8 +51,7 @@ class Pod(nn.Module):
     def fit(
         cls, field: torch.Tensor, rows: torch.Tensor, modes: int = 128, most: int = 16000, seed: int = 0
     ) -> "Pod":
-        """Fits to rows of a field (n, nvert, 3) [mm], at most `most` of them, by a randomised
-        decomposition."""
+        """Fits to at most `most` rows of a field (n, nvert, 3) [mm], by a randomised decomposition."""
         generator = torch.Generator().manual_seed(seed)
         if len(rows) > most:
             rows = rows[torch.randperm(len(rows), generator=generator)[:most].to(rows.device)]
@@ -63,7 +62,7 @@ class Pod(nn.Module):
         return out
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
-        """(n, modes) components, each of unit variance in training, of u (n, nvert, 3) [mm]."""
+        """(n, modes) components, with unit variance in training, of u (n, nvert, 3) [mm]."""
         return u.flatten(1).to(self.basis.dtype) @ self.basis / self.scale
 
     def decode(self, x: torch.Tensor) -> torch.Tensor:
@@ -72,15 +71,16 @@ class Pod(nn.Module):
 
 
 class FilmFeatures(nn.Module):
-    """Film and strain of the inner skin over each electrode, for one head that all electrodes share.
+    """Film and strain of the inner skin over each electrode, for one head shared by all electrodes.
 
     The gap h of an inner node is its rest value plus the displacement along the direction away from the core
-    (linearised), at least 50 um. For Gaussian patches of three radii around each electrode: mean ln(h / h0),
-    mean h0 / h - 1, displacement along the electrode's normal and two tangents [mm]; the slopes of the
-    displacement over the patch of the middle radius (6, the skin's local strain and tilt); and mean ln(h /
-    h0) near the four excitation electrodes and over the whole film (5), which all currents cross.
+    (linearised), at least 50 um. Gaussian patches of three radii around each electrode give: mean ln(h / h0),
+    mean h0 / h - 1, displacement along the electrode's normal and two tangents [mm]; the gradient of the
+    displacement over the middle patch (6, the skin's local strain and tilt); and mean ln(h / h0) near the
+    four excitation electrodes and over the whole film (5), which all currents cross.
 
-    The second tangent points away from the midplane, so that an electrode and its mirror image see alike.
+    The second tangent points away from the midplane, so that an electrode and its mirror image have equal
+    features.
 
     Args:
       geometry: SkinGeometry.
@@ -112,8 +112,8 @@ class FilmFeatures(nn.Module):
         across *= (np.sign(across[:, 2]) * side)[:, None]
         frame = np.stack([normal, along, across], 1)  # (19, 3, 3): rows are directions
 
-        # over an electrode: distance along the surface, from where its normal meets the skin; what lies
-        # across the finger is far in depth
+        # over an electrode: distance along the surface from the skin point on its normal; points across the
+        # finger are far in depth
         offset = place[None] - geometry.electrode_pos[:, None]
         height = np.einsum("enk,ek->en", offset, normal)
         flat = np.linalg.norm(offset - height[..., None] * normal[:, None], axis=2)
@@ -141,7 +141,7 @@ class FilmFeatures(nn.Module):
         g = np.exp(-0.5 * (np.linalg.norm(place[None] - seeds[:, None], axis=2) / 3e-3) ** 2)
         g = np.concatenate([g, np.ones((1, len(node)))])
         g /= g.sum(1, keepdims=True)
-        # each electrode sees those of its own side first
+        # each electrode's own side first
         order = np.where(
             geometry.electrode_pos[:, 2:] * np.sign(seeds[1, 2]) > 0, [[1, 0, 3, 2, 4]], [[0, 1, 2, 3, 4]]
         )
@@ -169,13 +169,13 @@ class FilmFeatures(nn.Module):
         mean_inverse = (
             torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), -1).transpose(1, 2)
         )
-        # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln
+        # ln of the mean of 1/h is for resistances in series; ln h alone is averaged as is
         local[..., len(_RADII) :] = mean_inverse
         whole = (thinner @ self.whole.T)[:, self.order]
         return torch.cat([local, linear, whole], 2)
 
 
 def mirror_matrix(geometry: "SkinGeometry") -> csr_matrix:
-    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0; curved surfaces do not
-    mirror onto themselves exactly."""
+    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0. Curved surfaces do not map
+    onto themselves exactly."""
     return shape_values(geometry.vert, geometry.tets, geometry.vert * [1, 1, -1])

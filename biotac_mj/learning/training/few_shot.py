@@ -1,5 +1,5 @@
-"""A new sensor with few touches: what the film and a trained model make of it as they are, and after a mixing
-of their electrodes was fitted to the touches."""
+"""Adaptation to a new sensor with few touches: errors of the film and of a trained model, unadapted and with
+a mixing of their electrodes fitted to the touches."""
 
 import json
 import pathlib
@@ -18,7 +18,7 @@ from .local import counts_change
 
 __all__ = ["evaluate_new_sensor", "fit_gains", "fit_mixing"]
 
-_PENALTIES = np.geomspace(1e-4, 1e2, 13)  # of a mixing, against the mean square of what is mixed
+_PENALTIES = np.geomspace(1e-4, 1e2, 13)  # of a mixing, relative to the mean square of its inputs
 
 
 def fit_gains(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""One loop for all networks: minibatches from tensors on the device, one cycle of the learning rate, the best
-state on validation kept.
+"""Training loop of all networks: minibatches from tensors on the device, one cycle of the learning rate, the
+best validation state is kept.
 
-These networks are small: on a GPU a step is mostly launches, so it is recorded once as a CUDA graph and
-replayed.
+These networks are small: on a GPU a step is mostly launch overhead, so it is captured once as a CUDA graph
+and replayed.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ from ...files import replacing
 
 __all__ = ["Watch", "cycle", "fast_products", "root_mean_square"]
 
-_WARM = 5  # steps before one is recorded
-_BETWEEN = 5.0  # [s] between two states that are kept: one takes as long as three small steps
+_WARM = 5  # warm-up steps before the capture
+_BETWEEN = 5.0  # [s] between two checkpoints: one takes as long as three small steps
 
 
 @contextlib.contextmanager
 def fast_products() -> Iterator[None]:
-    """TF32 for matrix products on a GPU: good enough inside a network, not for features and components, whose
-    small parts it would blur."""
+    """TF32 for matrix products on a GPU: accurate enough inside a network, not for features and components,
+    whose small values it would lose."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
     try:
@@ -35,14 +35,14 @@ def fast_products() -> Iterator[None]:
 
 
 class Watch:
-    """Sees the trainings of one job go by, and keeps where they are: run again in the same order, those that
-    are done are not repeated, and one that was stopped goes on, on the CPU to the same bits.
+    """Checkpoints the trainings of one job. When run again in the same order, finished ones are not repeated,
+    and an interrupted one continues, on the CPU bit-equal.
 
     Args:
-      folder: of what is kept, None keeps nothing. say: called with 1 at each step.
+      folder: of checkpoints, None: no checkpoints. say: progress callback, called with 1 at each step.
 
     Attributes:
-      steps: of all trainings so far, seconds: that those took which were done now, without their judging.
+      steps: of all trainings so far, seconds: of the steps of this run, without validation.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Watch:
         self._kept = time.perf_counter()
 
     def begin(self) -> dict | None:
-        """What is kept of the next training."""
+        """Checkpoint of the next training, or None."""
         self.number += 1
         path = self._path()
         kept = torch.load(path, weights_only=True) if path is not None and path.is_file() else None
@@ -68,7 +68,7 @@ class Watch:
         self.say(steps)
 
     def keep(self, last: bool, **state: object) -> None:
-        """Keeps the training's state: the last one, and others now and then."""
+        """Saves the training's state: the last one, and others every few seconds."""
         if self.folder is not None and (last or time.perf_counter() - self._kept >= _BETWEEN):
             self._kept = time.perf_counter()
             with replacing(self._path()) as temporary:
@@ -79,7 +79,7 @@ class Watch:
 
 
 def root_mean_square(error: torch.Tensor) -> torch.Tensor:
-    """Mean over samples of the RMS over the last axis: the paper's loss, and what its median counts."""
+    """Mean over samples of the RMS over the last axis: the paper's loss and metric."""
     return (error.square().mean(-1) + 1e-10).sqrt().mean()
 
 

@@ -1,4 +1,4 @@
-"""From electrodes back to the skin: displacements, contact forces and the patch that touches."""
+"""From electrodes to the skin: displacements, contact forces and the contact patch."""
 
 import typing
 from collections.abc import Callable
@@ -30,7 +30,7 @@ __all__ = [
     "train_inverse",
 ]
 
-PATCH = 0.15  # of the largest nodal force: nodes above it are the patch
+PATCH = 0.15  # fraction of the largest nodal force above which a node is in the patch
 
 
 class InverseHead(nn.Module):
@@ -52,8 +52,8 @@ class InverseHead(nn.Module):
         self.net = mlp([NELECTRODE, width, width, self.modes + force_modes], dropout)
 
     def codes(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z
-        (n, 19)."""
+        """Components of displacement (n, modes), relative to the root mean square of the first, and of force,
+        for d ln Z (n, 19)."""
         out = self.net(log_change / self.scale) - steady(self.net, torch.zeros_like(log_change[:1]))
         return out.split([self.modes, self.force_basis.shape[1]], 1)
 
@@ -76,15 +76,14 @@ def train_inverse(
     teach: bool = False,
     watch: Watch | None = None,
 ) -> InverseHead:
-    """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or
+    """Trains on labelled interactions. pod: (Pod, components of all rows, those of the mirrored touches or
     None).
 
-    The loss weighs components by their size, so it is the error of the fields themselves. teach: first learn
-    from the simulation's own film on all interactions of the training part, labelled or not, and on the same
-    mirrored.
+    The loss weighs components by their size, so it is the error of the fields. teach: first learn from the
+    simulation's own film on all training interactions, labelled or not, and on their mirror images.
 
     Returns:
-      the head; its attribute `validation` is its error on the validation part [unit of the loss].
+        the head; its attribute `validation` is its validation error [unit of the loss].
     """
     torch.manual_seed(seed)
     basis, now, then = pod
@@ -162,8 +161,8 @@ def field_errors(got: torch.Tensor, truth: torch.Tensor) -> dict:
 
 
 def contact_centre(force: np.ndarray, place: np.ndarray, patch: float = PATCH) -> np.ndarray:
-    """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), or what
-    stands for it, place (nouter, 3) [m] of the nodes; patch: of the largest, above which nodes are in it."""
+    """(n, 3) force-weighted centre of the patch [m], NaN without contact. force (n, nouter) or a substitute,
+    place (nouter, 3) [m] of the nodes; patch: fraction of the largest value above which nodes are in it."""
     force = np.asarray(force, float)
     weight = np.where(force > patch * force.max(1, keepdims=True), force, 0)
     total = weight.sum(1, keepdims=True)
@@ -172,8 +171,8 @@ def contact_centre(force: np.ndarray, place: np.ndarray, patch: float = PATCH) -
 
 
 def patch_overlap(got: np.ndarray, truth: np.ndarray, patch: float = PATCH) -> np.ndarray:
-    """(n,) intersection over union of the nodes above `patch` of their largest value in got (n, nouter), and
-    above PATCH of their largest force in truth; NaN where nothing touches."""
+    """(n,) intersection over union of the nodes above `patch` of the largest value in got (n, nouter), and
+    above PATCH of the largest force in truth; NaN without contact."""
     a = got > patch * got.max(1, keepdims=True)
     b = truth > PATCH * truth.max(1, keepdims=True)
     union = (a | b).sum(1)
@@ -181,10 +180,10 @@ def patch_overlap(got: np.ndarray, truth: np.ndarray, patch: float = PATCH) -> n
 
 
 def patch_of_push(push: np.ndarray, force: np.ndarray) -> float:
-    """Fraction of the deepest push, above which outer nodes best agree with the patch that touches.
+    """Fraction of the largest indentation above which outer nodes best agree with the contact patch.
 
     Args:
-      push: (n, nouter) how far nodes are pushed in. force: (n, nouter) contact force.
+      push: (n, nouter) indentation of nodes. force: (n, nouter) contact force.
     """
     shares = np.arange(0.1, 0.96, 0.05)
     return float(max(shares, key=lambda share: np.nanmean(patch_overlap(push, force, share))))
@@ -193,10 +192,10 @@ def patch_of_push(push: np.ndarray, force: np.ndarray) -> float:
 @torch.no_grad()
 def inverse_errors(arrays: "Arrays", model: Callable, rows: torch.Tensor, patch: float = PATCH) -> dict:
     """Errors of an inverse model, each (n,): of the field as `field_errors`, of the patch's centre [mm] and
-    its overlap, NaN where less than 0.1 N touch.
+    its overlap, NaN below 0.1 N.
 
     Args:
-      model: function of rows (k,) -> field (k, nvert, 3) [mm] and force or push (k, nouter).
+        model: rows (k,) -> field (k, nvert, 3) [mm] and force or indentation (k, nouter).
       rows: (n,) of the set. patch: see `contact_centre`.
     """
     place, found = arrays.geometry.vert[arrays.outer], []
@@ -212,7 +211,7 @@ def inverse_errors(arrays: "Arrays", model: Callable, rows: torch.Tensor, patch:
 
 
 def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:
-    """d ln Z (n, 19) of raw counts (n, 19) against the counts at rest, tare (19,) or (n, 19).
+    """d ln Z (n, 19) of raw counts (n, 19) relative to the counts at rest, tare (19,) or (n, 19).
 
     Raises:
       ValueError: not 19 channels, values that are not finite, or outside 0..4095.

@@ -1,5 +1,5 @@
-"""The better models: principal components or local film features, d ln Z as the target, the simulation's film
-as a teacher."""
+"""Our models: principal components or local film features, target d ln Z, with the simulation's film as a
+teacher."""
 
 import functools
 import typing
@@ -25,7 +25,7 @@ __all__ = ["Features", "counts_change", "film_with_gains", "train_head"]
 
 def film_with_gains(arrays: "Arrays", fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
     """Change of counts (n, 19) of the simulation's own film in rows (n,), with one gain of d ln Z for each
-    electrode from labelled rows `fit`."""
+    electrode fitted to labelled rows `fit`."""
     counts = arrays.simulated.cpu().numpy()
     z = torch.as_tensor(log_impedance(counts), dtype=torch.float32, device=arrays.device)
     z = z - z[arrays.first]
@@ -40,14 +40,14 @@ def counts_change(log_change: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
 
 
 class Features:
-    """Features of all rows of a set, and of all touches mirrored in z, computed once.
+    """Features of all rows of a set, and of their mirror images in z, computed once.
 
     Args:
       arrays: Arrays. config: LearningConfig.
 
     Attributes:
-      film: FilmFeatures. local: (n, 19, k) now, and then minus its causal averages. mirrored: the same of the
-        mirrored touches, or None.
+        film: FilmFeatures. local: (n, 19, k) current features, then these minus their causal averages.
+          mirrored: the same for the mirrored touches, or None.
     """
 
     def __init__(self, arrays: "Arrays", config: "LearningConfig"):
@@ -83,7 +83,7 @@ class Features:
 
     @functools.cached_property
     def at_points(self) -> tuple["SkinPoints", "Arrays"]:
-        """Where the paper's networks read the skin, and the set there."""
+        """Points at which the paper's networks read the skin, and the set there."""
         from ..networks.points import SkinPoints
 
         points = SkinPoints.choose(self.config.mesh_points, self.config.mesh_factors)
@@ -108,11 +108,12 @@ def train_head(
 
     Args:
       features: Features. train, validation: numbers of interactions.
-      kind: "pod" or "local". window: with causal averages. teach: first learn the d ln Z of the simulation's
-        own film on all interactions of the training part, labelled or not, and on the same mirrored: the
-        simulation is symmetric. mirror: with measured touches mirrored, too, as if the sensor were: none is.
-        log: targets d ln Z against a known tare; False: tared counts.
-      pod: (Pod, components, mirrored components or None), fitted on the training part.
+        kind: "pod" or "local". window: with causal averages. teach: first learn d ln Z of the simulation's
+          own film on all training interactions, labelled or not, and on their mirror images, since the
+          simulation is symmetric. mirror: also use mirrored measured touches, though no sensor is symmetric.
+            log: target d ln Z relative to a
+          known tare; False: tared counts.
+        pod: (Pod, components, mirrored components or None), fitted on the training interactions.
 
     Returns:
       function (rows) -> (k, 19) predicted change of counts; the head is its attribute `head`.

@@ -1,5 +1,5 @@
 """The paper's networks (Narang et al., ICRA 2021) on one split: two VAEs, projections between their codes,
-PointNet++ beside them. They read the skin at `SkinPoints`."""
+and PointNet++. They read the skin at `SkinPoints`."""
 
 import typing
 
@@ -47,11 +47,11 @@ class LatentProjection(nn.Module):
         self.to_mesh = mlp([self.electrode.latent, *config.inverse_hidden, self.mesh.latent], config.dropout)
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
-        """(n, 19) of u (n, npoint, 3), displacements / mesh_scale: d ln Z, or tared counts / 2048."""
+        """(n, 19) for u (n, npoint, 3), displacements / mesh_scale: d ln Z, or tared counts / 2048."""
         return self.electrode.decode(self.to_electrode(self.mesh.encode(u)[0]))
 
     def inverse(self, y: torch.Tensor) -> torch.Tensor:
-        """(n, npoint, 3) displacements / mesh_scale of y (n, 19)."""
+        """(n, npoint, 3) displacements / mesh_scale for y (n, 19)."""
         return self.mesh.decode(self.to_mesh(self.electrode.encode(y)[0]))
 
 
@@ -61,7 +61,7 @@ def make_pointnet(points: "SkinPoints", config: "LearningConfig") -> PointNet:
 
 
 class _Target:
-    """What the electrodes are to the networks, and what counts they make of it."""
+    """Target of the networks, and its conversion to counts."""
 
     def __init__(self, arrays, rows, config):
         self.arrays, self.config = arrays, config
@@ -89,10 +89,11 @@ def train_latent_projection(
     """Trains both VAEs, freezes them, trains the projections.
 
     Args:
-      arrays: of `Arrays.at_points`. train, validation: numbers of interactions. seed: of weights and batches.
+        arrays: of `Arrays.at_points`. train, validation: numbers of interactions. seed: of weights and
+          batches.
 
-    Returns:
-      the networks, and how the validation errors of the four trainings fell: {name: [[step, error]]}.
+      Returns:
+        the networks, and the validation curves of the four trainings: {name: [[step, error]]}.
     """
     torch.manual_seed(seed)
     model = LatentProjection(points, config).to(arrays.device)
@@ -172,7 +173,7 @@ def train_pointnet(
     seed: int = 0,
     watch: Watch | None = None,
 ) -> PointNet:
-    """Trains the baseline on labelled interactions alone; arrays: of `Arrays.at_points`. Input and output are
+    """Trains the baseline on labelled interactions only; arrays: of `Arrays.at_points`. Input and output are
     those of `LatentProjection`."""
     torch.manual_seed(seed)
     unit = 1e-3 / config.mesh_scale
@@ -192,7 +193,7 @@ def train_pointnet(
 
 
 def _spread(rows, count):
-    """That many rows at most, evenly."""
+    """At most `count` rows, evenly spaced."""
     return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows)), device=rows.device).long()]
 
 
