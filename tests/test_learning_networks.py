@@ -18,7 +18,7 @@ from biotac_mj.learning.networks.heads import LocalHead, PodHead, averages, next
 from biotac_mj.learning.networks.hierarchy import build_hierarchy  # noqa: E402
 from biotac_mj.learning.networks.mesh_vae import MeshVAE  # noqa: E402
 from biotac_mj.learning.networks.pointnet import PointNet  # noqa: E402
-from biotac_mj.learning.training.config import LearningConfig, without_gone  # noqa: E402
+from biotac_mj.learning.training.config import LearningConfig, without_obsolete  # noqa: E402
 from biotac_mj.learning.training.experiment import _refuse_others  # noqa: E402
 from biotac_mj.learning.training.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
 from biotac_mj.learning.training.fitting import _schedule, cycle  # noqa: E402
@@ -223,12 +223,12 @@ def test_config_names_what_is_wrong():
 def test_settings_of_earlier_versions_are_still_read(tmp_path):
     """Two of them had one choice each, and say nothing any more: a training goes on beside its results."""
     old = {"hierarchy": "geodesic", "tare": "row 0", "steps": 120}
-    assert LearningConfig(**without_gone(old)) == LearningConfig(steps=120)
+    assert LearningConfig(**without_obsolete(old)) == LearningConfig(steps=120)
     (tmp_path / "trajectory-0.json").write_text(json.dumps({"settings": {"config": old}}))
     _refuse_others(tmp_path, {"config": {"steps": 120}})
     with pytest.raises(ValueError, match=r"of other settings \(config\)"):
         _refuse_others(tmp_path, {"config": {"steps": 121}})
-    assert "hierarchy" in without_gone({"hierarchy": "of my own"})  # and is refused as unknown
+    assert "hierarchy" in without_obsolete({"hierarchy": "of my own"})  # and is refused as unknown
 
 
 def test_the_rate_is_one_cycle_or_falls_by_a_factor():

@@ -16,7 +16,7 @@ from biotac_mj import cli  # noqa: E402
 from biotac_mj.geometry.design import read_design  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
 from biotac_mj.learning.instants.force import causal_average  # noqa: E402
-from biotac_mj.learning.instants.novelty import Known, Moving  # noqa: E402
+from biotac_mj.learning.instants.novelty import NoveltyDetector, StuckDetector  # noqa: E402
 from biotac_mj.learning.instants.reader import Reader, fit_reader, judge  # noqa: E402
 from biotac_mj.learning.instants.terms import Terms  # noqa: E402
 from biotac_mj.learning.weights import shipped  # noqa: E402
@@ -156,7 +156,7 @@ def test_novelty_sees_an_electrode_that_is_stuck(noise):
 def test_a_stuck_electrode_differs_from_a_quiet_sensor():
     rng = np.random.default_rng(0)
     x = np.cumsum(rng.normal(size=(4000, 1)), 0) * rng.uniform(0.5, 1.5, 5) + rng.normal(0, 0.3, (4000, 5))
-    moving = Moving.fit(x[:2000], np.arange(2000) < 1400)
+    moving = StuckDetector.fit(x[:2000], np.arange(2000) < 1400)
     quiet = x[[1999]] + rng.normal(0, 0.3, (500, 5))
     assert (moving(np.concatenate([x[:2000], quiet])) <= 1).all() and (moving(x[2000:]) <= 1).mean() > 0.98
     stuck = x.copy()
@@ -169,7 +169,7 @@ def test_distance_is_one_where_rows_lie_as_known_ones_do():
     rng = np.random.default_rng(0)
     x, owner = np.repeat(rng.normal(size=(200, 3)), 5, 0), np.repeat(np.arange(200), 5)
     x = x + 0.01 * rng.normal(size=x.shape)
-    known = Known.fit(x, owner)
+    known = NoveltyDetector.fit(x, owner)
     assert 0.7 < np.median(known(rng.normal(size=(400, 3)))) < 1.3
     far = np.array([[8.0, 0, 0], [0, 8, 0]])
     assert (known(far) > 3).all()

@@ -29,7 +29,7 @@ from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.experiment import FORWARD, train_all  # noqa: E402
 from biotac_mj.learning.training.features import Pod  # noqa: E402
 from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains, fit_mixing  # noqa: E402
-from biotac_mj.learning.training.fitting import Watch  # noqa: E402
+from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.training.local import Features, train_head  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
@@ -139,7 +139,7 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
 
 @pytest.mark.slow
 def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
-    count, steps = Watch.count, []
+    count, steps = Checkpoints.count, []
 
     def counted(self, n, seconds=0.0):
         count(self, n, seconds)
@@ -149,7 +149,7 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
 
     same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
     monkeypatch.setattr(experiment, "_step_time", lambda *_: 0.0)  # its steps are not these
-    monkeypatch.setattr(Watch, "count", counted)
+    monkeypatch.setattr(Checkpoints, "count", counted)
     monkeypatch.setattr(fitting, "_BETWEEN", 0.0)
     with pytest.raises(KeyboardInterrupt):
         train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)

@@ -47,8 +47,8 @@ _DAMAGED = "it is damaged: train again, or copy it again"
 FORMAT = "biotac_mj.learning.weights/1"
 SHIPPED = ("forward", "inverse", "latent_projection")
 # entries of a file's description
-_SAID = {"channels": list}
-_SAID_OF = {
+_DESCRIPTION = {"channels": list}
+_DESCRIPTION_OF = {
     "forward": {
         "mesh": str,
         "skin": str,
@@ -239,7 +239,7 @@ def _refuse_other(meta, path, geometry, direction):
             f"{path} holds no {direction} model of {FORMAT}: it says {meta.get('format')}, {said}, "
             f"{_kind(meta)}"
         )
-    check_entries(f"the description of {path}", meta, _SAID | _SAID_OF[said])
+    check_entries(f"the description of {path}", meta, _DESCRIPTION | _DESCRIPTION_OF[said])
     if meta["channels"] != list(ELECTRODES):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
@@ -308,12 +308,12 @@ def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
 def _points_model(path, meta, tensors, geometry):
     from .networks.points import SkinPoints
     from .predictor import PointsModel
-    from .training.config import LearningConfig, without_gone
+    from .training.config import LearningConfig, without_obsolete
     from .training.paper import LatentProjection, make_pointnet
 
     graph = {k.removeprefix("points."): v for k, v in tensors.items() if k.startswith("points.")}
     with reading(path, "file of weights that fit together", _DAMAGED):
-        config = LearningConfig(**without_gone(meta["config"]))
+        config = LearningConfig(**without_obsolete(meta["config"]))
         points = SkinPoints.of_arrays({k: v.double().numpy() for k, v in graph.items()}, meta["reference"])
         make = LatentProjection if _kind(meta) == "latent_projection" else make_pointnet
         net = make(points, config)

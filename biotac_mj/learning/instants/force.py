@@ -53,10 +53,10 @@ def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
     i, j = np.triu_indices(3)
     explained = np.linalg.qr(np.column_stack([np.ones(len(force)), force, force[:, i] * force[:, j]]))[0]
     rise = 1 - np.exp(-np.arange(len(force)) / tau)
-    rise_left = rise - explained @ (explained.T @ rise)
+    remaining_rise = rise - explained @ (explained.T @ rise)
     left = log_z - explained @ (explained.T @ log_z)
-    each = rise_left @ left / (rise_left @ rise_left)
-    weight = 1 / np.maximum((left - rise_left[:, None] * each).var(0), 1e-8)
+    each = remaining_rise @ left / (remaining_rise @ remaining_rise)
+    weight = 1 / np.maximum((left - remaining_rise[:, None] * each).var(0), 1e-8)
     return float(weight @ each / weight.sum())
 
 
@@ -229,7 +229,7 @@ def _best(candidates, error):
 
     One of each degree of flexibility, since their average generalises better than any of them. Weights are
     inverse mean squares in the trials; candidates with warm-up are included if it helped."""
-    winners = {kind: min(kin, key=error.get) for kind, kin in _kinds(candidates).items()}
+    winners = {kind: min(same_kind, key=error.get) for kind, same_kind in _kinds(candidates).items()}
     cold = {kind: error[c] for kind, c in winners.items() if not c.warm_up}
     kept = [
         c

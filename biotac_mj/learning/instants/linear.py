@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["best_ridge", "errors_left_out", "principal_components", "ridge", "ridges"]
+__all__ = ["best_ridge", "held_out_errors", "principal_components", "ridge", "ridges"]
 
 # scikit-learn is imported only for fitting: it takes two seconds, and saved models do not need it
 
@@ -42,7 +42,7 @@ def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np
     return ridges(x, y, [strength])[0]
 
 
-def errors_left_out(
+def held_out_errors(
     x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
 ) -> np.ndarray:
     """(len(strengths), m) mean squared errors of `ridges` on held-out groups.
@@ -66,7 +66,7 @@ def best_ridge(
     x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weights (k, m) and offset (m,), with the strength that minimises `held_out_errors` for each target."""
-    best = errors_left_out(x, y, groups, strengths, folds).argmin(0)
+    best = held_out_errors(x, y, groups, strengths, folds).argmin(0)
     fits, column = ridges(x, y, strengths), np.arange(y.shape[1])
     weights, offsets = (np.array(part) for part in zip(*fits))
     return weights[best, :, column].T, offsets[best, column]

@@ -10,7 +10,7 @@ from ...sensor.channels import FULL_SCALE
 from .force import causal_average
 from .linear import principal_components, ridge
 
-__all__ = ["Known", "Moving", "even"]
+__all__ = ["NoveltyDetector", "StuckDetector", "compressed"]
 
 _NEAR, _ALIKE = 5, 10  # nearest neighbours for the distance, and for the expected PDC
 _MOST = 8000  # most reference rows
@@ -26,13 +26,13 @@ _RIDGE = 1e-4
 _COUNT = 4 / FULL_SCALE  # change of ln Z per count at mid-range: the resolution of rows
 
 
-def even(change: np.ndarray) -> np.ndarray:
+def compressed(change: np.ndarray) -> np.ndarray:
     """(n, 19) changes of ln Z, compressed so that light and hard touches are equally dense."""
     return np.arcsinh(change / _KNEE)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Moving:
+class StuckDetector:
     """Detects electrodes that no longer move as predicted by the others; made by `fit`, called with rows in
     order.
 
@@ -50,7 +50,7 @@ class Moving:
     most: np.ndarray
 
     @classmethod
-    def fit(cls, x: np.ndarray, learned: np.ndarray) -> "Moving":
+    def fit(cls, x: np.ndarray, learned: np.ndarray) -> "StuckDetector":
         """Fits to rows x (n, k) of ln Z: correlations of electrodes from the rows `learned` (n,), the largest
         evidence without a stuck electrode from all."""
         move = _moves(x)[learned]
@@ -83,7 +83,7 @@ def _moves(x):
 # 0.971 for an electrode that stays at its baseline, 0.997 against 0.998 for two contacts (touches of
 # tests/test_learning_reader.py). It can neither exclude a row's own trajectory nor be saved as plain numbers.
 @dataclasses.dataclass(frozen=True, eq=False)
-class Known:
+class NoveltyDetector:
     """Reference rows; made by `fit`, called with other rows.
 
     Attributes:
@@ -103,7 +103,9 @@ class Known:
     off: np.ndarray
 
     @classmethod
-    def fit(cls, x: np.ndarray, owner: np.ndarray, pdc: np.ndarray | None = None, seed: int = 0) -> "Known":
+    def fit(
+        cls, x: np.ndarray, owner: np.ndarray, pdc: np.ndarray | None = None, seed: int = 0
+    ) -> "NoveltyDetector":
         """Fits to rows x (n, k) of at least two trajectories `owner` (n,). pdc: (n,) changes [counts]; seed:
         of the subsample of rows."""
         mean, axes, variance = principal_components(x)

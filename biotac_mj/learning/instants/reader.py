@@ -16,7 +16,7 @@ from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impeda
 from ..protocol import conformal_width
 from .examples import Examples
 from .linear import best_ridge, principal_components
-from .novelty import Known, Moving, even
+from .novelty import NoveltyDetector, StuckDetector, compressed
 from .terms import KINDS, Terms
 
 __all__ = [
@@ -98,7 +98,7 @@ class Reader:
             raise ValueError("this model reads changes from rest: give rows at rest with --tare")
         rest = log_impedance(tare) if self.meta["tared"] else np.zeros(n)
         x = log_impedance(counts) - rest
-        strange = self._strange(x, pdc)
+        strange = self._novelty(x, pdc)
         value, half = {}, {}
         for name in self.targets:
             out = self._code(x) if name == "electrodes" else self._regress(name, x)
@@ -106,9 +106,9 @@ class Reader:
             half[name] = self.tensors[f"{name}.half"] * _scale(strange)[:, None]
         novelty = strange
         if self.meta["tared"]:  # an unusual baseline makes every row unusual
-            level = self._known["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
+            level = self._novelty_detector["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
             novelty = np.where(level > 1, np.maximum(level, strange), strange)
-        stuck = self._moving(x)
+        stuck = self._stuck_detector(x)
         novelty = np.where(stuck > 1, np.maximum(novelty, stuck), novelty)
         return Prediction(value, half, novelty)
 
@@ -128,21 +128,25 @@ class Reader:
         return (x - t["mean"]) @ t["axes"][:, :_CODE] @ t["axes"][:, :_CODE].T + t["mean"]
 
     @property
-    def _moving(self):
-        return Moving(*(self.tensors[f"moving.{field.name}"] for field in dataclasses.fields(Moving)))
+    def _stuck_detector(self):
+        return StuckDetector(
+            *(self.tensors[f"moving.{field.name}"] for field in dataclasses.fields(StuckDetector))
+        )
 
     @functools.cached_property
-    def _known(self):
-        names = [field.name for field in dataclasses.fields(Known)]
+    def _novelty_detector(self):
+        names = [field.name for field in dataclasses.fields(NoveltyDetector)]
         spaces = [space for space in _SPACES if f"{space}.rows" in self.tensors]
-        return {space: Known(*(self.tensors[f"{space}.{name}"] for name in names)) for space in spaces}
+        return {
+            space: NoveltyDetector(*(self.tensors[f"{space}.{name}"] for name in names)) for space in spaces
+        }
 
-    def _strange(self, x, pdc):
+    def _novelty(self, x, pdc):
         """(n,) novelty of rows, without that of their baseline."""
-        seen = even(x - self.tensors["centre"])
+        seen = compressed(x - self.tensors["centre"])
         if pdc is None or "pressed.usual" not in self.tensors:
-            return self._known["rows"](seen) / self.tensors["rows.usual"]
-        return self._known["rows"](seen, pdc) / self.tensors["pressed.usual"]
+            return self._novelty_detector["rows"](seen) / self.tensors["rows.usual"]
+        return self._novelty_detector["rows"](seen, pdc) / self.tensors["pressed.usual"]
 
     def save(self, path: pathlib.Path | str) -> None:
         """Writes a safetensors file."""
@@ -221,21 +225,23 @@ def fit_reader(
     x = data.log_change
     mean, axes, _ = principal_components(x[fit])
     tensors = {"mean": mean, "axes": axes}
-    moving = Moving.fit(x[fit | aside], fit[fit | aside])
-    tensors |= {f"moving.{f.name}": getattr(moving, f.name) for f in dataclasses.fields(Moving)}
+    moving = StuckDetector.fit(x[fit | aside], fit[fit | aside])
+    tensors |= {f"moving.{f.name}": getattr(moving, f.name) for f in dataclasses.fields(StuckDetector)}
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
-    seen, pressed = even(x - tensors["centre"]), data.pdc is not None
-    known = {"rows": Known.fit(seen[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)}
+    seen, pressed = compressed(x - tensors["centre"]), data.pdc is not None
+    known = {
+        "rows": NoveltyDetector.fit(seen[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)
+    }
     usual = {"rows": np.quantile(known["rows"](seen[aside]), 0.95)}
     if pressed:
         usual["pressed"] = np.quantile(known["rows"](seen[aside], data.pdc[aside]), 0.95)
     if data.tared:  # one baseline per trajectory
         first = np.isin(np.arange(len(x)), np.unique(data.owner, return_index=True)[1])
         rest = log_impedance(data.tare)
-        known["level"] = Known.fit(rest[fit & first], data.owner[fit & first], seed=seed)
+        known["level"] = NoveltyDetector.fit(rest[fit & first], data.owner[fit & first], seed=seed)
         usual["level"] = max(known["level"](rest[aside & first]).max(), 1.0)
     for name, one in known.items():
-        tensors |= {f"{name}.{f.name}": getattr(one, f.name) for f in dataclasses.fields(Known)}
+        tensors |= {f"{name}.{f.name}": getattr(one, f.name) for f in dataclasses.fields(NoveltyDetector)}
     tensors |= {f"{name}.usual": np.array(value) for name, value in usual.items()}
     kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in KINDS]
     for k, terms in enumerate(kinds):

@@ -6,7 +6,7 @@ from scipy.signal import find_peaks
 
 from ...sensor.channels import log_impedance
 from .force import causal_average
-from .linear import errors_left_out, ridge
+from .linear import held_out_errors, ridge
 from .terms import KINDS, Terms
 
 __all__ = ["TOUCHES", "label", "touches_of_force", "transfer_force"]
@@ -87,7 +87,7 @@ def _amended(columns, believed, force, rows, touch):
     """Prediction for all rows (n, 3), and its mean square on held-out touches (3,)."""
     starts = (np.zeros_like(believed), believed)
     left = [force - start[rows] for start in starts]
-    error = np.concatenate([errors_left_out(columns[rows], y, touch, _RIDGE, _FOLDS) for y in left])
+    error = np.concatenate([held_out_errors(columns[rows], y, touch, _RIDGE, _FOLDS) for y in left])
     out = np.empty_like(believed)
     for c, which in enumerate(error.argmin(0)):
         start, strength = divmod(which, len(_RIDGE))

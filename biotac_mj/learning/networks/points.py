@@ -88,11 +88,11 @@ class SkinPoints:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Arrays for a file of weights, inverse of `of_arrays`."""
-        out = {"place": self.place, **_taken_apart("spread", self.spread)}
+        out = {"place": self.place, **_csr_arrays("spread", self.spread)}
         for k, level in enumerate(self.levels):
-            out |= _taken_apart(f"laplacian{k}", level.laplacian)
+            out |= _csr_arrays(f"laplacian{k}", level.laplacian)
             if level.keep is not None:
-                out |= {f"keep{k}": level.keep, **_taken_apart(f"up{k}", level.up)}
+                out |= {f"keep{k}": level.keep, **_csr_arrays(f"up{k}", level.up)}
         return out
 
     @classmethod
@@ -102,17 +102,17 @@ class SkinPoints:
         while f"laplacian{len(levels)}.shape" in arrays:
             k, keep, up = len(levels), None, None
             if f"keep{k}" in arrays:
-                keep, up = arrays[f"keep{k}"].astype(int), _put_together(arrays, f"up{k}")
-            levels.append(Level(_put_together(arrays, f"laplacian{k}"), keep, up))
-        return cls(arrays["place"], levels, _put_together(arrays, "spread"), reference)
+                keep, up = arrays[f"keep{k}"].astype(int), _csr_from(arrays, f"up{k}")
+            levels.append(Level(_csr_from(arrays, f"laplacian{k}"), keep, up))
+        return cls(arrays["place"], levels, _csr_from(arrays, "spread"), reference)
 
 
-def _taken_apart(name, matrix):
+def _csr_arrays(name, matrix):
     matrix = csr_matrix(matrix)
     parts = {"shape": np.array(matrix.shape), "crow": matrix.indptr, "col": matrix.indices}
     return {f"{name}.{part}": value for part, value in (parts | {"value": matrix.data}).items()}
 
 
-def _put_together(arrays, name):
+def _csr_from(arrays, name):
     crow, col, shape = (arrays[f"{name}.{part}"].astype(int) for part in ("crow", "col", "shape"))
     return csr_matrix((arrays[f"{name}.value"], col, crow), shape=tuple(shape))

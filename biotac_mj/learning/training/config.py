@@ -6,10 +6,10 @@ import numpy as np
 
 from ...fields import check_types
 
-__all__ = ["LearningConfig", "without_gone"]
+__all__ = ["LearningConfig", "without_obsolete"]
 
 # fields in files of earlier versions that had a single value
-_GONE = {"hierarchy": "geodesic", "tare": "row 0"}
+_OBSOLETE = {"hierarchy": "geodesic", "tare": "row 0"}
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
@@ -120,6 +120,6 @@ class LearningConfig:
             )
 
 
-def without_gone(settings: dict) -> dict:
+def without_obsolete(settings: dict) -> dict:
     """Fields of a LearningConfig from a file, without obsolete ones of earlier versions."""
-    return {name: value for name, value in settings.items() if _GONE.get(name, ()) != value}
+    return {name: value for name, value in settings.items() if _OBSOLETE.get(name, ()) != value}

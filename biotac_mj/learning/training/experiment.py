@@ -24,9 +24,9 @@ from ..predictor import PointsModel
 from ..protocol import interaction_errors
 from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays
-from .config import LearningConfig, without_gone
+from .config import LearningConfig, without_obsolete
 from .features import Pod
-from .fitting import Watch
+from .fitting import Checkpoints
 from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_inverse
 from .local import Features, film_with_gains, train_head
 from .paper import train_latent_projection, train_pointnet
@@ -101,8 +101,8 @@ def train_all(
     for split in splits:
         division_of(path, split, 0, count)  # raises if it cannot be split
     # time the steps for the estimate
-    ahead = size * len(tasks) if progress and ray is None and str(device) == "cpu" else 0
-    work = _Train(settings, str(device), size, ahead)
+    timed_steps = size * len(tasks) if progress and ray is None and str(device) == "cpu" else 0
+    work = _Train(settings, str(device), size, timed_steps)
     for _ in run_tasks(
         work, tasks, out, "train", "step", ray, gpus=int(str(device) != "cpu"), progress=progress
     ):
@@ -132,7 +132,7 @@ class _Train:
     settings: dict
     device: str
     size: int
-    ahead: int
+    timed_steps: int
 
     def __call__(self, values, folder, say):
         with _one_thread():
@@ -141,10 +141,10 @@ class _Train:
                     self._features = self._read(say)
                 given = self.settings
                 name = hashlib.sha256(json.dumps([given, self.device, split, seed]).encode()).hexdigest()[:16]
-                watch = Watch(folder / f"unfinished-{name}", say)
-                train_split(self._features, split, seed, folder, given, watch)
-                say(self.size - watch.steps)  # if a network with fewer steps was the best
-                shutil.rmtree(watch.folder, ignore_errors=True)
+                checkpoints = Checkpoints(folder / f"unfinished-{name}", say)
+                train_split(self._features, split, seed, folder, given, checkpoints)
+                say(self.size - checkpoints.steps)  # if a network with fewer steps was the best
+                shutil.rmtree(checkpoints.folder, ignore_errors=True)
                 yield split, seed
 
     def _read(self, say):
@@ -155,8 +155,8 @@ class _Train:
         features = Features(arrays, config)
         text = f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps"
         say(f"{text} read in {time.time() - begun:.0f} s")
-        if self.ahead:
-            minutes = self.ahead * _step_time(features, given["models"], given["paper"]) / 60
+        if self.timed_steps:
+            minutes = self.timed_steps * _step_time(features, given["models"], given["paper"]) / 60
             say(f"about {max(1, round(minutes))} minutes on one core; stopped, it goes on where it was")
         return features
 
@@ -175,16 +175,16 @@ def _step_time(features, names, paper, steps=4):
     }
     short = dataclasses.replace(config, steps=steps, **papers)
     parts = labelled, labelled[:8], short
-    for watch in (Watch(), Watch()):  # the first calls are slow
+    for checkpoints in (Checkpoints(), Checkpoints()):  # the first calls are slow
         for name in names:
-            train_head(features, *parts, pod=pod, watch=watch, **FORWARD[name])
+            train_head(features, *parts, pod=pod, checkpoints=checkpoints, **FORWARD[name])
         for teach in (False, True):
-            train_inverse(arrays, *parts, pod, 0, teach, watch)
+            train_inverse(arrays, *parts, pod, 0, teach, checkpoints)
     if paper:
         points, there = features.at_points
-        train_latent_projection(there, points, *parts, watch=watch)
-        train_pointnet(there, points, *parts, watch=watch)
-    return watch.seconds / watch.steps
+        train_latent_projection(there, points, *parts, checkpoints=checkpoints)
+        train_pointnet(there, points, *parts, checkpoints=checkpoints)
+    return checkpoints.seconds / checkpoints.steps
 
 
 @contextlib.contextmanager
@@ -207,7 +207,7 @@ def _refuse_others(out, settings):
         )
         found = found.get("settings", {})
         if "config" in found:
-            found = found | {"config": without_gone(found["config"])}
+            found = found | {"config": without_obsolete(found["config"])}
         differ = [name for name, value in settings.items() if not found or found.get(name) != value]
         if differ:
             raise ValueError(
@@ -222,12 +222,12 @@ def train_split(
     seed: int,
     out: pathlib.Path,
     settings: dict,
-    watch: Watch | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> None:
     """Trains one split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of
-    seed 0, and last SPLIT-SEED.json with the settings of the whole training. watch: of all networks."""
+    seed 0, and last SPLIT-SEED.json with the settings of the whole training. checkpoints: of all networks."""
     arrays, config = features.arrays, features.config
-    path, names, watch = settings["set"], settings["models"], watch or Watch()
+    path, names, checkpoints = settings["set"], settings["models"], checkpoints or Checkpoints()
     division = division_of(path, split, seed, len(arrays.objects))
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
@@ -258,7 +258,14 @@ def train_split(
         models[name] = timed(
             name,
             lambda name=name: train_head(
-                features, train, validation, config, seed=seed, pod=pod, watch=watch, **FORWARD[name]
+                features,
+                train,
+                validation,
+                config,
+                seed=seed,
+                pod=pod,
+                checkpoints=checkpoints,
+                **FORWARD[name],
             ),
         )
         predictions[name] = models[name](both)
@@ -281,7 +288,7 @@ def train_split(
                     config,
                     seed=1000 * (k + 1) + seed,
                     pod=pod,
-                    watch=watch,
+                    checkpoints=checkpoints,
                     **FORWARD[best],
                 ),
             )
@@ -293,7 +300,9 @@ def train_split(
     inverses = {
         name: timed(
             name,
-            lambda teach=teach: train_inverse(arrays, train, validation, config, pod, seed, teach, watch),
+            lambda teach=teach: train_inverse(
+                arrays, train, validation, config, pod, seed, teach, checkpoints
+            ),
         )
         for name, teach in (("pod_inverse", False), ("pod_inverse_taught", True))
     }
@@ -318,15 +327,17 @@ def train_split(
         points, there = features.at_points
         lp, report["curves"] = timed(
             "latent_projection",
-            lambda: train_latent_projection(there, points, train, validation, config, seed, watch),
+            lambda: train_latent_projection(there, points, train, validation, config, seed, checkpoints),
         )
-        net = timed("pointnet", lambda: train_pointnet(there, points, train, validation, config, seed, watch))
+        net = timed(
+            "pointnet", lambda: train_pointnet(there, points, train, validation, config, seed, checkpoints)
+        )
         served = {
             name: PointsModel(one, points, arrays.geometry, config, {}).to(device).eval()
             for name, one in (("latent_projection", lp), ("pointnet", net))
         }
         for name, one in served.items():
-            predictions[name] = _in_parts(lambda r, one=one: one.change(arrays, r), both)
+            predictions[name] = _in_batches(lambda r, one=one: one.change(arrays, r), both)
         signal = served["latent_projection"].target(arrays, both)
         predictions["electrode_vae"] = served["latent_projection"].change_of(
             lp.electrode(signal)[0].detach(), arrays.tare[both]
@@ -337,7 +348,7 @@ def train_split(
         )
         fit_patch = fit[torch.linspace(0, len(fit) - 1, min(2000, len(fit)), device=device).long()]
         shares["latent_inverse"] = patch_of_push(
-            _in_parts(lambda r: back["latent_inverse"](r)[1], fit_patch).cpu().numpy(),
+            _in_batches(lambda r: back["latent_inverse"](r)[1], fit_patch).cpu().numpy(),
             arrays.force[fit_patch].float().cpu().numpy(),
         )
     report["mesh"] = {name: _mesh_errors(arrays, code, every) for name, code in codes.items()}
@@ -389,7 +400,7 @@ def _linear(arrays, now, fit, check, both):
 
 
 @torch.no_grad()
-def _in_parts(work, rows):
+def _in_batches(work, rows):
     return torch.cat([work(r) for r in rows.split(512)])
 
 

@@ -16,7 +16,7 @@ from torch.optim.lr_scheduler import LambdaLR, OneCycleLR
 
 from ...files import replacing
 
-__all__ = ["Watch", "cycle", "fast_products", "root_mean_square"]
+__all__ = ["Checkpoints", "cycle", "fast_products", "root_mean_square"]
 
 _WARM = 5  # warm-up steps before the capture
 _BETWEEN = 5.0  # [s] between two checkpoints: one takes as long as three small steps
@@ -34,7 +34,7 @@ def fast_products() -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
-class Watch:
+class Checkpoints:
     """Checkpoints the trainings of one job. When run again in the same order, finished ones are not repeated,
     and an interrupted one continues, on the CPU bit-equal.
 
@@ -96,7 +96,7 @@ def cycle(
     decay: float | None = None,
     seed: int = 0,
     graph: bool = True,
-    watch: Watch | None = None,
+    checkpoints: Checkpoints | None = None,
     curve: list | None = None,
 ) -> float | None:
     """Trains in place.
@@ -112,7 +112,7 @@ def cycle(
         host.
       validate: function () -> float, called `checks` times; the state of its smallest value is kept at the
         end. None keeps the last.
-      watch: what sees and keeps the steps. curve: gets [step, value] of each validation.
+      checkpoints: counts and saves the steps. curve: gets [step, value] of each validation.
 
     Returns:
       smallest value of validate, or None.
@@ -133,8 +133,8 @@ def cycle(
     best, state, first = None, None, 0
     module.train()
     every = max(1, steps // checks)
-    watch = watch or Watch()
-    kept = watch.begin()
+    checkpoints = checkpoints or Checkpoints()
+    kept = checkpoints.begin()
     if kept:
         best, state, first = kept["best"], kept["state"], kept["step"]
         module.load_state_dict(kept["module"])
@@ -160,9 +160,9 @@ def cycle(
             replay, value = _record(one)
             replay.replay()
         else:
-            value = _aside(one) if cuda and graph else one()
+            value = _on_side_stream(one) if cuda and graph else one()
         schedule.step()
-        watch.count(1, time.perf_counter() - clock)
+        checkpoints.count(1, time.perf_counter() - clock)
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(
@@ -178,7 +178,7 @@ def cycle(
                     curve.append([step + 1, now])
                 if best is None or now < best:
                     best, state = now, copy.deepcopy(module.state_dict())
-            watch.keep(
+            checkpoints.keep(
                 last=step + 1 == steps,
                 step=step + 1,
                 best=best,
@@ -213,7 +213,7 @@ def _schedule(optimizer, rate, steps, decay):
     return LambdaLR(optimizer, lambda step: decay ** (20 * step / steps))
 
 
-def _aside(one):
+def _on_side_stream(one):
     """A step on a stream of its own, as PyTorch wants the first ones of what is recorded later."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())

@@ -12,7 +12,7 @@ from ...sensor.channels import NELECTRODE, check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
 from .features import ELECTRODE_MIRROR, orthogonal_modes
-from .fitting import Watch, cycle, root_mean_square
+from .fitting import Checkpoints, cycle, root_mean_square
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays
@@ -74,7 +74,7 @@ def train_inverse(
     pod: tuple,
     seed: int = 0,
     teach: bool = False,
-    watch: Watch | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> InverseHead:
     """Trains on labelled interactions. pod: (Pod, components of all rows, those of the mirrored touches or
     None).
@@ -128,7 +128,7 @@ def train_inverse(
             2 * config.learning_rate,
             seed=seed,
             graph=config.graphs,
-            watch=watch,
+            checkpoints=checkpoints,
         )
     rate = config.learning_rate * (0.5 if teach else 1)
     head.validation = cycle(
@@ -142,7 +142,7 @@ def train_inverse(
         weight_decay=0.01,
         seed=seed,
         graph=config.graphs,
-        watch=watch,
+        checkpoints=checkpoints,
     )
     return head
 

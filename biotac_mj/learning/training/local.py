@@ -12,7 +12,7 @@ from ...sensor.channels import FULL_SCALE, log_impedance
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead, PodHead, averages
 from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
-from .fitting import Watch, cycle, root_mean_square
+from .fitting import Checkpoints, cycle, root_mean_square
 
 if typing.TYPE_CHECKING:
     from ..networks.points import SkinPoints
@@ -102,7 +102,7 @@ def train_head(
     log: bool = True,
     seed: int = 0,
     pod: tuple | None = None,
-    watch: Watch | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Trains one head.
 
@@ -175,7 +175,7 @@ def train_head(
             2 * config.learning_rate,
             seed=seed,
             graph=config.graphs,
-            watch=watch,
+            checkpoints=checkpoints,
         )
     rate = config.learning_rate * (0.5 if teach else 1)
     cycle(
@@ -189,7 +189,7 @@ def train_head(
         weight_decay=0.01,
         seed=seed,
         graph=config.graphs,
-        watch=watch,
+        checkpoints=checkpoints,
     )
 
     @torch.no_grad()

@@ -11,7 +11,7 @@ from ..networks.electrode_vae import ElectrodeVAE, mlp
 from ..networks.heads import FromRest
 from ..networks.mesh_vae import MeshVAE
 from ..networks.pointnet import PointNet
-from .fitting import Watch, cycle, fast_products, root_mean_square
+from .fitting import Checkpoints, cycle, fast_products, root_mean_square
 from .local import counts_change
 
 if typing.TYPE_CHECKING:
@@ -84,7 +84,7 @@ def train_latent_projection(
     validation: np.ndarray,
     config: "LearningConfig",
     seed: int = 0,
-    watch: Watch | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> tuple[LatentProjection, dict]:
     """Trains both VAEs, freezes them, trains the projections.
 
@@ -113,7 +113,7 @@ def train_latent_projection(
         return _vae_loss(u, *vae(u), config.mesh_kl, config.reconstruction)
 
     cycle(vae, mesh_loss, mesh_rows, config.mesh_batch, config.mesh_steps, config.learning_rate,
-          mesh_validate, decay=config.decay, seed=seed, graph=False, watch=watch,
+          mesh_validate, decay=config.decay, seed=seed, graph=False, checkpoints=checkpoints,
           curve=curves["mesh"])  # fmt: skip
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
@@ -121,7 +121,7 @@ def train_latent_projection(
     target = _Target(arrays, both, config)
     y = target.value
     kind = dict(batch=config.batch, steps=config.paper_steps, learning_rate=config.learning_rate,
-                decay=config.decay, seed=seed, graph=config.graphs, watch=watch)  # fmt: skip
+                decay=config.decay, seed=seed, graph=config.graphs, checkpoints=checkpoints)  # fmt: skip
 
     def electrode_loss(r):
         return _vae_loss(y[r], *electrode(y[r]), config.electrode_kl, config.reconstruction)
@@ -171,7 +171,7 @@ def train_pointnet(
     validation: np.ndarray,
     config: "LearningConfig",
     seed: int = 0,
-    watch: Watch | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> PointNet:
     """Trains the baseline on labelled interactions only; arrays: of `Arrays.at_points`. Input and output are
     those of `LatentProjection`."""
@@ -188,7 +188,7 @@ def train_pointnet(
         return sum(float(loss(r)) * len(r) for r in check.split(1024)) / len(check)
 
     cycle(from_rest, loss, rows, config.batch, config.paper_steps, config.learning_rate, validate,
-          decay=config.decay, seed=seed, graph=False, watch=watch)  # fmt: skip
+          decay=config.decay, seed=seed, graph=False, checkpoints=checkpoints)  # fmt: skip
     return net.eval()
 
 
