@@ -43,7 +43,7 @@ from biotac_mj.learning.protocol import paired_test, quartiles
 from biotac_mj.learning.training.arrays import join, load_arrays
 from biotac_mj.learning.training.config import LearningConfig
 from biotac_mj.learning.training.features import Pod
-from biotac_mj.learning.training.fitting import cycle, fast_products, root_mean_square
+from biotac_mj.learning.training.fitting import TrainingOptions, fast_products, root_mean_square, train
 from biotac_mj.learning.training.local import Features, counts_change
 from biotac_mj.sensor.channels import log_impedance
 from biotac_mj.shards import Task, one_per_gpu, run_tasks
@@ -160,7 +160,8 @@ class Table:
 
     def train(self, module, loss, rows, check, seed):
         """Trains a module by a loss (rows) -> scalar; the state that is best on rows `check` is kept."""
-        cycle(module, loss, rows, 128, self.steps, 1e-3, lambda: loss(check), weight_decay=0.01, seed=seed)
+        options = TrainingOptions(128, self.steps, 1e-3, weight_decay=0.01, seed=seed)
+        train(module, loss, rows, options, lambda: loss(check))
 
     def wrong(self, counts, rows):
         """Loss of a change of counts (k, 19)."""

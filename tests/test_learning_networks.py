@@ -21,7 +21,7 @@ from biotac_mj.learning.networks.pointnet import PointNet  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig, without_obsolete  # noqa: E402
 from biotac_mj.learning.training.experiment import _refuse_others  # noqa: E402
 from biotac_mj.learning.training.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
-from biotac_mj.learning.training.fitting import _schedule, cycle  # noqa: E402
+from biotac_mj.learning.training.fitting import TrainingOptions, _schedule, train  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -257,5 +257,6 @@ def test_replayed_steps_train_as_launched_ones_do():
         loss = lambda r, net=net: (net(x[r]) - y[r]).square().mean()  # noqa: E731
         rows = torch.arange(300, device="cuda")
         whole = lambda loss=loss, rows=rows: loss(rows)  # noqa: E731
-        found.append(float(cycle(net, loss, rows, 64, 300, 3e-3, whole, decay=0.95, graph=graph)))
+        options = TrainingOptions(64, 300, 3e-3, decay=0.95, graph=graph)
+        found.append(float(train(net, loss, rows, options, whole)))
     assert abs(found[0] - found[1]) < 0.02 * found[0] and found[0] < 0.5

@@ -1,4 +1,4 @@
-"""Where, how deep and over how much skin an object touches: the labels of a set's time steps."""
+"""Contact position, depth and area of an object on the skin: labels of a set's time steps."""
 
 import numpy as np
 
@@ -21,8 +21,8 @@ def contact_labels(
 
     Args:
       displacement: (n, nvert, 3) of the nodes against `geometry.vert` [m].
-      force: (n, nouter, 3) of the object on the outer nodes [N]. area: (n,) that it touches [m^2].
-      rest: (nvert, 3) displacements at which the untouched skin lies, which depth is measured from; None: 0.
+        force: (n, nouter, 3) of the object on the outer nodes [N]. area: (n,) contact area [m^2].
+        rest: (nvert, 3) displacements of the untouched skin, the zero of depth; None: 0.
     """
     outer, size = nodes_of(geometry), np.linalg.norm(np.asarray(force, float), axis=2)
     total = size.sum(1)

@@ -1,4 +1,4 @@
-"""Recordings of real sensors in the native store: interactions of kind "recorded", no simulation."""
+"""Recordings of real sensors as data sets: interactions of kind "recorded", without simulation."""
 
 import pathlib
 import typing
@@ -21,9 +21,8 @@ class Measured(typing.NamedTuple):
     """Rows of a recording as a set's columns.
 
     Attributes:
-      counts: (n, nchannel), NaN where a channel was not recorded. pac: (n, 22), None without raw counts of
-        it.
-      wrench: (n, 6) in the recording's frame, None without forces. notes: what had to be assumed.
+        counts: (n, nchannel), NaN if a channel was not recorded. pac: (n, 22), None without raw counts.
+        wrench: (n, 6) in the recording's frame, None without forces. notes: assumptions.
     """
 
     counts: np.ndarray
@@ -33,10 +32,10 @@ class Measured(typing.NamedTuple):
 
 
 def measured(recording: Recording) -> Measured:
-    """What a recording measured.
+    """Columns of a data set from a recording.
 
     Raises:
-      ValueError: no raw counts can be made of its electrodes.
+        ValueError: the electrodes cannot be converted to raw counts.
     """
     electrodes, notes = recording.counts()
     n, first = electrodes.shape
@@ -57,16 +56,16 @@ def measured(recording: Recording) -> Measured:
 
 
 def interactions(recording: Recording, block: float | None = None) -> list[Interaction]:
-    """A recording cut where its clock has a gap of more than 0.5 s.
+    """A recording, split where its clock has a gap of more than 0.5 s.
 
-    Electrodes become `measured_counts`, PAC `measured_pac` as well, forces `measured_wrench`; the object's
-    pose becomes `indenter_pos`, where it touches `contact_pos`, in the recording's frame.
+    Electrodes become `measured_counts`, PAC also `measured_pac`, forces `measured_wrench`; the object's pose
+    becomes `indenter_pos`, the contact position `contact_pos`, in the recording's frame.
 
     Args:
-      block: cuts into this length [s], too. Neighbouring blocks share their drift: they are alike.
+      block: also splits into this length [s]. Neighbouring blocks have the same drift, so they are similar.
 
     Raises:
-      ValueError: no raw counts can be made of its electrodes.
+        ValueError: the electrodes cannot be converted to raw counts.
     """
     n, found = len(recording), measured(recording)
     cut = set(np.flatnonzero(np.diff(recording.time) > _GAP) + 1)
@@ -99,7 +98,7 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
 
 
 def _whole(value, rows):
-    """Rows of a pose, None where it is not there in all of them."""
+    """Rows of a pose, None if some are missing."""
     return value[rows] if value is not None and np.isfinite(value[rows]).all() else None
 
 
@@ -111,15 +110,15 @@ def import_recordings(
     say: Callable[[str], object] | None = None,
     **options: object,
 ) -> int:
-    """Reads files and writes a set, a shard for each file, split by interaction.
+    """Reads files and writes a set, a shard for each file, with a split by interaction.
 
     Args:
-      paths: files. out: folder of the set; it must not hold one already.
-      seed: of the split. block: see `interactions`. options: of `recordings.load`.
-      say: gets what makes a recording doubtful, a line at a time.
+        paths: files. out: folder of the set; it must not contain one.
+        seed: of the split. block: see `interactions`. options: of `recordings.load`.
+        say: gets doubts about a recording, line by line.
 
-    Returns:
-      how many interactions.
+      Returns:
+        number of interactions.
 
     Raises:
       ValueError, FileNotFoundError: see `recordings.load` and `interactions`.
@@ -144,7 +143,7 @@ def import_recordings(
     for number, group in enumerate(groups):
         for one in group:
             one.split = str(next(part))
-        # a column is in all interactions of a shard or in none
+        # a column exists in all interactions of a shard or in none
         for name in ("contact_pos", "indenter_pos", "indenter_quat", "measured_pac", "measured_wrench"):
             if any(getattr(one, name) is None for one in group):
                 for one in group:

@@ -1,5 +1,5 @@
-"""Export to the directory layout of LeRobotDataset v3.0 (Parquet and JSON), written with pyarrow alone; the
-skin's nodes stay in HDF5.
+"""Export to the directory layout of LeRobotDataset v3.0 (Parquet and JSON) with pyarrow only; the skin's
+nodes stay in HDF5.
 
 An interaction is an episode. Layout as `lerobot` 0.4 reads it: meta/info.json, meta/stats.json,
 meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet and data/chunk-000/file-000.parquet."""
@@ -29,7 +29,7 @@ _CONTACT = {
 }
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 PAC = tuple(f"pac{i + 1}" for i in range(NPAC))
-_REAL = ("recorded", "resimulated")  # kinds whose measured counts a real sensor gave
+_REAL = ("recorded", "resimulated")  # kinds with measured counts of a real sensor
 _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 
@@ -43,28 +43,26 @@ def export_lerobot(
 ) -> pathlib.Path:
     """Writes the folder `out` (built under another name, then renamed).
 
-    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19, of
-      other designs as many as they have), .pdc,
-      .tdc, .tac (1 each), .pac (22, or the latest where the set has no more)
-    [counts], observation.force (6, of the skin on the object), observation.contact.pos, .normal (3), .depth
-      and .area (1; all 0 where nothing touches) and action (7), the pose at the next time step.
-    The task says what is done
-    with what: "press with ring_7mm". `source.json` tells which interaction each episode was, so that
-      (episode_index, frame_index) leads to
-    the nodes in the HDF5 shards.
+    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19; other
+    designs have
+      their own number), .pdc, .tdc, .tac (1 each), .pac (22, or the latest if the set has no more) [counts],
+      observation.force (6, of the skin on the object), observation.contact.pos, .normal (3), .depth and .area
+      (1; all 0 without contact) and action (7), the pose at the next time step.
+    The task names action and object: "press with ring_7mm". `source.json` maps each episode to its
+    interaction, so that (episode_index, frame_index) leads to the nodes in the HDF5 shards.
 
     Args:
       data: TactileSet with poses.
-      counts: "counts" for simulated readings of all interactions, "measured_counts" for those that have
-        measured ones.
-      rate: [Hz] of the frames; each holds the nearest row, none is made up. None: the set's own, where its
-        clock is even, or that of a recording from which rows are missing.
+        counts: "counts" for simulated readings of all interactions, "measured_counts" for those of
+          interactions that have measured ones.
+        rate: [Hz] of the frames, which take the nearest row. None: the set's own, if its clock is even, or
+          that of a recording with missing rows.
 
     Episodes are in the order train, validation, test, and meta/info.json has the set's splits.
 
     Raises:
-      ValueError: no poses or counts in the set, nothing to export, time steps that are not even, one row
-        alone where no rate is given, or a folder that is there.
+        ValueError: no poses or counts in the set, nothing to export, uneven time steps, a single row without
+          a rate, or an existing folder.
       ImportError: no pyarrow; the text says how to get it.
     """
     _pyarrow()
@@ -85,7 +83,7 @@ def interactions_to_export(
     """Numbers of the interactions that have counts, in the order train, validation, test.
 
     Raises:
-      ValueError: `out` is there, the set is unfinished, has no counts or no columns that are needed.
+        ValueError: `out` exists, or the set is unfinished or lacks counts or needed columns.
     """
     if pathlib.Path(out).exists():
         raise ValueError(f"{out} is there already: choose another folder, or delete it")
@@ -97,7 +95,7 @@ def interactions_to_export(
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
     for name in (counts, *needed):
-        data[name]  # says what is missing
+        data[name]  # raises if it is missing
     chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))
     if not len(chosen):
         raise ValueError(f"no interaction of {data.path} has {counts}: there is nothing to export")
@@ -139,27 +137,27 @@ class _Export:
         tasks = [f"{kind} with {name}" for kind, name in zip(data.kind[chosen], data.object[chosen])]
         self.tasks = sorted(set(tasks))
         self.task = [self.tasks.index(task) for task in tasks]
-        if recorded:  # nobody simulated it: what was not measured in all of its rows is no feature
+        if recorded:  # not simulated: columns with missing rows are no features
             episodes = [self._episode(number, int(i), 0) for number, i in enumerate(chosen)]
             for name in list(self.features):
                 if not all(np.isfinite(one[name]).all() for one in episodes):
                     del self.features[name], self.all_features[name]
 
     def _contact(self):
-        """Names of the numbers of where it touches, as far as the set has them."""
+        """Names of the contact's numbers that the set has."""
         return {name: axes for name, axes in _CONTACT.items() if f"contact_{name}" in self.data.columns}
 
     def _axes(self):
-        """Names of the force's numbers: a recording without torques has three."""
+        """Names of the force's numbers: three for a recording without torques."""
         if not self.recorded or "measured_wrench" not in self.data.columns:
             return _WRENCH
         return _WRENCH if np.isfinite(self.data["measured_wrench"][:][:, 3:]).any() else _WRENCH[:3]
 
     def _rate(self, wanted):
-        """Frames per second, and whether rows are frames as they are."""
+        """Frames per second, and whether rows can be used as frames."""
         steps = [np.diff(self.data["time"][self.data.start[i] : self.data.stop[i]]) for i in self.chosen[:50]]
         step = np.concatenate(steps)
-        # a real clock shakes; half a step off, a row was dropped
+        # a real clock jitters; half a step off means a missing row
         shaken = 0.5 * np.median(step) if self.recorded and len(step) else 1e-4
         even = len(step) > 0 and np.ptp(step) <= shaken
         if not len(step) and wanted is None:
@@ -170,7 +168,7 @@ class _Export:
                 "give it with --rate, frames hold the nearest rows"
             )
         own = 1 / (step.mean() if even else np.median(step)) if len(step) else wanted
-        near = 1e-2 if self.recorded else 1e-3  # a real clock is hardly ever right
+        near = 1e-2 if self.recorded else 1e-3  # tolerance for a real clock
         own = int(round(own)) if abs(own - round(own)) < near * own else float(own)
         if wanted is None:
             return own, even
@@ -236,7 +234,7 @@ class _Export:
         return {name: out[name] for name in self.all_features}
 
     def _rows(self, i):
-        """(n,) rows of the set that the frames of interaction i are."""
+        """(n,) rows of the set for the frames of interaction i."""
         rows = np.arange(self.data.start[i], self.data.stop[i])
         if self.even:
             return rows
@@ -246,13 +244,13 @@ class _Export:
         return rows[np.where(due - time[after - 1] <= time[after % len(time)] - due, after - 1, after)]
 
     def _column(self, name, rows, width):
-        """(n, width) of a column; NaN where the set has none."""
+        """(n, width) of a column; NaN if the set has none."""
         if name in self.data.columns:
             return self.data[name][rows]
         return np.full((len(rows), width), np.nan)
 
     def _touch(self, name, rows):
-        """(n, k) or (n,) of where it touches; 0 where nothing does: LeRobot normalises all rows."""
+        """(n, k) or (n,) of the contact; 0 without: LeRobot normalises all rows."""
         value = self.data[f"contact_{name}"][rows].astype(np.float32)
         return value if self.recorded else np.nan_to_num(value)
 
@@ -329,7 +327,7 @@ class _Export:
         }
 
     def _splits(self):
-        """Ranges of episodes, as they were chosen: one split after the other."""
+        """Ranges of episodes, one split after the other."""
         split, out, begin = self.data.split[self.chosen], {}, 0
         for name in SPLITS:
             count = int((split == name).sum())
@@ -360,7 +358,7 @@ def _feature(names):
 
 
 def _statistics(value):
-    """Of a column (n, k) or (n,): each (k,) or (1,)."""
+    """Statistics of a column (n, k) or (n,): each (k,) or (1,)."""
     value = np.asarray(value, float).reshape(len(value), -1)
     quantile = np.quantile(value, (0.01, 0.10, 0.50, 0.90, 0.99), axis=0)
     return {

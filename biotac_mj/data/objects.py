@@ -1,9 +1,8 @@
-"""The seventeen things that touch the sensor: the paper's eight indenters, six pegs and three features of a
+"""The seventeen objects that touch the sensor: the paper's eight indenters, six pegs and three features of a
 table.
 
-Narang et al. (ICRA 2021) name pegs and table features without their sizes: those here are chosen. Frames are
-those of
-`press.indenter`: the tip at the origin, +y ahead.
+Narang et al. (ICRA 2021) name pegs and table features without sizes: those here are chosen. Frames are those
+of `press.indenter`: the tip at the origin, +y forward.
 """
 
 import functools
@@ -20,7 +19,7 @@ __all__ = ["OBJECTS", "grid_of", "make_object"]
 
 _EDGE = 0.5e-3  # [m] rounding of pegs and of the table's edges
 _LENGTH = 12e-3  # [m] of a peg
-_TABLE = 20e-3  # [m] half width of the block that stands for the table: beyond the finger on all sides
+_TABLE = 20e-3  # [m] half width of the block for the table: larger than the finger on all sides
 
 PEGS = (
     "peg_round_4mm",
@@ -35,7 +34,7 @@ OBJECTS = (*INDENTERS, *PEGS, *TABLE)
 
 
 def _box(name, half, turn):
-    """A rounded box, turned about its centre and moved so that what is then foremost lies at the origin."""
+    """A rounded box, rotated about its centre and shifted so that its foremost point is at the origin."""
     half, inner = np.array(half), np.array(half) - _EDGE
     quat = (
         UPRIGHT
@@ -45,7 +44,7 @@ def _box(name, half, turn):
     rotation = matrix(quat)
     reach = np.abs(rotation[1]) @ inner + _EDGE
     pos = np.array([0.0, -reach, 0.0])
-    mesh = trimesh.creation.box(extents=2 * half)  # for rays and pictures: its edges are sharp
+    mesh = trimesh.creation.box(extents=2 * half)  # for rays and pictures, with sharp edges
     return Indenter(
         name, "box", tuple(half), _EDGE, pos, quat, mesh.vertices @ rotation.T + pos, np.asarray(mesh.faces)
     )
@@ -59,8 +58,8 @@ def _cylinder(name, radius):
 
 
 def _prism(name, corners, width):
-    """A regular prism as a mesh: the hull of balls at its corners, so that its edges are round; `width` is
-    the circle around it [m]."""
+    """A regular prism as a mesh: the hull of balls at its corners, so that its edges are round; `width`:
+    diameter of the circumscribed circle [m]."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=_EDGE).vertices
     angle = 2 * np.pi * np.arange(corners) / corners
     radius = width / 2 - _EDGE
@@ -74,7 +73,7 @@ def _prism(name, corners, width):
 
 @functools.lru_cache(maxsize=32)
 def make_object(name: str) -> Indenter:
-    """One of OBJECTS; besides, whatever `press.indenter.make_indenter` understands.
+    """One of OBJECTS, or any name for `press.indenter.make_indenter`.
 
     Raises:
       ValueError: unknown name; the text lists the names.

@@ -1,4 +1,4 @@
-"""What a data set of tactile interactions holds: names, shapes, units. The file's layout is in
+"""Schema of a data set of tactile interactions: names, shapes, units. The file's layout is in
 `docs/howto/file_formats.md`."""
 
 import dataclasses
@@ -24,12 +24,10 @@ __all__ = [
 SCHEMA = "biotac_mj.data/1"
 KINDS = ("press", "slide", "twist", "tap", "recorded", "resimulated")
 SPLITS = ("train", "validation", "test")
-DISPLACEMENT_SCALE = (
-    2.5e-7  # [m] of one unit of the stored integers: rounding of at most 0.125 um, reach of 8.19 mm
-)
+DISPLACEMENT_SCALE = 2.5e-7  # [m] per stored integer: rounding of at most 0.125 um, range of 8.19 mm
 
-# Of each time step: name -> (shape, stored type, unit). "nvert" and "nouter" stand for the skin's node
-# numbers, "nelectrode" and "nchannel" for those of its design. PAC has the 10 ms before a row.
+# Per time step: name -> (shape, stored type, unit). "nvert" and "nouter" are the skin's numbers of nodes,
+# "nelectrode" and "nchannel" those of its design. PAC covers the 10 ms before a row.
 COLUMNS = {
     "time": ((), "f8", "s"),
     "displacement": (("nvert", 3), "i2", "m"),  # times DISPLACEMENT_SCALE
@@ -50,42 +48,41 @@ COLUMNS = {
     "measured_pac": ((NPAC,), "f4", "count"),
     "measured_wrench": ((6,), "f4", "N, N m"),
 }
-# NaN where nothing touches, or where nothing was measured
+# NaN without contact or measurement
 MAY_LACK = ("contact_pos", "contact_normal", "measured_counts", "measured_pac", "measured_wrench")
 
 
 @dataclasses.dataclass
 class Interaction:
-    """One contact from beginning to end: n time steps in the BioTac frame. What is None was not recorded.
+    """One contact from start to end: n time steps in the BioTac frame. Fields that were not recorded are
+    None.
 
     Attributes:
       id: unique in its set.
-      object: what touched, as `biotac data generate --objects` names it, or as the file read says.
+        object: as in `biotac data generate --objects`, or in the imported file.
       kind: of KINDS.
       split: of SPLITS, the default split by interaction.
       seed: of its random numbers.
-      parameters: how it was made; numbers, strings and lists, so that JSON keeps it.
+        parameters: of its generation; JSON types.
       time: (n,) increasing [s].
       displacement: (n, nvert, 3) float32, nodes against the skin's `vert` [m].
       wrench: (n, 6) of the skin on the object, torque about the BioTac frame's origin [N, N m].
       contact_force: (n, nouter, 3) of the object on the nodes of the outer surface, `nodes_of(geometry)` [N].
-      contact_pos: (n, 3) where the object touches: the centre of its forces on the deformed skin, weighted by
-        their size [m]; contact_normal: (n, 3) unit outward normal of the deformed skin there. Both NaN where
-        nothing touches.
-      contact_depth: (n,) largest inward displacement of the nodes that it pushes, along the normals of the
-        untouched skin [m]; contact_area: (n,) of the skin that it touches [m^2]. Both 0 where nothing
-        touches.
+        contact_pos: (n, 3) centre of the contact forces on the deformed skin, weighted by their norm [m];
+          contact_normal: (n, 3) unit outward normal of the deformed skin there. Both NaN without contact.
+        contact_depth: (n,) largest inward displacement of the nodes in contact, along the normals of the
+          untouched skin [m]; contact_area: (n,) [m^2]. Both 0 without contact.
       pressure: (n,) of the liquid above rest [Pa].
       impedance: (n, nelectrode) e1, e2, ... of the simulated film [ohm].
       counts: (n, nchannel) simulated readings in the order of the design's `channels` [counts].
       pac: (n, 22) of these, PAC of the last 10 ms in the order of time [counts].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
       converged: (n,) whether the skin's step converged.
-      measured_counts: (n, nchannel) readings of the sensor that is to be predicted, real or synthetic; NaN
-        where it has no such channel.
-      measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN where there
-        is none.
-      measured_wrench: (n, 6) measured with it; NaN where it was not.
+        measured_counts: (n, nchannel) readings of the target sensor, real or synthetic; NaN for channels that
+          it does not have.
+        measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN if
+          missing.
+        measured_wrench: (n, 6) measured with it; NaN if missing.
     """
 
     id: str
@@ -124,8 +121,8 @@ class Interaction:
         """Returns itself. design: of the sensor, for the number of its channels.
 
         Raises:
-          ValueError: a wrong kind, split, shape, a time that does not increase, or NaN where none may be; the
-            text names it.
+            ValueError: a wrong kind, split or shape, a time that does not increase, or an invalid NaN; the
+              text has the name.
         """
         where = f"interaction {self.id!r}"
         if self.kind not in KINDS:
@@ -160,10 +157,10 @@ class Interaction:
 
 
 def channel_sizes(design: Design) -> dict[str, int]:
-    """What "nelectrode" and "nchannel" stand for in COLUMNS."""
+    """Sizes for "nelectrode" and "nchannel" in COLUMNS."""
     return {"nelectrode": design.nelectrode, "nchannel": len(design.channels)}
 
 
 def nodes_of(geometry: SkinGeometry) -> np.ndarray:
-    """(nouter,) sorted nodes of a skin's outer surface: those that `contact_force` is stored for."""
+    """(nouter,) sorted nodes of a skin's outer surface, for which `contact_force` is stored."""
     return np.unique(geometry.outer_face)

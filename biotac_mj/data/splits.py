@@ -1,5 +1,5 @@
-"""Which interactions train, choose and judge a model. Whole interactions or whole objects, never time steps:
-neighbours are alike."""
+"""Splits into training, validation and test. Whole interactions or objects, never time steps, since
+neighbouring ones are similar."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ class Split:
     test: np.ndarray
 
     def check(self) -> "Split":
-        """Returns itself; ValueError where a part is empty."""
+        """Returns itself; ValueError if a part is empty."""
         for name in ("train", "validation", "test"):
             if not len(getattr(self, name)):
                 raise ValueError(
@@ -38,20 +38,20 @@ def assign(count: int, seed: int = 0, fractions: tuple = FRACTIONS) -> np.ndarra
         )
     bound = np.rint(np.cumsum(fractions) * count).astype(int)
     part = np.searchsorted(bound, np.arange(count), side="right")
-    # not scikit-learn's ShuffleSplit: published numbers and kept models name their parts by this seed
+    # not scikit-learn's ShuffleSplit: published numbers and saved models refer to these splits by seed
     return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(part)]
 
 
 def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIONS) -> Split:
-    """Random interactions; labelled and unlabelled ones are divided each on their own, so that both appear in
-    every part.
+    """Random interactions; labelled and unlabelled ones are split separately, so that both appear in every
+    part.
 
     Args:
       data: TactileSet.
       seed: of the division.
 
     Raises:
-      ValueError: a part that would be empty, or fractions that do not add up to 1.
+        ValueError: an empty part, or fractions that do not sum to 1.
     """
     part = np.empty(len(data), "<U10")
     for k, flag in enumerate((False, True)):
@@ -63,8 +63,8 @@ def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIO
 def split_by_object(
     data: object, unseen: str | list | tuple = "ring_7mm", seed: int = 0, validation: float = 0.2
 ) -> Split:
-    """All interactions of the unseen object (or objects) test; of the others a fraction chooses and the rest
-    train.
+    """All interactions of the unseen object (or objects) are the test set; a fraction of the others is the
+    validation set, the remainder trains.
 
     Raises:
       ValueError: an object that the set does not have; the text lists those it has.

@@ -1,5 +1,5 @@
-"""A data set on disk: a folder of HDF5 shards. `write_shard` writes one, `TactileSet` reads all of them as if
-they were one array."""
+"""A data set on disk: a folder of HDF5 shards. `write_shard` writes one; `TactileSet` reads all of them as
+one array."""
 
 import bisect
 import json
@@ -48,7 +48,7 @@ _REMEDY = "it is damaged, or another file; delete it and run the command again"
 
 
 def shard_path(folder: pathlib.Path | str, number: int) -> pathlib.Path:
-    """Where shard `number` of a set lies."""
+    """Path of shard `number` of a set."""
     return pathlib.Path(folder) / f"shard-{number:05d}.h5"
 
 
@@ -59,19 +59,19 @@ def write_shard(
     attributes: dict | None = None,
     design: Design = BIOTAC,
 ) -> None:
-    """Writes one shard (to a temporary name, then renamed): its bytes follow from its arguments and the
-    versions alone.
+    """Writes one shard (to a temporary name, then renamed). Its bytes depend only on the arguments and the
+    versions.
 
     Args:
       path: see `shard_path`.
       interactions: Interactions that all have the same columns.
-      geometry: the skin that displacement and contact_force belong to; None where there are none.
-      attributes: what holds for all of them: material, element, tier, device, settings; JSON's types.
-      design: of the sensor where there is no skin, whose own it is otherwise.
+        geometry: the skin of displacement and contact_force; None without these.
+        attributes: common to all: material, element, tier, device, settings; JSON types.
+        design: of the sensor if there is no skin, which has its own.
 
     Raises:
-      ValueError: no interactions, one that does not fit (see `Interaction.check`), different columns, a name
-        that occurs twice, or a displacement beyond 8.19 mm.
+        ValueError: no interactions, an invalid one (see `Interaction.check`), different columns, a duplicate
+          name, or a displacement beyond 8.19 mm.
     """
     interactions = list(interactions)
     if not interactions:
@@ -155,11 +155,11 @@ def _integers(displacement):
 
 
 class Column:
-    """One column of all shards, read when it is indexed: `column[3]`, `column[10:20]`, `column[mask]`,
+    """One column of all shards, read on indexing: `column[3]`, `column[10:20]`, `column[mask]`,
     `column[indices]`.
 
     Attributes:
-      name; shape (nstep, ...); dtype of what indexing returns.
+      name; shape (nstep, ...); dtype of the result of indexing.
     """
 
     def __init__(self, name: str, parts: list, shape: tuple, offsets: np.ndarray):
@@ -192,7 +192,7 @@ class Column:
         low, high = int(rows.min()), int(rows.max()) + 1
         path = part.file.filename
         with reading(path, "readable shard", _REMEDY):
-            if high - low == len(rows):  # one piece
+            if high - low == len(rows):  # contiguous
                 value = part[low:high]
                 value = value if (np.diff(rows) > 0).all() else value[rows - low]
             else:
@@ -204,7 +204,8 @@ class Column:
 
 
 def _runs(rows):
-    """Pieces (first, beyond) of sorted numbers: HDF5 reads pieces a hundred times faster than single rows."""
+    """Contiguous ranges (first, beyond) of sorted numbers: HDF5 reads them a hundred times faster than single
+    rows."""
     cut = np.flatnonzero(np.diff(rows) > 1)
     return zip(rows[np.r_[0, cut + 1]].tolist(), (rows[np.r_[cut, len(rows) - 1]] + 1).tolist())
 
@@ -224,12 +225,12 @@ class TactileSet:
         shard.
       id, object, kind, split: (n,) str; seed (n,) int; labelled (n,) bool; start, stop (n,) int: of each
         interaction, its time steps are start..stop-1 of every column.
-      columns: names of the columns that are there; "measured_counts" and "measured_wrench" are NaN in
-        interactions without a label.
+        columns: names of the columns in the set; "measured_counts" and "measured_wrench" are NaN in
+          interactions without a label.
 
     Raises:
       FileNotFoundError: no such folder or file, or no shards in it.
-      ValueError: a file that is no shard, of another schema, or shards that do not belong together.
+        ValueError: a file that is not a shard, of another schema, or shards of different sets.
     """
 
     def __init__(self, path: pathlib.Path | str):
@@ -291,7 +292,7 @@ class TactileSet:
 
     @property
     def unfinished(self) -> str:
-        """What a generated set still lacks, "" where it is whole."""
+        """Missing content of a generated set, "" if it is complete."""
         settings = self.attributes.get("settings")
         wanted = settings.get("count") if isinstance(settings, dict) else None
         short = self.path.is_dir() and isinstance(wanted, int) and len(self) < wanted
@@ -307,18 +308,18 @@ class TactileSet:
         self.close()
 
     def close(self) -> None:
-        """Closes the files; nothing can be read then."""
+        """Closes the files; afterwards nothing can be read."""
         for file in self._files:
             file.close()
 
     @property
     def rest_vert(self) -> np.ndarray:
-        """(nvert, 3) nodes that the displacements are measured from [m]."""
+        """(nvert, 3) reference positions of the displacements [m]."""
         return self._skin().vert
 
     @property
     def outer_node(self) -> np.ndarray:
-        """(nouter,) nodes that `contact_force` is given for."""
+        """(nouter,) nodes of `contact_force`."""
         return nodes_of(self._skin())
 
     def _skin(self):
@@ -346,7 +347,7 @@ class TactileSet:
         return self["displacement"][index] + rest
 
     def steps(self, interactions: ArrayLike) -> np.ndarray:
-        """Time steps (k,) of interactions, given by number or as a mask."""
+        """Time steps (k,) of interactions, given by number or mask."""
         chosen = np.atleast_1d(np.arange(len(self))[interactions])
         return np.concatenate([np.arange(self.start[i], self.stop[i]) for i in chosen] or [np.zeros(0, int)])
 
@@ -355,14 +356,14 @@ class TactileSet:
         return np.repeat(np.arange(len(self)), self.stop - self.start)
 
     def parameters(self, i: int) -> dict:
-        """How interaction i was made."""
+        """Parameters of the generation of interaction i."""
         k = bisect.bisect_right(self._offsets.tolist(), int(self.start[i])) - 1
         file = self._files[k]
         row = int(np.searchsorted(file["interaction/start"][:], self.start[i] - self._offsets[k]))
         return json.loads(file["interaction/parameters"].asstr()[row])
 
     def interaction(self, i: int) -> Interaction:
-        """Interaction i, all of it."""
+        """Interaction i with all columns."""
         i = range(len(self))[i]
         rows = slice(self.start[i], self.stop[i])
         columns = {
@@ -394,8 +395,8 @@ def _open(path):
 
 
 def _check(path, file):
-    """Refuses (ValueError) what is no shard: schema, names, types, shapes and numbers of rows; what only
-    reading a whole column would show is found there."""
+    """Raises ValueError for a file that is not a shard: schema, names, types, shapes and numbers of rows.
+    Columns are checked when they are read."""
     schema = file.attrs.get("schema")
     if schema != SCHEMA:
         raise Unfit(f"{path} has schema {schema!r}: this version reads {SCHEMA!r}; {_AGAIN}")
@@ -454,7 +455,7 @@ def _channels(file):
 
 
 def _known(file):
-    """Designs that a shard may be of: that which it names, or without a skin those that are shipped."""
+    """Possible designs of a shard: the named one, or without a skin the shipped ones."""
     where = file["geometry"] if "geometry" in file else file
     if "design" not in where.attrs and "geometry" not in file:
         return designs()
@@ -462,7 +463,7 @@ def _known(file):
 
 
 def _design(file):
-    """The one whose channels a shard has, None where there is none."""
+    """The design whose channels a shard has, None if there is none."""
     return next((one for one in _known(file) if one.channels == _channels(file)), None)
 
 

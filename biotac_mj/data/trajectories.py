@@ -1,8 +1,8 @@
-"""Export to MuJoCo's own form: a model for each object, and for each interaction the states and sensor data
-that `mujoco.mj_setState`, `mujoco.rollout` and the viewer take.
+"""Export to MuJoCo's own format: a model for each object, and for each interaction the states and sensor data
+for `mujoco.mj_setState`, `mujoco.rollout` and the viewer.
 
-The models need nothing of this package. The BioTac in them is rigid, and nothing collides: states are played
-back. The skin's nodes stay in HDF5."""
+The models do not need this package. The BioTac in them is rigid and there are no collisions: states are for
+playback. The skin's nodes stay in HDF5."""
 
 import json
 import pathlib
@@ -25,7 +25,7 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _FOLDER = pathlib.Path(__file__).parents[1]
 _MESHES = "core", "nail", "clamp"
 _CONTACT = {"contact_pos": 3, "contact_normal": 3, "contact_depth": 1, "contact_area": 1}
-_TIMESTEP = 1e-2  # [s] of models whose set has one row an interaction
+_TIMESTEP = 1e-2  # [s] of models whose set has one row per interaction
 
 
 def export_mujoco(
@@ -38,17 +38,17 @@ def export_mujoco(
     INTERACTION.npz and index.json.
 
     A model has the BioTac at the world's origin, and the object on a free joint "object". An .npz has `state`
-    (n, nstate) of mjSTATE_FULLPHYSICS (time, qpos, qvel) and `sensordata` (n, nsensordata), whose parts have
-    names in the model: electrodes (19), pdc, pac (22), tac, tdc [counts], contact_force (6, on the BioTac,
-    about its origin) [N, N m], contact_pos (3) [m], contact_normal (3), contact_depth [m], contact_area
-    [m^2]. NaN: not in the set, or nothing touches. Velocities are differences of the poses.
+    (n, nstate) of mjSTATE_FULLPHYSICS (time, qpos, qvel) and `sensordata` (n, nsensordata) with the model's
+    sensors: electrodes (19), pdc, pac (22), tac, tdc [counts], contact_force (6, on the BioTac, about its
+    origin) [N, N m], contact_pos (3) [m], contact_normal (3), contact_depth [m], contact_area [m^2]. NaN:
+    missing, or no contact. Velocities are differences of the poses.
 
     Args:
       data: TactileSet with poses.
       counts: "counts", or "measured_counts" for those interactions that have measured ones.
 
     Raises:
-      ValueError: no poses or counts in the set, nothing to export, or a folder that is there.
+        ValueError: no poses or counts in the set, nothing to export, or an existing folder.
     """
     out = pathlib.Path(out)
     chosen = interactions_to_export(data, out, counts, ("indenter_pos", "indenter_quat"))
@@ -75,7 +75,7 @@ def export_mujoco(
 
 
 def _timestep(data, rows):
-    """Of the rows, to be played at their speed [s]."""
+    """Median interval of the rows [s], for playback at their speed."""
     return float(np.median(np.diff(data["time"][rows]))) if len(rows) > 1 else _TIMESTEP
 
 
@@ -89,7 +89,7 @@ def _write_model(thing, timestep, path):
         sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_SITE, "frame"
         sensor.needstage = mujoco.mjtStage.mjSTAGE_VEL
     body = spec.worldbody.add_body(name="object")
-    # its centre of mass is where its pose is, so that velocities are those of the poses
+    # the centre of mass is at the pose's origin, so that velocities are those of the poses
     body.mass, body.inertia, body.ipos, body.explicitinertial = 1.0, [1e-3] * 3, np.zeros(3), True
     body.add_freejoint(name="object")
     add_indenter(spec, body, make_object(thing), rgba=[0.9, 0.6, 0.2, 0.5])
@@ -123,7 +123,7 @@ def _sensors(model, data, rows, counts):
     columns |= {name: read[:, NELECTRODE + k, None] for k, name in enumerate(CHANNELS[NELECTRODE:])}
     if f"{prefix}pac" in data.columns:
         columns["pac"] = data[f"{prefix}pac"][rows]
-    elif NPAC > columns["pac"].shape[1]:  # the set has the latest value alone
+    elif NPAC > columns["pac"].shape[1]:  # the set has the latest value only
         columns["pac"] = np.column_stack([np.full((len(rows), NPAC - 1), np.nan), columns["pac"]])
     if f"{prefix}wrench" in data.columns:
         columns["contact_force"] = -data[f"{prefix}wrench"][rows]

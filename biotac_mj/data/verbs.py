@@ -1,4 +1,4 @@
-"""What `biotac data generate`, `biotac data import` and `biotac data export` do with their arguments."""
+"""Runs `biotac data generate`, `biotac data import` and `biotac data export`."""
 
 import argparse
 
@@ -6,7 +6,7 @@ __all__ = ["export_verb", "generate_verb", "import_verb"]
 
 
 def generate_verb(args: argparse.Namespace) -> None:
-    """`biotac data generate`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac data generate`; raises ValueError or FileNotFoundError for invalid input."""
     from ..effects.amended import amend_settings
     from .generation.generate import GenerateOptions, generate
 
@@ -56,7 +56,7 @@ def generate_verb(args: argparse.Namespace) -> None:
 
 
 def import_verb(args: argparse.Namespace) -> None:
-    """`biotac data import`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac data import`; raises ValueError or FileNotFoundError for invalid input."""
     from .importers import import_recordings
     from .store import TactileSet
 
@@ -78,7 +78,7 @@ def import_verb(args: argparse.Namespace) -> None:
 
 
 def export_verb(args: argparse.Namespace) -> None:
-    """`biotac data export`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac data export`; raises ValueError or FileNotFoundError for invalid input."""
     from .store import TactileSet
 
     if args.form == "mujoco" and args.rate is not None:

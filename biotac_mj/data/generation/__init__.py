@@ -1,1 +1,1 @@
-"""How `biotac data generate` makes a set: plans, simulates, varies and reads synthetic interactions."""
+"""`biotac data generate`: plans, simulates, varies and reads synthetic interactions."""

@@ -1,5 +1,5 @@
-"""How far objects are from the skin and from the core, for many poses at once: where they first touch and how
-deep they may go."""
+"""Distance of objects from the skin and the core, for many poses in parallel: first touch and admissible
+depth."""
 
 import numpy as np
 import warp as wp
@@ -16,7 +16,7 @@ __all__ = ["Placed", "first_touch", "surface_samples"]
 
 wp.set_module_options({"enable_backward": False})
 
-_FAR = 2e-3  # [m] margin of a mesh's distance grid: beyond it nothing more is known than that
+_FAR = 2e-3  # [m] range of a mesh's distance grid
 
 
 @wp.kernel
@@ -95,8 +95,8 @@ def first_touch(
     """Travel (nworld,) [m] from start (nworld, 3) along direction (nworld, 3) until the object touches one of
     the points.
 
-    Each step goes as far as the nearest point is away, so it cannot pass one. NaN where none is met within
-    `reach`, or where the object starts in touch."""
+    Each step is as long as the smallest distance, so it cannot pass a point. NaN if none is met within
+    `reach`, or if the object starts in contact."""
     travel = np.zeros(len(start))
     for _ in range(400):
         placed.place(start + travel[:, None] * direction, mat)

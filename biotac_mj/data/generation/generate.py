@@ -1,6 +1,5 @@
-"""`biotac data generate`: plans, simulates, reads and stores synthetic interactions, one shard for each
-batch of
-worlds."""
+"""`biotac data generate`: plans, simulates, reads and stores synthetic interactions, one shard for each batch
+of worlds."""
 
 import dataclasses
 import json
@@ -29,46 +28,47 @@ from .vary import check_vary
 
 __all__ = ["RECORDINGS", "Batch", "GenerateOptions", "GenerateReport", "batches", "generate", "made_already"]
 
-# folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
+# folder in a set's folder for interactions with only the synthetic measured sensor's readings
 RECORDINGS = "recordings"
-_MOST_STEPS = 2000  # a batch lies in memory with all its nodes
+_MOST_STEPS = 2000  # a batch is in memory with all its nodes
 
 
 @dataclasses.dataclass(frozen=True)
 class GenerateOptions:
-    """What is generated. All of it but `device` is kept with the set and must be the same when an interrupted
-    run goes on.
+    """Settings of a set. All except `device` are stored with the set and must be the same when an interrupted
+    run continues.
 
     Attributes:
-      count: interactions. labelled: of them, how many also get the readings of the synthetic measured sensor;
-        the paper's indenters only.
-      recordings: further interactions, with pegs and table, of which the synthetic measured sensor's readings
-        alone are kept, as if logged by hand; in a set of their own, the folder `recordings` in this one.
+        count: interactions. labelled: number of them with readings of the synthetic measured sensor; the
+          paper's indenters only.
+        recordings: number of further interactions, with pegs and table, with readings of the synthetic
+          measured sensor only, as if logged by hand; a separate set in the folder `recordings`.
       steps: time steps of each. rate: of them [Hz].
       seed: of everything.
       objects, kinds: to draw from.
-      skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid
-        None: the material's. The material may be a dict of Material's fields, or a .json file of them.
+        skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and
+          liquid None: the material's. The material may be a dict of Material's fields, or a .json file of
+            them.
       options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus of the elements,
         or a .npy file, "film": see `sensor.film.read_film`}, or a .json file of it.
-      vary: {name: (low, high)}, what is drawn anew for each interaction: youngs_modulus, poissons_ratio,
-        friction, stiffening of the material; factors prony and hysteresis on its strengths; and what worlds
-        can differ in but modulus (`skin.per_world.NAMES`). What was drawn is kept in the interaction's
-        parameters, under "skin".
-      sensor, randomise: which sensor it is (None: the design's own), and effects that are drawn, see
-        `biotac_mj.attach`; all that is drawn is drawn anew for each interaction and kept in its parameters.
-      signal: where the electrodes come from: "physics", "latent_projection", "learned", or a file of weights,
-        see `biotac_mj.attach`.
-      thermal: what all objects are of ("steel", see `sensor.materials.read_thermal`), texture: of what
-        surface (`sensor.vibration.read_texture`); of a list one is drawn for each interaction. None leaves
-        heat or vibration out. textures: the same as texture, as attach calls it.
-      batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
-        part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
-        objects. A shard holds one batch.
-      measured_seed, measured_skin: number and mesh of the synthetic measured sensor; None: the finest of the
-        skin's design.
-      device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": a process for each, which take batches as
-        they come free. Devices of one kind make the same files, however many they are.
+        vary: {name: (low, high)}, ranges of random values per interaction: youngs_modulus, poissons_ratio,
+          friction, stiffening of the material; factors prony and hysteresis on its strengths; and properties
+          that may differ between worlds except modulus (`skin.per_world.NAMES`). The values are stored in the
+          interaction's parameters, under "skin".
+        sensor, randomise: which sensor (None: the design's own), and random effects, see `biotac_mj.attach`;
+          random values are drawn per interaction and stored in its parameters.
+        signal: source of the electrodes: "physics", "latent_projection", "learned", or a file of weights, see
+          `biotac_mj.attach`.
+        thermal: material of all objects ("steel", see `sensor.materials.read_thermal`), texture: of their
+          surface (`sensor.vibration.read_texture`); of a list one is drawn per interaction. None: no heat or
+          vibration. textures: alias of texture, as in attach.
+        batch, measured_batch: most worlds in a batch, and in one with the synthetic measured sensor: on a
+          fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its objects. A
+          shard holds one batch.
+        measured_seed, measured_skin: number and mesh of the synthetic measured sensor; None: the finest of
+          the skin's design.
+        device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": one process each, which take batches from a
+          queue. The files do not depend on the number of devices of one kind.
     """
 
     count: int = 2600
@@ -177,14 +177,14 @@ class GenerateOptions:
 
 @dataclasses.dataclass(frozen=True)
 class GenerateReport:
-    """What a run did.
+    """Result of a run.
 
     Attributes:
-      interactions, steps: in the set. recordings: in that beside it. nonconverged: of these steps.
-      made: shards made by this run; those that were there are kept.
-      seconds: wall time of this run, once and per stage (of several devices together). bytes: of the shards.
+      interactions, steps: in the set. recordings: in its subset. nonconverged: of these steps.
+      made: shards made by this run; existing ones are kept.
+      seconds: wall time of this run, in total and per stage (summed over devices). bytes: of the shards.
         device: its name.
-      devices: how many worked at once.
+      devices: number of devices in parallel.
     """
 
     interactions: int
@@ -200,11 +200,11 @@ class GenerateReport:
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """What is simulated together and stored in one shard.
+    """Interactions that are simulated in one batch and stored in one shard.
 
     Attributes:
-      names: of the object of each member. members: numbers of the interactions.
-      simulated, measured: whether the simulator and whether the synthetic measured sensor takes part.
+      names: object of each member. members: numbers of the interactions.
+      simulated, measured: whether the simulator and the synthetic measured sensor take part.
       path: of the shard in the set's folder.
     """
 
@@ -216,8 +216,8 @@ class Batch:
 
 
 def batches(options: GenerateOptions) -> list[Batch]:
-    """Labelled interactions first, then the others, then recordings; objects take turns, so a part of a set
-    is a smaller one like it."""
+    """Labelled interactions first, then the others, then recordings. Objects alternate, so that a part of a
+    set is representative."""
     indenters = [name for name in options.objects if name in INDENTERS]
     others = [name for name in options.objects if name not in INDENTERS] or indenters
     ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
@@ -242,16 +242,16 @@ def generate(
     progress: bool = True,
     ray: str | None = None,
 ) -> GenerateReport:  # noqa: B008 - frozen
-    """Makes a set in folder `out`, or what is missing of it.
+    """Makes a set in folder `out`, or completes it.
 
     Args:
       out: folder.
       options: see GenerateOptions.
-      workers: processes, which on the CPU each make whole shards and beside GPUs compute film and readings;
-        None takes the cores there are, 0 this process.
-      progress: whether to show a bar.
-      ray: address of a Ray cluster, or "local": a task for each batch, of one core, one GPU
-        where the device is one, and `workers` cores (none: 0).
+        workers: processes, which make whole shards on the CPU, or compute film and readings for GPUs; None:
+          number of cores, 0: this process.
+        progress: whether to show a bar.
+        ray: address of a Ray cluster, or "local": a task for each batch, with one core, one GPU if the device
+          is one, and `workers` cores (None: 0).
 
     Raises:
       ValueError: the folder holds a set with other options, or an option is not possible.
@@ -260,7 +260,7 @@ def generate(
     from .making import make_shards
 
     out = pathlib.Path(out)
-    read_settings(options.material, options.options, ("film",))  # these refuse what is wrong or not there
+    read_settings(options.material, options.options, ("film",))  # raise for invalid or missing ones
     skin, measured = (design_of(name) for name in (options.skin, options.measured_skin))
     if (options.labelled or options.recordings) and measured != skin:
         raise ValueError(
@@ -303,7 +303,7 @@ def generate(
 
 
 def made_already(path: pathlib.Path, settings: dict) -> bool:
-    """Whether a shard is there; ValueError where it was made with other settings."""
+    """Whether a shard exists; ValueError if it was made with other settings."""
     if not path.is_file():
         return False
     with TactileSet(path) as data:

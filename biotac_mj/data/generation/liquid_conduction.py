@@ -1,11 +1,11 @@
 """Three-dimensional conduction in the liquid between core and skin: the transduction of the synthetic
 measured sensor.
 
-It shares nothing with `sensor.film` but the places of the electrodes: the liquid is meshed with tetrahedra
-between the core and the deformed skin, electrodes are discs of one potential (so floating ones shunt the
-liquid along them), and the potential is solved with scikit-fem. The mesh is made once: columns stand on the
-core along fixed directions and end where they meet the skin, wherever it is, so no tetrahedron turns over
-when the skin slides over the electrodes or is pressed onto the core."""
+It is independent of `sensor.film` except for the electrodes' positions. The liquid between the core and the
+deformed skin is meshed with tetrahedra, electrodes are discs of constant potential (so floating ones shunt
+the liquid), and the potential is solved with scikit-fem. The mesh is made once: columns start on the core in
+fixed directions and end at the skin, so no tetrahedron inverts when the skin slides over the electrodes or is
+pressed onto the core."""
 
 from collections.abc import Callable
 
@@ -27,22 +27,22 @@ _RINGS = (
     (0.75e-3, 14),
     (1.1e-3, 14),
 )  # radius [m] and points around each electrode; 0.5 mm is its rim
-_LAYERS = (0.0, 0.2, 0.5, 1.0)  # of the gap: fine at the core, where the electrodes are
-_SPACING = 0.2e-3  # [m] points nearer than that are left out
-_WET = 0.1e-3  # [m] less liquid than that at rest is none: the skin is bonded there, or lies on the core
-_SLIP = 1.6e-3  # [m] how far the skin may slide over the core
+_LAYERS = (0.0, 0.2, 0.5, 1.0)  # of the gap: fine at the core, at the electrodes
+_SPACING = 0.2e-3  # [m] least distance of points
+_WET = 0.1e-3  # [m] thinner films at rest count as none: the skin is bonded there, or touches the core
+_SLIP = 1.6e-3  # [m] most sliding of the skin over the core
 
 
 class LiquidConduction:
-    """Impedances of the electrodes by a solution in three dimensions. Constant after construction.
+    """Impedances of the electrodes by a three-dimensional solution. Constant after construction.
 
     Args:
       geometry: the skin with its core and electrodes.
       excitation: of X1, X2, ..., which are shorted and grounded; see `sensor.film.FilmConduction`.
       conductivity: of the liquid [S/m].
-      residual_film: liquid that stays where the skin lies on the core [m]; a function of places (n, 3) [m]
-        on the core gives (n,).
-      relief: by how much the liquid is thicker than the geometry says, a function like that; None: by none.
+        residual_film: thickness of liquid where the skin touches the core [m]; or a function of points (n, 3)
+          [m] on the core -> (n,).
+        relief: additional thickness of the liquid over the geometry's, such a function; None: zero.
 
     Attributes:
       core_point (n, 3) [m], normal (n, 3): feet and directions of the columns. triangle (m, 3): of the core's
@@ -50,7 +50,7 @@ class LiquidConduction:
       elem (9 m, 4): tetrahedra over nodes layer * n + column.
 
     Raises:
-      ValueError: an electrode that the liquid does not cover.
+        ValueError: an electrode without liquid.
     """
 
     def __init__(
@@ -190,8 +190,7 @@ class LiquidConduction:
 
 
 def _points(core, centre, direction, core_vert):
-    """Points on the core (n, 3), dense around the electrodes, and which disc (n,) they lie on, -1 for
-    none."""
+    """Points on the core (n, 3), dense around the electrodes, and the disc (n,) of each, -1 for none."""
     ring, disc = [centre], [np.arange(len(centre))]
     first, second = across(direction)
     for k, (radius, count) in enumerate(_RINGS):
@@ -208,15 +207,15 @@ def _points(core, centre, direction, core_vert):
     keep &= (disc >= 0) | (far > 0.6e-3)  # no other point inside a disc
     point, disc = point[keep], disc[keep]
     tree, dropped = cKDTree(point), np.zeros(len(point), bool)
-    for i, j in sorted(tree.query_pairs(_SPACING)):  # discs come first and stay
+    for i, j in sorted(tree.query_pairs(_SPACING)):  # points of discs come first and stay
         if not (dropped[i] or dropped[j]) and disc[j] < 0:
             dropped[j] = True
     return point[~dropped], disc[~dropped]
 
 
 def _triangulate(point, core):
-    """Triangles (m, 3) over points of the core, normals outwards: Delaunay on the sphere that the core is
-    drawn onto."""
+    """Triangles (m, 3) over points of the core, normals outwards: Delaunay on a sphere to which the core is
+    mapped."""
     middle = (point.max(0) + point.min(0)) / 2
     flat = (point - middle) * [0.5, 1, 1]  # about as long as it is wide
     triangle = ConvexHull(flat / np.linalg.norm(flat, axis=1, keepdims=True)).simplices
@@ -228,7 +227,7 @@ def _triangulate(point, core):
 
 
 def _smooth_normals(point, triangle):
-    """Unit directions (n, 3) that fan out smoothly over the core's edges."""
+    """Unit directions (n, 3) that vary smoothly over the core's edges."""
     a, b, c = np.moveaxis(point[triangle], 1, 0)
     normal = np.zeros_like(point)
     np.add.at(normal, triangle, np.cross(b - a, c - a)[:, None])

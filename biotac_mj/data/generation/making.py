@@ -1,8 +1,7 @@
-"""The pipeline behind `biotac data generate`: while workers read one batch, the next one is planned and
-simulated.
+"""Pipeline of `biotac data generate`: while workers read one batch, the next one is planned and simulated.
 
-With several GPUs there is one such pipeline in a process for each; they take the batches one after another.
-On a Ray cluster each batch is a task.
+With several GPUs each has such a pipeline in a process, and takes batches from a common queue. On a Ray
+cluster each batch is a task.
 """
 
 import dataclasses
@@ -27,7 +26,7 @@ from .vary import draw_sense, draw_worlds, refuse_impossible
 __all__ = ["MakeShards", "Maker", "make_shards"]
 
 _STAGES = ("start", "plan", "skin", "measured skin", "waiting for readings")
-_AHEAD = 4  # batches that wait for their readings at most: they lie in memory
+_LOOKAHEAD = 4  # most batches in memory that wait for their readings
 
 
 def make_shards(
@@ -42,15 +41,15 @@ def make_shards(
     """Makes the shards of batches `todo` in folder `out`, on all of the options' devices, or on a cluster.
 
     Args:
-      settings: kept with every shard. workers: on the CPU, processes that each make whole batches; with GPUs,
-        processes for film and readings, shared by the devices; on Ray those of each task. progress: whether
-        to show a bar. ray: see `shards.run_tasks`.
+        settings: stored with every shard. workers: on the CPU, processes that each make whole batches; with
+          GPUs, processes for film and readings, shared by the devices; on Ray those of each task. progress:
+          whether to show a bar. ray: see `shards.run_tasks`.
 
-    Returns:
-      seconds of each stage, of all devices together.
+      Returns:
+        seconds of each stage, summed over devices.
 
     Raises:
-      ValueError: an option is not possible.
+      ValueError: an invalid option.
       RuntimeError: a device's process failed; the text is its error.
     """
     from .readings import THREADS
@@ -61,11 +60,11 @@ def make_shards(
     processes = one_per_gpu(options.devices) if several else None
     steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
     tasks = [Task(batch, size, batch.path) for batch, size in zip(todo, steps)]
-    if not cuda and ray is None and min(workers, len(tasks)) > 1:  # a core solves, reads and stores
+    if not cuda and ray is None and min(workers, len(tasks)) > 1:  # each core solves, reads and stores
         processes = {f"process {k}": dict.fromkeys(THREADS, "1") for k in range(min(workers, len(tasks)))}
         cores = 0
     if processes or ray is not None:
-        tasks.sort(key=lambda task: not task.value.measured)  # what takes long first
+        tasks.sort(key=lambda task: not task.value.measured)  # longest first
     work = MakeShards(options, settings, "cuda:0" if alone else options.device, cores)
     seconds = {}
     for spent in run_tasks(
@@ -86,8 +85,8 @@ def make_shards(
 
 @dataclasses.dataclass
 class MakeShards:
-    """Work of `shards.run_tasks`: shards of batches, made on a device of Warp with that many worker
-    processes; a result is the seconds that went into each stage."""
+    """Work of `shards.run_tasks`: makes shards of batches on a Warp device with that many worker processes; a
+    result is the seconds of each stage."""
 
     options: Any
     settings: dict
@@ -102,7 +101,7 @@ class MakeShards:
 
 @dataclasses.dataclass
 class _Running:
-    """A batch whose readings the workers compute."""
+    """A batch whose readings are being computed by the workers."""
 
     batch: object
     motions: list
@@ -119,7 +118,7 @@ class Maker:
     """Makes shards on one device.
 
     Args:
-      options: GenerateOptions. settings: what of them is kept with every shard.
+        options: GenerateOptions. settings: stored with every shard.
       device: of Warp.
 
     Attributes:
@@ -144,10 +143,10 @@ class Maker:
         refuse_impossible(self.vary, rubber)
         between = {name: self.vary[name] for name in NAMES if name in self.vary}
         skin, modulus = make_room(skin, modulus, between, len(self.geometry.elem))
-        if self.vary.get("stiffening") and not rubber.stiffening:  # zero has no place for others
+        if self.vary.get("stiffening") and not rubber.stiffening:  # zero disables it for all worlds
             rubber = dataclasses.replace(rubber, stiffening=sum(self.vary["stiffening"]) / 2)
         model = self.model = SkinModel(self.geometry, rubber, skin, device, modulus=modulus)
-        self.geometry = model.geometry  # with all nodes that are solved
+        self.geometry = model.geometry  # with all solved nodes
         if options.tier == "condensed":
             refuse(model.material.extensions, skin, model.has_liquid, model.device.is_cuda)
         self.attributes = {
@@ -178,28 +177,28 @@ class Maker:
 
             self.measured = SyntheticSensor(options.measured_seed, options.measured_skin, model.device)
         filled = model.options.fill_volume or model.options.rest_pressure
-        self._rest = self.geometry  # what an object meets first
+        self._untouched = self.geometry  # the surface for first touch
         if filled:
-            self._rest = dataclasses.replace(self.geometry, vert=model.rest.vert)
+            self._untouched = dataclasses.replace(self.geometry, vert=model.rest.vert)
         self._count("start", clock)
 
     def run(
         self, todo: Iterable, out: pathlib.Path, workers: int, say: Callable[[int | str], object]
     ) -> Iterator[dict]:
         """Makes the shards of an iterator of batches in folder `out` with that many worker processes; yields
-        the seconds that went into each stage. say: called with time steps done, and a line on each batch."""
+        the seconds of each stage. say: gets completed time steps, and a line on each batch."""
         from . import readings, synthetic_sensor
 
-        rest = None if self._rest is self.geometry else self._rest.vert
+        rest = None if self._untouched is self.geometry else self._untouched.vert
         meter = self.measured and self.measured.meter()
         args = (self.geometry, meter, rest, self.film, self.options.signal)
         with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:
                 waiting.append(self._begin(batch, pool, say))
-                while waiting and (len(waiting) > _AHEAD or waiting[0].done()):
+                while waiting and (len(waiting) > _LOOKAHEAD or waiting[0].done()):
                     written.append(self._end(waiting.pop(0), pool, out))
-                for one in written:  # a shard that could not be written stops the run now, not at its end
+                for one in written:  # a failed write stops the run now, not at its end
                     if one.done():
                         one.result()
                 yield self._spent()
@@ -209,12 +208,12 @@ class Maker:
             yield self._spent()
 
     def _spent(self):
-        """Seconds of each stage since it was asked last."""
+        """Seconds of each stage since the last call."""
         seconds, self.seconds = self.seconds, dict.fromkeys(_STAGES, 0.0)
         return seconds
 
     def _begin(self, batch, pool, say) -> _Running:
-        """Plans and simulates a batch and hands its readings to the workers."""
+        """Plans and simulates a batch and submits its readings to the workers."""
         from . import readings, simulate, synthetic_sensor
 
         o = self.options
@@ -226,7 +225,7 @@ class Maker:
             mine = [k for k, other in enumerate(batch.names) if other == name]
             seeds = [[o.seed, batch.members[k]] for k in mine]
             for k, motion in zip(
-                mine, plan_motions(self._rest, name, seeds, o.steps, o.kinds, self.model.device)
+                mine, plan_motions(self._untouched, name, seeds, o.steps, o.kinds, self.model.device)
             ):
                 motions[k] = motion
         running = _Running(batch, motions)
@@ -269,7 +268,7 @@ class Maker:
             self._free()
             answer = running.answer = self.measured.simulate(batch.names, motions, say)
             self._count("measured skin", clock)
-            # each contact of the session begins some seconds after the last one, while the sensor warms up
+            # contacts of the session follow each other after some seconds, while the sensor warms up
             running.labels = [
                 pool.submit(
                     synthetic_sensor.measure_in_worker,
@@ -288,14 +287,14 @@ class Maker:
         return running
 
     def _contact(self, fields, k):
-        """Where the skin is touched in interaction k."""
+        """Contact labels of interaction k."""
         rest = self.model.rest.vert - self.geometry.vert if fields.rest is None else fields.rest[k]
         moved = fields.displacement[k] * DISPLACEMENT_SCALE
         return contact_labels(self.geometry, moved, fields.contact_force[k], fields.area[k], rest)
 
     def _free(self):
-        """Gives the device memory of the last batch back: its data and graphs refer to each other, and torch
-        keeps what it once had."""
+        """Frees the device memory of the last batch: its data and graphs refer to each other, and torch
+        caches memory."""
         gc.collect()
         if self.model.device.is_cuda:
             import torch
@@ -308,8 +307,8 @@ class Maker:
         return now
 
     def _end(self, running, pool, out):
-        """Waits for the readings of a batch and has its shard written: compressing it takes a core some
-        seconds."""
+        """Waits for the readings of a batch and submits its shard for writing: compression takes some seconds
+        on a core."""
         batch, ones = running.batch, []
         clock = time.perf_counter()
         for k, (number, name, motion) in enumerate(zip(batch.members, batch.names, running.motions)):

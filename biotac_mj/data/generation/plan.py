@@ -1,4 +1,4 @@
-"""Where the objects go: random presses, slides, twists and taps all over the sensing surface, kept clear of
+"""Plans motions of objects: random presses, slides, twists and taps all over the sensing surface, clear of
 the core."""
 
 import dataclasses
@@ -17,7 +17,7 @@ __all__ = ["Motion", "plan_motions", "sensing_faces"]
 
 KINDS = ("press", "slide", "twist", "tap")
 _PROBABILITY = (0.4, 0.3, 0.15, 0.15)
-_TILT = np.radians(25.0)  # largest angle between the way of the press and the skin's inward normal
+_TILT = np.radians(25.0)  # largest angle between the press and the skin's inward normal
 _DEPTH = {
     "press": (0.4e-3, 2.4e-3),
     "slide": (0.4e-3, 1.6e-3),
@@ -26,20 +26,20 @@ _DEPTH = {
 }  # [m]
 _SLIDE = (0.8e-3, 3e-3)  # [m]
 _TWIST = np.radians((10.0, 35.0))
-_BACK = 0.05  # [m] the objects come from there
-_LEAD = 5e-6  # [m] before first touch: where row 0 is
-# [m] never nearer to the core: the skin is 1.5 mm thick there; forces then reach some 20 N, as the paper's
+_BACK = 0.05  # [m] distance from which objects approach
+_LEAD = 5e-6  # [m] distance of row 0 before first touch
+# [m] least distance from the core: the skin is 1.5 mm thick there; forces reach some 20 N, as in the paper
 _CLEAR = 0.6e-3
-_FILM = 0.1e-3  # [m] less liquid under the skin is none
-_SHALLOW = 0.1e-3  # [m] less is no contact worth keeping
+_FILM = 0.1e-3  # [m] least film under the sensing surface
+_SHALLOW = 0.1e-3  # [m] least depth
 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """The way of one object, n time steps.
+    """Path of one object, n time steps.
 
     Attributes:
-      kind: of KINDS. parameters: for the record, JSON's types.
+        kind: of KINDS. parameters: as stored, JSON types.
       pos: (n, 3) tip of the object [m]. mat: (n, 3, 3) its orientation.
     """
 
@@ -50,8 +50,8 @@ class Motion:
 
 
 def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
-    """(k,) outer faces over liquid: in front of the clamp, where there is one (x < 3 mm), below the nail (y <
-    0.5 mm), more than 0.1 mm of film beneath."""
+    """(k,) outer faces over liquid: in front of the clamp, if there is one (x < 3 mm), below the nail (y <
+    0.5 mm), over more than 0.1 mm of film."""
     centre = geometry.vert[geometry.outer_face].mean(1)
     inner = np.unique(geometry.inner_face)
     gap = CoreSurface(geometry.core_vert, geometry.core_face).closest(geometry.vert[inner])[0]
@@ -70,17 +70,17 @@ def plan_motions(
     device: str = "cpu",
     progress: Callable | None = None,
 ) -> list[Motion]:
-    """One motion for each seed; the same seed gives the same motion whatever the others are.
+    """One motion for each seed, independent of the others.
 
     Args:
-      geometry: the resting skin.
+        geometry: the skin at rest.
       name: of the object.
       seeds: lists of ints, see numpy's SeedSequence.
       steps: rows of each motion, row 0 just before first touch.
       kinds: of KINDS, to choose from.
 
     Raises:
-      ValueError: unknown kind, too few steps, or an object that finds no room.
+        ValueError: unknown kind, too few steps, or no admissible motion.
     """
     for kind in kinds:
         if kind not in KINDS:
@@ -124,7 +124,7 @@ class _Planner:
         met = np.isfinite(travel) & (
             np.abs(travel - _BACK) < 4e-3
         )  # the object's tip touches, not its far end
-        start[~met] = 1.0  # [m] far away
+        start[~met] = 1.0  # [m] out of reach
         paths = Placed(self.name, len(drawn) * self.steps, self.device)
         for _ in range(8):
             pos, turned = self._paths(drawn, start, depth)
@@ -187,7 +187,7 @@ class _Planner:
 
 
 def _profile(kind, steps, rng):
-    """How far down (n,) and along (n,) the way, both from 0 to 1, at each time step."""
+    """Fractions of depth (n,) and of sliding distance (n,) at each time step."""
     last = steps - 1
     step = np.arange(steps)
     if kind == "tap":
@@ -195,7 +195,7 @@ def _profile(kind, steps, rng):
         phase = step * count / last
         return 1 - np.abs(2 * (phase - np.floor(phase)) - 1), np.zeros(steps)
     if kind == "press":
-        # down only, or down and up again
+        # press only, or press and release
         turn = last if rng.random() < 0.5 else int(round(rng.uniform(0.5, 0.8) * last))
         return np.interp(step, [0, turn, last], [0, 1, 1 if turn == last else rng.uniform(0, 0.6)]), np.zeros(
             steps
@@ -205,7 +205,7 @@ def _profile(kind, steps, rng):
 
 
 def _across(normal):
-    """Two unit vectors across a unit vector."""
+    """Two unit vectors orthogonal to a unit vector."""
     helper = np.eye(3)[np.abs(normal).argmin()]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)

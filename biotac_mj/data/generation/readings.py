@@ -1,5 +1,5 @@
-"""Impedances and counts of whole interactions, in worker processes: one reading of the film costs a core some
-milliseconds."""
+"""Impedances and counts of whole interactions, in worker processes: one evaluation of the film takes some
+milliseconds on a core."""
 
 import contextlib
 import dataclasses
@@ -43,12 +43,12 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @dataclasses.dataclass
 class Readings:
-    """Of one interaction of n time steps.
+    """Readings of one interaction of n time steps.
 
     Attributes:
       impedance: (n, nelectrode) [ohm]. counts: (n, nchannel) in the order of the design's channels. pac:
         (n, 22) counts of the last 10 ms in the order of time.
-      failed: (n,) bool, steps whose film had no solution and kept the last one.
+        failed: (n,) bool, steps without a solution of the film, which keep the last one.
     """
 
     impedance: np.ndarray
@@ -59,11 +59,12 @@ class Readings:
 
 @dataclasses.dataclass(frozen=True)
 class Sense:
-    """One interaction's sensor and what it touches.
+    """Sensor and touched object of one interaction.
 
     Attributes:
-      sensor: its own numbers; None: the design's own.
-      body: what is touched, for heat; texture: its surface, for vibration; None leaves them out.
+      sensor: its constants; None: the design's own.
+      body: material of the object, for heat; texture: of its surface, for vibration; None: no heat, no
+        vibration.
       modes: of the skin, for vibration.
     """
 
@@ -75,7 +76,7 @@ class Sense:
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
-    """What the object does to the skin at each of n time steps, see `skin.touched.Touched`.
+    """Contact of the object with the skin in n time steps, see `skin.touched.Touched`.
 
     Attributes:
       area: (n,) [m^2]; force: (n,) [N]; slip: (n,) [m/s]; drive: (n, nmode); gain: (n, nmode + 1).
@@ -89,13 +90,13 @@ class Touch:
 
 
 def in_order(pac: np.ndarray, time: float) -> np.ndarray:
-    """(npac,) samples of the frame's slots as they were taken, the last one at or before time [s]."""
+    """(npac,) samples of the frame's slots in order of time, the last one at or before time [s]."""
     slot = (int(np.floor(time * SLOT_RATE + 1e-6)) - 1) % (2 * len(pac))
     return np.roll(pac, -1 - slot // 2)
 
 
 def _row(readings, time):
-    """(nchannel,) counts in the order of the channels, of PAC the latest, and PAC's of 10 ms (22,)."""
+    """(nchannel,) counts in the order of the channels, the latest of PAC, and PAC of 10 ms (22,)."""
     pac = in_order(readings["pac"], time)
     singles = [pac[-1] if name == "pac" else readings[name] for name in SINGLES]
     return [*readings["electrodes"], *singles], pac[-NPAC:]
@@ -110,14 +111,14 @@ def sample(
     sensor: Sensor = SENSORS["1"],
     design: Design = BIOTAC,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, nchannel) counts in the order of the design's channels that the multiplexer reports at each time,
-    of PAC the latest, and (n, 22) all of PAC of the last 10 ms in the order of time.
+    """(n, nchannel) counts of the multiplexer at each time, in the order of the design's channels, with the
+    latest of PAC, and (n, 22) all PAC samples of the last 10 ms in order of time.
 
     Args:
       time: (n,) [s]; impedance: (n, nelectrode) [ohm]; pressure: (n,) above rest [Pa]; linear between
         samples.
       seed: of the noise.
-      temperature: (n,) of the core [C]; None is steady. sensor: whose noise and levels these are.
+        temperature: (n,) of the core [C]; None is constant. sensor: of noise and levels.
     """
     acquisition = Acquisition(seed=seed, film_every_step=True, sensor=sensor, design=design)
     state = np.zeros(acquisition.nstate)
@@ -133,8 +134,8 @@ def sample(
 
 
 def _steps(time, design):
-    """Beginning and length of the step to each row; one frame goes ahead of row 0, so that it has noise."""
-    frame = round(design.slots / SLOT_RATE + 1e-3, 6)  # [s], and one sample more
+    """Start and length of the step to each row; one frame before row 0 gives it noise."""
+    frame = round(design.slots / SLOT_RATE + 1e-3, 6)  # [s], plus one sample
     return [(time[0] - frame, frame), *zip(time[:-1], np.diff(time))]
 
 
@@ -152,8 +153,9 @@ def read_motion(
 
     Args:
       film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa].
-      seed: of the noise. sense: the sensor and what it touches. touch: how; needed for heat and vibration.
-      rest: (nvert, 3) where the skin rests, if not as the film's [m]: there it reads what the film's does.
+        seed: of the noise. sense: sensor and object. touch: contact, for heat and vibration.
+        rest: (nvert, 3) rest positions of the skin if not the film's [m]: there the readings are the film's
+          at rest.
     """
     scale = 1.0 if rest is None else film.rest / film.impedance(rest)
     design = film.geometry.design
@@ -162,7 +164,7 @@ def read_motion(
     for i, x in enumerate(vert_xpos):
         try:
             last = scale * film.impedance(x)
-        except ValueError:  # the skin has left an electrode or is folded
+        except ValueError:  # an electrode without film, or a folded skin
             failed[i] = True
         impedance[i] = last
     bodies = None if sense.body is None else [sense.body]
@@ -187,7 +189,7 @@ def read_motion(
     return Readings(impedance, np.array(counts, np.float32), np.array(pac, np.float32), failed)
 
 
-_here = {}  # what a worker keeps: the film of the set's skin
+_here = {}  # a worker's state: the film of the set's skin
 
 
 def prepare_worker(
@@ -196,10 +198,10 @@ def prepare_worker(
     film: dict | None = None,
     signal: str = "physics",
 ) -> None:
-    """Makes the film of a skin in this process, or the network that stands for it.
+    """Makes the film of a skin, or the network in its place, in this process.
 
     Args:
-      rest_vert: (nvert, 3) where the skin rests on its filling [m]. film: settings of FilmConduction.
+        rest_vert: (nvert, 3) rest positions of the filled skin [m]. film: settings of FilmConduction.
       signal: see `sensor.signals.read_signal`.
     """
     _here["vert"] = geometry.vert
@@ -236,7 +238,7 @@ def _start_worker(start, args):
 
 
 class _Now:
-    """Runs what is submitted at once, in this process."""
+    """Executor that runs submitted work at once, in this process."""
 
     def submit(self, function, *args):
         future = Future()
@@ -251,17 +253,15 @@ def readings_pool(
     start: Callable = prepare_worker,
     start_args: tuple | None = None,
 ) -> object:
-    """Gives an executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0
-    workers: this process.
+    """An executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0 workers:
+    this process.
 
     New processes are spawned, since CUDA does not survive a fork.
     """
     args = (geometry,) if start_args is None else start_args
     if not workers:
         start(*args)
-        with threadpool_limits(
-            1, "blas"
-        ):  # as in the workers, so that the numbers are the same to the last bit
+        with threadpool_limits(1, "blas"):  # one thread as in the workers, so that the results are bit-equal
             yield _Now()
         return
     kept = {name: os.environ.get(name) for name in THREADS}
@@ -271,7 +271,7 @@ def readings_pool(
         with ProcessPoolExecutor(workers, spawned, _start_worker, (start, args)) as pool:
             try:
                 yield pool
-            except BaseException:  # nobody waits for what is still to be read
+            except BaseException:  # pending readings are not needed
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
     finally:

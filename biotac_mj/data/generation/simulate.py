@@ -1,4 +1,4 @@
-"""The skin under a batch of motions: every interaction is a world."""
+"""Simulates the skin under a batch of motions; every interaction is a world."""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,27 +21,24 @@ __all__ = ["Fields", "Scene", "clock", "simulate", "simulate_condensed"]
 
 wp.set_module_options({"enable_backward": False})
 
-_LARGEST_STEP = (
-    1.0e-4  # [m] longest way between two steps of the skin: twice that costs convergence where edges dig in
-)
-_ARM = 4e-3  # [m] lever arm that turns of an object count with
-_AWAY = 1.0  # [m] where a world keeps the objects of other worlds
+_LARGEST_STEP = 1.0e-4  # [m] longest displacement in a step of the skin: twice that converges worse at edges
+_ARM = 4e-3  # [m] lever arm that converts rotations of an object to displacements
+_AWAY = 1.0  # [m] position of the objects of other worlds
 
 
 @dataclasses.dataclass
 class Fields:
-    """What the skin did: k interactions of n time steps.
+    """Fields of the skin: k interactions of n time steps.
 
     Attributes:
       displacement: (k, n, nvert, 3) int16, in units of schema.DISPLACEMENT_SCALE; nodes against the
         unstressed skin.
       contact_force: (k, n, nouter, 3) float32 [N].
       wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
-      area: (k, n) that the object touches [m^2].
-      slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; nothing
-        where no modes were given.
-      rest: (k, nvert, 3) displacements at which the skins rest, where each has a rest of its own [m]; else
-        None.
+        area: (k, n) contact area [m^2].
+        slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; empty
+          without modes.
+        rest: (k, nvert, 3) displacements of the skins at rest [m], if they differ; else None.
     """
 
     displacement: np.ndarray
@@ -56,12 +53,12 @@ class Fields:
     rest: np.ndarray | None = None
 
     def touch(self, i: int) -> Touch:
-        """What the object does to the skin in interaction i."""
+        """The object's contact in interaction i."""
         force = np.linalg.norm(self.wrench[i, :, :3], axis=1)
         return Touch(self.area[i], force, self.slip[i], self.drive[i], self.gain[i])
 
     def vert_xpos(self, vert: np.ndarray, i: int) -> np.ndarray:
-        """(n, nvert, 3) nodes of interaction i as they are stored [m]; vert: the skin at rest."""
+        """(n, nvert, 3) stored node positions of interaction i [m]; vert: the skin at rest."""
         return vert + self.displacement[i] * DISPLACEMENT_SCALE
 
 
@@ -75,24 +72,23 @@ def simulate(
     worlds: dict | None = None,
     modes: SkinModes | None = None,
 ) -> Fields:
-    """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a
-    batch takes as many iterations as its worst world, with nothing won. A step that does not converge keeps
-    the last good state and is marked.
+    """Simulates all motions: on a GPU in parallel, on a CPU one after another, where a batch would only cost
+    more. A step that does not converge keeps the last converged state and is marked.
 
     Args:
       model: the skin, on any device.
-      names: of the object of each motion, or of the one that all share.
-      motions: plan.Motions of equal length.
-      progress: called with the number of time steps of all motions that a step of the solver has finished.
-      time: (n,) of the motions' rows [s], or one such for each motion; rubber that relaxes and inertia need
-        it. What comes before the first row takes as long as what comes after it.
-      materials: one for each motion, or None for the model's.
-      worlds: name -> (k,) in what motions differ besides, see `skin.per_world.make_worlds`.
-      modes: of the skin, where slip, drive and gain are wanted; they need time.
+        names: object of each motion, or of all.
+        motions: plan.Motions of equal length.
+        progress: called with the number of completed time steps over all motions, after each step of the
+          solver.
+        time: (n,) of the motions' rows [s], or one for each motion; required for relaxing rubber and inertia.
+          The approach before the first row takes as long as the first row's step.
+        materials: one for each motion, or None for the model's.
+        worlds: name -> (k,) further properties per motion, see `skin.per_world.make_worlds`.
+        modes: of the skin, for slip, drive and gain; requires time.
 
     Raises:
-      ValueError: an object deep inside the rigid core (plans keep clear of it), or no time where it is
-        needed.
+        ValueError: an object deep inside the rigid core (plans avoid it), or missing times.
     """
     names = [names] * len(motions) if isinstance(names, str) else list(names)
     k = len(motions)
@@ -128,7 +124,7 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         clocks = [clock(walk[2], time, time[1] - time[0])[0] for walk, time in zip(walks, times)]
     scene.place([w[0][0] for w in walks], [w[1][0] for w in walks])
     for k in range(max(len(w[0]) for w in walks)):
-        at = [min(k, len(w[0]) - 1) for w in walks]  # who has arrived waits there
+        at = [min(k, len(w[0]) - 1) for w in walks]  # finished motions stay at their end
         scene.place([w[0][i] for w, i in zip(walks, at)], [w[1][i] for w, i in zip(walks, at)])
         dt = None if clocks is None else np.array([c[i] for c, i in zip(clocks, at)])
         touched.begin()
@@ -136,25 +132,24 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         there = np.array([[i, w[2][k]] for i, w in enumerate(walks) if k < len(w[0]) and w[2][k] >= 0])
         if not len(there):
             continue
-        who, row = there.T
-        # whether what is stored is in balance with the object where it is: failures on the way that were made
-        # good do not count
-        fields.converged[who, row] = data.converged[who]
-        fields.displacement[who, row], fields.contact_force[who, row] = reader.read(data, who)
-        fields.wrench[who, row], fields.pressure[who, row] = data.wrench[who, 0], data.pressure[who]
+        world, row = there.T
+        # convergence at the stored pose; failures of intermediate steps that were corrected do not count
+        fields.converged[world, row] = data.converged[world]
+        fields.displacement[world, row], fields.contact_force[world, row] = reader.read(data, world)
+        fields.wrench[world, row], fields.pressure[world, row] = data.wrench[world, 0], data.pressure[world]
         if dt is not None:
             data.dt.assign(dt)
-        _feel(touched, data, scene.geoms, modes is not None)
+        _evaluate_touch(touched, data, scene.geoms, modes is not None)
         for name in ("area", "slip", "drive", "gain"):
             array = getattr(touched, name).numpy()
-            getattr(fields, name)[who, row] = array[who] if name == "drive" else array[who, 0]
+            getattr(fields, name)[world, row] = array[world] if name == "drive" else array[world, 0]
         if progress:
             progress(len(there))
     return fields
 
 
-def _feel(touched, data, geoms, shaken):
-    """Has `touched` look at what the step left; the tangent costs a solve."""
+def _evaluate_touch(touched, data, geoms, shaken):
+    """Evaluates `touched` for the step's result; the tangent costs a solve."""
     device = data.model.device
     wrench = np.ascontiguousarray(np.swapaxes(data.wrench, 0, 1))
     shape = (geoms.ngroup, data.nworld, 6, 6)
@@ -166,11 +161,12 @@ def _feel(touched, data, geoms, shaken):
 
 
 def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, np.ndarray]:
-    """Time steps (m,) [s] of the poses of a walk, and when they end (m,) [s].
+    """Time steps (m,) [s] of the poses of a path, and their end times (m,) [s].
 
     Args:
-      row: (m,) the row that each pose ends, -1 on the way, see `_walk`. time: (n,) of the rows [s].
-      first: how long what comes before the first row takes [s].
+        row: (m,) row that each pose completes, -1 for intermediate ones, see `_walk`. time: (n,) of the rows
+          [s].
+        first: duration before the first row [s].
     """
     count = np.diff(np.flatnonzero(row >= 0), prepend=-1)  # steps to each row
     dt = np.repeat(np.diff(time, prepend=time[0] - first) / count, count)
@@ -187,10 +183,10 @@ def simulate_condensed(
     worlds: dict | None = None,
     modes: SkinModes | None = None,
 ) -> Fields:
-    """The same with the condensed skin, one interaction after another on one core; nothing in it takes time.
+    """`simulate` for the condensed skin, one interaction after another on one core, without rate effects.
 
     Raises:
-      ValueError: what the condensed tier cannot do, materials or worlds that differ, or modes.
+        ValueError: a feature that the condensed tier lacks, different materials or worlds, or modes.
     """
     from ...skin.condensed import CondensedSkin, Memory
 
@@ -231,13 +227,13 @@ def simulate_condensed(
 
 
 class Scene:
-    """All objects of a batch in every world: its own one where it is put, the others out of reach.
+    """All objects of a batch in every world: its own one at its pose, the others out of reach.
 
     Args:
-      names: of the object of each world. device: of Warp. friction: Coulomb coefficient.
+        names: object of each world. device: of Warp. friction: Coulomb coefficient.
 
     Attributes:
-      geoms: GeomSet of the different objects, in the order in which they first appear.
+        geoms: GeomSet of the different objects, in order of first appearance.
     """
 
     def __init__(self, names: list | tuple, device: str = "cpu", friction: float = 0.0):
@@ -256,7 +252,7 @@ class Scene:
         )
 
     def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
-        """Puts each world's object at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
+        """Moves each world's object to pos (nworld, 3) [m] with rotation mat (nworld, 3, 3)."""
         pos, mat = np.asarray(pos, float), np.asarray(mat, float)
         at = np.tile([0.0, -_AWAY, 0.0], (len(pos), len(self._placed), 1))
         turn = np.tile(np.eye(3), (len(pos), len(self._placed), 1, 1))
@@ -280,7 +276,7 @@ def gather(
     displacement_out: wp.array2d(dtype=wp.vec3s),
     force_out: wp.array2d(dtype=wp.vec3),
 ):
-    """Displacements as the store's integers and forces of the outer nodes, of some worlds."""
+    """Displacements as the store's integers, and forces of the outer nodes, of some worlds."""
     k, i = wp.tid()
     w = world[k]
     u = (x[i, w] - vert[i]) / scale
@@ -296,7 +292,7 @@ def gather(
 
 
 class _Reader:
-    """What is stored of some worlds, made on the device: a tenth of what the state is."""
+    """Stored fields of some worlds, computed on the device: a tenth of the state's size."""
 
     def __init__(self, model, outer):
         self.model, self.count = model, len(outer)
@@ -339,8 +335,8 @@ def _units(displacement):
 
 
 def _walk(pos, mat):
-    """Poses of one motion (n, 3), (n, 3, 3) with those between its time steps: positions (m, 3), rotations
-    (m, 3, 3) and the time step (m,) that each pose ends, -1 where it is on the way."""
+    """Poses of one motion (n, 3), (n, 3, 3) with intermediate ones: positions (m, 3), rotations (m, 3, 3) and
+    the time step (m,) that each pose completes, -1 for intermediate ones."""
     vector = Rotation.from_matrix(mat[1:] @ np.swapaxes(mat[:-1], 1, 2)).as_rotvec()
     distance = np.linalg.norm(np.diff(pos, axis=0), axis=1) + _ARM * np.linalg.norm(vector, axis=1)
     out = [(pos[0], mat[0], 0)]

@@ -1,12 +1,12 @@
-"""A synthetic 'real sensor': where measured data are wanted and none are at hand, and never anything else.
+"""A synthetic substitute for a real sensor, used only where measured data are wanted and none are available.
 
-The simulator does not use it. It differs from the simulator in everything that a real sensor differs in:
-another mesh, another law and constants of the skin, three-dimensional conduction with electrodes in slightly
-other places, and what no simulation here has: warm-up drift, slow temperature, relaxation. What learns on its
-counts is trained on synthetic data, whatever it is called.
+The simulator does not use it. It differs from the simulator like a real sensor: another mesh, another law and
+constants of the skin, three-dimensional conduction with electrodes at slightly different positions, and
+effects that the simulation lacks: warm-up drift, slow temperature, relaxation. A model trained on its counts
+is trained on synthetic data.
 
-Sizes of the effects are those measured on real sensors (a real unloaded sensor beside a flat press, EPFL,
-22508 rows, and published grasps); what is chosen says so."""
+Sizes of the effects are those measured on real sensors (an unloaded sensor next to a flat press, EPFL, 22508
+rows, and published grasps); chosen values are marked."""
 
 import dataclasses
 import importlib.util
@@ -28,15 +28,15 @@ from .readings import sample
 
 __all__ = ["SensorVariation", "SyntheticSensor", "start_worker", "measure_in_worker", "relax"]
 
-_CLEARING = 12.0  # [s] from the start of one contact of a session to that of the next: chosen
-_TARE = 50  # frames of 10 ms before the contact, whose mean is row 0, as one tares a sensor
-_WAVES = 64  # of which a random field is the sum
+_CLEARING = 12.0  # [s] between the starts of successive contacts of a session: chosen
+_TARE = 50  # frames of 10 ms before the contact, whose mean is row 0, like a sensor's tare
+_WAVES = 64  # number of waves in a random field
 
 
 @dataclasses.dataclass(frozen=True)
 class Waves:
-    """A smooth random field: a function of places (n, 3) [m] that gives (n,), of mean 0 and RMS `size`, alike
-    within `length` [m]."""
+    """A smooth random field: a function of points (n, 3) [m] -> (n,), with mean 0, RMS `size` and correlation
+    length `length` [m]."""
 
     seed: tuple
     size: float
@@ -50,32 +50,33 @@ class Waves:
 
 @dataclasses.dataclass(frozen=True)
 class SensorVariation:
-    """What makes one sensor different from the next; `draw(seed)` gives sensor number `seed`.
+    """Differences between sensors; `draw(seed)` gives sensor number `seed`.
 
-    Ranges are those that real sensors showed, in the lab books named here, or say that they are chosen.
+    Ranges are those of real sensors, in the cited lab books, or marked as chosen.
 
     Attributes:
       youngs_modulus, poissons_ratio, friction: of a Neo-Hookean skin. E: all fits to two pressed sensors
         (docs/lab/real_match.md, 0.47 to 1.36 MPa); nu: the default's and the least compressible tried there.
-      uneven: how the modulus rises along and across the finger [1/cm], the catalogue's `inhomog` (0.15).
-      rest_pressure: of its liquid [Pa]: none to 0.0194 E (docs/lab/real_match.md, Filling).
-      film, film_spread, film_length: what stays where the skin lies on the core [m], from place to place by
-        so much in its logarithm: the catalogue's range, 20-100 um, in the mean and again from place to place.
-      texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls that were fitted
-        to two sensors lie up to 0.29 mm off (docs/lab/real_match.md, The tip); the length is chosen.
-      excitation: (4, 2) of X1..X4 as `sensor.film.FilmConduction` takes them, or (4, 3), within 0.7 mm of the
-        design's (chosen: the BioTac's is known to some millimetres at best).
-      electrode_shift: (nelectrode, 3) [m] of the electrodes, all together by up to 1 mm along and across (the
-        catalogue's `misalign`), and each by 0.3 mm (chosen).
-      mixing: (nelectrode, nelectrode) that the changes of ln Z are multiplied with: gains that scatter by
-        0.27 (0.25 to 0.29 in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within
-        2-6 mm, and far coupling, a fraction of the mean (the catalogue's `crosstalk`).
+        uneven: gradient of the modulus along and across the finger [1/cm], the catalogue's `inhomog` (0.15).
+        rest_pressure: of its liquid [Pa]: 0 to 0.0194 E (docs/lab/real_match.md, Filling).
+        film, film_spread, film_length: thickness where the skin touches the core [m], and its spatial scatter
+          in the logarithm: the catalogue's range, 20-100 um, for the mean and again from place to place.
+        texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls fitted to two
+          sensors deviate by up to 0.29 mm (docs/lab/real_match.md, The tip); the length is chosen.
+        excitation: (4, 2) of X1..X4 as in `sensor.film.FilmConduction`, or (4, 3), within 0.7 mm of the
+          design's (chosen: the BioTac's is known to some millimetres at best).
+        electrode_shift: (nelectrode, 3) [m] of the electrodes, in common by up to 1 mm along and across (the
+          catalogue's `misalign`), and each by 0.3 mm (chosen).
+        mixing: (nelectrode, nelectrode) matrix on the changes of ln Z: gains with a scatter of 0.27 (0.25 to
+          0.29 in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within 2-6 mm, and
+          global coupling, a fraction of the mean (the catalogue's `crosstalk`).
       sensor: rest counts, noise and warm-up, drawn from the spread of the measured ones (`sensor.presets`).
       ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards
         (chosen).
-      overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure answer a step by
-        these shares too much and relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a constant
-        grip, electrodes undershoot 5-25 counts after release.
+        overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure overshoot a
+          step by these fractions and relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a
+            constant grip,
+          electrodes undershoot 5-25 counts after release.
     """
 
     youngs_modulus: float
@@ -113,11 +114,11 @@ class SensorVariation:
             uneven={name: rng.normal(0, 0.15) for name in ("along", "across")},
             rest_pressure=rng.uniform(0, 0.0194) * youngs_modulus,
             film=np.exp(rng.uniform(*np.log([20e-6, 100e-6]))),
-            film_spread=np.log(100 / 20) / np.sqrt(12),  # that of an even draw from the range
+            film_spread=np.log(100 / 20) / np.sqrt(12),  # that of a uniform draw from the range
             film_length=rng.uniform(1.5e-3, 4e-3),
             texture=rng.uniform(0.1e-3, 0.29e-3),
             texture_length=rng.uniform(1.5e-3, 4e-3),
-            excitation=_moved(design, rng),
+            excitation=_shifted_excitation(design, rng),
             electrode_shift=rng.uniform(-1e-3, 1e-3, 3) * [1, 0, 1] + rng.normal(0, 0.3e-3, (n, 3)),
             mixing=gain @ (np.eye(n) + near + rng.uniform(-0.6, 0.6) / n),
             sensor=draw_sensor(rng, design),
@@ -129,8 +130,8 @@ class SensorVariation:
         )
 
 
-def _moved(design, rng):
-    """The design's excitation somewhere near, as `excitation_places` takes it."""
+def _shifted_excitation(design, rng):
+    """Randomly shifted excitation of the design, as argument of `excitation_places`."""
     place = np.array(design.excitation)
     if place.shape[1] == 2:
         return place + rng.uniform(-1, 1, place.shape) * [0.7e-3, 0.1]
@@ -169,20 +170,20 @@ class SyntheticSensor:
         self.model = SkinModel(geometry, material, options, device, modulus=modulus_of(v.uneven))
 
     def simulate(self, names: list | tuple, motions: list, progress: Callable | None = None) -> object:
-        """Its skin under the same motions of the same objects: simulate.Fields, of its own mesh."""
+        """Its skin under the same motions of the same objects: simulate.Fields, on its own mesh."""
         from .simulate import simulate
 
         return simulate(self.model, names, motions, progress)
 
     def meter(self) -> "Meter":
-        """What turns its skin into counts; light enough to be sent to another process."""
+        """Converter from its skin to counts, light enough to be sent to another process."""
         return Meter(self.variation, self.model.geometry, self.model.rest.vert, self.seed)
 
 
 @dataclasses.dataclass
 class Meter:
-    """Liquid, electrodes and electronics of a synthetic sensor: geometry and rest_vert (nvert, 3) [m] are of
-    its own skin."""
+    """Liquid, electrodes and electronics of a synthetic sensor; geometry and rest_vert (nvert, 3) [m] of its
+    own skin."""
 
     variation: SensorVariation
     geometry: object
@@ -193,20 +194,20 @@ class Meter:
         self._conduction = None
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
-        """(n, nelectrode) [ohm] for nodes (n, nvert, 3) [m]: the sensor's rest, and changes of ln Z from it
-        that are mixed."""
+        """(n, nelectrode) [ohm] for nodes (n, nvert, 3) [m]: the sensor's rest values times mixed changes of
+        ln Z."""
         v = self.variation
         if self._conduction is None:
             self._conduction = self._make()
             self._rest = np.log(self._conduction.impedance(self.rest_vert))
         out = []
-        for i, x in enumerate(vert_xpos):  # a skin that stands still is solved once
+        for i, x in enumerate(vert_xpos):  # repeated skins are solved once
             same = i and np.array_equal(x, vert_xpos[i - 1])
             out.append(out[-1] if same else np.log(self._conduction.impedance(x)) - self._rest)
         return v.sensor.impedance * np.exp(np.array(out) @ v.mixing.T)
 
     def _make(self):
-        """The liquid over electrodes that are moved, as far as there is liquid over them."""
+        """The liquid over shifted electrodes; the shift is limited to positions with liquid."""
         v, geometry = self.variation, self.geometry
         core = CoreSurface(geometry.core_vert, geometry.core_face)
         floor = Waves((self.seed, 1), v.film_spread, v.film_length)
@@ -228,12 +229,12 @@ class Meter:
         """(n, nchannel) counts, in the order of the design's channels, and (n, 22) PAC of the last 10 ms,
         of one contact that begins `start` seconds into the session.
 
-        Row 0 is the mean of 50 frames before the contact, so it has fractions; the others are whole numbers
-        with their noise.
+        Row 0 is the mean of 50 frames before the contact, so it is fractional; the others are whole numbers
+        with noise.
 
         Args:
-          vert_xpos: (n, nvert, 3) [m]; time: (n,) [s]; pressure: (n,) above rest [Pa]. Before them the skin
-            was at rest.
+          vert_xpos: (n, nvert, 3) [m]; time: (n,) [s]; pressure: (n,) above rest [Pa]. Before row 0 the skin
+            is at rest.
           seed: of the noise.
         """
         v = self.variation
@@ -247,15 +248,14 @@ class Meter:
         )
         temperature = self.temperature(start + when)
         log_z = log_z + (v.sensor.per_degree * (v.sensor.temperature - temperature))[:, None]
-        # its warm-up and gains are in ln Z already
+        # ln Z already includes its warm-up and gains
         plain = dataclasses.replace(v.sensor, warm_up=0.0, mixing=())
         counts, pac = sample(when, np.exp(log_z), pressure, seed, temperature, plain, self.geometry.design)
         counts = np.concatenate([counts[:_TARE].mean(0, keepdims=True), counts[_TARE + 1 :]])
         return counts, np.concatenate([pac[_TARE - 1 : _TARE], pac[_TARE + 1 :]])
 
     def temperature(self, t: np.ndarray) -> np.ndarray:
-        """(n,) [C] at times (n,) of the session [s]: warming up, then wandering as slow sines, the same for
-        every contact."""
+        """(n,) [C] at times (n,) of the session [s]: warm-up, then slow sines, the same for every contact."""
         v = self.variation
         rng = np.random.default_rng([self.seed, 23])
         slow = 2 * np.pi / (v.ambient_time * rng.uniform(0.5, 4.0, 8))
@@ -265,11 +265,11 @@ class Meter:
 
 
 def relax(time: np.ndarray, value: np.ndarray, fraction: float, tau: float) -> np.ndarray:
-    """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of fraction (value - its low-pass),
-    exact between samples (linear).
+    """A signal (n,) or (n, k) with overshoot and relaxation: value + sum of fraction (value - its low-pass),
+    exact for linear interpolation between samples.
 
     Args:
-      time: (n,) [s]; value: the signal; fraction, tau: (m,), (m,) [s], of each part.
+        time: (n,) [s]; value: the signal; fraction, tau: (m,), (m,) [s], of each term.
     """
     value = np.asarray(value, float)
     out = value.copy()
@@ -283,12 +283,12 @@ def relax(time: np.ndarray, value: np.ndarray, fraction: float, tau: float) -> n
     return out
 
 
-_meter = {}  # what a worker keeps
+_meter = {}  # a worker's state
 
 
 def start_worker(geometry: SkinGeometry, meter: Meter | None, *film: object) -> None:
-    """Prepares a worker: what reads the simulated skin, and the synthetic sensor where there are labels to
-    make; film: further arguments of `readings.prepare_worker`."""
+    """Prepares a worker: the film of the simulated skin, and the synthetic sensor if there are labels; film:
+    further arguments of `readings.prepare_worker`."""
     from . import readings
 
     readings.prepare_worker(geometry, *film)

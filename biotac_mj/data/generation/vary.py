@@ -1,4 +1,4 @@
-"""Skins, sensors and surfaces that differ from interaction to interaction: what is drawn for each."""
+"""Random skins, sensors and surfaces per interaction."""
 
 import dataclasses
 from typing import Any
@@ -21,7 +21,7 @@ _WORLDS = tuple(name for name in NAMES if name != "modulus")
 
 
 def check_vary(vary: dict) -> None:
-    """Refuses unknown names and intervals that are none (ValueError)."""
+    """Raises ValueError for unknown names and invalid intervals."""
     known = (*_NUMBERS, *_FACTORS, *_WORLDS)
     for name, interval in vary.items():
         if name not in known:
@@ -35,7 +35,7 @@ def check_vary(vary: dict) -> None:
 
 
 def refuse_impossible(vary: dict, material: Material) -> None:
-    """Refuses what this material has nothing of, and ends that no material can have (ValueError)."""
+    """Raises ValueError for a property that this material lacks, and bounds that no material can have."""
     for name in _FACTORS:
         if name in vary and not getattr(material, name):
             raise ValueError(
@@ -48,7 +48,7 @@ def refuse_impossible(vary: dict, material: Material) -> None:
 
 
 def _of_material(material, drawn):
-    """The material with the numbers that were drawn."""
+    """The material with the random values."""
     changes = {name: drawn[name] for name in _NUMBERS if name in drawn}
     for name in _FACTORS:
         if name in drawn:
@@ -57,14 +57,14 @@ def _of_material(material, drawn):
 
 
 def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | None, dict, list]:
-    """What the skins of some interactions are.
+    """Skins of some interactions.
 
     Args:
-      vary: {name: (low, high)}, see `GenerateOptions.vary`. material: of all, but for what varies.
-      seeds: of each interaction.
+        vary: {name: (low, high)}, see `GenerateOptions.vary`. material: of all, except for varied properties.
+        seeds: of each interaction.
 
-    Returns:
-      materials of each (None where all have the same), {name: (k,)} for `make_worlds`, and [{name: value}].
+      Returns:
+        materials of each (None if they are equal), {name: (k,)} for `make_worlds`, and [{name: value}].
     """
     drawn = []
     for seed in seeds:
@@ -77,14 +77,14 @@ def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | Non
 
 
 def draw_sense(options: Any, seed: list, modes: Modes | None, design: Design = BIOTAC) -> tuple[Sense, dict]:
-    """The sensor of an interaction and what it touches.
+    """Sensor and object of an interaction.
 
     Args:
       options: GenerateOptions: sensor, randomise, thermal, texture. seed: of the interaction. modes: of the
         skin, for vibration. design: of the sensor.
 
     Returns:
-      Sense, and what of it was drawn: {"sensor": numbers, "thermal": value, "texture": value}.
+        Sense, and its random values: {"sensor": numbers, "thermal": value, "texture": value}.
     """
     sensor, _, open_ = take_sensor({"sensor": options.sensor, "randomise": options.randomise}, seed, design)
     drawn, rng = {}, np.random.default_rng(seed)

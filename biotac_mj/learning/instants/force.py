@@ -255,7 +255,7 @@ def _network(log_z, target, part, seed, members=6, epochs=8, width=64, batch=256
     are augmented by noise and a common gain, for robustness to drift."""
     import torch
 
-    from ..training.fitting import cycle
+    from ..training.fitting import TrainingOptions, train
 
     mean, scale = log_z[part].mean(0), np.maximum(log_z[part].std(0), 1e-3)
     size = np.maximum(target.std(0), 1e-6)
@@ -275,7 +275,7 @@ def _network(log_z, target, part, seed, members=6, epochs=8, width=64, batch=256
             shaken = x[row] + 0.05 * torch.randn(len(row), x.shape[1]) + torch.randn(len(row), 1) * common
             return ((net(shaken) - y[row]) ** 2).mean()
 
-        cycle(net, loss, rows, batch, steps, 2e-3, weight_decay=0.01, seed=seed)
+        train(net, loss, rows, TrainingOptions(batch, steps, 2e-3, weight_decay=0.01, seed=seed))
         with torch.no_grad():
             return net(x).numpy() * size
 

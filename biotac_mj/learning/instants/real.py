@@ -184,7 +184,7 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
-    from ..training.fitting import Checkpoints, cycle
+    from ..training.fitting import Checkpoints, TrainingOptions, train
 
     torch.manual_seed(seed)
     size = counts[:ntrain].std()  # one scale for all channels: errors weigh equally
@@ -211,16 +211,8 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
             value = value + _KL * 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
         return value
 
-    cycle(
-        net,
-        loss,
-        torch.arange(ntrain),
-        _BATCH,
-        steps,
-        1e-3,
-        seed=seed,
-        checkpoints=Checkpoints(say=bar.update),
-    )
+    options = TrainingOptions(_BATCH, steps, 1e-3, seed=seed)
+    train(net, loss, torch.arange(ntrain), options, checkpoints=Checkpoints(say=bar.update))
     with torch.no_grad():
         return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
 

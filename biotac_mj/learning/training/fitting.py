@@ -7,6 +7,7 @@ and replayed.
 
 import contextlib
 import copy
+import dataclasses
 import pathlib
 import time
 from collections.abc import Callable, Iterator
@@ -16,8 +17,9 @@ from torch.optim.lr_scheduler import LambdaLR, OneCycleLR
 
 from ...files import replacing
 
-__all__ = ["Checkpoints", "cycle", "fast_products", "root_mean_square"]
+__all__ = ["Checkpoints", "TrainingOptions", "fast_products", "root_mean_square", "train"]
 
+_CHECKS = 12  # validations in a training
 _WARM = 5  # warm-up steps before the capture
 _BETWEEN = 5.0  # [s] between two checkpoints: one takes as long as three small steps
 
@@ -83,35 +85,43 @@ def root_mean_square(error: torch.Tensor) -> torch.Tensor:
     return (error.square().mean(-1) + 1e-10).sqrt().mean()
 
 
-def cycle(
+@dataclasses.dataclass(frozen=True)
+class TrainingOptions:
+    """Settings of a training.
+
+    Attributes:
+      batch: rows per step. learning_rate: of AdamW, with its weight_decay. seed: of the batches.
+      decay: the rate falls by this factor twenty times over the training, as the paper's does every epoch;
+        None: one cycle, up to twice the rate in the first 15 % of the training, then to zero (Smith, 2018).
+      graph: on a GPU, replay the steps as a CUDA graph; the loss must then not synchronise with the host.
+    """
+
+    batch: int
+    steps: int
+    learning_rate: float
+    weight_decay: float = 0.0
+    decay: float | None = None
+    seed: int = 0
+    graph: bool = True
+
+
+def train(
     module: torch.nn.Module,
     loss: Callable[[torch.Tensor], torch.Tensor],
     rows: torch.Tensor,
-    batch: int,
-    steps: int,
-    learning_rate: float,
+    options: TrainingOptions,
     validate: Callable[[], float] | None = None,
-    checks: int = 12,
-    weight_decay: float = 0.0,
-    decay: float | None = None,
-    seed: int = 0,
-    graph: bool = True,
     checkpoints: Checkpoints | None = None,
     curve: list | None = None,
 ) -> float | None:
-    """Trains in place.
+    """Trains a module in place.
 
     Args:
-      module: module that is trained (parameters that need no gradient stay).
-      loss: function of a tensor of rows -> scalar.
+      module: parameters without gradient stay fixed.
+      loss: tensor of rows -> scalar.
       rows: (k,) rows to draw from, on the device.
-      decay: the rate falls by this factor twenty times over the training, as the paper's does every epoch;
-        None: one cycle, up to twice the rate in the first 15 % of the training and down to nothing (Smith,
-        2018).
-      graph: whether a step is replayed as a CUDA graph where there is CUDA; the loss must then do without the
-        host.
-      validate: function () -> float, called `checks` times; the state of its smallest value is kept at the
-        end. None keeps the last.
+      validate: () -> float, called twelve times; the state with its smallest value is restored at the end.
+        None keeps the last.
       checkpoints: counts and saves the steps. curve: gets [step, value] of each validation.
 
     Returns:
@@ -124,15 +134,18 @@ def cycle(
         raise ValueError("no rows to train on: the train part of the split is empty")
     parameters = [p for p in module.parameters() if p.requires_grad]
     cuda = rows.is_cuda
-    # in the device's memory, where a replayed step finds it
-    rate = torch.tensor(float(learning_rate), device=rows.device)
-    optimizer = torch.optim.AdamW(parameters, rate, weight_decay=weight_decay, fused=cuda, capturable=cuda)
-    schedule = _schedule(optimizer, learning_rate, steps, decay)
-    generator = torch.Generator(device=rows.device).manual_seed(seed)
-    chosen = torch.zeros(min(batch, len(rows)), dtype=rows.dtype, device=rows.device)
+    steps = options.steps
+    # on the device, where a replayed step reads it
+    rate = torch.tensor(float(options.learning_rate), device=rows.device)
+    optimizer = torch.optim.AdamW(
+        parameters, rate, weight_decay=options.weight_decay, fused=cuda, capturable=cuda
+    )
+    schedule = _schedule(optimizer, options.learning_rate, steps, options.decay)
+    generator = torch.Generator(device=rows.device).manual_seed(options.seed)
+    chosen = torch.zeros(min(options.batch, len(rows)), dtype=rows.dtype, device=rows.device)
     best, state, first = None, None, 0
     module.train()
-    every = max(1, steps // checks)
+    every = max(1, steps // _CHECKS)
     checkpoints = checkpoints or Checkpoints()
     kept = checkpoints.begin()
     if kept:
@@ -156,11 +169,11 @@ def cycle(
         chosen.copy_(rows[torch.randint(len(rows), chosen.shape, generator=generator, device=rows.device)])
         if replay:
             replay.replay()
-        elif cuda and graph and step >= first + _WARM:
+        elif cuda and options.graph and step >= first + _WARM:
             replay, value = _record(one)
             replay.replay()
         else:
-            value = _on_side_stream(one) if cuda and graph else one()
+            value = _on_side_stream(one) if cuda and options.graph else one()
         schedule.step()
         checkpoints.count(1, time.perf_counter() - clock)
         if (step + 1) % every == 0 or step + 1 == steps:
@@ -207,14 +220,14 @@ def _set_random(states):
 
 
 def _schedule(optimizer, rate, steps, decay):
-    """Of the learning rate, see `cycle`."""
+    """Schedule of the learning rate, see `TrainingOptions`."""
     if decay is None:
         return OneCycleLR(optimizer, 2 * rate, steps, pct_start=0.15, cycle_momentum=False)
     return LambdaLR(optimizer, lambda step: decay ** (20 * step / steps))
 
 
 def _on_side_stream(one):
-    """A step on a stream of its own, as PyTorch wants the first ones of what is recorded later."""
+    """A step on a separate stream, as PyTorch requires for warm-up steps before a capture."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -224,7 +237,7 @@ def _on_side_stream(one):
 
 
 def _record(one):
-    """A step as a CUDA graph, and where its loss will stand."""
+    """A step as a CUDA graph, and the tensor of its loss."""
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         value = one()

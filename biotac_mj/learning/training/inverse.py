@@ -11,8 +11,9 @@ from torch import nn
 from ...sensor.channels import NELECTRODE, check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
+from . import fitting
 from .features import ELECTRODE_MIRROR, orthogonal_modes
-from .fitting import Checkpoints, cycle, root_mean_square
+from .fitting import Checkpoints, TrainingOptions, root_mean_square
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays
@@ -119,31 +120,15 @@ def train_inverse(
         def symmetric(r):
             return error(r, source=film) + (0.5 * error(r, True, film) if then is not None else 0)
 
-        cycle(
-            head,
-            symmetric,
-            every,
-            2 * config.batch,
-            2 * config.steps,
-            2 * config.learning_rate,
-            seed=seed,
-            graph=config.graphs,
-            checkpoints=checkpoints,
+        options = TrainingOptions(
+            2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed, graph=config.graphs
         )
+        fitting.train(head, symmetric, every, options, checkpoints=checkpoints)
     rate = config.learning_rate * (0.5 if teach else 1)
-    head.validation = cycle(
-        head,
-        error,
-        rows,
-        config.batch,
-        config.steps,
-        rate,
-        lambda: error(check),
-        weight_decay=0.01,
-        seed=seed,
-        graph=config.graphs,
-        checkpoints=checkpoints,
+    options = TrainingOptions(
+        config.batch, config.steps, rate, weight_decay=0.01, seed=seed, graph=config.graphs
     )
+    head.validation = fitting.train(head, error, rows, options, lambda: error(check), checkpoints)
     return head
 
 

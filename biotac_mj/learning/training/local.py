@@ -11,8 +11,9 @@ import torch
 from ...sensor.channels import FULL_SCALE, log_impedance
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead, PodHead, averages
+from . import fitting
 from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
-from .fitting import Checkpoints, cycle, root_mean_square
+from .fitting import Checkpoints, TrainingOptions, root_mean_square
 
 if typing.TYPE_CHECKING:
     from ..networks.points import SkinPoints
@@ -166,31 +167,16 @@ def train_head(
                 else value
             )
 
-        cycle(
-            head,
-            teacher_loss,
-            a.rows(train),
-            2 * config.batch,
-            config.steps,
-            2 * config.learning_rate,
-            seed=seed,
-            graph=config.graphs,
-            checkpoints=checkpoints,
+        options = TrainingOptions(
+            2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed, graph=config.graphs
         )
+        fitting.train(head, teacher_loss, a.rows(train), options, checkpoints=checkpoints)
     rate = config.learning_rate * (0.5 if teach else 1)
-    cycle(
-        head,
-        loss,
-        labelled,
-        config.batch,
-        config.steps,
-        rate,
-        lambda: root_mean_square(predict(check) - a.change(check)),
-        weight_decay=0.01,
-        seed=seed,
-        graph=config.graphs,
-        checkpoints=checkpoints,
+    options = TrainingOptions(
+        config.batch, config.steps, rate, weight_decay=0.01, seed=seed, graph=config.graphs
     )
+    error = lambda: root_mean_square(predict(check) - a.change(check))  # noqa: E731
+    fitting.train(head, loss, labelled, options, error, checkpoints)
 
     @torch.no_grad()
     def evaluate(rows):

@@ -11,7 +11,8 @@ from ..networks.electrode_vae import ElectrodeVAE, mlp
 from ..networks.heads import FromRest
 from ..networks.mesh_vae import MeshVAE
 from ..networks.pointnet import PointNet
-from .fitting import Checkpoints, cycle, fast_products, root_mean_square
+from . import fitting
+from .fitting import Checkpoints, TrainingOptions, fast_products, root_mean_square
 from .local import counts_change
 
 if typing.TYPE_CHECKING:
@@ -112,22 +113,22 @@ def train_latent_projection(
         u = field(rows)
         return _vae_loss(u, *vae(u), config.mesh_kl, config.reconstruction)
 
-    cycle(vae, mesh_loss, mesh_rows, config.mesh_batch, config.mesh_steps, config.learning_rate,
-          mesh_validate, decay=config.decay, seed=seed, graph=False, checkpoints=checkpoints,
-          curve=curves["mesh"])  # fmt: skip
+    options = TrainingOptions(config.mesh_batch, config.mesh_steps, config.learning_rate, decay=config.decay,
+                              seed=seed, graph=False)  # fmt: skip
+    fitting.train(vae, mesh_loss, mesh_rows, options, mesh_validate, checkpoints, curves["mesh"])
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     both = torch.cat([rows, check])
     target = _Target(arrays, both, config)
     y = target.value
-    kind = dict(batch=config.batch, steps=config.paper_steps, learning_rate=config.learning_rate,
-                decay=config.decay, seed=seed, graph=config.graphs, checkpoints=checkpoints)  # fmt: skip
+    options = TrainingOptions(config.batch, config.paper_steps, config.learning_rate, decay=config.decay,
+                              seed=seed, graph=config.graphs)  # fmt: skip
 
     def electrode_loss(r):
         return _vae_loss(y[r], *electrode(y[r]), config.electrode_kl, config.reconstruction)
 
-    cycle(electrode, electrode_loss, rows, **kind, curve=curves["electrode"],
-          validate=lambda: (electrode(y[check])[0] - y[check]).square().mean())  # fmt: skip
+    error = lambda: (electrode(y[check])[0] - y[check]).square().mean()  # noqa: E731
+    fitting.train(electrode, electrode_loss, rows, options, error, checkpoints, curves["electrode"])
 
     for part in (vae, electrode):
         part.requires_grad_(False)
@@ -158,8 +159,8 @@ def train_latent_projection(
         return root_mean_square(model.to_mesh(b) - a)
 
     for name, loss in (("to_electrode", forward_loss), ("to_mesh", inverse_loss)):
-        cycle(getattr(model, name), loss, rows, **kind, curve=curves[name],
-              validate=lambda loss=loss: loss(check))  # fmt: skip
+        error = lambda loss=loss: loss(check)  # noqa: E731
+        fitting.train(getattr(model, name), loss, rows, options, error, checkpoints, curves[name])
     return model.eval(), curves
 
 
@@ -187,8 +188,9 @@ def train_pointnet(
     def validate():
         return sum(float(loss(r)) * len(r) for r in check.split(1024)) / len(check)
 
-    cycle(from_rest, loss, rows, config.batch, config.paper_steps, config.learning_rate, validate,
-          decay=config.decay, seed=seed, graph=False, checkpoints=checkpoints)  # fmt: skip
+    options = TrainingOptions(config.batch, config.paper_steps, config.learning_rate, decay=config.decay,
+                              seed=seed, graph=False)  # fmt: skip
+    fitting.train(from_rest, loss, rows, options, validate, checkpoints)
     return net.eval()
 
 
