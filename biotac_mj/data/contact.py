@@ -21,8 +21,8 @@ def contact_labels(
 
     Args:
       displacement: (n, nvert, 3) of the nodes against `geometry.vert` [m].
-        force: (n, nouter, 3) of the object on the outer nodes [N]. area: (n,) contact area [m^2].
-        rest: (nvert, 3) displacements of the untouched skin, the zero of depth; None: 0.
+      force: (n, nouter, 3) of the object on the outer nodes [N]. area: (n,) contact area [m^2].
+      rest: (nvert, 3) displacements of the untouched skin, the zero of depth; None: 0.
     """
     outer, size = nodes_of(geometry), np.linalg.norm(np.asarray(force, float), axis=2)
     total = size.sum(1)

@@ -21,8 +21,8 @@ class Measured(typing.NamedTuple):
     """Rows of a recording as a set's columns.
 
     Attributes:
-        counts: (n, nchannel), NaN if a channel was not recorded. pac: (n, 22), None without raw counts.
-        wrench: (n, 6) in the recording's frame, None without forces. notes: assumptions.
+      counts: (n, nchannel), NaN if a channel was not recorded. pac: (n, 22), None without raw counts.
+      wrench: (n, 6) in the recording's frame, None without forces. notes: assumptions.
     """
 
     counts: np.ndarray
@@ -35,7 +35,7 @@ def measured(recording: Recording) -> Measured:
     """Columns of a data set from a recording.
 
     Raises:
-        ValueError: the electrodes cannot be converted to raw counts.
+      ValueError: the electrodes cannot be converted to raw counts.
     """
     electrodes, notes = recording.counts()
     n, first = electrodes.shape
@@ -65,7 +65,7 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
       block: also splits into this length [s]. Neighbouring blocks have the same drift, so they are similar.
 
     Raises:
-        ValueError: the electrodes cannot be converted to raw counts.
+      ValueError: the electrodes cannot be converted to raw counts.
     """
     n, found = len(recording), measured(recording)
     cut = set(np.flatnonzero(np.diff(recording.time) > _GAP) + 1)
@@ -113,12 +113,12 @@ def import_recordings(
     """Reads files and writes a set, a shard for each file, with a split by interaction.
 
     Args:
-        paths: files. out: folder of the set; it must not contain one.
-        seed: of the split. block: see `interactions`. options: of `recordings.load`.
-        say: gets doubts about a recording, line by line.
+      paths: files. out: folder of the set; it must not contain one.
+      seed: of the split. block: see `interactions`. options: of `recordings.load`.
+      say: gets doubts about a recording, line by line.
 
-      Returns:
-        number of interactions.
+    Returns:
+      number of interactions.
 
     Raises:
       ValueError, FileNotFoundError: see `recordings.load` and `interactions`.

@@ -53,16 +53,16 @@ def export_lerobot(
 
     Args:
       data: TactileSet with poses.
-        counts: "counts" for simulated readings of all interactions, "measured_counts" for those of
-          interactions that have measured ones.
-        rate: [Hz] of the frames, which take the nearest row. None: the set's own, if its clock is even, or
-          that of a recording with missing rows.
+      counts: "counts" for simulated readings of all interactions, "measured_counts" for those of interactions
+        that have measured ones.
+      rate: [Hz] of the frames, which take the nearest row. None: the set's own, if its clock is even, or that
+        of a recording with missing rows.
 
     Episodes are in the order train, validation, test, and meta/info.json has the set's splits.
 
     Raises:
-        ValueError: no poses or counts in the set, nothing to export, uneven time steps, a single row without
-          a rate, or an existing folder.
+      ValueError: no poses or counts in the set, nothing to export, uneven time steps, a single row without a
+        rate, or an existing folder.
       ImportError: no pyarrow; the text says how to get it.
     """
     _pyarrow()
@@ -83,7 +83,7 @@ def interactions_to_export(
     """Numbers of the interactions that have counts, in the order train, validation, test.
 
     Raises:
-        ValueError: `out` exists, or the set is unfinished or lacks counts or needed columns.
+      ValueError: `out` exists, or the set is unfinished or lacks counts or needed columns.
     """
     if pathlib.Path(out).exists():
         raise ValueError(f"{out} is there already: choose another folder, or delete it")

@@ -59,30 +59,29 @@ class Interaction:
 
     Attributes:
       id: unique in its set.
-        object: as in `biotac data generate --objects`, or in the imported file.
+      object: as in `biotac data generate --objects`, or in the imported file.
       kind: of KINDS.
       split: of SPLITS, the default split by interaction.
       seed: of its random numbers.
-        parameters: of its generation; JSON types.
+      parameters: of its generation; JSON types.
       time: (n,) increasing [s].
       displacement: (n, nvert, 3) float32, nodes against the skin's `vert` [m].
       wrench: (n, 6) of the skin on the object, torque about the BioTac frame's origin [N, N m].
       contact_force: (n, nouter, 3) of the object on the nodes of the outer surface, `nodes_of(geometry)` [N].
-        contact_pos: (n, 3) centre of the contact forces on the deformed skin, weighted by their norm [m];
-          contact_normal: (n, 3) unit outward normal of the deformed skin there. Both NaN without contact.
-        contact_depth: (n,) largest inward displacement of the nodes in contact, along the normals of the
-          untouched skin [m]; contact_area: (n,) [m^2]. Both 0 without contact.
+      contact_pos: (n, 3) centre of the contact forces on the deformed skin, weighted by their norm [m];
+        contact_normal: (n, 3) unit outward normal of the deformed skin there. Both NaN without contact.
+      contact_depth: (n,) largest inward displacement of the nodes in contact, along the normals of the
+        untouched skin [m]; contact_area: (n,) [m^2]. Both 0 without contact.
       pressure: (n,) of the liquid above rest [Pa].
       impedance: (n, nelectrode) e1, e2, ... of the simulated film [ohm].
       counts: (n, nchannel) simulated readings in the order of the design's `channels` [counts].
       pac: (n, 22) of these, PAC of the last 10 ms in the order of time [counts].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
       converged: (n,) whether the skin's step converged.
-        measured_counts: (n, nchannel) readings of the target sensor, real or synthetic; NaN for channels that
-          it does not have.
-        measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN if
-          missing.
-        measured_wrench: (n, 6) measured with it; NaN if missing.
+      measured_counts: (n, nchannel) readings of the target sensor, real or synthetic; NaN for channels that
+        it does not have.
+      measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN if missing.
+      measured_wrench: (n, 6) measured with it; NaN if missing.
     """
 
     id: str
@@ -121,8 +120,8 @@ class Interaction:
         """Returns itself. design: of the sensor, for the number of its channels.
 
         Raises:
-            ValueError: a wrong kind, split or shape, a time that does not increase, or an invalid NaN; the
-              text has the name.
+          ValueError: a wrong kind, split or shape, a time that does not increase, or an invalid NaN; the text
+            has the name.
         """
         where = f"interaction {self.id!r}"
         if self.kind not in KINDS:

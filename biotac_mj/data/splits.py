@@ -51,7 +51,7 @@ def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIO
       seed: of the division.
 
     Raises:
-        ValueError: an empty part, or fractions that do not sum to 1.
+      ValueError: an empty part, or fractions that do not sum to 1.
     """
     part = np.empty(len(data), "<U10")
     for k, flag in enumerate((False, True)):

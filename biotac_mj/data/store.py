@@ -65,13 +65,13 @@ def write_shard(
     Args:
       path: see `shard_path`.
       interactions: Interactions that all have the same columns.
-        geometry: the skin of displacement and contact_force; None without these.
-        attributes: common to all: material, element, tier, device, settings; JSON types.
-        design: of the sensor if there is no skin, which has its own.
+      geometry: the skin of displacement and contact_force; None without these.
+      attributes: common to all: material, element, tier, device, settings; JSON types.
+      design: of the sensor if there is no skin, which has its own.
 
     Raises:
-        ValueError: no interactions, an invalid one (see `Interaction.check`), different columns, a duplicate
-          name, or a displacement beyond 8.19 mm.
+      ValueError: no interactions, an invalid one (see `Interaction.check`), different columns, a duplicate
+        name, or a displacement beyond 8.19 mm.
     """
     interactions = list(interactions)
     if not interactions:
@@ -225,12 +225,12 @@ class TactileSet:
         shard.
       id, object, kind, split: (n,) str; seed (n,) int; labelled (n,) bool; start, stop (n,) int: of each
         interaction, its time steps are start..stop-1 of every column.
-        columns: names of the columns in the set; "measured_counts" and "measured_wrench" are NaN in
-          interactions without a label.
+      columns: names of the columns in the set; "measured_counts" and "measured_wrench" are NaN in
+        interactions without a label.
 
     Raises:
       FileNotFoundError: no such folder or file, or no shards in it.
-        ValueError: a file that is not a shard, of another schema, or shards of different sets.
+      ValueError: a file that is not a shard, of another schema, or shards of different sets.
     """
 
     def __init__(self, path: pathlib.Path | str):

@@ -48,7 +48,7 @@ def export_mujoco(
       counts: "counts", or "measured_counts" for those interactions that have measured ones.
 
     Raises:
-        ValueError: no poses or counts in the set, nothing to export, or an existing folder.
+      ValueError: no poses or counts in the set, nothing to export, or an existing folder.
     """
     out = pathlib.Path(out)
     chosen = interactions_to_export(data, out, counts, ("indenter_pos", "indenter_quat"))

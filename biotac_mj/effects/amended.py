@@ -71,7 +71,7 @@ def amend(model: Model, effects: Effects) -> Model:
       effects: a sensor file, such as `biotac diagnose` writes, or [(Effect, theta)].
 
     Raises:
-        FileNotFoundError, ValueError: see `take_effects`; an effect that a running sensor cannot have.
+      FileNotFoundError, ValueError: see `take_effects`; an effect that a running sensor cannot have.
     """
     file, where = take_effects(effects)
     base, omitted = file.base, []

@@ -52,9 +52,9 @@ class Param:
 
     Attributes:
       unit; low, high: bounds; source: of the bounds.
-        scale: a realistic size, for signatures and the prior.
-        start: value without the effect.
-        shape: whether it has no effect by itself (a time constant, a knee); several values are tried.
+      scale: a realistic size, for signatures and the prior.
+      start: value without the effect.
+      shape: whether it has no effect by itself (a time constant, a knee); several values are tried.
     """
 
     unit: str
@@ -71,22 +71,21 @@ class Run:
     """One trajectory of n rows that passes through the stages; effects change it in place.
 
     Attributes:
-        time (n,) within the trajectory, clock (n,) of the session [s]; tool; heading (3,); depth (n,) [m];
-        order:
-          number in the session.
-        offset (n, 3): of the object from its commanded position [m]; log_radius, log_friction: of the tool
-          and the contact.
-        bubble: volume of trapped air [m3].
-        force (n, 3) [N], pressure (n,) [Pa], log_z (n, nelectrode): ln of the impedances [ohm]; without
-        effects until
-          the skin is solved. counts (n, nelectrode), pdc (n,): after the converter, before rounding.
-        temperature: (n,) above the first row of the session [C], or None.
-        stiffness: (n,) d normal force / d depth [N/m], None if unknown.
-        answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) per unit of it,
-          for solved changes; modulus: factor on the material's since.
-        turn: (3,) or (n, 3) rotation vector from the frame of poses and force to the sensor [rad].
-        pos: (n, 3) of the object [m], None if only its contact position is known.
-        session: dict shared by the effects of one simulation, from trajectory to trajectory.
+      time (n,) within the trajectory, clock (n,) of the session [s]; tool; heading (3,); depth (n,) [m];
+      order:
+        number in the session.
+      offset (n, 3): of the object from its commanded position [m]; log_radius, log_friction: of the tool and
+      the contact. bubble: volume of trapped air [m3].
+      force (n, 3) [N], pressure (n,) [Pa], log_z (n, nelectrode): ln of the impedances [ohm]; without effects
+      until
+        the skin is solved. counts (n, nelectrode), pdc (n,): after the converter, before rounding.
+      temperature: (n,) above the first row of the session [C], or None.
+      stiffness: (n,) d normal force / d depth [N/m], None if unknown.
+      answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) per unit of it, for
+        solved changes; modulus: factor on the material's since.
+      turn: (3,) or (n, 3) rotation vector from the frame of poses and force to the sensor [rad].
+      pos: (n, 3) of the object [m], None if only its contact position is known.
+      session: dict shared by the effects of one simulation, from trajectory to trajectory.
     """
 
     time: np.ndarray
@@ -122,8 +121,7 @@ class Run:
 
         Args:
           rest_log_z: (nelectrode,) ln of the impedances at rest [ohm]. time: (n,) [s]; None: all rows at one
-            time.
-          more: other fields, such as force (n, 3) [N]."""
+          time. more: other fields, such as force (n, 3) [N]."""
         n = len(counts)
         time = np.zeros(n) if time is None else time
         plain = {
@@ -180,36 +178,34 @@ class Effect(abc.ABC):
     """Subclasses override these attributes and implement `apply`.
 
     Attributes:
-        id, name: of the effect. stage: key of STAGES. physics: description.
-        fits: data in which the effect is searched, a set of "poses" (trajectories with the object's poses),
-          "log" (recordings without), "checkup" (segments of a checkup's protocol) and "plate" (presses of a
-          flat plate). An id may have a form for each.
-        params: {name: Param}. each: the parameter that every electrode has, in `params` by its name. design:
-          of the electrodes.
-        grid: values of the shape parameters that are tried.
-        rare: further parameters, added only if the data require them (`given`).
-        law: distance of the true law from this one: standard deviation as a fraction of a parameter, included
-          in its interval.
-        confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
-          appearance, separated only by much evidence. refit_with: ids of effects that are always fitted with
-            this one.
-        per_channel: whether each free parameter belongs to one electrode.
-        of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
-        wiring: whether it assigns electrodes to channels, and has no other form.
-        of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
-        moves_object: whether it moves the object. pose_offset: whether it moves all poses equally, like their
-          scatter between trials.
-        remembers: whether rubber or contact can model it inside the skin, with a delay of the films.
-        answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it
-          uses.
-        instead_of: nuisance parameters of the base model that it replaces.
-        sound: root mean square of its parameters that a healthy sensor may have.
-        drifts: whether it is a level that changes with the session's clock. in_noise: whether measured noise
-          includes it. silent: whether an electrode has one value under any contact.
-        alike: whether a running sensor has it equally on all electrodes. most: {parameter: largest value that
-          a running sensor can have}.
-        detector: class of evidence in logs, which sets a name's confidence
-          (`discrepancy.recordings.confidence`).
+      id, name: of the effect. stage: key of STAGES. physics: description.
+      fits: data in which the effect is searched, a set of "poses" (trajectories with the object's poses),
+        "log" (recordings without), "checkup" (segments of a checkup's protocol) and "plate" (presses of a
+        flat plate). An id may have a form for each.
+      params: {name: Param}. each: the parameter that every electrode has, in `params` by its name. design: of
+      the electrodes. grid: values of the shape parameters that are tried.
+      rare: further parameters, added only if the data require them (`given`).
+      law: distance of the true law from this one: standard deviation as a fraction of a parameter, included
+      in its interval. confusable: {id: experiment that separates the two}. equivalents: ids of other laws
+      with the same
+        appearance, separated only by much evidence. refit_with: ids of effects that are always fitted with
+          this one.
+      per_channel: whether each free parameter belongs to one electrode.
+      of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
+      wiring: whether it assigns electrodes to channels, and has no other form.
+      of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
+      moves_object: whether it moves the object. pose_offset: whether it moves all poses equally, like their
+      scatter between trials. remembers: whether rubber or contact can model it inside the skin, with a delay
+      of the films.
+      answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it uses.
+      instead_of: nuisance parameters of the base model that it replaces.
+      sound: root mean square of its parameters that a healthy sensor may have.
+      drifts: whether it is a level that changes with the session's clock. in_noise: whether measured noise
+        includes it. silent: whether an electrode has one value under any contact.
+      alike: whether a running sensor has it equally on all electrodes. most: {parameter: largest value that a
+        running sensor can have}.
+      detector: class of evidence in logs, which sets a name's confidence
+        (`discrepancy.recordings.confidence`).
     """
 
     id = name = stage = physics = ""

@@ -33,7 +33,7 @@ class SunkFilm(FilmConduction):
     """A film whose skin is closer to the core than solved, by the same depth everywhere.
 
     Args:
-        film: FilmConduction; depth: [m], where the film at rest is thick enough.
+      film: FilmConduction; depth: [m], where the film at rest is thick enough.
     """
 
     def __init__(self, film: FilmConduction, depth: float):

@@ -26,8 +26,8 @@ class Logged(Effect):
     """An effect on some electrodes for some time.
 
     Args:
-        channels: affected electrodes (from 0). start, end: [s] of the Run's time.
-        rng: for random values; None: the same values every time.
+      channels: affected electrodes (from 0). start, end: [s] of the Run's time.
+      rng: for random values; None: the same values every time.
     """
 
     stage = "A"

@@ -68,12 +68,11 @@ class PlateEffect(Effect):
     """An effect of one parameter.
 
     Attributes:
-        id, name, stage, physics: as of an Effect.
-        parameter, unit: fitted quantity; base, other: its value in the base model and at the solved change
-          (amount 1).
-        film: settings of FilmConduction for a design. material, options, shape: of a skin that must be
-          solved.
-        attach: arguments of `biotac_mj.attach` for a value of the parameter; None: no running sensor has it.
+      id, name, stage, physics: as of an Effect.
+      parameter, unit: fitted quantity; base, other: its value in the base model and at the solved change
+        (amount 1).
+      film: settings of FilmConduction for a design. material, options, shape: of a skin that must be solved.
+      attach: arguments of `biotac_mj.attach` for a value of the parameter; None: no running sensor has it.
     """
 
     id: str

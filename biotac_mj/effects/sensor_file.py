@@ -40,9 +40,9 @@ class SensorFile:
     """Content of a sensor file.
 
     Attributes:
-        base: settings in the file among skin, tier, material, options, sensor (as for `attach`), constitutive
-          ("reduced" | "in_skin") and modulus_factor, on the material's Young's modulus.
-        effects: [(Effect, theta)]. intervals: {effect id: {parameter: (low, high)}}, 95 %.
+      base: settings in the file among skin, tier, material, options, sensor (as for `attach`), constitutive
+        ("reduced" | "in_skin") and modulus_factor, on the material's Young's modulus.
+      effects: [(Effect, theta)]. intervals: {effect id: {parameter: (low, high)}}, 95 %.
     """
 
     base: dict

@@ -75,13 +75,13 @@ def take_sensor(settings: dict, seed: ArrayLike = 0, design: Design = BIOTAC) ->
 
     Args:
       settings: with "sensor" (see `presets.read_sensor`) and "randomise" (see `read_randomise`), or without.
-        seed: of random draws, whole numbers. design: of the sensor.
+      seed: of random draws, whole numbers. design: of the sensor.
 
     Returns:
-        the sensor, the other settings, and whether the sensor depends on the seed.
+      the sensor, the other settings, and whether the sensor depends on the seed.
 
-      Raises:
-        ValueError: an invalid name or number.
+    Raises:
+      ValueError: an invalid name or number.
     """
     rest = {name: value for name, value in settings.items() if name not in ("sensor", "randomise")}
     choice, randomise = settings.get("sensor"), settings.get("randomise", {})

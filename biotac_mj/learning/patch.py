@@ -51,11 +51,11 @@ def estimate(
     """Displacements and contact of raw counts.
 
     Args:
-        counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin. weights: file, a name of
-          `weights.SHIPPED`; None is "inverse", for the default skin.
+      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin. weights: file, a name of
+        `weights.SHIPPED`; None is "inverse", for the default skin.
 
     Raises:
-        ValueError: not 19 channels, values that are not finite or not raw counts, or weights of another skin.
+      ValueError: not 19 channels, values that are not finite or not raw counts, or weights of another skin.
     """
     change = log_change_of(counts, tare)
     head = load_inverse(find_weights(weights, "inverse"), geometry)
@@ -78,14 +78,14 @@ def contact_patch(
     """Estimates every row of a recording and draws one; writes contact.png and contact.json into `out`.
 
     Args:
-        source: a recording, or readings.csv of `biotac press`. tare: number of first rows whose mean is the
-          sensor at rest.
-        row: row to draw and return; None: the one with the largest force or, without recorded force, the
-          largest change from rest.
+      source: a recording, or readings.csv of `biotac press`. tare: number of first rows whose mean is the
+        sensor at rest.
+      row: row to draw and return; None: the one with the largest force or, without recorded force, the
+        largest change from rest.
 
     Raises:
       FileNotFoundError: no such file.
-        ValueError: an invalid table, or a tare or row outside the recording.
+      ValueError: an invalid table, or a tare or row outside the recording.
     """
     recording, notes = load_one(source)
     counts, assumed = recording.counts()
@@ -192,7 +192,7 @@ def draw_skin(
       axis: of matplotlib. vert: (n, 3) [m]; face: (m, 3); value: (n,); limit: of the colours.
 
     Returns:
-        the collection, for a colour bar.
+      the collection, for a colour bar.
     """
     import matplotlib
     from matplotlib.collections import PolyCollection

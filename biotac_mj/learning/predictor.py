@@ -49,10 +49,10 @@ class PointsModel(_Served):
 
     Args:
       net: LatentProjection, or PointNet. points: SkinPoints. geometry: the skin that it reads.
-        config: of the training. meta: description in the weights' file.
+      config: of the training. meta: description in the weights' file.
 
     Attributes:
-        window: (), without memory.
+      window: (), without memory.
     """
 
     window: tuple[float, ...] = ()
@@ -136,7 +136,7 @@ class ForwardModel(_Served):
     """Ensemble of heads on film features and mesh components; made by `weights.load_forward`.
 
     Args:
-        geometry: SkinGeometry of the training. meta: description in the weights' file. modes: components.
+      geometry: SkinGeometry of the training. meta: description in the weights' file. modes: components.
 
     Attributes:
       window: time constants [s] of the causal averages; () for a model without memory.
@@ -170,9 +170,9 @@ class ForwardModel(_Served):
 
         Args:
           displacement: (n, nvert, 3) tensor [mm].
-            average: (n, *memory) causal averages before this step; None: a skin that has been constant for
-              long.
-            dt: since the last call [s].
+          average: (n, *memory) causal averages before this step; None: a skin that has been constant for
+            long.
+          dt: since the last call [s].
 
         Returns:
           (n, 19) and the averages after the step.

@@ -64,7 +64,7 @@ def paired_test(a: ArrayLike, b: ArrayLike) -> dict:
     """Wilcoxon's signed-rank test of paired errors a, b (k,) of the same interactions, two-sided.
 
     Returns:
-        dict: n, median of a - b [counts], fraction of interactions with smaller a, p (1 if nothing differs).
+      dict: n, median of a - b [counts], fraction of interactions with smaller a, p (1 if nothing differs).
     """
     a, b = np.asarray(a, float), np.asarray(b, float)
     if a.shape != b.shape or a.ndim != 1 or len(a) < 5:
@@ -93,7 +93,7 @@ def conformal_width(error: np.ndarray, owner: ArrayLike, alpha: float = 0.1) -> 
       error: (n, 19) predicted - truth on the validation interactions. owner: (n,).
 
     Returns:
-        (19,); infinite if there are too few interactions for alpha.
+      (19,); infinite if there are too few interactions for alpha.
     """
     error, owner = np.abs(np.asarray(error, float)), np.asarray(owner)
     which, index = np.unique(owner, return_inverse=True)

@@ -284,8 +284,8 @@ def draw_errors(result: dict, path: pathlib.Path | str) -> None:
     """A picture of medians and quartiles over interactions: a row for each model, a column for each split.
 
     Args:
-        result: of `evaluate_models`; used: data, default, and per split noise_floor and the models' median
-          and quartiles [counts].
+      result: of `evaluate_models`; used: data, default, and per split noise_floor and the models' median and
+        quartiles [counts].
     """
     from matplotlib.figure import Figure
 

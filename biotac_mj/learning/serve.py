@@ -29,10 +29,10 @@ class NetworkFilm:
       geometry, weights: as for `NetworkReadings`.
 
     Attributes:
-        geometry: the skin. rest: (n,) impedance at rest [ohm].
+      geometry: the skin. rest: (n,) impedance at rest [ohm].
 
     Raises:
-        ValueError: a network with a window.
+      ValueError: a network with a window.
     """
 
     def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
@@ -53,13 +53,13 @@ class NetworkReadings:
     The caller owns the state.
 
     Args:
-        geometry: the skin.
-        weights: file, or a name of `weights.SHIPPED`; None is "forward" (all are trained on synthetic data).
-        seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
-          baseline of `sensor`.
+      geometry: the skin.
+      weights: file, or a name of `weights.SHIPPED`; None is "forward" (all are trained on synthetic data).
+      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
+        baseline of `sensor`.
 
     Attributes:
-        nstate: length of the state: the acquisition's, the time of the last film, and the network's window.
+      nstate: length of the state: the acquisition's, the time of the last film, and the network's window.
     """
 
     def __init__(
@@ -173,12 +173,12 @@ class LearnedBatchFilm:
     launches are not Warp's.
 
     Args:
-        geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: time
-          between two solves, for the window [s].
+      geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: time
+        between two solves, for the window [s].
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
-            design. lasting: the arrays that persist between steps.
+        design. lasting: the arrays that persist between steps.
     """
 
     def __init__(

@@ -21,7 +21,7 @@ def check_shippable(folder: pathlib.Path | str) -> dict[str, pathlib.Path]:
     """Direction -> weights of the trajectory split in a folder of `biotac learn train`.
 
     Raises:
-        FileNotFoundError: seed 0 of that split was not trained, or only without our models (`--only`).
+      FileNotFoundError: seed 0 of that split was not trained, or only without our models (`--only`).
     """
     folder = pathlib.Path(folder)
     sources = {name: folder / f"{name}-trajectory.safetensors" for name in ("forward", "inverse")}
@@ -35,8 +35,8 @@ def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -
     """Copies the weights of the trajectory split (all objects seen) and writes a card for each.
 
     Args:
-        folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder, such as
-          biotac_mj/assets/weights.
+      folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder, such as
+        biotac_mj/assets/weights.
 
     Raises:
       FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: more than 16 MB.

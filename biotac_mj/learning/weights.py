@@ -191,8 +191,8 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
     """Description and tensors (all, or of these names) of a file.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite or differ
-          from the checksum.
+      FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite or differ
+        from the checksum.
     """
     from safetensors import safe_open
 

@@ -47,7 +47,7 @@ def guessed_rate(*counts: np.ndarray) -> tuple[float, str]:
     """Estimated rate [Hz] of logs (n, c) without times, and the reason in words.
 
     Args:
-        counts: of sensors that were logged together.
+      counts: of sensors that were logged together.
     """
     repeated = np.mean([repeated_rows(one).mean() for one in counts]) if counts else 0.0
     if _GUESS[0] < repeated < _GUESS[1]:
@@ -84,8 +84,8 @@ def clock_faults(
     """(n,) number of rows missing before each row, or None if the clock does not show it, and clock faults.
 
     Args:
-        time: (n,) increasing [s]. counts: (n, c), or None: then no gap is taken for a jump of the clock.
-        complete: whether times and rows are those of the file; if not, no row counts as missing.
+      time: (n,) increasing [s]. counts: (n, c), or None: then no gap is taken for a jump of the clock.
+      complete: whether times and rows are those of the file; if not, no row counts as missing.
     """
     missing, found = missing_rows(time) if complete else None, []
     if missing is not None and counts is not None:

@@ -15,17 +15,17 @@ class Fault:
     Attributes:
       id: "clock", "contact", "freeze", "hum", "jump", "lost_rows", "order", "overflow", "quantise",
         "saturate", "spikes" or "stuck".
-        channels: from 0. start, end: [s] from the first row. message: one line.
-        parameters: name -> (value, low, high), nan if no interval is known.
-        mask: (n, c) bool, samples without a measurement, or None.
-        correct: counts (n, c) -> counts without the fault, or None if it cannot be corrected.
-        places: times of single events [s].
-        beyond: side of the true value of masked samples: 1 above the recorded one, -1 below, 0 unknown.
-        silent: whether its channels do not respond to contact. held: whether rows repeat or jitter about the
-          one before (sample and hold).
-        detector: key of `confidence.WEIGHTS`. features: inputs of its confidence.
-        nats: log-likelihood ratio against chance. p: probability by chance. confidence: 0..1.
-        ties: ids of effects that it cannot be distinguished from.
+      channels: from 0. start, end: [s] from the first row. message: one line.
+      parameters: name -> (value, low, high), nan if no interval is known.
+      mask: (n, c) bool, samples without a measurement, or None.
+      correct: counts (n, c) -> counts without the fault, or None if it cannot be corrected.
+      places: times of single events [s].
+      beyond: side of the true value of masked samples: 1 above the recorded one, -1 below, 0 unknown.
+      silent: whether its channels do not respond to contact. held: whether rows repeat or jitter about the
+        one before (sample and hold).
+      detector: key of `confidence.WEIGHTS`. features: inputs of its confidence.
+      nats: log-likelihood ratio against chance. p: probability by chance. confidence: 0..1.
+      ties: ids of effects that it cannot be distinguished from.
     """
 
     id: str

@@ -98,7 +98,7 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
     ("jump").
 
     Args:
-        begun: start times [s] of other effects on all channels.
+      begun: start times [s] of other effects on all channels.
     """
     rows = np.flatnonzero(~log.repeated)
     good = log.masked[~log.masked.all(1)].mean(0) < 0.02

@@ -56,14 +56,14 @@ def load(
 
     Args:
       paths: files, or folders of ROS 2 bags.
-        force, tdc: text files of forces [N], or raw counts of the thermistor, row by row.
-        rate: [Hz] of rows without times (None: guessed; `Recording.rate_source` has the source).
-        scale: counts per unit of the channels, 4095 for normalised ones.
-        object_name: what touched. objects: names of NVIDIA's indenter types.
+      force, tdc: text files of forces [N], or raw counts of the thermistor, row by row.
+      rate: [Hz] of rows without times (None: guessed; `Recording.rate_source` has the source).
+      scale: counts per unit of the channels, 4095 for normalised ones.
+      object_name: what touched. objects: names of NVIDIA's indenter types.
 
     Raises:
-        FileNotFoundError, ValueError: a file that does not exist or cannot be read; the text has file, place
-          and remedy.
+      FileNotFoundError, ValueError: a file that does not exist or cannot be read; the text has file, place
+        and remedy.
     """
     paths = [paths] if isinstance(paths, str | os.PathLike) else paths
     for what, given in (("paths", paths), ("force", [force or ""]), ("tdc", [tdc or ""])):
@@ -170,8 +170,8 @@ def load_one(path: pathlib.Path | str, recording: str | None = None, **options: 
     """Loads one recording of a file, with notes.
 
     Args:
-        path: as for `load`, which returns all its recordings.
-        recording: its name, or the end of it; None: the first. options: of `load`.
+      path: as for `load`, which returns all its recordings.
+      recording: its name, or the end of it; None: the first. options: of `load`.
 
     Raises:
       FileNotFoundError, ValueError: see `load`; or no recording of that name.

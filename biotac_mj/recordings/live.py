@@ -18,7 +18,7 @@ def record_topics(topics: list[str], seconds: float, object_name: str | None = N
     """Recordings of running topics.
 
     Raises:
-        ValueError: neither ROS 1 nor ROS 2 is available, a topic without a publisher, or no message arrived.
+      ValueError: neither ROS 1 nor ROS 2 is available, a topic without a publisher, or no message arrived.
     """
     listen = _ros2 if _is_here("rclpy") else _ros1 if _is_here("rospy") else None
     if listen is None:
@@ -102,7 +102,7 @@ def record_serial(
         their time of arrival.
 
     Raises:
-        ValueError: pyserial is not installed, the port cannot be opened, or no complete line arrived.
+      ValueError: pyserial is not installed, the port cannot be opened, or no complete line arrived.
     """
     if not _is_here("serial"):
         raise ValueError("--serial needs pyserial: pip install 'biotac-mj[serial]'")

@@ -34,9 +34,9 @@ def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
         no contact.
 
     Returns:
-        rest: (19,) counts without force at the start; loaded: whether it was always touched; noise: (19,) RMS
-          [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and warm_share (19,),
-          the fraction of it for each electrode.
+      rest: (19,) counts without force at the start; loaded: whether it was always touched; noise: (19,) RMS
+        [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and warm_share (19,), the
+        fraction of it for each electrode.
     """
     time, log_z = np.arange(len(counts)) / rate, log_impedance(counts)
     load, light = np.zeros((len(counts), 0)), np.ones(len(counts), bool)

@@ -121,7 +121,7 @@ def read_protocol(path: pathlib.Path | str) -> Protocol:
     """Reads a protocol.yaml.
 
     Raises:
-        FileNotFoundError, ValueError: no file, no YAML, another schema, or invalid segments.
+      FileNotFoundError, ValueError: no file, no YAML, another schema, or invalid segments.
     """
     document = read_yaml(path, "protocol", _REMEDY)
     if document.get("schema") != SCHEMA:

@@ -78,18 +78,18 @@ class Recording:
 
     Attributes:
       time: (n,) increasing [s].
-        electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`,
-        default
-          raw counts.
-        force, torque: (n, 3) [N], [N m].
-        contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
-        name: unique in its file. object: what touched, "" if unknown.
-        source: files that it comes from. frame: of forces and poses. rate_source: origin of the rate.
-        notes: on changes by the importer.
-        units: field -> one of UNITS.
+      electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`,
+      default
+        raw counts.
+      force, torque: (n, 3) [N], [N m].
+      contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
+      name: unique in its file. object: what touched, "" if unknown.
+      source: files that it comes from. frame: of forces and poses. rate_source: origin of the rate.
+      notes: on changes by the importer.
+      units: field -> one of UNITS.
 
     Raises:
-        ValueError: invalid shapes, units or values; the text has their names.
+      ValueError: invalid shapes, units or values; the text has their names.
     """
 
     time: np.ndarray
@@ -199,7 +199,7 @@ class Recording:
         Tared ones are shifted to the mean rest counts of the published sensors.
 
         Raises:
-            ValueError: no electrodes, gaps, volts or normalised values.
+          ValueError: no electrodes, gaps, volts or normalised values.
         """
         if self.electrodes is None:
             raise ValueError(f"{self.name} has no electrodes: give a recording that has them")
@@ -228,7 +228,7 @@ class Recording:
           which: a slice, numbers (k,) of rows in order, or (n,) bool.
 
         Raises:
-            ValueError: another type, or no existing row.
+          ValueError: another type, or no existing row.
         """
         which = self._which(which)
         taken = {}
@@ -281,7 +281,7 @@ def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
     docs/howto/file_formats.md.
 
     Raises:
-        ValueError: no recording, or two of one name. OSError: it cannot be written.
+      ValueError: no recording, or two of one name. OSError: it cannot be written.
     """
     if not all(isinstance(one, Recording) for one in recordings):
         raise ValueError(f"recordings are {short_repr(recordings)}: give a list of Recordings")
@@ -307,8 +307,8 @@ def read(path: pathlib.Path | str) -> list[Recording]:
     """Reads the recordings of a file that `write` made.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, another schema, a missing or unknown name, or a wrong
-          shape, type, unit or value; the text has the name.
+      FileNotFoundError, ValueError: no such file, another schema, a missing or unknown name, or a wrong
+        shape, type, unit or value; the text has the name.
     """
     import h5py
 

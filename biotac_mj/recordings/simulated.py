@@ -18,14 +18,14 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
     BioTac SP's frame are dropped.
 
     Args:
-        time: (n,) of the rows [s]. reads: n results of `Handle.read(data)`.
-        about: further fields of Recording, such as object_pos, object_quat or name.
+      time: (n,) of the rows [s]. reads: n results of `Handle.read(data)`.
+      about: further fields of Recording, such as object_pos, object_quat or name.
 
     Returns:
-        the recording; force is on the touching object, in the BioTac frame.
+      the recording; force is on the touching object, in the BioTac frame.
 
-      Raises:
-        ValueError: a row without a channel, or another number of times than rows.
+    Raises:
+      ValueError: a row without a channel, or another number of times than rows.
     """
     reads = list(reads)
     for i, row in enumerate(reads):

@@ -66,16 +66,16 @@ class Acquisition:
     signal.
 
     Args:
-        seed: of the noise, 0 .. 2**64 - 1; give every sensor its own.
-        noise: False keeps quantisation only.
-        film_every_step: see `needs_impedance`.
-        sensor: preset whose constants `reset` writes into the state.
-        film_rest: (n,) impedances of the film at rest [ohm]; None: this sensor's own.
-        heat: whether a heat model (`sensor.heat`) computes the warm-up.
-        design: of the sensor; n is its number of electrodes.
+      seed: of the noise, 0 .. 2**64 - 1; give every sensor its own.
+      noise: False keeps quantisation only.
+      film_every_step: see `needs_impedance`.
+      sensor: preset whose constants `reset` writes into the state.
+      film_rest: (n,) impedances of the film at rest [ohm]; None: this sensor's own.
+      heat: whether a heat model (`sensor.heat`) computes the warm-up.
+      design: of the sensor; n is its number of electrodes.
 
     Attributes:
-        nstate: length of the state vector. place: offsets of its fields.
+      nstate: length of the state vector. place: offsets of its fields.
 
     Raises:
       ValueError: the seed is out of range.
@@ -117,8 +117,8 @@ class Acquisition:
 
         Args:
           state: (nstate,) float64, written in place.
-            impedance: (n,) [ohm]; pressure: above rest [Pa]; temperature: [C], None: the sensor's; time: now
-              [s]; liquid: temperature above that of the impedances [C].
+          impedance: (n,) [ohm]; pressure: above rest [Pa]; temperature: [C], None: the sensor's; time: now
+            [s]; liquid: temperature above that of the impedances [C].
         """
         self._check_state(state)
         at, n = self.place, self.place.nelectrode
@@ -179,9 +179,9 @@ class Acquisition:
           impedance: (n,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
           pressure: at the end of the step, above rest [Pa].
           temperature: of the core at the end of the step [C]; None keeps the last one.
-            shaken: (1, n) float64 on the CPU, further band-passed pressure on PAC at each of the slots [Pa]
-              (`vibration`).
-            liquid: temperature at the end of the step above that of the impedances [C].
+          shaken: (1, n) float64 on the CPU, further band-passed pressure on PAC at each of the slots [Pa]
+            (`vibration`).
+          liquid: temperature at the end of the step above that of the impedances [C].
 
         Raises:
           ValueError: wrong shape, not finite, impedance not positive, or dt not positive. The state is
@@ -324,15 +324,15 @@ class BatchAcquisition:
     counts, including noise, equal those of a single sensor with its seed.
 
     Args:
-        rest: (n,) impedance of the film at rest [ohm], the initial state of every world.
+      rest: (n,) impedance of the film at rest [ohm], the initial state of every world.
       nworld: number of worlds.
-        seed: of world 0, world w has seed + w; or (nworld,) seeds, 0 .. 2**64 - 1.
-        noise: False keeps quantisation only.
+      seed: of world 0, world w has seed + w; or (nworld,) seeds, 0 .. 2**64 - 1.
+      noise: False keeps quantisation only.
       film_every_step: see `Acquisition.needs_impedance`.
-        temperature: of the core at rest [C]; None: each sensor's own. liquid: initial temperature of the
-          liquid above that of the impedances [C]. One, or one for each sensor.
-        sensor: of all worlds, or a list of one per world. With `redraw` the list may be longer, and every
-          later reset draws from it by seed and reset count.
+      temperature: of the core at rest [C]; None: each sensor's own. liquid: initial temperature of the liquid
+        above that of the impedances [C]. One, or one for each sensor.
+      sensor: of all worlds, or a list of one per world. With `redraw` the list may be longer, and every later
+        reset draws from it by seed and reset count.
       heat, design: see `Acquisition`.
       device: Warp device.
 
@@ -341,15 +341,15 @@ class BatchAcquisition:
       state: (nworld, nstate) wp.array float64, each row the state vector of an `Acquisition`.
       time: (nworld,) wp.array float64 [s], each sensor's clock, zero at its reset.
       temperature: (nworld,) wp.array float64, of the core at the end of the next step [C].
-        liquid: (nworld,) wp.array float64, temperature of the liquid above that of the impedances [C].
+      liquid: (nworld,) wp.array float64, temperature of the liquid above that of the impedances [C].
       due: (nworld,) wp.array int, written by `find_due`.
-        row: (nworld,) wp.array int, index of each world's sensor in the list. rest_states: (n, nstate)
-          wp.array float64, initial states of the sensors of the list.
-        seed: (nworld,) wp.array uint64. drawn: (nworld,) wp.array int, number of resets; redraws: 1 if resets
-          draw a sensor.
+      row: (nworld,) wp.array int, index of each world's sensor in the list. rest_states: (n, nstate) wp.array
+        float64, initial states of the sensors of the list.
+      seed: (nworld,) wp.array uint64. drawn: (nworld,) wp.array int, number of resets; redraws: 1 if resets
+        draw a sensor.
 
     Raises:
-        ValueError: a seed out of range, or a number of seeds or sensors that does not fit `nworld`.
+      ValueError: a seed out of range, or a number of seeds or sensors that does not fit `nworld`.
     """
 
     def __init__(
@@ -429,8 +429,8 @@ class BatchAcquisition:
 
         Args:
           dt: length of the step [s].
-            impedance: (nworld, n) wp.array float64 at the end of the step [ohm], used in worlds that are
-              `due` and `valid`.
+          impedance: (nworld, n) wp.array float64 at the end of the step [ohm], used in worlds that are `due`
+            and `valid`.
           valid: (nworld,) wp.array int.
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
           shaken: (nworld, n) wp.array float64, see `Acquisition.advance`.

@@ -126,12 +126,12 @@ class CoreSurface:
 
     Args:
       vert: (n, 3) [m].
-        face: (m, 3), normals outwards; those without area are ignored.
+      face: (m, 3), normals outwards; those without area are ignored.
       device: Warp device.
 
     Attributes:
       normal: (ntriangle, 3) outwards.
-        core: argument of `nearest_on_core`.
+      core: argument of `nearest_on_core`.
     """
 
     def __init__(self, vert: ArrayLike, face: ArrayLike, device: str = "cpu"):

@@ -80,12 +80,12 @@ class HeatParameters:
     """Constants of one sensor. Sources and intervals: docs/lab/sensor.md.
 
     Attributes:
-        power: of the heater, which is the sensor's own electronics [W].
-        ambient: temperature of the air and of the mount [C].
-        core: heat capacity of the whole core [J/K]; near: of its part about the thermistor and under the
-          contact; liquid: of the liquid.
-        mount: core to mount [W/K]; inside: core to liquid [W/K]; spread: core to the part near the thermistor
-          [W/K].
+      power: of the heater, which is the sensor's own electronics [W].
+      ambient: temperature of the air and of the mount [C].
+      core: heat capacity of the whole core [J/K]; near: of its part about the thermistor and under the
+        contact; liquid: of the liquid.
+      mount: core to mount [W/K]; inside: core to liquid [W/K]; spread: core to the part near the thermistor
+        [W/K].
       area: of the skin [m^2]; thickness: of the skin [m].
       conductivity: of the rubber [W/(m K)]; capacity: its density times specific heat [J/(m^3 K)].
       gap: liquid to skin at rest [W/(m^2 K)]; film: core to skin where the skin is pressed on it.
@@ -419,12 +419,12 @@ class Heat:
 
     Attributes:
       state: (nworld, nstate) wp.array float64, laid out as this module's constants say; temperatures in [C].
-        area: (nworld, ngroup) wp.array float64, contact area of each body [m^2]; write it before `advance`.
+      area: (nworld, ngroup) wp.array float64, contact area of each body [m^2]; write it before `advance`.
       force: (nworld, ngroup) wp.array float64, the normal force of each [N]; likewise.
       nstate: length of a sensor's state.
 
     Raises:
-        ValueError: the number of parameters differs from the number of sensors.
+      ValueError: the number of parameters differs from the number of sensors.
     """
 
     def __init__(

@@ -39,7 +39,7 @@ class Material:
     Attributes:
       name: of the material.
       conductivity: k [W/(m K)]; density: [kg/m^3]; heat: specific heat capacity [J/(kg K)].
-        source: the kind of handbook with the three numbers (see the table's head).
+      source: the kind of handbook with the three numbers (see the table's head).
       temperature: before it is touched [C].
     """
 
@@ -201,10 +201,10 @@ def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _N
     found. A material has precedence over an object: a glass bottle is of glass, a bottle of polyethylene.
 
     Args:
-        choices, numbers: suggestions of the error for an unknown name: names, and what to give instead.
+      choices, numbers: suggestions of the error for an unknown name: names, and what to give instead.
 
     Raises:
-        ValueError: the name has no known word.
+      ValueError: the name has no known word.
     """
     words = re.findall(r"[a-z]+", name.lower())
     for table in _NAMES:
@@ -254,10 +254,10 @@ def read_thermal(value: str | Material | Mapping) -> Material:
       value: a name for `material_of`, "name at 40" for another temperature [C], a `Material`, or a dict with
         any of: material (such a name), effusivity [W s^0.5 / (m^2 K)], conductivity [W/(m K)], temperature
         [C].
-            An effusivity without a conductivity gets the typical one of the table's materials.
+        An effusivity without a conductivity gets the typical one of the table's materials.
 
     Raises:
-        ValueError: an unknown name or key, or an impossible number.
+      ValueError: an unknown name or key, or an impossible number.
     """
     if isinstance(value, Material):
         return _checked(value)

@@ -29,15 +29,15 @@ class PadShape:
     """Shape of a pad: one of dome, block and mesh. Lengths in mm.
 
     Attributes:
-        dome: semi-axes (along the finger, across it, depth) of half an ellipsoid on a flat backing: a shell
-          of `thickness` with liquid over the `core`. core: its semi-axes, or an .obj [m] in the BioTac frame.
-        block: size (along, across, depth) of solid rubber on a flat backing.
-        mesh: .msh, .tet or .vtu [m] in the BioTac frame (tip at -x, pad at -y), its rim or back on the plane
-          y = 0. With a core it is a shell over liquid, else solid.
-        edge: of the generated tetrahedra.
+      dome: semi-axes (along the finger, across it, depth) of half an ellipsoid on a flat backing: a shell of
+        `thickness` with liquid over the `core`. core: its semi-axes, or an .obj [m] in the BioTac frame.
+      block: size (along, across, depth) of solid rubber on a flat backing.
+      mesh: .msh, .tet or .vtu [m] in the BioTac frame (tip at -x, pad at -y), its rim or back on the plane y
+        = 0. With a core it is a shell over liquid, else solid.
+      edge: of the generated tetrahedra.
 
     Raises:
-        ValueError: not exactly one shape, or an invalid size.
+      ValueError: not exactly one shape, or an invalid size.
     """
 
     dome: tuple = ()
@@ -79,7 +79,7 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
     """The skin of a pad on a flat backing.
 
     Raises:
-        FileNotFoundError, ValueError: an unreadable file, or a mesh that cannot be simulated.
+      FileNotFoundError, ValueError: an unreadable file, or a mesh that cannot be simulated.
     """
     curved = None
     if shape.dome:
@@ -128,12 +128,12 @@ def new_design(
 
     Args:
       folder: its name is the design's.
-        electrodes_mm, excitation_mm: (n, 3), (k, 3) points near the core, x to the fingertip, z out of the
-          nail; both empty for a pad without electrodes, such as that of a camera.
-        title: its name in messages.
+      electrodes_mm, excitation_mm: (n, 3), (k, 3) points near the core, x to the fingertip, z out of the
+        nail; both empty for a pad without electrodes, such as that of a camera.
+      title: its name in messages.
 
     Raises:
-        FileNotFoundError, ValueError: an invalid shape, or one that cannot be simulated.
+      FileNotFoundError, ValueError: an invalid shape, or one that cannot be simulated.
     """
     folder = pathlib.Path(folder)
     n = len(electrodes_mm)

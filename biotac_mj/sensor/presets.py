@@ -60,26 +60,24 @@ class Sensor:
     reset.
 
     Attributes:
-        rest: (n,) of the electrodes. noise: (n,) RMS of the electrodes at rest; None: by `electrode_noise`.
-        mixing: (n, n) matrix on the electrodes' changes of counts from rest: gains, dead taxels and
-          cross-talk; () is the identity.
-        pdc_rest, pdc_noise: of PDC [counts]; pdc_gain: of its change.
-        pac_rest, pac_noise, pac_colour: level, and n[i] = colour n[i - 1] + noise white.
-        tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
-        per_degree: decrease of ln Z per degree of the liquid [1/C].
-        warm_up: warming of liquid and electrodes after the reset [C]; warm_time: time constant [s];
-          warm_share: (n,) fraction of it for each electrode, may be negative, () is all. With heat, the time
-            constant follows from
-          the heat model.
-        relaxation: fraction and time constant [s] of PDC's decaying excess response.
-        loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (n,).
-        power: exponent on the change of ln Z from rest. saturation: fraction and knee [counts]: that fraction
-          of a change beyond the knee is lost. lowpass: time constant of the electrodes [s]. latency: of the
-            electrodes
-          [s], up to MOST_LATENCY.
+      rest: (n,) of the electrodes. noise: (n,) RMS of the electrodes at rest; None: by `electrode_noise`.
+      mixing: (n, n) matrix on the electrodes' changes of counts from rest: gains, dead taxels and cross-talk;
+        () is the identity.
+      pdc_rest, pdc_noise: of PDC [counts]; pdc_gain: of its change.
+      pac_rest, pac_noise, pac_colour: level, and n[i] = colour n[i - 1] + noise white.
+      tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
+      per_degree: decrease of ln Z per degree of the liquid [1/C].
+      warm_up: warming of liquid and electrodes after the reset [C]; warm_time: time constant [s]; warm_share:
+        (n,) fraction of it for each electrode, may be negative, () is all. With heat, the time constant
+        follows from the heat model.
+      relaxation: fraction and time constant [s] of PDC's decaying excess response.
+      loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (n,).
+      power: exponent on the change of ln Z from rest. saturation: fraction and knee [counts]: that fraction
+        of a change beyond the knee is lost. lowpass: time constant of the electrodes [s]. latency: of the
+        electrodes [s], up to MOST_LATENCY.
 
     Raises:
-        ValueError: an invalid number.
+      ValueError: an invalid number.
     """
 
     rest: tuple = tuple(BIOTAC.of_sensor("1")["rest"])
@@ -198,8 +196,8 @@ class Sensor:
         """(nnumber,) constants in the layout of an acquisition's state (`numbers_of` has the offsets).
 
         Args:
-            film_rest: (n,) impedance of the film at rest [ohm]; None: this sensor's own.
-            heat: whether a heat model computes the warm-up.
+          film_rest: (n,) impedance of the film at rest [ohm]; None: this sensor's own.
+          heat: whether a heat model computes the warm-up.
         """
         values = {
             "scale": np.ones(self.nelectrode) if film_rest is None else self.impedance / film_rest,
@@ -287,12 +285,12 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
     """A sensor from a user's description.
 
     Args:
-        value: a name of `sensor_names(design)`, or a dict of Sensor's fields, which override those of "like"
-          (default: the design's own); None is the design's own.
-        seed: of "random", whole numbers. design: of the fingertip.
+      value: a name of `sensor_names(design)`, or a dict of Sensor's fields, which override those of "like"
+        (default: the design's own); None is the design's own.
+      seed: of "random", whole numbers. design: of the fingertip.
 
     Raises:
-        ValueError: an unknown name or field, an invalid number, or another number of electrodes.
+      ValueError: an unknown name or field, an invalid number, or another number of electrodes.
     """
     if value is None:
         value = design.sensor

@@ -34,18 +34,18 @@ class PhysicsReadings:
     Args:
       geometry: the skin.
       seed: of the noise; give every sensor its own.
-        noise: False keeps quantisation only.
-        sensor: see `presets.read_sensor`; "random" is drawn by the seed.
-        film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
-          `Acquisition.needs_impedance`).
-        temperature: of the core at the reset [C], None: the sensor's. Without `bodies` it changes only by the
-          sensor's own warm-up.
-        bodies: material of each body that may touch. The sensor then has a heat model (`sensor.heat`), which
-          changes TDC, TAC and, through the liquid's temperature, all electrodes. None: no heat model.
-        cold: the sensor is switched on at the reset: it starts at ambient temperature and warms up.
-        film: a FilmConduction to share between sensors of the same geometry; None builds one.
-        vibration: of one sensor on the CPU, for PAC's response to taps, stick-slip and `textures` of the
-          bodies; None: PAC has only the pressure of whole steps.
+      noise: False keeps quantisation only.
+      sensor: see `presets.read_sensor`; "random" is drawn by the seed.
+      film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
+        `Acquisition.needs_impedance`).
+      temperature: of the core at the reset [C], None: the sensor's. Without `bodies` it changes only by the
+        sensor's own warm-up.
+      bodies: material of each body that may touch. The sensor then has a heat model (`sensor.heat`), which
+        changes TDC, TAC and, through the liquid's temperature, all electrodes. None: no heat model.
+      cold: the sensor is switched on at the reset: it starts at ambient temperature and warms up.
+      film: a FilmConduction to share between sensors of the same geometry; None builds one.
+      vibration: of one sensor on the CPU, for PAC's response to taps, stick-slip and `textures` of the
+        bodies; None: PAC has only the pressure of whole steps.
 
     Attributes:
       nstate: length of the state vector.
@@ -145,9 +145,9 @@ class PhysicsReadings:
           time: at the start of the step [s]; dt: its length [s].
           vert_xpos: (nvert, 3), nodes at the end of the step, BioTac frame [m].
           pressure: of the liquid at the end of the step, above rest [Pa].
-            area, force: (nbody,) contact area [m^2] and force [N] of each body, for heat; None: no contact.
-            shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
-            impedance: (n,) of the film at the end of the step [ohm]; the film is not solved then.
+          area, force: (nbody,) contact area [m^2] and force [N] of each body, for heat; None: no contact.
+          shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
+          impedance: (n,) of the film at the end of the step [ohm]; the film is not solved then.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
@@ -209,11 +209,11 @@ def check_settings(
     """Returns settings of `PhysicsReadings`, given by name, after a check.
 
     Args:
-        given: of noise, sensor, film_every_step, temperature. more: further names and their types.
-        what: their name in errors. design: of the sensor.
+      given: of noise, sensor, film_every_step, temperature. more: further names and their types.
+      what: their name in errors. design: of the sensor.
 
     Raises:
-        ValueError: not a dict, an unknown name, or an invalid value.
+      ValueError: not a dict, an unknown name, or an invalid value.
     """
     known = _SETTINGS | (more or {})
     check_entries(what, given, known, known)
@@ -232,9 +232,9 @@ def record(readings: PhysicsReadings, time: np.ndarray, vert_xpos: np.ndarray, p
       time: (nt,) increasing [s]; vert_xpos: (nt, nvert, 3) [m]; pressure: (nt,) above rest [Pa].
 
     Returns:
-        dict of int arrays, row i the bus report at time[i]: electrodes (nt, n), pdc (nt,), pac (nt, npac),
-        tac (nt,),
-          tdc (nt,).
+      dict of int arrays, row i the bus report at time[i]: electrodes (nt, n), pdc (nt,), pac (nt, npac), tac
+      (nt,),
+        tdc (nt,).
 
     Raises:
       ValueError: lengths that differ, or time that does not increase.

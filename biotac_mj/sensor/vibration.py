@@ -74,7 +74,7 @@ class Texture:
     """Texture of a surface.
 
     Attributes:
-        pitch: of ridges across the sliding direction [m]; height: of ridges, from bottom to top [m].
+      pitch: of ridges across the sliding direction [m]; height: of ridges, from bottom to top [m].
       roughness: RMS [m].
     """
 
@@ -91,7 +91,7 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
         roughness [m].
 
     Raises:
-        ValueError: an unknown name or key, or an invalid number.
+      ValueError: an unknown name or key, or an invalid number.
     """
     if isinstance(value, Texture):
         return value
@@ -144,7 +144,7 @@ def sections(rate: ArrayLike, loss: float = LOSS_FACTOR) -> np.ndarray:
       (nmode, 3): b0 = b1 / 2 = b2, a1 and a2; the poles lie inside the unit circle.
 
     Raises:
-        ValueError: a mode above the Nyquist frequency.
+      ValueError: a mode above the Nyquist frequency.
     """
     rate = np.asarray(rate, float)
     if not (rate < np.pi * SLOT_RATE).all():
@@ -266,14 +266,13 @@ class Vibration:
       device: Warp device.
 
     Attributes:
-        state: (nworld, nstate) wp.array float64; `rest` gives the initial one.
+      state: (nworld, nstate) wp.array float64; `rest` gives the initial one.
       time: (nworld,) wp.array float64, at the start of the next step [s]; the caller's.
       drive: (nworld, nmode) wp.array float64, modal force of all contacts at the end of the step
-            [N kg^-1/2]. gain: (nworld, nbody, nmode + 1), modal forces per height under each body [N kg^-1/2
-            / m], and last its steady pressure [Pa/m]. slip: (nworld, nbody) speed [m/s]. area: touched
-            (nworld, nbody) [m^2]. Write them before `advance`.
-          pressure: (nworld, nslot) wp.array float64, pressure on PAC at the step's slots [Pa], see
-            `acquisition`.
+        [N kg^-1/2]. gain: (nworld, nbody, nmode + 1), modal forces per height under each body [N kg^-1/2 /
+        m], and last its steady pressure [Pa/m]. slip: (nworld, nbody) speed [m/s]. area: touched (nworld,
+        nbody) [m^2]. Write them before `advance`.
+      pressure: (nworld, nslot) wp.array float64, pressure on PAC at the step's slots [Pa], see `acquisition`.
       nstate: length of a sensor's state.
     """
 

@@ -25,9 +25,9 @@ class WeightedElectrodes:
 
     Args:
       geometry: of the skin.
-        scale: (3,) [N/count] of the axes of the BioTac frame; None: of the shipped BioTac, fitted to
-          synthetic presses. `fitted` computes that of a sensor.
-        power: of the position's weights; the paper's is 2.
+      scale: (3,) [N/count] of the axes of the BioTac frame; None: of the shipped BioTac, fitted to synthetic
+        presses. `fitted` computes that of a sensor.
+      power: of the position's weights; the paper's is 2.
     """
 
     geometry: SkinGeometry
@@ -56,7 +56,7 @@ class WeightedElectrodes:
         """(..., 3) on the BioTac [N], in its frame; change as for `place`.
 
         Raises:
-            ValueError: no scale is known for this fingertip.
+          ValueError: no scale is known for this fingertip.
         """
         scale = self.scale
         if scale is None:

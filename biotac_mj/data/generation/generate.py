@@ -39,36 +39,35 @@ class GenerateOptions:
     run continues.
 
     Attributes:
-        count: interactions. labelled: number of them with readings of the synthetic measured sensor; the
-          paper's indenters only.
-        recordings: number of further interactions, with pegs and table, with readings of the synthetic
-          measured sensor only, as if logged by hand; a separate set in the folder `recordings`.
+      count: interactions. labelled: number of them with readings of the synthetic measured sensor; the
+        paper's indenters only.
+      recordings: number of further interactions, with pegs and table, with readings of the synthetic measured
+        sensor only, as if logged by hand; a separate set in the folder `recordings`.
       steps: time steps of each. rate: of them [Hz].
       seed: of everything.
       objects, kinds: to draw from.
-        skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and
-          liquid None: the material's. The material may be a dict of Material's fields, or a .json file of
-            them.
+      skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid
+        None: the material's. The material may be a dict of Material's fields, or a .json file of them.
       options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus of the elements,
         or a .npy file, "film": see `sensor.film.read_film`}, or a .json file of it.
-        vary: {name: (low, high)}, ranges of random values per interaction: youngs_modulus, poissons_ratio,
-          friction, stiffening of the material; factors prony and hysteresis on its strengths; and properties
-          that may differ between worlds except modulus (`skin.per_world.NAMES`). The values are stored in the
-          interaction's parameters, under "skin".
-        sensor, randomise: which sensor (None: the design's own), and random effects, see `biotac_mj.attach`;
-          random values are drawn per interaction and stored in its parameters.
-        signal: source of the electrodes: "physics", "latent_projection", "learned", or a file of weights, see
-          `biotac_mj.attach`.
-        thermal: material of all objects ("steel", see `sensor.materials.read_thermal`), texture: of their
-          surface (`sensor.vibration.read_texture`); of a list one is drawn per interaction. None: no heat or
-          vibration. textures: alias of texture, as in attach.
-        batch, measured_batch: most worlds in a batch, and in one with the synthetic measured sensor: on a
-          fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its objects. A
-          shard holds one batch.
-        measured_seed, measured_skin: number and mesh of the synthetic measured sensor; None: the finest of
-          the skin's design.
-        device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": one process each, which take batches from a
-          queue. The files do not depend on the number of devices of one kind.
+      vary: {name: (low, high)}, ranges of random values per interaction: youngs_modulus, poissons_ratio,
+        friction, stiffening of the material; factors prony and hysteresis on its strengths; and properties
+        that may differ between worlds except modulus (`skin.per_world.NAMES`). The values are stored in the
+        interaction's parameters, under "skin".
+      sensor, randomise: which sensor (None: the design's own), and random effects, see `biotac_mj.attach`;
+        random values are drawn per interaction and stored in its parameters.
+      signal: source of the electrodes: "physics", "latent_projection", "learned", or a file of weights, see
+        `biotac_mj.attach`.
+      thermal: material of all objects ("steel", see `sensor.materials.read_thermal`), texture: of their
+        surface (`sensor.vibration.read_texture`); of a list one is drawn per interaction. None: no heat or
+        vibration. textures: alias of texture, as in attach.
+      batch, measured_batch: most worlds in a batch, and in one with the synthetic measured sensor: on a fine
+        mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its objects. A shard
+        holds one batch.
+      measured_seed, measured_skin: number and mesh of the synthetic measured sensor; None: the finest of the
+        skin's design.
+      device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": one process each, which take batches from a
+        queue. The files do not depend on the number of devices of one kind.
     """
 
     count: int = 2600
@@ -247,11 +246,11 @@ def generate(
     Args:
       out: folder.
       options: see GenerateOptions.
-        workers: processes, which make whole shards on the CPU, or compute film and readings for GPUs; None:
-          number of cores, 0: this process.
-        progress: whether to show a bar.
-        ray: address of a Ray cluster, or "local": a task for each batch, with one core, one GPU if the device
-          is one, and `workers` cores (None: 0).
+      workers: processes, which make whole shards on the CPU, or compute film and readings for GPUs; None:
+        number of cores, 0: this process.
+      progress: whether to show a bar.
+      ray: address of a Ray cluster, or "local": a task for each batch, with one core, one GPU if the device
+        is one, and `workers` cores (None: 0).
 
     Raises:
       ValueError: the folder holds a set with other options, or an option is not possible.

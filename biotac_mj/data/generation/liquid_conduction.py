@@ -40,9 +40,9 @@ class LiquidConduction:
       geometry: the skin with its core and electrodes.
       excitation: of X1, X2, ..., which are shorted and grounded; see `sensor.film.FilmConduction`.
       conductivity: of the liquid [S/m].
-        residual_film: thickness of liquid where the skin touches the core [m]; or a function of points (n, 3)
-          [m] on the core -> (n,).
-        relief: additional thickness of the liquid over the geometry's, such a function; None: zero.
+      residual_film: thickness of liquid where the skin touches the core [m]; or a function of points (n, 3)
+        [m] on the core -> (n,).
+      relief: additional thickness of the liquid over the geometry's, such a function; None: zero.
 
     Attributes:
       core_point (n, 3) [m], normal (n, 3): feet and directions of the columns. triangle (m, 3): of the core's
@@ -50,7 +50,7 @@ class LiquidConduction:
       elem (9 m, 4): tetrahedra over nodes layer * n + column.
 
     Raises:
-        ValueError: an electrode without liquid.
+      ValueError: an electrode without liquid.
     """
 
     def __init__(

@@ -41,12 +41,12 @@ def make_shards(
     """Makes the shards of batches `todo` in folder `out`, on all of the options' devices, or on a cluster.
 
     Args:
-        settings: stored with every shard. workers: on the CPU, processes that each make whole batches; with
-          GPUs, processes for film and readings, shared by the devices; on Ray those of each task. progress:
-          whether to show a bar. ray: see `shards.run_tasks`.
+      settings: stored with every shard. workers: on the CPU, processes that each make whole batches; with
+        GPUs, processes for film and readings, shared by the devices; on Ray those of each task. progress:
+        whether to show a bar. ray: see `shards.run_tasks`.
 
-      Returns:
-        seconds of each stage, summed over devices.
+    Returns:
+      seconds of each stage, summed over devices.
 
     Raises:
       ValueError: an invalid option.
@@ -118,7 +118,7 @@ class Maker:
     """Makes shards on one device.
 
     Args:
-        options: GenerateOptions. settings: stored with every shard.
+      options: GenerateOptions. settings: stored with every shard.
       device: of Warp.
 
     Attributes:

@@ -39,7 +39,7 @@ class Motion:
     """Path of one object, n time steps.
 
     Attributes:
-        kind: of KINDS. parameters: as stored, JSON types.
+      kind: of KINDS. parameters: as stored, JSON types.
       pos: (n, 3) tip of the object [m]. mat: (n, 3, 3) its orientation.
     """
 
@@ -73,14 +73,14 @@ def plan_motions(
     """One motion for each seed, independent of the others.
 
     Args:
-        geometry: the skin at rest.
+      geometry: the skin at rest.
       name: of the object.
       seeds: lists of ints, see numpy's SeedSequence.
       steps: rows of each motion, row 0 just before first touch.
       kinds: of KINDS, to choose from.
 
     Raises:
-        ValueError: unknown kind, too few steps, or no admissible motion.
+      ValueError: unknown kind, too few steps, or no admissible motion.
     """
     for kind in kinds:
         if kind not in KINDS:

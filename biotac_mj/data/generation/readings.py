@@ -48,7 +48,7 @@ class Readings:
     Attributes:
       impedance: (n, nelectrode) [ohm]. counts: (n, nchannel) in the order of the design's channels. pac:
         (n, 22) counts of the last 10 ms in the order of time.
-        failed: (n,) bool, steps without a solution of the film, which keep the last one.
+      failed: (n,) bool, steps without a solution of the film, which keep the last one.
     """
 
     impedance: np.ndarray
@@ -118,7 +118,7 @@ def sample(
       time: (n,) [s]; impedance: (n, nelectrode) [ohm]; pressure: (n,) above rest [Pa]; linear between
         samples.
       seed: of the noise.
-        temperature: (n,) of the core [C]; None is constant. sensor: of noise and levels.
+      temperature: (n,) of the core [C]; None is constant. sensor: of noise and levels.
     """
     acquisition = Acquisition(seed=seed, film_every_step=True, sensor=sensor, design=design)
     state = np.zeros(acquisition.nstate)
@@ -153,9 +153,9 @@ def read_motion(
 
     Args:
       film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa].
-        seed: of the noise. sense: sensor and object. touch: contact, for heat and vibration.
-        rest: (nvert, 3) rest positions of the skin if not the film's [m]: there the readings are the film's
-          at rest.
+      seed: of the noise. sense: sensor and object. touch: contact, for heat and vibration.
+      rest: (nvert, 3) rest positions of the skin if not the film's [m]: there the readings are the film's at
+        rest.
     """
     scale = 1.0 if rest is None else film.rest / film.impedance(rest)
     design = film.geometry.design
@@ -201,7 +201,7 @@ def prepare_worker(
     """Makes the film of a skin, or the network in its place, in this process.
 
     Args:
-        rest_vert: (nvert, 3) rest positions of the filled skin [m]. film: settings of FilmConduction.
+      rest_vert: (nvert, 3) rest positions of the filled skin [m]. film: settings of FilmConduction.
       signal: see `sensor.signals.read_signal`.
     """
     _here["vert"] = geometry.vert

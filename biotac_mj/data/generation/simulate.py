@@ -35,10 +35,10 @@ class Fields:
         unstressed skin.
       contact_force: (k, n, nouter, 3) float32 [N].
       wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
-        area: (k, n) contact area [m^2].
-        slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; empty
-          without modes.
-        rest: (k, nvert, 3) displacements of the skins at rest [m], if they differ; else None.
+      area: (k, n) contact area [m^2].
+      slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; empty
+        without modes.
+      rest: (k, nvert, 3) displacements of the skins at rest [m], if they differ; else None.
     """
 
     displacement: np.ndarray
@@ -77,18 +77,18 @@ def simulate(
 
     Args:
       model: the skin, on any device.
-        names: object of each motion, or of all.
-        motions: plan.Motions of equal length.
-        progress: called with the number of completed time steps over all motions, after each step of the
-          solver.
-        time: (n,) of the motions' rows [s], or one for each motion; required for relaxing rubber and inertia.
-          The approach before the first row takes as long as the first row's step.
-        materials: one for each motion, or None for the model's.
-        worlds: name -> (k,) further properties per motion, see `skin.per_world.make_worlds`.
-        modes: of the skin, for slip, drive and gain; requires time.
+      names: object of each motion, or of all.
+      motions: plan.Motions of equal length.
+      progress: called with the number of completed time steps over all motions, after each step of the
+        solver.
+      time: (n,) of the motions' rows [s], or one for each motion; required for relaxing rubber and inertia.
+        The approach before the first row takes as long as the first row's step.
+      materials: one for each motion, or None for the model's.
+      worlds: name -> (k,) further properties per motion, see `skin.per_world.make_worlds`.
+      modes: of the skin, for slip, drive and gain; requires time.
 
     Raises:
-        ValueError: an object deep inside the rigid core (plans avoid it), or missing times.
+      ValueError: an object deep inside the rigid core (plans avoid it), or missing times.
     """
     names = [names] * len(motions) if isinstance(names, str) else list(names)
     k = len(motions)
@@ -164,9 +164,9 @@ def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, 
     """Time steps (m,) [s] of the poses of a path, and their end times (m,) [s].
 
     Args:
-        row: (m,) row that each pose completes, -1 for intermediate ones, see `_walk`. time: (n,) of the rows
-          [s].
-        first: duration before the first row [s].
+      row: (m,) row that each pose completes, -1 for intermediate ones, see `_walk`. time: (n,) of the rows
+        [s].
+      first: duration before the first row [s].
     """
     count = np.diff(np.flatnonzero(row >= 0), prepend=-1)  # steps to each row
     dt = np.repeat(np.diff(time, prepend=time[0] - first) / count, count)
@@ -186,7 +186,7 @@ def simulate_condensed(
     """`simulate` for the condensed skin, one interaction after another on one core, without rate effects.
 
     Raises:
-        ValueError: a feature that the condensed tier lacks, different materials or worlds, or modes.
+      ValueError: a feature that the condensed tier lacks, different materials or worlds, or modes.
     """
     from ...skin.condensed import CondensedSkin, Memory
 
@@ -230,10 +230,10 @@ class Scene:
     """All objects of a batch in every world: its own one at its pose, the others out of reach.
 
     Args:
-        names: object of each world. device: of Warp. friction: Coulomb coefficient.
+      names: object of each world. device: of Warp. friction: Coulomb coefficient.
 
     Attributes:
-        geoms: GeomSet of the different objects, in order of first appearance.
+      geoms: GeomSet of the different objects, in order of first appearance.
     """
 
     def __init__(self, names: list | tuple, device: str = "cpu", friction: float = 0.0):

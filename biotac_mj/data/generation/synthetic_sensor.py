@@ -57,26 +57,25 @@ class SensorVariation:
     Attributes:
       youngs_modulus, poissons_ratio, friction: of a Neo-Hookean skin. E: all fits to two pressed sensors
         (docs/lab/real_match.md, 0.47 to 1.36 MPa); nu: the default's and the least compressible tried there.
-        uneven: gradient of the modulus along and across the finger [1/cm], the catalogue's `inhomog` (0.15).
-        rest_pressure: of its liquid [Pa]: 0 to 0.0194 E (docs/lab/real_match.md, Filling).
-        film, film_spread, film_length: thickness where the skin touches the core [m], and its spatial scatter
-          in the logarithm: the catalogue's range, 20-100 um, for the mean and again from place to place.
-        texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls fitted to two
-          sensors deviate by up to 0.29 mm (docs/lab/real_match.md, The tip); the length is chosen.
-        excitation: (4, 2) of X1..X4 as in `sensor.film.FilmConduction`, or (4, 3), within 0.7 mm of the
-          design's (chosen: the BioTac's is known to some millimetres at best).
-        electrode_shift: (nelectrode, 3) [m] of the electrodes, in common by up to 1 mm along and across (the
-          catalogue's `misalign`), and each by 0.3 mm (chosen).
-        mixing: (nelectrode, nelectrode) matrix on the changes of ln Z: gains with a scatter of 0.27 (0.25 to
-          0.29 in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within 2-6 mm, and
-          global coupling, a fraction of the mean (the catalogue's `crosstalk`).
+      uneven: gradient of the modulus along and across the finger [1/cm], the catalogue's `inhomog` (0.15).
+      rest_pressure: of its liquid [Pa]: 0 to 0.0194 E (docs/lab/real_match.md, Filling).
+      film, film_spread, film_length: thickness where the skin touches the core [m], and its spatial scatter
+        in the logarithm: the catalogue's range, 20-100 um, for the mean and again from place to place.
+      texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls fitted to two
+        sensors deviate by up to 0.29 mm (docs/lab/real_match.md, The tip); the length is chosen.
+      excitation: (4, 2) of X1..X4 as in `sensor.film.FilmConduction`, or (4, 3), within 0.7 mm of the
+        design's (chosen: the BioTac's is known to some millimetres at best).
+      electrode_shift: (nelectrode, 3) [m] of the electrodes, in common by up to 1 mm along and across (the
+        catalogue's `misalign`), and each by 0.3 mm (chosen).
+      mixing: (nelectrode, nelectrode) matrix on the changes of ln Z: gains with a scatter of 0.27 (0.25 to
+        0.29 in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within 2-6 mm, and global
+        coupling, a fraction of the mean (the catalogue's `crosstalk`).
       sensor: rest counts, noise and warm-up, drawn from the spread of the measured ones (`sensor.presets`).
       ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards
         (chosen).
-        overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure overshoot a
-          step by these fractions and relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a
-            constant grip,
-          electrodes undershoot 5-25 counts after release.
+      overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure overshoot a step
+        by these fractions and relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a constant
+        grip, electrodes undershoot 5-25 counts after release.
     """
 
     youngs_modulus: float
@@ -234,8 +233,7 @@ class Meter:
 
         Args:
           vert_xpos: (n, nvert, 3) [m]; time: (n,) [s]; pressure: (n,) above rest [Pa]. Before row 0 the skin
-            is at rest.
-          seed: of the noise.
+          is at rest. seed: of the noise.
         """
         v = self.variation
         early = time[0] - 0.01 * np.arange(_TARE, 0, -1)
@@ -269,7 +267,7 @@ def relax(time: np.ndarray, value: np.ndarray, fraction: float, tau: float) -> n
     exact for linear interpolation between samples.
 
     Args:
-        time: (n,) [s]; value: the signal; fraction, tau: (m,), (m,) [s], of each term.
+      time: (n,) [s]; value: the signal; fraction, tau: (m,), (m,) [s], of each term.
     """
     value = np.asarray(value, float)
     out = value.copy()

@@ -60,11 +60,11 @@ def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | Non
     """Skins of some interactions.
 
     Args:
-        vary: {name: (low, high)}, see `GenerateOptions.vary`. material: of all, except for varied properties.
-        seeds: of each interaction.
+      vary: {name: (low, high)}, see `GenerateOptions.vary`. material: of all, except for varied properties.
+      seeds: of each interaction.
 
-      Returns:
-        materials of each (None if they are equal), {name: (k,)} for `make_worlds`, and [{name: value}].
+    Returns:
+      materials of each (None if they are equal), {name: (k,)} for `make_worlds`, and [{name: value}].
     """
     drawn = []
     for seed in seeds:
@@ -84,7 +84,7 @@ def draw_sense(options: Any, seed: list, modes: Modes | None, design: Design = B
         skin, for vibration. design: of the sensor.
 
     Returns:
-        Sense, and its random values: {"sensor": numbers, "thermal": value, "texture": value}.
+      Sense, and its random values: {"sensor": numbers, "thermal": value, "texture": value}.
     """
     sensor, _, open_ = take_sensor({"sensor": options.sensor, "randomise": options.randomise}, seed, design)
     drawn, rng = {}, np.random.default_rng(seed)

@@ -19,10 +19,10 @@ class Examples:
     """n rows.
 
     Attributes:
-        counts: (n, nelectrode) raw; tare: (n, nelectrode) at rest. owner: (n,) number of the trajectory.
-        targets: "force" (n, 3) [N], "place" (n, 3) [m], if known; NaN in rows without.
-        pdc: (n,) change of PDC from rest [counts], None if unknown.
-        tared: whether the tare was measured; else absolute ln Z is used. synthetic: not a real sensor.
+      counts: (n, nelectrode) raw; tare: (n, nelectrode) at rest. owner: (n,) number of the trajectory.
+      targets: "force" (n, 3) [N], "place" (n, 3) [m], if known; NaN in rows without.
+      pdc: (n,) change of PDC from rest [counts], None if unknown.
+      tared: whether the tare was measured; else absolute ln Z is used. synthetic: not a real sensor.
     """
 
     counts: np.ndarray

@@ -136,10 +136,10 @@ class ForceModel:
     """Predicts force from the counts up to each row; result of `fit_force`.
 
     Attributes:
-        chosen: for x, y, z, descriptions of the averaged candidates.
-        trust: (3,) retained fraction of the ridge's deviation from the mean, see `_trust`.
-        network: whether the network's correction is used, for x, y, z.
-        trials: walk-forward RMSE [N] of the ridge and of ridge plus network, each (3,).
+      chosen: for x, y, z, descriptions of the averaged candidates.
+      trust: (3,) retained fraction of the ridge's deviation from the mean, see `_trust`.
+      network: whether the network's correction is used, for x, y, z.
+      trials: walk-forward RMSE [N] of the ridge and of ridge plus network, each (3,).
     """
 
     def __init__(
@@ -166,7 +166,7 @@ def fit_force(
     """Fits on rows 0..ntrain-1 and predicts every row.
 
     Args:
-        counts: (n, 19); force: (n, 3) [N], of which only the first ntrain rows are used.
+      counts: (n, 19); force: (n, 3) [N], of which only the first ntrain rows are used.
 
     Returns:
       ForceModel whose `prediction` is (n, 3) [N].

@@ -32,17 +32,16 @@ def predict(
     """Runs a model on all rows.
 
     Args:
-        model: reads electrodes, or, for direction "forward", a skin's deformation.
-        source: file of a recording; for a forward model a data set. recording, load: of
-          `recordings.load_one`.
-        tare: number of first rows of a recording whose mean is the sensor at rest.
+      model: reads electrodes, or, for direction "forward", a skin's deformation.
+      source: file of a recording; for a forward model a data set. recording, load: of `recordings.load_one`.
+      tare: number of first rows of a recording whose mean is the sensor at rest.
 
     Returns:
-        columns that identify the row ("time" [s], for a set "interaction"), Prediction, and the model's
-        description, with "notes" on the recording.
+      columns that identify the row ("time" [s], for a set "interaction"), Prediction, and the model's
+      description, with "notes" on the recording.
 
-      Raises:
-        FileNotFoundError, ValueError: no such file, a model that does not fit, or a missing tare.
+    Raises:
+      FileNotFoundError, ValueError: no such file, a model that does not fit, or a missing tare.
     """
     meta = describe(model)
     if meta.get("direction") == "forward":

@@ -45,8 +45,8 @@ class Prediction:
     Attributes:
       value: target -> (n, k), of TARGETS: force [N], place [m], electrodes [counts]. half: target -> (n, k),
         half widths of the intervals.
-        novelty: (n,) 1 at the 95 % quantile of ordinary rows; larger for a row or tare farther from the
-          training data, or if an electrode does not move as predicted by the others.
+      novelty: (n,) 1 at the 95 % quantile of ordinary rows; larger for a row or tare farther from the
+        training data, or if an electrode does not move as predicted by the others.
     """
 
     value: dict[str, np.ndarray]
@@ -86,7 +86,7 @@ class Reader:
             from rest [counts], only for novelty, if it was in the training data.
 
         Raises:
-            ValueError: a missing tare, or another number of electrodes.
+          ValueError: a missing tare, or another number of electrodes.
         """
         n = len(self.electrodes)
         if np.shape(counts)[-1] != n:

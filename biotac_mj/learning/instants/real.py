@@ -37,19 +37,19 @@ def evaluate_recording(
     """Evaluates one recording; writes `out` (JSON, described in docs/lab/learning.md) and a plot next to it.
 
     Args:
-        recording: without force only the reconstruction is evaluated.
-        fraction: of the rows, in time, for training; everything is fitted on them only.
-        seed: of the networks.
-        network: False: PCA and ridge only (seconds, for tests).
-        known: another sensor with force: its transfer, adapted with `touches` of this sensor's training rows,
-          is compared with a model of all these rows.
+      recording: without force only the reconstruction is evaluated.
+      fraction: of the rows, in time, for training; everything is fitted on them only.
+      seed: of the networks.
+      network: False: PCA and ridge only (seconds, for tests).
+      known: another sensor with force: its transfer, adapted with `touches` of this sensor's training rows,
+        is compared with a model of all these rows.
 
     Returns:
-        the written content.
+      the written content.
 
-      Raises:
-        ValueError: electrodes that cannot be converted to raw counts, too few rows, constant electrodes or
-          force.
+    Raises:
+      ValueError: electrodes that cannot be converted to raw counts, too few rows, constant electrodes or
+        force.
     """
     from tqdm import tqdm
 

@@ -42,9 +42,9 @@ class Terms:
         """Fits to rows (n, nelectrode).
 
         Args:
-            products: number of components with products. common: without the mean over the electrodes.
-              length: scale of the random features, in median distances between rows; 0: none. seed: of the
-                random features.
+          products: number of components with products. common: without the mean over the electrodes. length:
+            scale of the random features, in median distances between rows; 0: none. seed: of the random
+            features.
         """
         x = log_z - log_z.mean(1, keepdims=True) if common else log_z
         mean, axes, _ = principal_components(x)

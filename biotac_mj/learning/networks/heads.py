@@ -43,7 +43,7 @@ class PodHead(nn.Module):
       modes: components. width: of the two hidden layers. dropout: behind each.
 
     Attributes:
-        damp: (modes,) factors on the components: at unit variance, the last ones would be mostly noise.
+      damp: (modes,) factors on the components: at unit variance, the last ones would be mostly noise.
     """
 
     def __init__(self, modes: int, width: int = 128, dropout: float = 0.1):

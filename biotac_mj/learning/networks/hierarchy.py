@@ -25,8 +25,8 @@ class Level:
 
     Attributes:
       laplacian: (n, n) CSR, symmetric, eigenvalues in [-1, 1].
-        keep: (m,) nodes of this level in the next one; None at the last.
-        up: (n, m) CSR from the next level's fields to this one's; rows sum to one; None at the last.
+      keep: (m,) nodes of this level in the next one; None at the last.
+      up: (n, m) CSR from the next level's fields to this one's; rows sum to one; None at the last.
     """
 
     laplacian: csr_matrix
@@ -56,10 +56,10 @@ def build_hierarchy(
 
     Args:
       vert: (n, 3); elem: (m, 4).
-        factors: ratio of the numbers of nodes of successive levels.
+      factors: ratio of the numbers of nodes of successive levels.
 
     Raises:
-        ValueError: a disconnected mesh, or too few nodes for the factors.
+      ValueError: a disconnected mesh, or too few nodes for the factors.
     """
     vert = np.asarray(vert, float)
     n = len(vert)

@@ -67,7 +67,7 @@ class SkinPoints:
         """(n, nvert) CSR: interpolation from the nodes of a skin to the points.
 
         Raises:
-            ValueError: the points are not in that skin.
+          ValueError: the points are not in that skin.
         """
         out = shape_values(geometry.vert, geometry.tets, self.place)
         off = np.linalg.norm(out @ geometry.vert - self.place, axis=1)

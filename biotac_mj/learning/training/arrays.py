@@ -28,10 +28,10 @@ class Arrays:
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
       counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the
         interaction's first row.
-        simulated: (n, 19) counts of the simulation's own film, without noise if the set has its impedances.
-        force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
-        geometry: SkinGeometry. path: of the set. sensor: "real" if resimulated recordings have the measured
-          counts, else "synthetic".
+      simulated: (n, 19) counts of the simulation's own film, without noise if the set has its impedances.
+      force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
+      geometry: SkinGeometry. path: of the set. sensor: "real" if resimulated recordings have the measured
+        counts, else "synthetic".
     """
 
     field: torch.Tensor

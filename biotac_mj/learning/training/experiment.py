@@ -66,13 +66,13 @@ def train_all(
 
     Args:
       path: data set. out: folder.
-        seeds: of splits, weights and batches. splits: "trajectory" (72/18/10 % of the interactions), or the
-          object (or objects, with +) that is held out for the test.
-        config: LearningConfig. device: of torch. paper: False skips what is slow without a GPU: latent
-          projection and PointNet++.
-        only: names of our models to train; None: all of FORWARD. limit: number of interactions to read.
-        progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for each split and
-          seed, with one core, and one GPU if the device is one. All nodes read the set at its path.
+      seeds: of splits, weights and batches. splits: "trajectory" (72/18/10 % of the interactions), or the
+        object (or objects, with +) that is held out for the test.
+      config: LearningConfig. device: of torch. paper: False skips what is slow without a GPU: latent
+        projection and PointNet++.
+      only: names of our models to train; None: all of FORWARD. limit: number of interactions to read.
+      progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for each split and
+        seed, with one core, and one GPU if the device is one. All nodes read the set at its path.
     """
     config = config or LearningConfig()
     out = pathlib.Path(out)
@@ -125,8 +125,7 @@ class _Train:
     """Work of `shards.run_tasks`: all models of a split and seed; size: their steps.
 
     Attributes:
-        settings: of the whole training. device: of torch. timed_steps: steps to time for an estimate, 0:
-          none.
+      settings: of the whole training. device: of torch. timed_steps: steps to time for an estimate, 0: none.
     """
 
     settings: dict

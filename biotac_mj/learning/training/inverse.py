@@ -84,7 +84,7 @@ def train_inverse(
     simulation's own film on all training interactions, labelled or not, and on their mirror images.
 
     Returns:
-        the head; its attribute `validation` is its validation error [unit of the loss].
+      the head; its attribute `validation` is its validation error [unit of the loss].
     """
     torch.manual_seed(seed)
     basis, now, then = pod
@@ -180,7 +180,7 @@ def inverse_errors(arrays: "Arrays", model: Callable, rows: torch.Tensor, patch:
     its overlap, NaN below 0.1 N.
 
     Args:
-        model: rows (k,) -> field (k, nvert, 3) [mm] and force or indentation (k, nouter).
+      model: rows (k,) -> field (k, nvert, 3) [mm] and force or indentation (k, nouter).
       rows: (n,) of the set. patch: see `contact_centre`.
     """
     place, found = arrays.geometry.vert[arrays.outer], []

@@ -47,8 +47,8 @@ class Features:
       arrays: Arrays. config: LearningConfig.
 
     Attributes:
-        film: FilmFeatures. local: (n, 19, k) current features, then these minus their causal averages.
-          mirrored: the same for the mirrored touches, or None.
+      film: FilmFeatures. local: (n, 19, k) current features, then these minus their causal averages.
+        mirrored: the same for the mirrored touches, or None.
     """
 
     def __init__(self, arrays: "Arrays", config: "LearningConfig"):
@@ -109,12 +109,11 @@ def train_head(
 
     Args:
       features: Features. train, validation: numbers of interactions.
-        kind: "pod" or "local". window: with causal averages. teach: first learn d ln Z of the simulation's
-          own film on all training interactions, labelled or not, and on their mirror images, since the
-          simulation is symmetric. mirror: also use mirrored measured touches, though no sensor is symmetric.
-            log: target d ln Z relative to a
-          known tare; False: tared counts.
-        pod: (Pod, components, mirrored components or None), fitted on the training interactions.
+      kind: "pod" or "local". window: with causal averages. teach: first learn d ln Z of the simulation's own
+        film on all training interactions, labelled or not, and on their mirror images, since the simulation
+        is symmetric. mirror: also use mirrored measured touches, though no sensor is symmetric. log: target d
+        ln Z relative to a known tare; False: tared counts.
+      pod: (Pod, components, mirrored components or None), fitted on the training interactions.
 
     Returns:
       function (rows) -> (k, 19) predicted change of counts; the head is its attribute `head`.

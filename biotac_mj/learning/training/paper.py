@@ -90,11 +90,10 @@ def train_latent_projection(
     """Trains both VAEs, freezes them, trains the projections.
 
     Args:
-        arrays: of `Arrays.at_points`. train, validation: numbers of interactions. seed: of weights and
-          batches.
+      arrays: of `Arrays.at_points`. train, validation: numbers of interactions. seed: of weights and batches.
 
-      Returns:
-        the networks, and the validation curves of the four trainings: {name: [[step, error]]}.
+    Returns:
+      the networks, and the validation curves of the four trainings: {name: [[step, error]]}.
     """
     torch.manual_seed(seed)
     model = LatentProjection(points, config).to(arrays.device)

@@ -96,14 +96,14 @@ def write_bag(
     (geometry_msgs/PoseStamped) if the recording has them.
 
     Args:
-        path: of the .bag, or of a new folder for a ROS 2 bag (SQLite).
+      path: of the .bag, or of a new folder for a ROS 2 bag (SQLite).
       ros: 1 or 2. form: of FORMS.
 
     Returns:
       the topics.
 
     Raises:
-        ValueError: rosbags is not installed, the folder exists, or a raw channel of the sensor is missing.
+      ValueError: rosbags is not installed, the folder exists, or a raw channel of the sensor is missing.
     """
     try:
         from rosbags.rosbag1 import Writer as Writer1

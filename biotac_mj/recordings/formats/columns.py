@@ -33,10 +33,10 @@ class Table:
     """A log as text.
 
     Attributes:
-        path: of the file, for errors.
-        names: of the columns, as in the header; None without a header.
-        lines: (n,) line number of each row. cells: n rows of words, all of one length.
-        notes: what was ignored or interpreted.
+      path: of the file, for errors.
+      names: of the columns, as in the header; None without a header.
+      lines: (n,) line number of each row. cells: n rows of words, all of one length.
+      notes: what was ignored or interpreted.
     """
 
     path: pathlib.Path
@@ -57,7 +57,7 @@ class Table:
           gaps: read empty cells and nan as NaN.
 
         Raises:
-            ValueError: a cell is not a finite number; the text has line, column and remedy.
+          ValueError: a cell is not a finite number; the text has line, column and remedy.
         """
         cells = [[row[k] for k in columns] for row in self.cells]
         empty = ("", "nan", "-nan", "none", "null", "na", "n/a") if gaps else ()
@@ -138,11 +138,11 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
     separate columns. An incomplete last line is ignored: the logger was stopped while it wrote.
 
     Args:
-        needed: description of the expected content, for errors.
+      needed: description of the expected content, for errors.
 
     Raises:
-        ValueError: no text, no rows, rows of different length or of another one than the header's, or one
-          without any number.
+      ValueError: no text, no rows, rows of different length or of another one than the header's, or one
+        without any number.
     """
     path = pathlib.Path(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):

@@ -52,7 +52,7 @@ def rows_of(recording: Recording, form: str) -> dict[str, list]:
       form: of FORMS.
 
     Raises:
-        ValueError: a channel without raw counts in every row.
+      ValueError: a channel without raw counts in every row.
     """
     lacks = [
         channel
@@ -93,7 +93,7 @@ class Messages:
         """The message of a topic.
 
         Args:
-            topic: of KINDS. values: a row of `rows_of`; for the sensors' own topic a list of `row_of`.
+          topic: of KINDS. values: a row of `rows_of`; for the sensors' own topic a list of `row_of`.
         """
         numbered = {"seq": i} if self._ros == 1 else {}
         header = self._of("std_msgs/msg/Header", **numbered, stamp=self.stamp(time), frame_id=frame)

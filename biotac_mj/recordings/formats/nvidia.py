@@ -36,7 +36,7 @@ def read_nvidia(
       objects: names of indenter types 0, 1, ...; None calls them indenter_0 and so on.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, or another layout; the text has the key.
+      FileNotFoundError, ValueError: no such file, or another layout; the text has the key.
     """
     remedy = f"give an HDF5 file with {', '.join(_KEYS)} and indenter_type/data, one row for each sample"
     data, _ = read_hdf5(path, "recording of NVIDIA's", remedy, _KEYS)

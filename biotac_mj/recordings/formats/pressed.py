@@ -26,7 +26,7 @@ def read_press(path: pathlib.Path) -> list[Recording]:
     """The press as one recording, in the BioTac frame; force is that on the indenter.
 
     Raises:
-        ValueError: another file, or one of an older version, without PAC's samples of a frame.
+      ValueError: another file, or one of an older version, without PAC's samples of a frame.
     """
     found, attributes = read_hdf5(path, "recorded press", _REMEDY, KEYS | _PAC, ("parameters",))
     n = found["counts"].shape[1] - len(SINGLES)

@@ -38,10 +38,10 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
 
     Args:
       path: for names and errors. content: of the file, not packed.
-        role: electrodes, force or tdc, the required content; None: by names and shape.
+      role: electrodes, force or tdc, the required content; None: by names and shape.
 
     Raises:
-        ValueError: no table of numbers, or an ambiguous one; the text has line and remedy.
+      ValueError: no table of numbers, or an ambiguous one; the text has line and remedy.
     """
     names = _ROLES[role][0] if role else None
     needed = f"{len(names)} columns of numbers, {_range(names)}" if names else "columns of numbers"
@@ -117,7 +117,7 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
     """Parts of a matrix without names; role: as for `read_text`.
 
     Raises:
-        ValueError: an ambiguous width, or cells that are not numbers.
+      ValueError: an ambiguous width, or cells that are not numbers.
     """
     path, width, n = table.path, table.width, len(table.cells)
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)

@@ -84,17 +84,17 @@ class FilmConduction:
     Args:
       geometry: the skin, its core and its electrodes.
       conductivity: of the liquid [S/m].
-        residual_film: thickness where the skin touches the core, kept by the asperities of its inner face [m]
-          (chosen; catalogue range 20-100 um).
-        electrode_radius: of all discs [m] (chosen: not published).
-        excitation: positions of X1, X2, ... if not the design's: (k, 2), x [m] and angle about the x axis
-          from the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), points near the core
-          [m]; BioTac frame.
-        sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes
-          the skin at rest give its rest counts. "" is the design's own. None: all factors one, pure physics.
+      residual_film: thickness where the skin touches the core, kept by the asperities of its inner face [m]
+        (chosen; catalogue range 20-100 um).
+      electrode_radius: of all discs [m] (chosen: not published).
+      excitation: positions of X1, X2, ... if not the design's: (k, 2), x [m] and angle about the x axis from
+        the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), points near the core [m];
+        BioTac frame.
+      sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes the
+        skin at rest give its rest counts. "" is the design's own. None: all factors one, pure physics.
 
     Attributes:
-        cell_constant: (n,), factor on the film's impedance.
+      cell_constant: (n,), factor on the film's impedance.
       rest: (n,) impedance of the skin at rest [ohm].
       excitation_pos: (k, 3), X1, X2, ... on the core [m].
 
@@ -155,7 +155,7 @@ class FilmConduction:
 
         Raises:
           ValueError: wrong shape, or a position that is not finite.
-            NoFilmError: the skin is folded, or so far off that an electrode is uncovered.
+          NoFilmError: the skin is folded, or so far off that an electrode is uncovered.
         """
         vert_xpos = as_numbers("vert_xpos", vert_xpos)
         if vert_xpos.ndim not in (2, 3) or vert_xpos.shape[-2:] != (self.geometry.nvert, 3):
@@ -284,12 +284,12 @@ def read_film(
     """Reads `options["film"]` into settings of `FilmConduction`.
 
     Args:
-        given: dict of residual_film, electrode_radius [m], excitation; None is empty.
-        electrode_radius: default [m]; None: the film's own.
-        geometry: of the skin, to check the values against; None leaves that to `FilmConduction`.
+      given: dict of residual_film, electrode_radius [m], excitation; None is empty.
+      electrode_radius: default [m]; None: the film's own.
+      geometry: of the skin, to check the values against; None leaves that to `FilmConduction`.
 
     Raises:
-        ValueError: not a dict, an unknown name, or an invalid value.
+      ValueError: not a dict, an unknown name, or an invalid value.
     """
     kinds = {"residual_film": float, "electrode_radius": float, "excitation": list}
     out = dict(check_entries("options['film']", {} if given is None else given, kinds, kinds))
@@ -352,17 +352,17 @@ class BatchFilm:
     the same launches can be recorded in a CUDA graph and replayed every step.
 
     Args:
-        film: `FilmConduction` that supplies the constants.
+      film: `FilmConduction` that supplies the constants.
       nworld: number of worlds.
       device: Warp device.
-        band: whether the Laplacian is solved as a band of tiles, else by its sparse factor (CPU only); None:
-          only on CUDA.
+      band: whether the Laplacian is solved as a band of tiles, else by its sparse factor (CPU only); None:
+        only on CUDA.
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
       valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
-            position that is not finite.
-          lasting: the arrays that persist between steps: these two.
+        position that is not finite.
+      lasting: the arrays that persist between steps: these two.
       rest: (n,) impedance at rest [ohm]. design: of the skin.
       middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
         world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
@@ -437,10 +437,10 @@ class BatchFilm:
         """Sets the cell constants of each world so that its skin at rest has the film's impedances.
 
         Args:
-            x: (nvert, nworld) wp.array of vec3d, rest positions [m].
+          x: (nvert, nworld) wp.array of vec3d, rest positions [m].
 
         Raises:
-            NoFilmError: an electrode of some world has no film.
+          NoFilmError: an electrode of some world has no film.
         """
         self.solve_film(x, wp.ones(self.nworld, dtype=int, device=self.device))
         if not self.valid.numpy().all():
@@ -476,7 +476,7 @@ class BatchFilm:
 
         Args:
           x: (nvert, nworld) wp.array of vec3d, nodes in the BioTac frame [m].
-            due: (nworld,) wp.array of int, 0: keep the last impedances.
+          due: (nworld,) wp.array of int, 0: keep the last impedances.
 
         Raises:
           ValueError: an array is on another device.

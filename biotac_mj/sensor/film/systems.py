@@ -48,9 +48,9 @@ class BandLayout:
       face: (m, 3) of nodes in an order of small bandwidth. n: nodes.
 
     Attributes:
-        entry (nentry, 2): row and column in a world's system; entry 0 is the first diagonal. sign (nentry,),
-          start (nentry + 1,), slot: edges of faces (3 face + corner) that each entry sums, none for padding.
-        rhs: first row of the right-hand sides. rows: of the system in all.
+      entry (nentry, 2): row and column in a world's system; entry 0 is the first diagonal. sign (nentry,),
+        start (nentry + 1,), slot: edges of faces (3 face + corner) that each entry sums, none for padding.
+      rhs: first row of the right-hand sides. rows: of the system in all.
     """
 
     def __init__(self, face: np.ndarray, n: int):
@@ -82,7 +82,7 @@ class SparseLayout:
     the band's operations.
 
     Args:
-        face, n: as for `BandLayout`. columns: number of right-hand sides.
+      face, n: as for `BandLayout`. columns: number of right-hand sides.
 
     Attributes: as for `BandLayout`.
     """
