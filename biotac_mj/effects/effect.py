@@ -75,7 +75,8 @@ class Run:
       order:
         number in the session.
       offset (n, 3): of the object from its commanded position [m]; log_radius, log_friction: of the tool and
-      the contact. bubble: volume of trapped air [m3].
+        the contact.
+      bubble: volume of trapped air [m3].
       force (n, 3) [N], pressure (n,) [Pa], log_z (n, nelectrode): ln of the impedances [ohm]; without effects
       until
         the skin is solved. counts (n, nelectrode), pdc (n,): after the converter, before rounding.
@@ -121,7 +122,8 @@ class Run:
 
         Args:
           rest_log_z: (nelectrode,) ln of the impedances at rest [ohm]. time: (n,) [s]; None: all rows at one
-          time. more: other fields, such as force (n, 3) [N]."""
+            time.
+          more: other fields, such as force (n, 3) [N]."""
         n = len(counts)
         time = np.zeros(n) if time is None else time
         plain = {
@@ -183,20 +185,20 @@ class Effect(abc.ABC):
         "log" (recordings without), "checkup" (segments of a checkup's protocol) and "plate" (presses of a
         flat plate). An id may have a form for each.
       params: {name: Param}. each: the parameter that every electrode has, in `params` by its name. design: of
-      the electrodes. grid: values of the shape parameters that are tried.
+        the electrodes.
+      grid: values of the shape parameters that are tried.
       rare: further parameters, added only if the data require them (`given`).
       law: distance of the true law from this one: standard deviation as a fraction of a parameter, included
-      in its interval. confusable: {id: experiment that separates the two}. equivalents: ids of other laws
-      with the same
-        appearance, separated only by much evidence. refit_with: ids of effects that are always fitted with
-          this one.
+        in its interval.
+      confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
+        appearance, separated only by much evidence. refit_with: ids of effects that are fitted with it.
       per_channel: whether each free parameter belongs to one electrode.
       of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
       wiring: whether it assigns electrodes to channels, and has no other form.
       of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
       moves_object: whether it moves the object. pose_offset: whether it moves all poses equally, like their
-      scatter between trials. remembers: whether rubber or contact can model it inside the skin, with a delay
-      of the films.
+        scatter between trials.
+      remembers: whether rubber or contact can model it inside the skin, with a delay of the films.
       answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it uses.
       instead_of: nuisance parameters of the base model that it replaces.
       sound: root mean square of its parameters that a healthy sensor may have.

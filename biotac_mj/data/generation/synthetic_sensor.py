@@ -233,7 +233,8 @@ class Meter:
 
         Args:
           vert_xpos: (n, nvert, 3) [m]; time: (n,) [s]; pressure: (n,) above rest [Pa]. Before row 0 the skin
-          is at rest. seed: of the noise.
+            is at rest.
+          seed: of the noise.
         """
         v = self.variation
         early = time[0] - 0.01 * np.arange(_TARE, 0, -1)
