@@ -27,8 +27,8 @@ PAPER = {
     "nodal_peak": 1.41e-4,
     "nodal_mean": 1.81e-5,
 }
-_ANGLES = 50.0  # [deg] of the random places round the pad's midline
-_ALONG = (-0.0155, -0.0045)  # [m] of the places along the finger
+_ANGLES = 50.0  # [deg] range of the random locations about the pad's midline
+_ALONG = (-0.0155, -0.0045)  # [m] range of the locations along the finger
 _DEPTH = (0.6e-3, 1.6e-3)  # [m]
 
 
@@ -37,10 +37,10 @@ class Comparison:
     """One configuration against the reference.
 
     Attributes:
-      configuration: name. calibration: of its material, or None where it was given.
+      configuration: name. calibration: of its material, or None if that was given.
       force: indenter -> mean over its indentations of the mean norm of the force error over time [N].
-      relative: indenter -> the same over the indentation's largest reference force.
-      nodal_peak, nodal_mean: mean over indentations and time of the error of the largest norm and of the mean
+      relative: indenter -> the same, relative to the indentation's largest reference force.
+      nodal_peak, nodal_mean: mean over indentations and time of the errors of the largest and of the mean
         norm of the outer surface's nodal displacements [m]; nan without a reference.
       rows: one dict for each indentation.
     """
@@ -70,8 +70,8 @@ def plan_indentations(
     skin: str = "coarse",
     progress: Callable | None = None,
 ) -> list:
-    """`count` random indentations for each indenter: place on the pad, depth, direction up to 25 degrees off
-    the normal, and a slide.
+    """`count` random indentations for each indenter: location on the pad, depth, direction up to 25 degrees
+    off the normal, and a slide.
 
     Raises:
       ValueError: unknown indenter, or no room.
@@ -99,7 +99,7 @@ def plan_indentations(
 
 
 def references(plans, progress=None, **options) -> list[Indentation]:
-    """The stand-in's answers; see `stand_in`."""
+    """Reference solutions; see `stand_in`."""
     answers = []
     for plan in plans:
         answers.append(stand_in(plan, **options))
@@ -116,7 +116,7 @@ def evaluate(
     device: str = "cpu",
     progress: Callable | None = None,
 ) -> Comparison:
-    """Walks every indentation with one configuration and material.
+    """Simulates every indentation with one configuration and material.
 
     Raises:
       ValueError: no indentations.

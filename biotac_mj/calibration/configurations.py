@@ -15,7 +15,7 @@ __all__ = ["CONFIGURATIONS", "Configuration", "configuration"]
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:
-    """One of the four.
+    """One of the four configurations.
 
     Attributes:
       name: as in CONFIGURATIONS.
@@ -30,9 +30,9 @@ class Configuration:
     modulus: np.ndarray | Callable | None = None
 
 
-# The body's mesh (None: the skin asked for) and whether the inner surface can touch the rigid core. All are
-# held where they lie on nail and clamp plate. The shells are held where they are bonded to the core too;
-# `solid_with_core` is bonded to all of it, `solid` fills it.
+# Mesh of the body (None: the skin's mesh) and whether the inner surface can touch the rigid core. All are
+# fixed at nail and clamp plate. The shells are also fixed where they are bonded to the core;
+# `solid_with_core` is bonded to all of it, `solid` replaces it.
 CONFIGURATIONS = {
     "deformable_shell": (None, False),
     "shell_with_core": (None, True),
@@ -48,9 +48,9 @@ def configuration(
 
     Args:
       name: of CONFIGURATIONS.
-      skin: resolution; shells come as "coarse", "default", "fine" or a file, solids as "coarse" only.
+      skin: resolution; shells exist as "coarse", "default", "fine" or a file, solids as "coarse" only.
       modulus: factors on Young's modulus of the body's elements (nelem,), or a function of positions.
-      options: further SkinOptions; `liquid=True` is for shells.
+      options: further SkinOptions; `liquid=True` for shells only.
 
     Raises:
       ValueError: unknown name, a solid of another resolution, or a solid with liquid.

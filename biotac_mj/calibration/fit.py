@@ -1,9 +1,9 @@
 """Fits material and solver parameters to the forces of one indentation, as Narang et al. (ICRA 2021) did.
 
 The cost is the root mean square over time of the norm of the force error. Sequential least squares (scipy's
-SLSQP) minimises its square, which has the same minimum and a round bottom; a trust-region Gauss-Newton
-(scipy's least_squares) finishes. The model's value and all finite-difference columns of its Jacobian are the
-worlds of one batch; parameters that a batch shares (solver options) take a batch each."""
+SLSQP) minimises its square, which has the same minimum and is smooth there; a trust-region Gauss-Newton
+method (scipy's least_squares) finishes. The model's value and all finite-difference columns of its Jacobian
+are the worlds of one batch; each solver option, which a batch shares, needs a separate batch."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -20,12 +20,12 @@ from .statistics import covariance, ljung_box
 
 __all__ = ["PARAMETERS", "Calibration", "FitParameter", "calibrate", "forces_and_jacobian", "parameter"]
 
-_STEP = 0.01  # of a scaled parameter: 1 % of a positive one, far above the solver's error at TOLERANCE
-# Of the skin's solver: forces repeat to 1e-5 N. A step given up for want of iterations makes the cost jump,
-# so there are many.
+_STEP = 0.01  # finite difference of a scaled parameter: 1 % of a positive one, far above the solver's error
+# Solver tolerance at which forces repeat to 1e-5 N. A step without convergence makes the cost jump, so the
+# iteration limit is high.
 TOLERANCE, MAX_NEWTON = 1e-6, 200
 _CONFIDENCE = 0.95
-_GAIN = 1e-3  # of the cost, for which another start is worth a fit
+_GAIN = 1e-3  # least predicted reduction of the cost for another fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class FitParameter:
     Attributes:
       name: a number of Material or of SkinOptions.
       lower, upper: bounds.
-      logarithmic: the fit moves in its logarithm (positive bounds), else in the number over the width of its
+      logarithmic: the fit is in the logarithm (positive bounds), else in the number over the width of its
         bounds.
     """
 
@@ -45,11 +45,11 @@ class FitParameter:
     logarithmic: bool = False
 
     def scaled(self, value: float) -> float:
-        """The number without a unit that is searched instead of a value."""
+        """Scaled, dimensionless search variable for a value."""
         return np.log(value) if self.logarithmic else 2 * value / (self.upper - self.lower)
 
     def value(self, scaled: float) -> float:
-        """The value, in its unit, of such a number."""
+        """The value, in its unit, for a scaled variable."""
         return float(np.exp(scaled)) if self.logarithmic else float(scaled * (self.upper - self.lower) / 2)
 
     def slope(self, value: float) -> float:
@@ -79,7 +79,7 @@ def parameter(text: str) -> FitParameter:
     ratio and friction.
 
     Raises:
-      ValueError: unknown name, bounds that are no interval or that cannot be, or none where none are known.
+      ValueError: unknown name, invalid bounds, or no bounds for a name without default ones.
     """
     name, *bounds = text.split(":")
     name = _SHORT.get(name, name)
@@ -112,19 +112,19 @@ def parameter(text: str) -> FitParameter:
 
 @dataclasses.dataclass
 class Calibration:
-    """What a fit found. n samples, p parameters.
+    """Result of a fit with n samples and p parameters.
 
     Attributes:
-      configuration, skin, law, element, liquid, indenter: what was fitted with.
+      configuration, skin, law, element, liquid, indenter: settings of the fit.
       parameters: names.
       start, value: (p,) before and after.
-      interval: (p, 2) 95 % confidence; from the larger of the two standard errors.
+      interval: (p, 2) 95 % confidence, from the larger of the two standard errors.
       standard_error: (p,) for white residuals; standard_error_robust: (p,) after Newey and West, with `lags`.
       correlation: (p, p) of the parameters.
-      at_bound: (p,) whether a parameter ended on a bound, where its interval means little.
+      at_bound: (p,) whether a parameter is on a bound, where its interval is unreliable.
       rms, mean: of the norm of the force error over time [N]; peak: largest measured force [N].
-      whiteness: Ljung and Box's test of the residual's components.
-      material, options: of the result; those of the whole skin.
+      whiteness: Ljung-Box test of the residual's components.
+      material, options: of the result, including those that were not fitted.
       measured, fitted: (n, 3) [N]; time: (n,) [s].
       evaluations: batches; success, message: of the last optimiser.
       nonconverged: steps of the skin at the result that did not converge.
@@ -168,8 +168,8 @@ def forces_and_jacobian(
     indentation: Indentation,
     device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The model's forces and their derivatives by the parameters' scaled forms, columns as worlds of one
-    batch.
+    """The model's forces and their derivatives with respect to the scaled parameters, with columns as worlds
+    of one batch.
 
     Returns:
       force (n, 3) [N], jacobian (n, 3, p) [N], nonconverged steps of the first world.
@@ -204,7 +204,7 @@ def forces_and_jacobian(
 
 
 def _case(options, material, parameters, point):
-    """Options and material with the parameters set."""
+    """Options and material with the parameters' values."""
     changes = {p.name: float(v) for p, v in zip(parameters, point)}
     on_material = {name: v for name, v in changes.items() if name in _MATERIAL}
     on_options = {name: v for name, v in changes.items() if name not in _MATERIAL}
@@ -227,28 +227,27 @@ def calibrate(
 ) -> Calibration:
     """Fits parameters to the force of an indentation.
 
-    The contact stiffness stays that of the starting material, unless it is fitted: 180 E per millimetre is so
-    stiff that twice as much hardly changes the force, and the batch needs one.
+    The contact stiffness remains that of the starting material, unless it is fitted: 180 E per millimetre is
+    so stiff that twice as much hardly changes the force, and a batch has a single value.
 
     Args:
-      configuration: body and options; liquid is `options.liquid`, or the material's where that is None.
+      configuration: body and options; liquid is `options.liquid`, or the material's if that is None.
       material: law and starting values.
-      parameters: names, as `parameter` takes them, or Parameters.
+      parameters: names, as in `parameter`, or FitParameters.
       progress: whether to show a bar.
       finer: a finer mesh of the same body, or None. The fit on the configuration's mesh is then corrected by
         the difference of both meshes' forces at the fitted values and repeated, `corrections` times (space
-        mapping): it ends where the finer mesh fits the data, at the price of `corrections` indentations of
-        it.
-      forces: what gives forces and their Jacobian, as `forces_and_jacobian` does by differences. With
-        another the fit is Gauss and Newton's from the start.
-      starts: from how many points the fit is finished: others than the first are drawn from the error of the
-        best so far, and left where the slopes there promise nothing better. Where a step of the press has two
-        balances, the forces jump with the parameters, and a fit ends on the side of the jump on which it was;
-        the best of some ends on the better.
+        mapping). The result fits the data on the finer mesh, at the cost of `corrections` indentations of it.
+      forces: function that returns forces and their Jacobian, like `forces_and_jacobian`. With another one
+        the fit is Gauss-Newton from the start.
+      starts: number of starting points for the final fit: further ones are drawn from the error of the best
+        fit and skipped if the slopes predict no improvement. If a step of the press has two equilibria, the
+        forces jump as a function of the parameters, and a fit stays on its side of the jump; several starts
+        cover both sides.
 
     Raises:
-      ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not
-        tell the parameters apart.
+      ValueError: an unknown parameter, a start outside its bounds, data without force, or parameters that the
+        forces do not identify.
     """
     parameters = [p if isinstance(p, FitParameter) else parameter(p) for p in parameters]
     if not parameters or len({p.name for p in parameters}) != len(parameters):
@@ -260,7 +259,7 @@ def calibrate(
     )
     start = np.array([p.scaled(v) for p, v in zip(parameters, begin)])
     problem.check(start)
-    # with exact slopes the step after one that gains a ten-thousandth gains nothing
+    # with exact derivatives a step after one with a gain below 1e-4 gains nothing
     tolerance = (1e-4, 1e-4) if finer is not None or forces is not None else (1e-5, 1e-6)
 
     def finish(at, correction=0.0):
@@ -273,7 +272,7 @@ def calibrate(
         if problem.promised(at) < (1 - _GAIN) * found.cost:
             found = min(found, finish(at), key=_cost)
     modulus = configuration.modulus
-    if finer is not None and modulus is not None and not callable(modulus):  # in turn, see `refined`
+    if finer is not None and modulus is not None and not callable(modulus):  # repeat per child, see `refined`
         modulus = np.repeat(modulus, len(finer.elem) // len(modulus))
     for _ in range(corrections if finer is not None else 0):
         values, force, _, _ = problem.evaluate(found.x)
@@ -304,8 +303,7 @@ def calibrate(
 
 
 def _converged_further(configuration, material):
-    """The configuration with the starting material's contact stiffness and steps that end nearer to
-    equilibrium."""
+    """The configuration with the starting material's contact stiffness and a tighter tolerance."""
     options = configuration.options
     return dataclasses.replace(
         configuration,
@@ -333,8 +331,7 @@ def _begin(parameters, material, options):
 
 
 class _Problem:
-    """Least squares of the force of an indentation over scaled parameters (n,); what was simulated at a point
-    is kept.
+    """Least squares of the force of an indentation over scaled parameters (n,); simulated points are cached.
 
     Attributes:
       lower, upper: (n,) bounds.
@@ -364,7 +361,7 @@ class _Problem:
         self._bar.close()
 
     def evaluate(self, scaled):
-        """Values of the parameters, force, its Jacobian and steps that were lost."""
+        """Values of the parameters, force, its Jacobian and number of steps without convergence."""
         key = scaled.tobytes()
         if key not in self._cache:
             configuration, material, parameters = self._given
@@ -381,7 +378,7 @@ class _Problem:
         return self._cache[key]
 
     def check(self, start):
-        """Raises ValueError where the force does not depend on a parameter."""
+        """Raises ValueError if the force does not depend on a parameter."""
         for p, column in zip(self._given[2], np.moveaxis(self.evaluate(start)[2], -1, 0)):
             if np.sqrt((column**2).sum(1).mean()) < 1e-6 * self._scale:
                 raise ValueError(
@@ -390,8 +387,8 @@ class _Problem:
                 )
 
     def descend(self, start, max_iterations):
-        """Scaled parameters that SLSQP comes to, in unknowns u in which the Gauss-Newton matrix of the start
-        is the identity: E and nu pull together, and this straightens their valley."""
+        """Result of SLSQP from `start`, in variables u in which the Gauss-Newton matrix at the start is the
+        identity: this removes the correlation of E and nu."""
         from scipy.optimize import minimize
 
         there = self.evaluate(start)[2]
@@ -420,7 +417,7 @@ class _Problem:
         return start + back @ rough.x
 
     def within(self, at):
-        """The nearest point inside the bounds."""
+        """The nearest point within the bounds."""
         return np.clip(at, self.lower + 1e-9, self.upper - 1e-9)
 
     def _residual(self, s, correction=0.0):
@@ -430,8 +427,8 @@ class _Problem:
         return self.evaluate(s)[2].reshape(-1, len(s)) / self._scale
 
     def least_squares(self, at, correction, tolerance, max_iterations):
-        """A fit from there by Gauss and Newton: contacts that come and go put kinks into the cost, which
-        mislead SLSQP's model of the curvature. tolerance: of cost and of step."""
+        """Gauss-Newton fit from a point: changes of contact make kinks in the cost that mislead SLSQP's
+        curvature. tolerance: of cost and of step."""
         from scipy.optimize import least_squares
 
         return least_squares(
@@ -446,13 +443,13 @@ class _Problem:
         )
 
     def draw_near(self, at, rng):
-        """A point drawn from the error of a fit."""
+        """A point drawn from the error distribution of a fit."""
         _, force, jacobian, _ = self.evaluate(at)
         spread = np.linalg.cholesky(covariance(jacobian, force - self._indentation.force)[0])
         return self.within(at + spread @ rng.normal(size=len(at)))
 
     def promised(self, at):
-        """Least cost if forces go straight from there: of a fit on that side of a jump."""
+        """Predicted least cost for forces that are linear from there, so on that side of a jump."""
         residual, slopes = self._residual(at), self._slopes(at)
         return ((residual - slopes @ np.linalg.lstsq(slopes, residual)[0]) ** 2).sum() / 2
 
@@ -464,7 +461,7 @@ def _cost(found):
 def _result(
     configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found
 ):
-    from scipy.special import stdtrit  # not scipy.stats, which takes a second to import
+    from scipy.special import stdtrit  # scipy.stats takes a second to import
 
     residual = force - indentation.force
     by_value = jacobian / np.array([p.slope(v) for p, v in zip(parameters, values)])

@@ -1,4 +1,4 @@
-"""The forward model: one indentation of many materials at once, each material a world of one batch."""
+"""Forward model: one indentation of many materials in parallel, each material a world of one batch."""
 
 import dataclasses
 import functools
@@ -15,12 +15,12 @@ from .indentation import Indentation
 
 __all__ = ["Response", "Steps", "displacement_norms", "simulate", "steps_of"]
 
-_LARGEST_STEP = 2.5e-4  # [m] longer ways between two samples are taken in several steps
+_LARGEST_STEP = 2.5e-4  # [m] longer displacements between two samples are divided into several steps
 
 
 @dataclasses.dataclass(frozen=True)
 class Response:
-    """What k materials answer to one indentation of n samples.
+    """Response of k materials to one indentation of n samples.
 
     Attributes:
       force: (k, n, 3) of the skin on the indenter [N].
@@ -46,20 +46,20 @@ def simulate(
     progress: Callable | None = None,
     modulus: np.ndarray | Callable | None = None,
 ) -> Response:
-    """Walks the indentation once, every material as a world of one batch.
+    """Simulates the indentation once, with every material as a world of one batch.
 
-    The contact stiffness is `options.contact_stiffness`, or that which belongs to each material.
+    The contact stiffness is `options.contact_stiffness`, or each material's own.
 
     Args:
-      geometry, options: the body; its options count for all.
-      materials: k Materials of one law; Young's modulus, Poisson's ratio and friction may differ.
-      indentation: the way and its times; its force is not looked at. Before the first sample the skin has
-        rested as long as the first two are apart.
+      geometry, options: the body; options are common to all.
+      materials: k Materials with one law; Young's modulus, Poisson's ratio and friction may differ.
+      indentation: path and times; its force is not used. Before the first sample the skin is at rest for the
+        first interval.
       progress: called after every sample.
       modulus: factors on Young's modulus of the body's elements, see `SkinModel`.
 
     Raises:
-      ValueError: materials of several laws, or an indenter deep inside the rigid core.
+      ValueError: materials with different laws, or an indenter deep inside the rigid core.
     """
     materials = list(materials)
     model = SkinModel(geometry, materials[0], options, device, modulus=modulus)
@@ -84,11 +84,11 @@ def simulate(
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """The way of an indentation in steps.
+    """Path of an indentation in steps.
 
     Attributes:
       pos: (nstep, 1, 3) [m], mat: (nstep, 1, 3, 3) of the geom. dt: (nstep,) [s].
-      ends: (n,) number of the step at whose end each sample is.
+      ends: (n,) number of the step that ends at each sample.
     """
 
     pos: np.ndarray
@@ -98,7 +98,7 @@ class Steps:
 
 
 def steps_of(indentation: Indentation) -> tuple[Steps, dict]:
-    """The steps in which an indentation is walked, and the indenter as arguments of `skin.GeomSet`."""
+    """Steps of an indentation, and the indenter as arguments of `skin.GeomSet`."""
     shape, place = _indenter(indentation)
     pos, mat, times, ends = [], [], [], []
     at = indentation.tip[0]
@@ -114,13 +114,13 @@ def steps_of(indentation: Indentation) -> tuple[Steps, dict]:
 
 
 def displacement_norms(displacement: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Largest and mean norm of nodal displacements (..., m, 3) [m], the mean weighted with (m,)."""
+    """Largest and mean norm of nodal displacements (..., m, 3) [m]; weights of the mean: (m,)."""
     norm = np.linalg.norm(displacement, axis=-1)
     return norm.max(-1), norm @ weight / weight.sum()
 
 
 def _outer_weights(geometry):
-    """A third of the area of its faces for each node of the outer surface (m,) [m^2], and the nodes (m,)."""
+    """Area per node of the outer surface, a third of that of its faces (m,) [m^2], and the nodes (m,)."""
     face = geometry.outer_face
     edge = geometry.vert[face[:, 1:]] - geometry.vert[face[:, :1]]
     area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
@@ -132,7 +132,7 @@ def _outer_weights(geometry):
 
 @functools.lru_cache(maxsize=8)
 def _shape(name):
-    """The indenter of a name and, for a mesh, its distance grid."""
+    """The indenter with this name and, for a mesh, its distance grid."""
     shape = make_indenter(name)
     return shape, bake_distance_grid(shape.vert, shape.face) if shape.type == "mesh" else None
 

@@ -1,5 +1,4 @@
-"""One indentation: the way of an indenter and the force that was measured on it; read from CSV or from a
-press's skin.h5."""
+"""One indentation: the path of an indenter and the measured force, from CSV or from a press's skin.h5."""
 
 import csv
 import dataclasses
@@ -26,22 +25,22 @@ __all__ = [
 COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
 _ORIENTATION = ("quat_w", "quat_x", "quat_y", "quat_z")
 _PRESS = {"time": Array(("n",)), "force": Array(("n", 3)), "indenter_pose": Array(("n", 7))}
-_REACH = 0.2  # [m] a tip further from the BioTac's origin than this is not in metres
+_REACH = 0.2  # [m] largest distance of a tip from the BioTac's origin; larger ones are not in metres
 
 
 @dataclasses.dataclass(frozen=True)
 class Indentation:
-    """The way of an indenter that only translates, and what it felt. n is the number of samples.
+    """Path of an indenter that only translates, and the measured force; n samples.
 
     Attributes:
       name: in tables.
-      indenter: as `biotac press --indenter` takes it.
+      indenter: as in `biotac press --indenter`.
       time: (n,) [s].
       tip: (n, 3) origin of the indenter's frame in the BioTac frame [m].
-      quat: (4,) orientation of that frame, w x y z; its +y goes ahead.
+      quat: (4,) orientation of that frame, w x y z; its +y points forward.
       force: (n, 3) of the skin on the indenter [N].
       peak_norm, mean_norm: (n,) largest nodal displacement of the outer surface and its mean over the area
-        [m]; None where unknown.
+        [m]; None if unknown.
     """
 
     name: str
@@ -95,16 +94,16 @@ def plan_indentation(
     samples: int = 24,
     skin: str | SkinGeometry = "coarse",
 ) -> Indentation:
-    """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along
-    it.
+    """An indentation for simulation, with zero forces: a press from first touch of the skin at rest, then a
+    slide.
 
     Args:
-      indenter: as `biotac press --indenter`.
-      location: x [m] and angle round the finger [rad], or a point (3,) [m].
-      depth, slide: travel along `direction` and then along `slide_direction` [m].
+      indenter: as in `biotac press --indenter`.
+      location: x [m] and angle about the finger [rad], or a point (3,) [m].
+      depth, slide: travel along `direction`, then along `slide_direction` [m].
       direction: (3,); None is the skin's inward normal.
-      samples: rows along the way, the one before first touch not counted.
-      skin: the mesh on which first touch is looked for.
+      samples: rows along the path, without the one before first touch.
+      skin: the mesh for first touch.
 
     Raises:
       ValueError: see `press.plan_path`.
@@ -138,13 +137,13 @@ def plan_shear(
     largest_step: float = 2e-4,
     **place: object,
 ) -> Indentation:
-    """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a
-    press that squeezes the skin on the core, in which the force hardly depends on nu.
+    """The indentation that identifies E, nu and mu, with zero forces: a light press, a slide with slip, and a
+    press that compresses the skin on the core, where the force hardly depends on nu.
 
     Args:
-      corners: (depth, slid) [m] that the tip visits after first touch.
-      largest_step: longest way between two samples [m].
-      place: location, slide_direction, direction and skin as `plan_indentation` has them.
+      corners: (depth, slid) [m] of the tip after first touch, in sequence.
+      largest_step: longest displacement between two samples [m].
+      place: location, slide_direction, direction and skin as for `plan_indentation`.
     """
     plan = plan_indentation(indenter, depth=1e-3, slide=1e-3, samples=8, **place)
     axes = np.array(
@@ -164,19 +163,18 @@ def read_indentation(
 ) -> Indentation:
     """Reads force-deflection data.
 
-    CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter's orientation is
-      `direction`, or the columns quat_w
-    to quat_z, or the skin's inward normal where neither is given: along -y of the pad, so +y. A press's
-    skin.h5 holds all of it.
+    CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter points along
+    `direction`, or has the orientation in columns quat_w to quat_z, or else points along the pad's inward
+    normal, +y. A press's skin.h5 has all of it.
 
     Args:
       path: .csv or .h5.
-      indenter: shape; needed for CSV, a press knows its own.
-      direction: (3,) in which the indenter's tip points.
+      indenter: shape, required for CSV.
+      direction: (3,) of the indenter's tip.
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: a column is missing, has another unit or holds what is no number; the text names it.
+      ValueError: a column is missing, has another unit or an invalid number; the text has its name.
     """
     path = pathlib.Path(path)
     if not path.is_file():

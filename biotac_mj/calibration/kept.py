@@ -1,5 +1,5 @@
-"""Finished parts of a long comparison, in a file beside its results: stopped and called again with the same
-inputs, it goes on where it was. The file is JSON and makes nothing but the dataclasses named here."""
+"""Checkpoints of a long comparison, in a file next to its results: when called again with the same inputs, it
+continues. The file is JSON and can only restore the dataclasses named here."""
 
 import dataclasses
 import json
@@ -24,15 +24,15 @@ __all__ = ["Kept"]
 _MADE = {
     kind.__name__: kind for kind in (Calibration, Comparison, ContactLaw, Indentation, Material, SkinOptions)
 }
-_TYPE, _DATA = "type", "data"  # of a dict that stands for an array or a dataclass
+_TYPE, _DATA = "type", "data"  # keys of a dict that encodes an array or a dataclass
 _ARRAY = "array"
 
 
 class Kept:
-    """Results by name, written after each.
+    """Results by name, saved after each.
 
     Args:
-      path: file; one of other inputs or other code, or that cannot be read, is started anew.
+      path: file; one of other inputs or other code, or an unreadable one, is replaced.
       inputs: everything that the results depend on, see `cache.key_of`.
     """
 
@@ -44,14 +44,14 @@ class Kept:
             if content["key"] == self._key:
                 self._parts = {name: _made(part) for name, part in content["parts"].items()}
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
-            pass  # nothing there, cut short, or of another version of this package
+            pass  # missing, truncated, or of another version of this package
 
     @property
     def names(self) -> list:
         return list(self._parts)
 
     def get(self, name: str, kind: type, make: Callable) -> object:
-        """The part of this name and type, made by `make()` unless it is there."""
+        """The result of this name and type, computed by `make()` unless it is saved."""
         if not isinstance(self._parts.get(name), kind):
             self._parts[name] = make()
             content = {"key": self._key, "parts": _plain(self._parts)}
@@ -61,7 +61,7 @@ class Kept:
 
 
 def _plain(value):
-    """As JSON has it, so that `_made` makes it again."""
+    """JSON form of a value, inverse of `_made`."""
     if type(value).__name__ in _MADE:
         fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
         return {_TYPE: type(value).__name__, _DATA: fields}

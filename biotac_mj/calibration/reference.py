@@ -1,5 +1,5 @@
-"""Indentations of known answer: the project's own rubber with liquid, which stands in for ANSYS where the
-paper's data are not at hand."""
+"""Indentations with a known solution: our own rubber with liquid, as a substitute for ANSYS without the
+paper's data."""
 
 import dataclasses
 
@@ -26,12 +26,12 @@ def stand_in(
     device: str = "cpu",
     options: dict | None = None,
 ) -> Indentation:
-    """The same way with the forces and displacements of a skin that we know.
+    """The indentation with forces and displacements of a known skin.
 
     Args:
-      indentation: the way.
+      indentation: the path.
       material: preset, dict, .json file or Material; "rubber" is Neo-Hookean with the paper's ANSYS
-        constants, and has liquid.
+        constants, with liquid.
       skin: mesh, "refined:NAME" for each of its tetrahedra cut into eight.
       noise: standard deviation added to each force component [N].
       seed: of the noise.
@@ -39,7 +39,7 @@ def stand_in(
       options: {"skin": ..., "modulus": ...}, further ones, see `skin.settings.read_settings`.
 
     Raises:
-      ValueError: noise that is negative, or a way that the skin cannot follow.
+      ValueError: negative noise, or a path that the skin cannot follow.
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ValueError(f"noise is {noise}: pass a standard deviation in newtons, 0 or more")

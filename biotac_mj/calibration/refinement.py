@@ -1,5 +1,4 @@
-"""A finer mesh of the same body, for fits that are to know the material and not the stiffness of their own
-mesh."""
+"""A finer mesh of the same body, for fits of the material without the discretisation error of their mesh."""
 
 import dataclasses
 
@@ -16,13 +15,13 @@ _PREFIX = "refined:"
 
 
 def skin(name: str) -> SkinGeometry:
-    """A skin as `load_skin` knows it, or the refined one: "refined:default"."""
+    """A skin for `load_skin`, or a refined one: "refined:default"."""
     return refined(load_skin(name.removeprefix(_PREFIX))) if name.startswith(_PREFIX) else load_skin(name)
 
 
 def refined(geometry: SkinGeometry) -> SkinGeometry:
-    """Every ten-node tetrahedron cut into eight along its own curves; held where the new nodes, too, touch
-    the rigid bodies.
+    """Every ten-node tetrahedron cut into eight along its own curves; new nodes on the rigid bodies are fixed
+    too.
 
     Raises:
       ValueError: four-node tetrahedra.

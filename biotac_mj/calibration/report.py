@@ -1,4 +1,4 @@
-"""What a fit and a comparison leave behind: tables, JSON and a picture."""
+"""Reports of fits and comparisons: tables, JSON and a picture."""
 
 import dataclasses
 import json
@@ -21,7 +21,7 @@ _UNITS = {
 
 
 def calibration_table(result: Calibration) -> str:
-    """The result in words."""
+    """The result as text."""
     liquid = "with liquid" if result.liquid else "without liquid"
     lines = [
         f"{result.configuration} on skin {result.skin}, {result.law}, {result.element} elements, "
@@ -51,7 +51,7 @@ def calibration_table(result: Calibration) -> str:
 
 
 def plain(value):
-    """The value as JSON has it."""
+    """The value as JSON types."""
     if dataclasses.is_dataclass(value):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):
@@ -68,14 +68,14 @@ def plain(value):
 
 
 def write_json(content: dict, path: pathlib.Path | str) -> None:
-    """A dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite become
-    null."""
+    """Writes a dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite
+    become null."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
 
 
 def write_picture(result: Calibration, path: pathlib.Path | str) -> None:
-    """Measured and fitted force over time, and what is left."""
+    """Measured and fitted force over time, and the residual."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,10 +1,10 @@
-"""What a fit's residual says: how sure the parameters are, and whether anything is left in it."""
+"""Statistics of a fit's residual: covariance of the parameters, and a test of whiteness."""
 
 import numpy as np
 
 __all__ = ["covariance", "ljung_box"]
 
-# statsmodels has both (S_hac_simple, acorr_ljungbox) and needs pandas, which nothing else here does
+# statsmodels has both (S_hac_simple, acorr_ljungbox) but needs pandas, which nothing else here needs
 
 
 def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -22,7 +22,7 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
       white (p, p), robust (p, p), lags.
 
     Raises:
-      ValueError: not more numbers than parameters, or a parameter that the forces do not depend on.
+      ValueError: no more numbers than parameters, or a parameter on which the forces do not depend.
     """
     n, m, p = jacobian.shape
     if n * m <= p or n <= p:
@@ -46,7 +46,7 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
 
 
 def ljung_box(residual: np.ndarray, lags: int | None = None) -> dict:
-    """Ljung and Box's test (Biometrika 65, 1978) that a residual (n, m) is white, each component for itself.
+    """Ljung-Box test (Biometrika 65, 1978) of the whiteness of a residual (n, m), per component.
 
     Args:
       lags: None takes min(10, n // 5).
@@ -62,7 +62,7 @@ def ljung_box(residual: np.ndarray, lags: int | None = None) -> dict:
         raise ValueError(
             f"{n} samples are too few for {lags} lags of the whiteness test: record at least 5 samples"
         )
-    from scipy.special import chdtrc  # not scipy.stats, which takes a second to import
+    from scipy.special import chdtrc  # scipy.stats takes a second to import
 
     centred = residual - residual.mean(0)
     power = (centred**2).sum(0)

@@ -1,4 +1,4 @@
-"""What `biotac lab calibrate` and `biotac lab compare` do with their arguments."""
+"""Runs `biotac lab calibrate` and `biotac lab compare`."""
 
 import argparse
 import pathlib
@@ -21,7 +21,7 @@ from .report import calibration_table, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
 
-# what is of the synthetic skin alone, and what it is where nothing is said
+# arguments for the synthetic skin only, and their defaults
 _TRUTH = {
     "truth": "rubber",
     "truth_skin": "default",
@@ -41,11 +41,11 @@ _NO_SETTINGS = (
     "quiet",
     "device",
     "verb",
-)  # what finished parts of a comparison do not depend on
+)  # arguments that the results of a comparison do not depend on
 
 
 def _complete(args, defaults, used, remedy):
-    """Puts the defaults in; ValueError of what is given and not used."""
+    """Sets defaults; raises ValueError for arguments that have no effect."""
     for name, value in defaults.items():
         if getattr(args, name) is None:
             setattr(args, name, value)
@@ -56,16 +56,16 @@ def _complete(args, defaults, used, remedy):
 def _body(name, skin, liquid, options):
     """A configuration with the options of the command line."""
     given = read_dict(options, "options")
-    modulus = read_settings(None, given).modulus  # refuses what is unknown
+    modulus = read_settings(None, given).modulus  # raises for unknown names
     return configuration(name, skin, modulus, **{"liquid": liquid, **plain(given.get("skin") or {})})
 
 
 def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
-    """`biotac lab calibrate`; raises ValueError or FileNotFoundError for what cannot be.
+    """`biotac lab calibrate`; raises ValueError or FileNotFoundError for invalid input.
 
     Args:
-      forces_of: (configuration, material, parameters, indentation, device) -> what `calibrate` takes as its
-        forces, and what its slopes are by.
+      forces_of: (configuration, material, parameters, indentation, device) -> the argument `forces` of
+        `calibrate`, and the name of its method for derivatives.
     """
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
@@ -117,10 +117,10 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
 
 
 def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
-    """`biotac lab compare`; raises ValueError or FileNotFoundError for what cannot be. forces_of: see
+    """`biotac lab compare`; raises ValueError or FileNotFoundError for invalid input. forces_of: see
     `calibrate_verb`.
 
-    Called again with the same settings and folder it goes on where it was stopped.
+    When called again with the same settings and folder, it continues.
     """
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")

@@ -1,5 +1,4 @@
-"""The `biotac` command: one verb per job. The work of a verb lives in its folder and is loaded when the verb
-is used."""
+"""The `biotac` command: one verb per job. The work of a verb is in its folder, which is imported on use."""
 
 import contextlib
 import errno
@@ -51,7 +50,7 @@ _GROUPS = {
 }
 
 
-@functools.cache  # 26 verbs with 300 options: longer than many a verb takes to refuse bad input
+@functools.cache  # 26 verbs with 300 options take longer than many a verb's check of bad input
 def parser() -> Parser:
     """The command line."""
     from .. import __version__
@@ -86,7 +85,7 @@ def parser() -> Parser:
     return top
 
 
-# what is said of errors of the system beside their own text
+# remedies for errors of the operating system
 _REMEDIES = {
     errno.ENOSPC: "free some space on that disk, or choose another --out",
     errno.EDQUOT: "free some of your quota, or choose another --out",
@@ -110,7 +109,7 @@ def _said(error) -> str:
     return " ".join(text.split())
 
 
-# packages that verbs load when they are used, and the extra that brings each
+# packages that verbs import on use, and the extra that installs each
 _EXTRAS = dict.fromkeys(("torch", "safetensors"), "learning") | {
     "dm_control": "control",
     "gymnasium": "gymnasium",
@@ -136,8 +135,8 @@ def _unexpected(error: Exception) -> int:
 
 @contextlib.contextmanager
 def _tidy(ended):
-    """SIGTERM stops a verb as Ctrl-C does, so that what is half written or at work for it goes too; it is
-    noted in the list `ended`."""
+    """Makes SIGTERM stop a verb like Ctrl-C, so that unfinished files and processes are cleaned up; the
+    signal is noted in the list `ended`."""
 
     def end(number, frame):
         ended.append(number)
@@ -156,9 +155,10 @@ def _tidy(ended):
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a verb; bad input is one line on stderr and exit code 2.
 
-    What nobody expected is one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows all.
+    Unexpected errors are one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows the
+    traceback.
     """
-    for name in ("stdout", "stderr"):  # None where it is closed, as for some services
+    for name in ("stdout", "stderr"):  # None if closed, as in some services
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))
     ended = []
@@ -167,7 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             args = parser().parse_args(argv)
             args.run(args)
             sys.stdout.flush()
-    except BrokenPipeError:  # who read the output has left
+    except BrokenPipeError:  # the reader of the output is gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, OSError, MemoryError) as error:

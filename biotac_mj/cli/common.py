@@ -10,7 +10,7 @@ __all__ = ["add_options", "add_sensor", "add_skin", "add_verb", "choice"]
 
 
 class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Defaults where they say something."""
+    """Adds informative defaults to the help."""
 
     def _get_help_string(self, action):
         if isinstance(action.default, list):
@@ -30,7 +30,7 @@ def add_verb(
 
 
 def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise") -> None:
-    """Adds the skin, its rubber, tier, device and the seed; seed: what it is of."""
+    """Adds the skin, its rubber, tier, device and the seed; seed: its purpose."""
     verb.add_argument(
         "--skin",
         default="default",
@@ -59,7 +59,7 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
 
 
 def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
-    """Adds whose sensor it is, and of what `touched` is made."""
+    """Adds the sensor, and the material of `touched`."""
     verb.add_argument(
         "--sensor",
         type=choice,
@@ -110,7 +110,7 @@ def choice(text: str) -> str | dict:
 
 
 class _Drawn(argparse.Action):
-    """One value; of several, a list of which one is drawn."""
+    """One value, or a list of values from which one is drawn."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: list, option: str

@@ -1,4 +1,4 @@
-"""Names that the help shows without loading what defines them (tests hold them together)."""
+"""Names in the help, without importing the modules that define them (tests compare them)."""
 
 __all__ = [
     "INDENTER_HELP",

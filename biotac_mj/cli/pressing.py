@@ -10,7 +10,7 @@ from .names import INDENTER_HELP, LOCATION_HELP, TASKS
 
 __all__ = ["add_design", "add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
 
-_LONGEST_STEP = 0.1  # [s] quasi-static presses inside take longer ones
+_LONGEST_STEP = 0.1  # [s] quasi-static presses use longer internal steps
 
 
 def add_press(verbs: argparse._SubParsersAction) -> None:
@@ -127,7 +127,7 @@ def _press(args):
         depth=args.depth,
         slide=args.slide,
         slide_direction=tuple(args.slide_direction),
-        # what is as by default is left to the file of the effects
+        # defaults are taken from the effects' file
         material=None if args.material == "default" else args.material,
         liquid=args.liquid,
         skin=None if args.skin == "default" else args.skin,
@@ -238,7 +238,7 @@ def _view(args):
 
 
 def _seen(args):
-    """The skin that is shown."""
+    """The displayed skin."""
     check_device(args.device)
     names = ("skin", "tier", "material", "liquid", "seed", "device", "options")
     return {name: getattr(args, name) for name in names}

@@ -1,4 +1,4 @@
-"""Fits one state of the skin to every row of a recording, one set of constants of the sensor to all rows."""
+"""Fits a state of the skin to each row of a recording, and constants of the sensor to all rows."""
 
 import dataclasses
 import typing
@@ -10,29 +10,29 @@ from .response import Loaded, Response
 
 __all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
 
-_COUNTS = 20.0  # [counts] of an electrode that weigh as much as one sigma of a force or a prior
-_TOGETHER = 25  # rows that count as one against the priors: a model's errors hardly change from row to row
-_STEPS, _LEAST = 40, 16  # joint steps at most, and before which none is the last
-_NESTED = 8  # the latter where the search goes on from a model that this one contains
-_AGAIN = (6, 14)  # steps before which all states are sought anew: some began in the wrong valley
-_STARTS = 3  # directions of the table from which a row's state is sought
+_COUNTS = 20.0  # [counts] error of an electrode that weighs as much as one sigma of a force or a prior
+_TOGETHER = 25  # rows per independent one, relative to the priors: model errors hardly change between rows
+_STEPS, _LEAST = 40, 16  # most and fewest joint steps
+_NESTED = 8  # fewest steps if the search starts from a nested model
+_AGAIN = (6, 14)  # steps before which all states are searched globally, as some are in a local minimum
+_STARTS = 3  # starting directions from the table for each row's state
 
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What a fit may change, and what is known before.
+    """Free quantities of a fit, and their priors.
 
     Attributes:
       gains: sigma of the electrodes' factors on their change of ln Z about 1; 0: they are 1.
-      offsets: sigma of ln Z at rest about the mean of the published sensors, all electrodes' common level
-        free (the three published sensors scatter by 0.13 RMS).
+      offsets: sigma of ln Z at rest about the mean of the published sensors, with a free common level (the
+        three published sensors scatter by 0.13 RMS).
       drift: sigma of the size a of a common change of ln Z, a (1 - exp(-t / tau)) (warm-up, published -0.23);
         0: none.
-      shear: [N] sigma of the plate's tangential force against the measured one; 0: it is not looked at.
-      modulus: Young's modulus at which the search begins [Pa]. hold_modulus: it is known.
+      shear: [N] sigma of the plate's tangential force about the measured one; 0: not used.
+      modulus: initial Young's modulus [Pa]. hold_modulus: it is fixed.
       spread: sigma of the states about the middle of the table, in half widths of its axes; weak.
-      memory: sigma of the fraction of the load that answers as it was, see `Rows.past`; 0: none.
-      amount: sigma of how much of each of the response's changes there is; 0: none of them.
+      memory: sigma of the fraction of the load with a delayed response, see `Rows.past`; 0: none.
+      amount: sigma of the amount of each of the response's changes; 0: none.
     """
 
     gains: float = 0.3
@@ -53,7 +53,7 @@ class Rows:
     Attributes:
       counts: (n, nelectrode). force: (n, 3) of the plate on the skin, along the finger (towards the tip),
         across (to +z), pressing [N]. time: (n,) as a fraction of the recording.
-      past: (n,) what has pressed before, as rubber that creeps remembers it [N]; None: not known.
+      past: (n,) load history as creeping rubber remembers it [N]; None: unknown.
     """
 
     counts: np.ndarray
@@ -66,7 +66,7 @@ class Rows:
         return Rows(self.counts[which], self.force[which], self.time[which], past)
 
     def pressing(self, memory: float) -> np.ndarray:
-        """(n,) [N] that the skin answers to, a fraction of it as it was."""
+        """(n,) effective load [N] on the skin with a delayed fraction."""
         now = self.force[:, 2]
         return now if self.past is None else now + memory * (self.past - now)
 
@@ -75,8 +75,8 @@ class Rows:
 
 
 class _Places(typing.NamedTuple):
-    """Where constants lie in their vector: of the electrodes offset and gain; drift, ln of the modulus,
-    memory, and how much of each of the response's changes there is."""
+    """Positions of constants in their vector: offset and gain of the electrodes; drift, ln of the modulus,
+    memory, and amounts of the response's changes."""
 
     offset: slice
     gain: slice
@@ -93,12 +93,12 @@ class _Places(typing.NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Constants:
-    """Of one sensor, for all rows.
+    """Constants of one sensor, common to all rows.
 
     Attributes:
       offset: (nelectrode,) ln Z at rest at the first row. gain: (nelectrode,) on its change. drift: size a,
-        ln tau (tau as a fraction of the recording). modulus: Young's modulus [Pa]. memory: share of the load
-        that answers as it was. amount: (k,) of each of the response's changes.
+        ln tau (tau as a fraction of the recording). modulus: Young's modulus [Pa]. memory: fraction of the
+        load with a delayed response. amount: (k,) of each of the response's changes.
     """
 
     offset: np.ndarray
@@ -113,7 +113,7 @@ class Constants:
         return self.drift[0] * (1 - np.exp(-time / np.exp(self.drift[1])))
 
     def log_z(self, change: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """(n, nelectrode) of changes (n, nelectrode) by the skin's state."""
+        """(n, nelectrode) ln Z from changes (n, nelectrode) by the skin's state."""
         return self.offset + self.gain * change + self.drifted(time)[:, None]
 
     @property
@@ -126,7 +126,7 @@ class Constants:
         return _Places.of(len(self.offset))
 
     def _like(self, vector):
-        """Those of a vector of as many."""
+        """Constants from a vector of the same length."""
         at = self._places
         drift, modulus, memory = vector[at.drift], vector[at.modulus], vector[at.memory]
         drift = np.array([drift[0], np.clip(drift[1], -3.0, 1.0)])
@@ -136,7 +136,7 @@ class Constants:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Match:
-    """Rows with their states.
+    """Fitted states of rows.
 
     Attributes:
       state: (n, 4) pitch, roll [rad], drag along and across. counts: (n, nelectrode) of the model. force:
@@ -150,16 +150,16 @@ class Match:
 
 
 # scipy.optimize.least_squares with this Jacobian as a sparse matrix takes as long to the same cost (170
-# synthetic rows, 1.7 s). The states would still be sought anew in between, and its bounds refuse states that
-# cannot move, as the drags of a table that was made without.
+# synthetic rows, 1.7 s). It would not replace the global search of states, and its bounds reject fixed
+# states, such as drags of a table without drag.
 def fit_constants(
     response: Response, rows: Rows, setup: Setup, begin: tuple[Constants, np.ndarray] | None = None
 ) -> tuple[Constants, Match]:
-    """Constants and the states of all rows together: Gauss and Newton, the states eliminated in each step.
+    """Fits constants and the states of all rows jointly: Gauss-Newton with the states eliminated in each
+    step.
 
     Args:
-      begin: constants and states (n, 4) from which to begin, as of a model that this one contains; None seeks
-        them.
+      begin: initial constants and states (n, 4), for example of a nested model; None: global search.
     """
     const, state = begin or (_begin(response, rows, setup), None)
     more = len(response.changes) - len(const.amount)
@@ -193,11 +193,11 @@ def fit_states(
     electrodes: np.ndarray | None = None,
     also: np.ndarray | None = None,
 ) -> Match:
-    """The best state of every row for constants that are known.
+    """The best state of every row for known constants.
 
     Args:
-      electrodes: numbers of those that are looked at; None: all.
-      also: (n, 4) states to begin from beside the table's best nodes.
+      electrodes: numbers of the used ones; None: all.
+      also: (n, 4) further starting states in addition to the table's best nodes.
     """
     problem = _Problem(response, rows, const, setup, electrodes)
     starts = problem.best_nodes(const)
@@ -213,8 +213,8 @@ def fit_states(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Now:
-    """Where a search is: states, constants, values (n, nelectrode + 2), residuals (n, m), their slopes over
-    the states (n, m, 4), the cost."""
+    """State of the search: states, constants, values (n, nelectrode + 2), residuals (n, m), their derivatives
+    by the states (n, m, 4), cost."""
 
     state: np.ndarray
     const: Constants
@@ -225,7 +225,7 @@ class _Now:
 
 
 class _Problem:
-    """Residuals of rows and their slopes."""
+    """Residuals of rows and their derivatives."""
 
     def __init__(self, response, rows, const, setup, electrodes=None):
         self.response, self.rows, self.setup = response, rows, setup
@@ -247,8 +247,7 @@ class _Problem:
         return self.response.at_load(self.rows.pressing(const.memory) / const.modulus, const.amount)
 
     def residuals(self, value, state, const):
-        """(n, m): electrodes in counts, then shear and prior in the same measure; and counts (n,
-        nelectrode)."""
+        """(n, m): electrodes in counts, then shear and prior in the same unit; and counts (n, nelectrode)."""
         counts = counts_from_log_impedance(const.log_z(value[:, :-2], self.rows.time))
         r = [(counts - self.rows.counts)[:, self.electrodes], self._pull * (state - self._middle)]
         if self.setup.shear:
@@ -257,7 +256,7 @@ class _Problem:
         return np.concatenate(r, 1), counts
 
     def state_slopes(self, slope, counts, const):
-        """(n, m, 4) of the residuals from those of the response (n, nelectrode + 2, 4)."""
+        """(n, m, 4) derivatives of the residuals from those of the response (n, nelectrode + 2, 4)."""
         J = [((_slope(counts) * const.gain)[..., None] * slope[:, :-2])[:, self.electrodes]]
         J.append(np.broadcast_to(np.diag(self._pull), (len(counts), 4, 4)))
         if self.setup.shear:
@@ -272,7 +271,7 @@ class _Problem:
         return _Now(state, const, value, r, self.state_slopes(slope, counts, const), cost)
 
     def step(self, now, damp):
-        """New states and constants, the damped least squares of all residuals (Schur's complement)."""
+        """New states and constants: damped least squares of all residuals (Schur complement)."""
         Js, r, free = now.Js, now.r, self._free
         Jc = self._constant_slopes(now)[..., free]
         P = self._prior[:, free]
@@ -294,7 +293,7 @@ class _Problem:
         return state, now.const._like(vector)
 
     def _constant_slopes(self, now):
-        """(n, m, nconstant) of the residuals by the constants."""
+        """(n, m, nconstant) derivatives of the residuals by the constants."""
         const, time = now.const, self.rows.time
         counts = counts_from_log_impedance(const.log_z(now.value[:, :-2], time))
         vector, at, n = const._vector, const._places, len(const.offset)
@@ -304,14 +303,14 @@ class _Problem:
         ratio, tau = np.exp(-time / np.exp(const.drift[1])), np.exp(const.drift[1])
         J[:, :n, at.drift.start] = slope * (1 - ratio)[:, None]
         J[:, :n, at.drift.start + 1] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
-        for i in self._free[self._free >= at.modulus]:  # what moves the table itself
+        for i in self._free[self._free >= at.modulus]:  # constants that change the table
             there = const._like(vector + _PROBE * (np.arange(len(vector)) == i))
             value, _ = self._at(there)(now.state, False)
             J[..., i] = (self.residuals(value, now.state, there)[0] - now.r) / _PROBE
         return J
 
     def descend(self, state, const, steps=12):
-        """Levenberg and Marquardt, every row by itself: states (n, 4), costs (n,)."""
+        """Levenberg-Marquardt for each row separately: states (n, 4), costs (n,)."""
         loaded, damp = self.loaded(const), np.full(len(state), 1e-2)
 
         def look(state):
@@ -333,7 +332,7 @@ class _Problem:
         return state, cost
 
     def best_nodes(self, const):
-        """(_STARTS, n, 4) nodes of the table nearest to each row, of different directions."""
+        """(_STARTS, n, 4) nodes of the table nearest to each row, in different directions."""
         loaded, out = self.loaded(const), np.zeros((_STARTS, len(self.rows), 4))
         nodes = self.response.nodes
         for n, row in enumerate(loaded.table):
@@ -350,7 +349,7 @@ class _Problem:
         return out
 
 
-_PROBE = 1e-2  # of ln E, memory and amounts, for a difference
+_PROBE = 1e-2  # finite difference of ln E, memory and amounts
 
 
 def _slope(counts):
@@ -359,12 +358,12 @@ def _slope(counts):
 
 
 def _known_rest(design):
-    """(nelectrode,) mean ln Z at rest of the sensors that are known."""
+    """(nelectrode,) mean ln Z at rest of the known sensors."""
     return np.mean([log_impedance(counts) for counts in design.rests], axis=0)
 
 
 def _prior(setup, const, design):
-    """Which constants are free (k,), and the priors' matrix and right side: residuals P vector - at."""
+    """Free constants (k,), and matrix and right-hand side of the priors: residuals P vector - at."""
     weight, size = _COUNTS * np.sqrt(_TOGETHER), len(const._vector)
     n, place = design.nelectrode, const._places
     free = [np.arange(n)]
@@ -391,11 +390,12 @@ def _prior(setup, const, design):
     return np.concatenate(free), np.concatenate(P), np.concatenate(at)
 
 
-_TAU = 0.4  # of the recording: where the search for the drift's time constant begins, known to a factor e
+_TAU = 0.4  # initial time constant of the drift over the length of the recording, sigma a factor e
 
 
 def _begin(response, rows, setup):
-    """Constants from the known rest, its common level such that the table's best nodes fit the rows."""
+    """Constants from the known baseline, with a common level such that the table's best nodes fit the
+    rows."""
     start = np.array([0.0, np.log(_TAU)])
     none = np.zeros(len(response.changes))
     rest = _known_rest(response.states.design)

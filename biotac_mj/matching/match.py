@@ -1,4 +1,4 @@
-"""How well the sensor's model matches a recording of a flat press, judged on its last part."""
+"""Match of the sensor's model with a recording of a flat press, evaluated on its last part."""
 
 import dataclasses
 
@@ -12,23 +12,23 @@ from .states import PlateStates
 
 __all__ = ["HELD_OUT", "SIGNS", "Scores", "log_changes", "match", "rows_of"]
 
-_LOADED = 0.5  # [N] of force from which a row counts as loaded
-_TRAIN_FRACTION = 0.7  # of the rows, in time, that constants are fitted on
-_FEWEST = 40  # loaded rows that are compared
+_LOADED = 0.5  # [N] least force of a loaded row
+_TRAIN_FRACTION = 0.7  # fraction of the rows, in time, for fitting constants
+_FEWEST = 40  # least number of loaded rows
 HELD_OUT = (1, 7, 8, 12, 16)  # of e2 e8 e9 e13 e17: sides, tip and pad
-_TRIED = 13  # loads from which a row's force is sought, by a factor 10 below the largest
-FREE = 4  # numbers of a row's state
+_TRIED = 13  # candidate loads for a row's force, down to a tenth of the largest
+FREE = 4  # degrees of freedom of a row's state
 
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Measured against modelled change of the counts from rest.
+    """Errors of the model for changes of the counts from rest.
 
     Attributes:
-      correlation_median, correlation_low: over the electrodes of a row, median and lowest tenth of the rows.
-      rms_counts: root mean square of the difference. rms_rel: over that of the measured change.
-      rms_rel_mean: over that of the measured counts about their mean in the fitted part, which no fitted rest
-        can flatter.
+      correlation_median, correlation_low: over the electrodes of a row; median and lowest tenth of the rows.
+      rms_counts: root mean square of the error. rms_rel: relative to that of the measured change.
+      rms_rel_mean: relative to that of the measured counts about their mean in the fitted rows, which is
+        independent of the fitted baseline.
     """
 
     correlation_median: float
@@ -89,10 +89,10 @@ def match(
     """Fits constants to the first 70 % of rows and judges states of the last 30 %.
 
     Args:
-      alone: whether the force is sought from the electrodes alone, too.
+      alone: whether the force is also estimated from the electrodes only.
 
     Returns:
-      What `benchmarks/real_match.py` writes, and the constants.
+      content of `benchmarks/real_match.py`'s output, and the constants.
     """
     setup = setup or Setup()
     cut = int(_TRAIN_FRACTION * len(rows))
@@ -126,10 +126,10 @@ def match(
 
 
 def _force_alone(response, first, fitted, rows, const, setup):
-    """RMSE [N] along, across, pressing, of the force that the electrodes alone suggest, and its spread.
+    """RMSE [N] along, across, pressing, of the force estimated from the electrodes only, and its spread.
 
-    The best of several loads, a parabola through the best three. A load is as likely as the first rows' are,
-    and electrodes err by what the first rows are off."""
+    The best of several loads, refined by a parabola. The prior of a load is its frequency in the first rows,
+    and the electrodes' error is that of the first rows."""
     blind = dataclasses.replace(setup, shear=0.0)
     top = first.force[:, 2].max()
     loads = np.geomspace(top / 10, top * 1.2, _TRIED)

@@ -1,4 +1,4 @@
-"""What electrodes and force plate say in a table of states, between its nodes too."""
+"""Response of electrodes and force plate, interpolated in a table of states."""
 
 import copy
 import dataclasses
@@ -12,10 +12,10 @@ __all__ = ["Loaded", "Response"]
 
 
 class Response:
-    """Change of ln Z and tangential forces over pitch, roll and drag, at loads that are known.
+    """Change of ln Z and tangential forces over pitch, roll and drag, at known loads.
 
-    Cubic splines over the angles, the logarithm of the load and each drag, of which the changes
-    add. Rolls to the other side are the mirror image.
+    Cubic splines over the angles, the logarithm of the load and each drag, whose contributions add. Rolls to
+    the other side are mirror images.
 
     Args:
       states: the table. log_z: (npitch, nroll, npath, nload, nelectrode) change of ln Z in its states.
@@ -23,8 +23,9 @@ class Response:
     Attributes:
       states, log_z: as given.
       axes: nodes of pitch and roll (both sides). drag_paths: (npath, 2) drags. nodes: (ndirection, npath, 4)
-        states of the table. low, high: (4,) ends of a state. changes: (k, nload, npitch, nroll, npath,
-        nelectrode + 2) that the table may have in part, see `with_changes`.
+        states of the table. low, high: (4,) bounds of a state. changes: (k, nload, npitch, nroll, npath,
+          nelectrode + 2) partial
+        changes of the table, see `with_changes`.
     """
 
     def __init__(self, states: PlateStates, log_z: np.ndarray):
@@ -46,7 +47,7 @@ class Response:
         self.drag_paths, self.splines = grid.drag_paths, [_cardinal(axis) for axis in self.axes]
         node = np.unique(np.concatenate([[0.0], grid.drag, -np.array(grid.drag)]))
         self.over_drag = _cardinal(node) if grid.drag else None
-        # where the splines' weights of these nodes go among the ways, along and across
+        # positions of these nodes' spline weights among the paths, along and across
         self.path_of = [np.abs(node[:, None] - grid.drag_paths[:, i]).argmin(1) for i in (0, 1)]
         direction = np.stack(np.meshgrid(*self.axes, indexing="ij"), -1).reshape(-1, 1, 2)
         shape = len(direction), len(self.drag_paths), 2
@@ -57,8 +58,8 @@ class Response:
         self.changes = np.zeros((0, *self._table.shape))
 
     def with_changes(self, *pairs: tuple["Response", "Response"]) -> "Response":
-        """This response, and from it to others: a pair is what it is on some grid, which may be coarser, and
-        what it would be there. An amount of 1 of a change is all of it."""
+        """This response with optional changes: a pair is the response on some grid, which may be coarser,
+        without and with a change. An amount of 1 is the whole change."""
         out, nodes = copy.copy(self), self.nodes.reshape(-1, 4)
         new = np.empty((len(pairs), *self._table.shape))
         for change, (here, there) in zip(new, pairs):
@@ -76,7 +77,7 @@ class Response:
         return out
 
     def amended(self, amount: np.ndarray) -> "Response":
-        """The response that has amounts (k,) of its changes for good."""
+        """The response with fixed amounts (k,) of its changes."""
         out = copy.copy(self)
         out._table = self._table + np.tensordot(amount, self.changes, 1)
         out.changes = self.changes[:0]
@@ -87,7 +88,7 @@ class Response:
         changes."""
         inside = np.clip(np.log(np.maximum(load, 1e-30)), self._log_load[0], self._log_load[-1])
         weight = self._over_load(inside)
-        small = np.minimum(load / self._first, 1.0)  # below the first load in proportion
+        small = np.minimum(load / self._first, 1.0)  # proportional below the first load
         whole = self._table
         if np.any(amount):
             whole = whole + np.tensordot(amount, self.changes, 1)
@@ -104,7 +105,7 @@ class Loaded:
 
     def __call__(self, state: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
         """Values (n, nelectrode + 2) at states (n, 4) (pitch, roll, drag along and across): ln Z, then forces
-        along and across over E; and slopes (n, nelectrode + 2, 4)."""
+        along and across over E; and derivatives (n, nelectrode + 2, 4)."""
         pitch, roll = (
             [spline(state[:, i]), spline(state[:, i], 1)] for i, spline in enumerate(self.response.splines)
         )
@@ -118,11 +119,12 @@ class Loaded:
         return value, np.concatenate([np.stack(angles, -1), np.einsum("nwi,nwc->nci", turn, here)], -1)
 
     def _sum(self, pitch, roll):
-        """(n, npath, nelectrode + 2) of the table with weights over its directions."""
+        """(n, npath, nelectrode + 2) interpolation of the table over its directions."""
         return np.einsum("nj,njwc->nwc", roll, np.einsum("ni,nijwc->njwc", pitch, self.table)).astype(float)
 
     def _over_paths(self, drag):
-        """Weights (n, npath) of splines in each drag (n, 2), which add, and their slopes (n, npath, 2)."""
+        """Weights (n, npath) of splines in each drag (n, 2), which add, and their derivatives (n, npath,
+        2)."""
         response = self.response
         drag_path, slope = (
             np.zeros((len(drag), len(response.drag_paths))),
@@ -137,5 +139,5 @@ class Loaded:
 
 
 def _cardinal(node):
-    """Cubic spline whose values at places (n,) are the weights (n, len(node)) of values at the nodes."""
+    """Cardinal cubic splines: values at points (n,) are weights (n, len(node)) on the values at the nodes."""
     return CubicSpline(node, np.eye(len(node)), bc_type="not-a-knot")

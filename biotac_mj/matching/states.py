@@ -1,10 +1,9 @@
-"""A table of states of the skin under a flat plate: which way the plate faces, how it was dragged while it
-came, how hard it presses.
+"""A table of states of the skin under a flat plate: direction of the plate, drag during the approach, load.
 
-A large plate has no place of its own: where it touches follows from which way it faces. So a state has four
-numbers beside the force (pitch, roll and two of the drag), and the force, which is measured, is a coordinate
-of the table and not a result. Forces are told by Young's modulus: with a liquid that keeps its volume and a
-contact in proportion to E, a skin twice as stiff has the same shapes at twice the force."""
+A large plate has no location of its own: its contact follows from its direction. So a state has four numbers
+besides the force (pitch, roll and two drags), and the force, which is measured, is a coordinate of the table
+instead of a result. Forces are divided by Young's modulus: with a liquid of constant volume and a contact
+stiffness proportional to E, a skin twice as stiff has the same shapes at twice the force."""
 
 import dataclasses
 
@@ -19,21 +18,21 @@ from ..skin.model import filled
 
 __all__ = ["PlateGrid", "PlateStates", "plate_states"]
 
-_STRIDE = 1.6e-4  # [m] of a step towards the core
-_DEEPEST = 4.5e-3  # [m] from the first touch: beyond skin and gap
-_LOST = 3  # steps without a balance after which a path ends
+_STRIDE = 1.6e-4  # [m] step towards the core
+_DEEPEST = 4.5e-3  # [m] from first touch: more than skin and gap
+_LOST = 3  # steps without equilibrium that end a path
 
 
 @dataclasses.dataclass(frozen=True)
 class PlateGrid:
-    """Where a table has states.
+    """Grid of a table of states.
 
     Attributes:
-      pitch: angle of the plate from the pad towards the tip [rad], rising.
+      pitch: angle of the plate from the pad towards the tip [rad], increasing.
       roll: of the plate about the finger's axis, to +z, from 0 on [rad]; the other side is the mirror image.
-      drag: tangential over normal motion of the plate, rising and above 0: each direction is met straight
-        and with these drags to both sides along the finger and across it; () leaves drag out.
-      load: normal force over Young's modulus, rising [m^2].
+      drag: ratio of tangential and normal motion of the plate, increasing and above 0: each direction is
+        approached straight and with these drags to both sides, along the finger and across it; (): no drag.
+      load: normal force over Young's modulus, increasing [m^2].
     """
 
     pitch: tuple = tuple(np.radians([0, 5, 9, 14, 20, 30]).tolist())
@@ -67,12 +66,12 @@ class PlateStates:
 
     Attributes:
       grid: its axes.
-      node: (n,) nodes of the skin's inner surface. rest: (n, 3) their places at rest [m].
-      xpos: (npitch, nroll, npath, nload, n, 3) their places [m], single precision.
+      node: (n,) nodes of the skin's inner surface. rest: (n, 3) their rest positions [m].
+      xpos: (npitch, nroll, npath, nload, n, 3) their positions [m], single precision.
       force: (..., nload, 3) of the plate on the skin over Young's modulus, along the finger (towards the
         tip), across (to +z), towards the core [m^2].
       pressure: (..., nload) of the liquid over Young's modulus.
-      reached: (npitch, nroll, npath) largest load of a path [m^2]; states beyond are its last.
+      reached: (npitch, nroll, npath) largest load of a path [m^2]; states beyond repeat its last.
       depth: (..., nload) travel of the plate towards the core from first touch [m].
       design: of the skin.
     """
@@ -88,10 +87,10 @@ class PlateStates:
     design: Design = BIOTAC
 
     def on(self, grid: PlateGrid) -> "PlateStates":
-        """Those on a grid of some of its pitches, rolls and drags.
+        """The states on a subgrid in pitch, roll and drag.
 
         Raises:
-          ValueError: the grid has others, or other loads.
+          ValueError: the grid has other values, or other loads.
         """
         mine, found = self.grid, []
         pairs = (mine.pitch, grid.pitch), (mine.roll, grid.roll), (mine.drag_paths, grid.drag_paths)
@@ -107,8 +106,8 @@ class PlateStates:
 
 
 def frame(pitch: float, roll: float) -> np.ndarray:
-    """(3, 3) rows in the BioTac frame: towards the tip along the plate, across it (to +z), from the plate
-    towards the core."""
+    """(3, 3), rows in the BioTac frame: towards the tip along the plate, across it (to +z), from the plate to
+    the core."""
     sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
     inwards = np.array([sp, cp * cr, -cp * sr])
     along = np.array([-cp, sp * cr, -sp * sr])
@@ -122,16 +121,16 @@ def plate_states(
     grid: PlateGrid | None = None,
     quiet: bool = False,
 ) -> PlateStates:
-    """The table of a skin, kept on disk pitch by pitch: stopped, it goes on where it was. Skins that differ
-    in Young's modulus alone share it; of a filled one the table holds for a filling in proportion to E.
+    """The table of a skin, cached on disk pitch by pitch, so that an interrupted run continues. Skins that
+    differ only in Young's modulus share it; for a filled one the table holds for a filling proportional to E.
 
     Raises:
-      ValueError: a material that depends on time: states of a plate are those of rest.
+      ValueError: a rate-dependent material: states are equilibria.
     """
     grid, options = grid or PlateGrid(), filled(options or SkinOptions(), material)
     if material.remembers:
         raise ValueError("a table of states knows no time: leave prony, mullins and hysteresis out")
-    if not options.rest_pressure and options.contact_stiffness is None:  # else shapes do not go with E alone
+    if not options.rest_pressure and options.contact_stiffness is None:  # else shapes do not scale with E
         material = dataclasses.replace(material, youngs_modulus=Material().youngs_modulus)
     node = np.unique(geometry.inner_face)
     model = SkinModel(geometry, material, options)
@@ -152,7 +151,7 @@ def plate_states(
 
 
 def _press(model, node, axes, drag_paths, load):
-    """States along drag paths (npath, 2) of plates that face along axes (npath, 3, 3), a world for each: xpos
+    """States along drag paths (npath, 2) of plates with directions axes (npath, 3, 3), one per world: xpos
     (npath, nload, n, 3), force, pressure, depth, reached."""
     npath, E = len(drag_paths), model.material.youngs_modulus
     data = SkinData(model, npath)

@@ -1,6 +1,6 @@
-"""Sensor classes with the interfaces of other frameworks: `mjlab` inside mujoco_warp's step, `isaaclab`
-beside any physics that tells poses, and `ros`, which publishes a running simulation. All load where the
-framework is not installed."""
+"""Sensor classes with the interfaces of other frameworks: `mjlab` inside mujoco_warp's step, `isaaclab` with
+any physics that supplies poses, and `ros`, which publishes a running simulation. All can be imported without
+the framework."""
 
 import typing
 

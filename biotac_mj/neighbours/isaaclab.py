@@ -1,13 +1,13 @@
-"""A BioTac with the interface of Isaac Lab's sensors, beside a simulation that is not MuJoCo's.
+"""A BioTac with the interface of Isaac Lab's sensors, for a simulation other than MuJoCo's.
 
-`BioTacSensor` has the methods of `isaaclab.sensors.SensorBase` that a scene calls, and is no subclass of it:
-`SensorBase` needs a USD stage. `InteractiveScene` therefore does not make it from its configuration; put it
-there when the simulation is ready:
+`BioTacSensor` has the methods of `isaaclab.sensors.SensorBase` that a scene calls, but is no subclass of it,
+because `SensorBase` needs a USD stage. `InteractiveScene` therefore does not create it from its
+configuration; add it when the simulation is ready:
 
     scene.sensors["biotac"] = BioTacSensor(BioTacSensorCfg(model=model, poses=poses, num_envs=n))
 
-The scene then updates and resets it with its own. The skin is told where bodies are; what it answers lies in
-`forces`, for `set_external_force_and_torque` of the assets.
+The scene then updates and resets it with its own sensors. The skin gets the poses of bodies; its reaction is
+in `forces`, for `set_external_force_and_torque` of the assets.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["BioTacSensor", "BioTacSensorCfg"]
 
-_EARLY = 1e-6  # [s] a period is over so much before its end: sums of time steps err
+_EARLY = 1e-6  # [s] tolerance at the end of a period, for rounding errors of summed time steps
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -33,14 +33,14 @@ class BioTacSensorCfg:
     """Configuration.
 
     Attributes:
-      model: MjModel of the BioTac and of what can touch it, made with `biotac_mj.batch.add(spec,
+      model: MjModel of the BioTac and the objects that can touch it, made with `biotac_mj.batch.add(spec,
         coupling="one-way")`; its time step is the simulation's.
-      poses: () -> {body name: ((n, 3) [m], (n, 4) w x y z)} of the model's bodies that move, torch tensors in
-        one frame; bodies that are left out stay where the model has them.
+      poses: () -> {body name: ((n, 3) [m], (n, 4) w x y z)} of the model's moving bodies, torch tensors in
+        one frame; other bodies stay at their poses in the model.
       num_envs: n. device: of Warp and torch.
-      update_period: [s] between values of `data`, 0 for every step. prim_path, history_length, debug_vis: as
-        in `SensorBaseCfg`; no history is kept and nothing is drawn.
-      settings: further arguments of `biotac_mj.batch.make`, as {"skin": "coarse", "prefix": "biotac_"}.
+      update_period: [s] between updates of `data`, 0 for every step. prim_path, history_length, debug_vis: as
+        in `SensorBaseCfg`; there is no history and no drawing.
+      settings: further arguments of `biotac_mj.batch.make`, such as {"skin": "coarse", "prefix": "biotac_"}.
     """
 
     model: mujoco.MjModel
@@ -63,7 +63,7 @@ class BioTacSensor:
     """BioTacs of all environments.
 
     Raises:
-      ValueError: a setting that cannot be, or a history, which is not kept.
+      ValueError: an invalid setting, or a history.
     """
 
     has_debug_vis_implementation = False
@@ -94,12 +94,12 @@ class BioTacSensor:
 
     @property
     def is_initialized(self) -> bool:
-        """It is, once made."""
+        """Always True."""
         return True
 
     @property
     def num_instances(self) -> int:
-        """Sensors: one in each environment."""
+        """Number of sensors: one per environment."""
         return self.cfg.num_envs
 
     @property
@@ -109,14 +109,14 @@ class BioTacSensor:
 
     @property
     def data(self) -> BioTacData:
-        """As of each environment's last due update."""
+        """Readings at each environment's last due update."""
         return self._data
 
     @property
     def forces(self) -> dict[str, "torch.Tensor"]:
-        """{body name: (n, 6)} force and torque [N, N m] on the bodies that `poses` names and on what goes
-        with them, as the BioTac with its finger, at the named bodies' centres of mass, in the frame of the
-        poses, as of the last update."""
+        """{body name: (n, 6)} force and torque [N, N m] of the last update on the bodies in `poses` and on
+        those fixed to them, such as the BioTac with its finger, at the named bodies' centres of mass, in the
+        frame of the poses."""
         import torch
         import warp as wp
 
@@ -131,15 +131,15 @@ class BioTacSensor:
         return found
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
-        """False: nothing is drawn."""
+        """False: there is no drawing."""
         return False
 
     def update(self, dt: float, force_recompute: bool = False) -> None:
-        """After a step of the simulation. The skin is solved every time, as it has a memory; `data` is new
-        where the period is over.
+        """Call after a step of the simulation. The skin is solved every time, because it has memory; `data`
+        is updated when the period is over.
 
         Args:
-          dt: [s], the model's time step. force_recompute: new data everywhere.
+          dt: [s], the model's time step. force_recompute: update all data.
 
         Raises:
           ValueError: another time step, a body that the model does not have, or poses of another shape.
@@ -157,10 +157,10 @@ class BioTacSensor:
         self._elapsed[due] = 0.0
 
     def reset(self, env_ids: Sequence[int] | None = None, env_mask: object = None) -> None:
-        """Puts skins and clocks of some environments to rest: their next update is due.
+        """Resets skins and clocks of some environments; their next update is due.
 
         Args:
-          env_ids: their numbers, None for all. env_mask: (n,) of bool, in their place; of Warp, too.
+          env_ids: their numbers, None for all. env_mask: (n,) of bool instead, also of Warp.
         """
         if hasattr(env_mask, "numpy"):
             env_mask = env_mask.numpy()
@@ -169,7 +169,7 @@ class BioTacSensor:
         self._elapsed[mask.nonzero()[0]] = self.cfg.update_period
 
     def _place(self):
-        """Puts the bodies, and what is fixed to them, where `poses` says."""
+        """Moves the bodies, and those fixed to them, to `poses`."""
         model, n = self.cfg.model, self.cfg.num_envs
         there = [model.body(i).name for i in range(model.nbody)]
         told = self.cfg.poses()
@@ -191,7 +191,7 @@ class BioTacSensor:
             self._mat[:, body] = mat @ (back @ self._rest[1][body])
 
     def _carried(self, tops):
-        """(body, the nearest of `tops` that it is or is fixed to) of all that go with one of these."""
+        """(body, nearest of `tops` that it is or is fixed to) for all bodies fixed to one of these."""
         parent = self.cfg.model.body_parentid
         for body in range(1, self.cfg.model.nbody):
             top = body
@@ -201,7 +201,7 @@ class BioTacSensor:
                 yield body, top
 
     def _pose(self, pos, quat):
-        """(n, 3), (n, 3, 3) of positions and quaternions w x y z."""
+        """(n, 3), (n, 3, 3) from positions and quaternions w x y z."""
         import torch
 
         quat = quat / quat.norm(dim=1, keepdim=True)

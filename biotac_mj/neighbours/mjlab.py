@@ -2,8 +2,8 @@
 
     SceneCfg(sensors=(BioTacSensorCfg(name="biotac", body="robot/fingertip"),), ...)
 
-The interface is that of mjlab.sensor's `SensorCfg` and `Sensor`, which are neither imported nor inherited
-from: mjlab's scene calls their methods. The skin is two-way and part of `mujoco_warp.step`.
+The interface is that of mjlab.sensor's `SensorCfg` and `Sensor`, without import or inheritance: mjlab's scene
+calls their methods. The skin has two-way coupling and is part of `mujoco_warp.step`.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ class BioTacSensorCfg:
     """Configuration of one BioTac in every world.
 
     Attributes:
-      name: key in the scene, and with "_" the prefix of all that is added to the model.
-      body, site: where it goes, one of them, by its name in the scene, which begins with "ENTITY/".
+      name: key in the scene and, with "_", prefix of all names added to the model.
+      body, site: attachment, one of them, by its name in the scene, which begins with "ENTITY/".
       pos, quat: pose [m] of the BioTac frame there. skin, coupling, geoms: as for `batch.add`.
-      settings: further arguments of `batch.attach`, as {"material": "rubber", "seed": 1}.
+      settings: further arguments of `batch.attach`, such as {"material": "rubber", "seed": 1}.
     """
 
     name: str
@@ -54,9 +54,9 @@ class BioTacSensorCfg:
 class BioTacSensor:
     """Made by `BioTacSensorCfg.build`.
 
-    On CUDA mjlab captures its step before sensors are initialised: call `env.sim.create_graph()` once when
+    On CUDA mjlab captures its step before sensors are initialised: call `env.sim.create_graph()` once after
     the environment is made, else the captured step has no skin. The objects must be entities of the scene,
-    and `SimulationCfg.njmax` must leave six rows for each touching body.
+    and `SimulationCfg.njmax` must have room for six rows per touching body.
     """
 
     requires_sensor_context = False
@@ -66,7 +66,7 @@ class BioTacSensor:
         self._data, self._views = None, {}
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict) -> None:
-        """Adds the BioTac to the scene; entities are not looked at.
+        """Adds the BioTac to the scene; entities are not used.
 
         Raises:
           ValueError: see `batch.add`.
@@ -85,8 +85,8 @@ class BioTacSensor:
         )
 
     def initialize(self, mj_model: mujoco.MjModel, model: "mjw.Model", data: "mjw.Data", device: str) -> None:
-        """Makes the skins and hooks them into mujoco_warp's Model; mjlab's bridges around Model and Data are
-        opened.
+        """Makes the skins and hooks them into mujoco_warp's Model, which is unwrapped from mjlab's bridge,
+        like Data.
 
         Raises:
           ValueError: see `batch.attach`.
@@ -106,7 +106,7 @@ class BioTacSensor:
                 geoms=cfg.geoms,
                 **cfg.settings,
             )
-            mjw.forward(model, data)  # takes the memory that a capture of the step must find
+            mjw.forward(model, data)  # allocates memory before the step is captured
             self.batch.reset()
         sensed = wp.to_torch(data.sensordata)
         for field in dataclasses.fields(BioTacData):
@@ -115,24 +115,24 @@ class BioTacSensor:
 
     @property
     def data(self) -> BioTacData:
-        """What the last step left, copied once a step."""
+        """Result of the last step, copied once per step."""
         if self._data is None:
             self._data = BioTacData(**{name: view.clone() for name, view in self._views.items()})
         return self._data
 
     def invalidate_cache(self) -> None:
-        """Has `data` copied again."""
+        """Marks `data` for a new copy."""
         self._data = None
 
     def begin_control_step(self) -> None:
-        """Nothing is summed up between policy steps."""
+        """Does nothing: there are no sums over policy steps."""
 
     def update(self, dt: float) -> None:
-        """After a step of `dt` [s]."""
+        """Call after a step of `dt` [s]."""
         self.invalidate_cache()
 
     def reset(self, env_ids: object = None) -> None:
-        """Puts skins and clocks of some worlds to rest.
+        """Resets skins and clocks of some worlds.
 
         Args:
           env_ids: indices, a slice, or None for all.

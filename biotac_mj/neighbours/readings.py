@@ -1,4 +1,4 @@
-"""What a BioTac reads in many worlds, as tensors."""
+"""Readings of a BioTac in many worlds, as tensors."""
 
 import dataclasses
 import typing
@@ -13,7 +13,7 @@ __all__ = ["BioTacData", "world_mask"]
 
 @dataclasses.dataclass
 class BioTacData:
-    """Of n worlds; counts are those of the real sensor.
+    """Readings in n worlds, in counts of the real sensor.
 
     Attributes:
       electrodes: (n, 19), pac: (n, 22), pdc, tac, tdc: (n, 1) [counts].
@@ -31,7 +31,7 @@ class BioTacData:
 
 
 def world_mask(env_ids: object, nworld: int) -> np.ndarray:
-    """(nworld,) of bool from None (all), a slice, a mask, or indices, as frameworks give them."""
+    """(nworld,) of bool from None (all), a slice, a mask, or indices, as in other frameworks."""
     mask = np.zeros(nworld, bool)
     chosen = env_ids.cpu().numpy() if hasattr(env_ids, "cpu") else env_ids
     mask[slice(None) if chosen is None else chosen if isinstance(chosen, slice) else np.asarray(chosen)] = (

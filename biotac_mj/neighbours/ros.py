@@ -1,4 +1,5 @@
-"""A running simulation on ROS' topics, as a driver of the real sensor sends, by rclpy (ROS 2) or rospy."""
+"""Publishes a running simulation on ROS topics like a driver of the real sensor, with rclpy (ROS 2) or
+rospy."""
 
 import atexit
 import importlib
@@ -20,18 +21,18 @@ if typing.TYPE_CHECKING:
 __all__ = ["Publisher"]
 
 _CLOCK = "rosgraph_msgs/msg/Clock"
-_EARLY = 1e-3  # of a period: a row is due so much before its time, for sums of time steps err
+_EARLY = 1e-3  # of a period: tolerance of a row's due time, for rounding errors of summed time steps
 _QUEUE = 10  # messages that wait for a slow subscriber
 
 
 class Publisher:
-    """Publishes what BioTacs of a simulation read, one message for each row that a real sensor sends.
+    """Publishes readings of a simulation's BioTacs, one message for each row of a real sensor.
 
     Messages and topics are those of `recordings.write_bag`: /biotac_pub (biotac_sensors/BioTacHand, whose
     `bt_data` has all BioTacs in order) or /tactile_states (tactile_msgs/TactileState); /wrench
     (geometry_msgs/WrenchStamped, on what touches); /object/pose (geometry_msgs/PoseStamped). Wrench and pose
-    are in the BioTac frame. Stamps are the simulation's time. Where there are several BioTacs, each has
-    /ff/wrench and /ff/object/pose of its own, and its channels in tactile_msgs are called ff_electrodes etc.
+    are in the BioTac frame. Stamps are simulation time. With several BioTacs each has its own /ff/wrench and
+    /ff/object/pose, and its channels in tactile_msgs are named ff_electrodes etc.
 
         with Publisher(model) as publisher:
             while data.time < 10:
@@ -40,16 +41,17 @@ class Publisher:
 
     Args:
       model: the compiled MjModel.
-      fingers: {name: Handle}, as `attach_to_hand` returns; None: all of the model, by `biotac_mj.handles`.
+      fingers: {name: Handle}, as from `attach_to_hand`; None: all of the model, by `biotac_mj.handles`.
       form: "biotac_sensors" or "tactile_msgs".
-      object: name of the body whose pose is published; None: none is.
-      rate: messages in a second of simulated time [Hz].
+      object: name of the body whose pose is published; None: none.
+      rate: messages per second of simulated time [Hz].
       clock: publish the time on /clock with each call, for nodes with `use_sim_time`.
-      node: of rclpy, yours; None: one called biotac. ROS 1 has one node in a process: yours, if there is one.
+      node: an rclpy node; None: a new one called biotac. ROS 1 has one node per process: an existing one is
+        used.
 
     Raises:
-      ValueError: ROS' library or a package of messages is not here or has other fields; a form, rate, name or
-        body that cannot be; a model without BioTac. TypeError: model is no MjModel.
+      ValueError: ROS' library or a package of messages is missing or has other fields; an invalid form, rate,
+        name or body; a model without BioTac. TypeError: model is no MjModel.
     """
 
     def __init__(
@@ -84,7 +86,7 @@ class Publisher:
             for handle in self._fingers.values()
         ]
         pose = None if object is None else (np.zeros(3), np.eye(4)[0])
-        sent = self._messages(0.0, [(read, pose) for read in empty])  # says early what does not fit
+        sent = self._messages(0.0, [(read, pose) for read in empty])  # reports incompatible messages early
         if clock:
             self._ros.build(_CLOCK)
         self._ros.start(node)
@@ -95,21 +97,21 @@ class Publisher:
 
     @property
     def topics(self) -> list[str]:
-        """Names of its topics, without /clock; none once it is closed."""
+        """Names of its topics, without /clock; none after `close`."""
         return list(self._send)
 
     def publish(self, data: mujoco.MjData) -> bool:
         """Publishes a row if one is due; call it after every step.
 
-        Rows are due at multiples of 1 / rate of `data.time`, but not at 0; the first call at or after that
-        time sends one, and what was missed is not made up for. A reset, when time goes back, is no matter.
+        Rows are due at multiples of 1 / rate of `data.time`, except 0. The first call at or after that time
+        sends one; missed rows are skipped. Time may go back at a reset.
 
         Returns:
-          whether it was.
+          whether a row was published.
 
         Raises:
-          ValueError: data of another model, readings that are no numbers, as after an error, or it is closed.
-            TypeError: data is no MjData.
+          ValueError: data of another model, readings that are not finite, as after an error, or a closed
+            publisher. TypeError: data is no MjData.
         """
         if not self._send:
             raise ValueError("this Publisher is closed: make another one")
@@ -124,7 +126,7 @@ class Publisher:
         return True
 
     def close(self) -> None:
-        """Ends its topics; and its node and ROS 2, where it started them."""
+        """Ends its topics, and its node and ROS 2 if it started them."""
         if self._send:
             self._send = {}
             self._ros.close()
@@ -136,7 +138,7 @@ class Publisher:
         self.close()
 
     def _due(self, data):
-        """Handles to be read now."""
+        """Handles that are due."""
         if not hasattr(data, "sensordata"):
             raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")
         last, self._row = self._row, int(np.floor(data.time * self._rate + _EARLY))
@@ -154,7 +156,7 @@ class Publisher:
         return pos, quat
 
     def _messages(self, time, reads):
-        """{topic: message} of one row, of (what a Handle reads, pose) of each finger."""
+        """{topic: message} of one row, from (readings of a Handle, pose) of each finger."""
         alone, own, sensors, others = len(reads) == 1, TOPICS[self._form], [], {}
         for name, (read, pose) in zip(self._fingers, reads):
             for channel, width in _widths(self._fingers[name]).items():
@@ -177,7 +179,7 @@ def _widths(handle):
 
 
 def _named(fingers):
-    """{a word that ROS takes in a topic's name: Handle}."""
+    """{name that is valid in a ROS topic: Handle}."""
     out = {}
     for name, handle in fingers.items():
         word = re.sub(r"[^0-9A-Za-z]+", "_", str(name)).strip("_")
@@ -191,7 +193,7 @@ def _named(fingers):
 
 
 def _as_list(values, dtype):
-    """rclpy and rospy check for Python's numbers."""
+    """rclpy and rospy require Python numbers."""
     return np.asarray(values, dtype).tolist()
 
 
@@ -211,7 +213,7 @@ def _library():
 
 
 class _Ros:
-    """What both have in common: a package's messages by their names in ROS 2."""
+    """Common to ROS 1 and 2: a package's messages by their ROS 2 names."""
 
     def __init__(self, library):
         self._library, self._kinds = library, {}
@@ -263,7 +265,7 @@ class _Ros2(_Ros):
             self._node.destroy_publisher(topic)
         if self._made:
             self._node.destroy_node()
-        if self._started and self._library.ok():  # Ctrl-C ends it too
+        if self._started and self._library.ok():  # Ctrl-C also ends it
             self._library.shutdown()
 
 
@@ -282,7 +284,7 @@ class _Ros1(_Ros):
             )
         if not self._library.core.is_initialized():
             self._library.init_node("biotac", anonymous=True, disable_signals=True)
-            # once ended, a process cannot start it again
+            # ROS 1 cannot be started twice in a process
             atexit.register(self._library.signal_shutdown, "the simulation has ended")
         self._topics = []
 

@@ -1,4 +1,4 @@
-"""Recordings of real sensors with the simulated skin beside them: what it was like under each reading."""
+"""Recordings of real sensors with simulated skins: the deformation behind each reading."""
 
 import typing
 
@@ -8,7 +8,7 @@ if typing.TYPE_CHECKING:
     from . import resimulate as resimulate
     from .resimulate import ResimulateOptions as ResimulateOptions
 
-# the function keeps its place in the module of its name
+# so that the function, not its module, has the name
 _HOME = {"ResimulateOptions": ".resimulate", "resimulate": None}
 
 __all__ = list(_HOME)

@@ -1,4 +1,4 @@
-"""Poses of a plate that pressed a sensor by hand, fitted from force and electrodes: nobody recorded them."""
+"""Poses of a plate pressed on a sensor by hand, fitted to force and electrodes."""
 
 import dataclasses
 
@@ -22,11 +22,11 @@ from .touch import MOST, Touch
 __all__ = ["PLATE", "fitted_touches", "plate_way"]
 
 PLATE = "geom:plane"
-_LOADED = 0.5  # [N] from which a plate's pose is fitted; `matching` takes no lighter rows either
-_LEAD = 5e-6  # [m] before first touch: where row 0 is
-_SMOOTH = 5  # rows of the running median of states, each of which was sought by itself
-_CHUNK = 2000  # rows that are fitted together: each needs a table of its own
-_EVERY = 10  # of the loaded rows one takes part in the fit of the constants
+_LOADED = 0.5  # [N] least force for a fitted pose, as in `matching`
+_LEAD = 5e-6  # [m] distance of row 0 before first touch
+_SMOOTH = 5  # rows of the running median of states, which are fitted separately
+_CHUNK = 2000  # rows per fit: each needs its own table in memory
+_EVERY = 10  # every tenth loaded row is used for the fit of the constants
 _FEWEST = 8  # rows of a touch
 
 
@@ -36,13 +36,13 @@ def plate_way(
     """A plate's poses (n, 3) [m] and (n, 3, 3) through states (n, 4) at depths (n,) from first touch [m], and
     its axes (n, 3, 3), rows along, across and towards the core.
 
-    From row to row it rolls on the skin where it touches, without sliding there but for what the drags
-    differ by. Its frame has +y towards the core."""
+    From row to row it rolls on the skin without sliding, except for differences of the drags. Its frame has
+    +y towards the core."""
     outer = geometry.vert[np.unique(geometry.outer_face)]
     axes = np.array([frame(*angles) for angles in state[:, :2]])
     along, across, inwards = np.swapaxes(axes, 0, 1)
     height = outer @ inwards.T
-    first = height.argmin(0)  # the node that a plate meets first
+    first = height.argmin(0)  # the node of first touch
     level = height.min(0) + depth
     mat = np.stack([np.cross(inwards, across), inwards, across], 2)
     drag = (state[:, 2:3] * along + state[:, 3:] * across) * depth[:, None]
@@ -65,13 +65,13 @@ def fitted_touches(
     grid: PlateGrid | None = None,
     progress: bool = True,
 ) -> tuple[list[Touch], Material, list[str]]:
-    """Touches of `block` seconds [s] each, between rests that are the fit's, not the recording's.
+    """Touches of `block` seconds [s] each, with fitted rest rows between them.
 
     Args:
-      rate: [Hz] of the rows that are taken, at most. grid: of the table of states.
+      rate: [Hz] of the used rows, at most. grid: of the table of states.
 
     Returns:
-      touches, the material with the Young's modulus that was fitted, and what must be said of them.
+      touches, the material with the fitted Young's modulus, and notes.
 
     Raises:
       ValueError: no raw counts, no force, or too few loaded rows.
@@ -129,7 +129,7 @@ def _touch(recording, found, rows, state, force, const, states: PlateStates, geo
     time = recording.time[rows]
     step = np.median(np.diff(time))
     counts = np.concatenate([found.counts[rows[:1]], found.counts[rows]])
-    counts[0, n:] = np.nan  # the fit knows electrodes alone
+    counts[0, n:] = np.nan  # only electrodes are fitted
     counts[0, :n] = counts_from_log_impedance(
         const.offset + const.drifted(rows[:1] / len(recording))[:, None]
     )[0]

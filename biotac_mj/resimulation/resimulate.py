@@ -1,5 +1,5 @@
-"""`biotac data resimulate`: the skin driven along the touches of a recording, stored with what the sensor
-read."""
+"""`biotac data resimulate`: drives the skin along the touches of a recording and stores it with the sensor's
+readings."""
 
 import dataclasses
 import hashlib
@@ -38,20 +38,20 @@ POSES = ("recorded", "fitted")
 
 @dataclasses.dataclass(frozen=True)
 class ResimulateOptions:
-    """How a recording is simulated again. All of it but `device` is kept with the set and must be the same
-    when an interrupted run goes on.
+    """Settings of a resimulation. All except `device` are stored with the set and must be the same when an
+    interrupted run continues.
 
     Attributes:
-      object: what touches, see `data.objects.make_object`; None: what the recording says; fitted poses are
-        those of a plate.
+      object: what touches, see `data.objects.make_object`; None: as in the recording; fitted poses are those
+        of a plate.
       poses: "recorded", or "fitted" from force and electrodes for a flat plate pressed by hand.
       mount: pose x y z [m], qw qx qy qz of the BioTac frame in the frame of the recorded sensor's pose.
-      object_pose: of an object that stood still and has no recorded pose.
-      rate: [Hz] of the rows that are taken, at most; no row is made up.
+      object_pose: of a stationary object without recorded pose.
+      rate: [Hz] of the used rows, at most; rows are not interpolated.
       block: [s] of a touch with fitted poses.
       skin, material, element, liquid, options: of the simulated sensor, as in `biotac press`; skin None: the
         default of the recording's design.
-      batch: touches that a GPU solves together; a shard holds one batch.
+      batch: touches per batch on a GPU; a shard holds one batch.
       seed: of the split and of the simulated noise. device: of Warp.
     """
 
@@ -86,13 +86,13 @@ class ResimulateOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ResimulateReport:
-    """What a run did.
+    """Result of a run.
 
     Attributes:
       interactions, steps, nonconverged: in the set. made: shards made by this run.
-      agreement: median over rows in touch of the correlation of simulated and measured change of ln Z over
-        the electrodes; NaN where nothing changes. force_rms: [N] between simulated and measured normal force
-        of rows that have one, NaN without. notes: what was assumed and left out.
+      agreement: median over rows in contact of the correlation, over the electrodes, of simulated and
+        measured change of ln Z; NaN without changes. force_rms: [N] between simulated and measured normal
+        force, NaN without measurement. notes: assumptions and omissions.
     """
 
     interactions: int
@@ -112,19 +112,18 @@ def resimulate(
     progress: bool = True,
     ray: str | None = None,
 ) -> ResimulateReport:
-    """Makes a set in folder `out`, or what is missing of it: an interaction of kind "resimulated" for each
-    touch, with the simulated skin's columns and those measured.
+    """Makes a set in folder `out`, or completes it: an interaction of kind "resimulated" for each touch, with
+    the simulated skin's columns and the measured ones.
 
     Args:
       recording: with poses, or with force for fitted ones. options: see ResimulateOptions.
-      workers: processes for film and readings; None takes the cores there are, 0 this process.
+      workers: processes for film and readings; None: number of cores, 0: this process.
       progress: whether to show a bar.
-      ray: address of a Ray cluster, or "local": a task for each shard, of one core, one GPU
-        where the device is one, and `workers` cores (None: 0). Touches are found in this process, on the CPU.
+      ray: address of a Ray cluster, or "local": a task for each shard, with one core, one GPU if the device
+        is one, and `workers` cores (None: 0). Touches are found in this process, on the CPU.
 
     Raises:
-      ValueError: the recording lacks what is needed, the folder holds another set, or an option is not
-        possible.
+      ValueError: the recording lacks required data, the folder holds another set, or an invalid option.
     """
     options, out = options or ResimulateOptions(), pathlib.Path(out)
     if options.skin is None:
@@ -191,7 +190,7 @@ def _object(recording, given):
 
 
 def _fingerprint(recording):
-    """Digest of a recording's rows: another one does not belong into the same set."""
+    """Digest of a recording's rows, which identifies its set."""
     found = hashlib.sha256(np.ascontiguousarray(recording.time))
     for field in recording.fields:
         found.update(field.encode() + np.ascontiguousarray(getattr(recording, field)).tobytes())
@@ -204,7 +203,7 @@ class _Drive:
 
     Attributes:
       skins: geometry, material, options and modulus of the skin. name: of the object. touches, split: all.
-      about: what is kept with each shard, besides the skin. workers: processes for film and readings.
+      about: stored with each shard, in addition to the skin. workers: processes for film and readings.
     """
 
     options: ResimulateOptions
@@ -226,14 +225,14 @@ class _Drive:
             waiting = None
             for value in values:
                 begun = self._begin(value[1], pool, say)
-                if waiting is not None:  # its readings were made while the skin went on
+                if waiting is not None:  # its readings were computed during the next solve
                     yield self._end(*waiting, folder)
                 waiting = *value, begun
             if waiting is not None:
                 yield self._end(*waiting, folder)
 
     def _begin(self, members, pool, say):
-        """Simulates touches: of each (fields, its number there, readings to come)."""
+        """Simulates touches; for each: (fields, index, pending readings)."""
         together = [members] if self._model.device.is_cuda else [[i] for i in members]
         out = []
         for group in together:
@@ -251,7 +250,7 @@ class _Drive:
         return out
 
     def _end(self, path, members, parts, folder):
-        """Writes a shard; gives its file's name."""
+        """Writes a shard; returns its file's name."""
         ones = []
         for i, (fields, k, answer) in zip(members, parts):
             touch = self.touches[i]
@@ -301,12 +300,12 @@ class _Drive:
 
 
 def _longer(time, n):
-    """Times that go on evenly to n rows: of worlds solved together all have as many."""
+    """Times continued evenly to n rows, as all worlds of a batch have the same number."""
     return np.concatenate([time, time[-1] + (time[-1] - time[-2]) * np.arange(1, n - len(time) + 1)])
 
 
 def _longer_motion(motion, n):
-    """The motion, standing still where it has ended, n rows long."""
+    """The motion, continued at its last pose to n rows."""
     row = np.minimum(np.arange(n), len(motion.pos) - 1)
     return Motion(motion.kind, motion.parameters, motion.pos[row], motion.mat[row])
 

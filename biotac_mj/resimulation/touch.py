@@ -1,4 +1,4 @@
-"""Touches of a recording: rows, the object's way in the BioTac frame, readings."""
+"""Touches of a recording: rows, the object's path in the BioTac frame, readings."""
 
 import dataclasses
 
@@ -15,12 +15,12 @@ from ..recordings.own import rest_of
 
 __all__ = ["MOST", "Touch", "biotac_poses", "pose", "touches_of"]
 
-MOST = 2000  # rows of a touch: its nodes lie in memory
-_FEWEST = 8  # rows: fewer tell nothing of a press, and `biotac diagnose` refuses them
+MOST = 2000  # rows of a touch: its nodes are in memory
+_FEWEST = 8  # rows: fewer do not show a press, and `biotac diagnose` rejects them
 _GAP = 0.5  # [s] without a row ends a touch
 _TARE = 0.5  # [s] before a touch whose mean is the sensor at rest
-_INSIDE = 0.1e-3  # [m] from the core: nearer there is no room for the skin
-_CHUNK = 512  # poses that are looked at together
+_INSIDE = 0.1e-3  # [m] least distance from the core, for the skin
+_CHUNK = 512  # poses per batch
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Touch:
 
     Attributes:
       motion: of the object. time: (m,) [s]. counts: (m, 23). pac: (m, 22) or None.
-      wrench: (m, 6) of the skin on the object, BioTac frame, NaN where it is not known.
+      wrench: (m, 6) of the skin on the object, BioTac frame, NaN if unknown.
     """
 
     motion: Motion
@@ -43,7 +43,7 @@ def pose(numbers: tuple | list) -> tuple[np.ndarray, np.ndarray]:
     """Position (3,) and rotation (3, 3) of x y z [m], or of these and a quaternion w x y z.
 
     Raises:
-      ValueError: neither three nor seven finite numbers, or a quaternion that is no rotation.
+      ValueError: neither three nor seven finite numbers, or an invalid quaternion.
     """
     numbers = np.asarray(numbers, float)
     if numbers.shape not in ((3,), (7,)) or not np.isfinite(numbers).all():
@@ -60,15 +60,15 @@ def biotac_poses(
     """The object's frame in the BioTac frame.
 
     Args:
-      mount: pose of the BioTac frame in that of the recorded sensor's pose, or, where the sensor stood still
-        and has none, in that of the object's.
-      resting: pose of an object that stood still and has no recorded one.
+      mount: pose of the BioTac frame in the frame of the recorded sensor's pose or, for a stationary sensor
+        without one, in that of the object's.
+      resting: pose of a stationary object without a recorded one.
 
     Returns:
-      (n, 3) [m] and (n, 3, 3), NaN in rows without a pose; and what was assumed.
+      (n, 3) [m] and (n, 3, 3), NaN in rows without a pose; and assumptions.
 
     Raises:
-      ValueError: no pose of the object; the text says how to give one.
+      ValueError: no pose of the object; the text has a remedy.
     """
     n, notes = len(recording), []
     if recording.object_pos is None and resting is None:
@@ -104,14 +104,14 @@ def touches_of(
     geometry: SkinGeometry,
     device: str = "cpu",
 ) -> tuple[list[Touch], list[str]]:
-    """All touches of a recording with poses, and what must be said of them.
+    """All touches of a recording with poses, and notes.
 
     Args:
       name: of the object, see `data.objects.make_object`. mount, resting: see `biotac_poses`.
-      rate: [Hz] of the rows that are taken, at most; geometry: the skin at rest.
+      rate: [Hz] of the used rows, at most; geometry: the skin at rest.
 
     Raises:
-      ValueError: no poses, nothing that touches, or no rows at rest where they are needed.
+      ValueError: no poses, no contact, or no rows at rest where they are needed.
     """
     found = measured(recording)
     pos, mat, notes = biotac_poses(recording, mount, resting)
@@ -173,7 +173,7 @@ def touches_of(
 
 
 def _distances(name, pos, mat, points, device):
-    """(n,) of an object's poses to the nearest of points [m]."""
+    """(n,) distance of an object's poses to the nearest of points [m]."""
     parts = []
     for k in range(0, len(pos), _CHUNK):
         placed = Placed(name, len(pos[k : k + _CHUNK]), device)
@@ -183,7 +183,7 @@ def _distances(name, pos, mat, points, device):
 
 
 def _before(time, known, taken, contact, first):
-    """Rows of the recording in which nothing touched, up to half a second before taken row `first`."""
+    """Rows of the recording without contact, up to half a second before row `first` of the used ones."""
     last = np.flatnonzero(contact[:first])
     low = taken[last[-1]] + 1 if len(last) else 0
     rows = known[(known >= low) & (known <= taken[first])]
@@ -191,7 +191,7 @@ def _before(time, known, taken, contact, first):
 
 
 def _rest(recording, found):
-    """(nchannel,) counts at rest of a sensor that is always touched, from its force."""
+    """(nchannel,) counts at rest of a sensor that is always in contact, by its force."""
     if recording.force is None:
         raise ValueError(
             f"{recording.name} has no two rows before a touch, and no force to find its rest from: "

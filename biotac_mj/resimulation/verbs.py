@@ -1,4 +1,4 @@
-"""The verb `biotac data resimulate`: its arguments here, its work beside it."""
+"""Arguments of the verb `biotac data resimulate`."""
 
 import argparse
 from collections.abc import Callable

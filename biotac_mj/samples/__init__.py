@@ -1,5 +1,4 @@
-"""Synthetic samples of what the verbs read, for those who have no real sensor at hand: `biotac data
-samples`."""
+"""Synthetic samples of the verbs' input files, for users without a real sensor: `biotac data samples`."""
 
 import importlib.resources
 import pathlib
@@ -10,22 +9,22 @@ from .contents import EFFECT, OBJECT, TOUCHES
 
 __all__ = ["EFFECT", "OBJECT", "SHIPPED_SEED", "TOUCHES", "make_samples"]
 
-SHIPPED_SEED = 0  # whose samples the package brings along (scripts/make_samples.py): nobody waits for them
+SHIPPED_SEED = 0  # of the samples in the package (scripts/make_samples.py), which need no simulation
 _SET = "set"
 
 
 def make_samples(
     folder: pathlib.Path | str, seed: int = SHIPPED_SEED, progress: bool = True
 ) -> list[pathlib.Path]:
-    """Writes a synthetic recording of touches by a sphere in the forms that people have, and a set of it.
+    """Writes a synthetic recording of touches by a sphere in typical file formats, and a data set of it.
 
-    electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, without and with a touch;
-    log.csv has all channels and the sphere's pose beside them, every fifth row; set/ is all touches with
-    the simulated skin under them, for `biotac learn train`.
+    electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, with and without contact;
+    log.csv has all channels and the sphere's pose, every fifth row; set/ has all touches with the simulated
+    skin, for `biotac learn train`.
 
     Args:
-      folder: made if it is not there; what is in it under these names is the same, or refused.
-      seed: of the touches and the noise. SHIPPED_SEED is brought along, another one is simulated.
+      folder: created if missing; existing files of these names must be equal.
+      seed: of the touches and the noise. SHIPPED_SEED is in the package, others are simulated.
       progress: whether to show a bar for the set.
 
     Returns:
@@ -57,7 +56,7 @@ def _shipped():
 
 
 def _place(folder, files, seed):
-    """Writes files, if none there is another one; a set has no more shards than its own."""
+    """Writes files unless different ones exist; a set may have no other shards."""
     there = [folder / name for name in files]
     others = set((folder / _SET).glob("*.h5")) - set(there) if seed == SHIPPED_SEED else ()
     for path, content in [*zip(there, files.values()), *((path, None) for path in others)]:

@@ -1,4 +1,4 @@
-"""Touches that are simulated for samples, and a set of them: a minute's work."""
+"""Simulates touches for samples, and a set of them, in a minute."""
 
 import io
 import pathlib
@@ -22,11 +22,11 @@ from .contents import EFFECT, EVERY, OBJECT, PLACES, SKIN, TOUCHES
 
 __all__ = ["make_set", "record_touches", "tables"]
 
-_TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand, and on either side of it
-_GENTLE = 0.3, 0.6  # of the planned ways is gone, drawn for each touch: hard presses take long to solve
+_TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand's, and on either side of it
+_GENTLE = 0.3, 0.6  # range of the drawn fraction of the planned depth: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch
-_CLEAR = 4e-3  # [m] that the object goes away
-_SET_RATE = 10.0  # [Hz] of the rows that the set takes: eight or nine of a touch
+_CLEAR = 4e-3  # [m] distance of the object between touches
+_SET_RATE = 10.0  # [Hz] of the set's rows: eight or nine per touch
 
 
 def tables(recording: Recording) -> dict[str, bytes]:
@@ -48,7 +48,7 @@ def tables(recording: Recording) -> dict[str, bytes]:
 
 
 def make_set(recording: Recording, out: pathlib.Path, seed: int, progress: bool) -> None:
-    """The skin under a recording's touches, as a set.
+    """Resimulates a recording's touches as a set.
 
     Raises:
       ValueError: the folder holds another one.
@@ -64,11 +64,11 @@ def _table(rows, form, header=""):
 
 
 def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
-    """A sphere that presses and slides at PLACES of the skin, round after round to other depths, as a sensor
-    with EFFECT reads it at 100 Hz: synthetic, by the condensed skin.
+    """A sphere presses and slides at PLACES of the skin, round after round to other depths, with a sensor
+    that has EFFECT, at 100 Hz: synthetic, with the condensed skin.
 
     Args:
-      seed: of the touches and the noise. touches: how many.
+      seed: of the touches and the noise. touches: number of touches.
     """
     paths = plan_motions(
         load_skin(SKIN), OBJECT, [[seed, i] for i in range(min(PLACES, touches))], _TOUCH, ("press", "slide")
@@ -80,7 +80,7 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
     spec.option.timestep, spec.option.gravity = 1 / BUS_RATE, np.zeros(3)
     spec.worldbody.add_body(name="finger")
     body = spec.worldbody.add_body(name="object", pos=pos[0], quat=quat[0], mocap=True)
-    # without friction of its own: the larger one counts, as in MuJoCo, so the skin's does
+    # without friction of its own: MuJoCo takes the larger one, so the skin's counts
     slick = [0.0, 0.005, 1e-4]
     add_indenter(spec, body, make_object(OBJECT), contype=0, conaffinity=0, friction=slick)
     name, theta = EFFECT
@@ -115,9 +115,8 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
 
 
 def _touch_paths(paths, depths):
-    """Poses (n, 3) and (n, 4) of touches one after another: from away into each, and back; depths: of each,
-    as a part of its way."""
-    # Slow where it meets the skin, as electrodes are read some milliseconds after they feel.
+    """Poses (n, 3) and (n, 4) of successive touches: approach and retraction; depths: fraction of each
+    path."""  # Slow near the skin, because electrodes are read with a delay of some milliseconds.
     out = np.r_[1.0, 1.0, np.linspace(1, 0, _AWAY - 2, endpoint=False) ** 2][:, None]
     pos, mat = [], []
     for path, depth in zip(paths, depths):
