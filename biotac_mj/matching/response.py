@@ -24,8 +24,7 @@ class Response:
       states, log_z: as given.
       axes: nodes of pitch and roll (both sides). drag_paths: (npath, 2) drags. nodes: (ndirection, npath, 4)
         states of the table. low, high: (4,) bounds of a state. changes: (k, nload, npitch, nroll, npath,
-          nelectrode + 2) partial
-        changes of the table, see `with_changes`.
+        nelectrode + 2) partial changes of the table, see `with_changes`.
     """
 
     def __init__(self, states: PlateStates, log_z: np.ndarray):
