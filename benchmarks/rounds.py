@@ -73,6 +73,10 @@ def _record(report, seconds):
         "closed": report.closed,
         "decided": beliefs.decided,
         "explanations": [[one.ids, one.weight] for one in beliefs.explanations],
+        "tried": [
+            [{key: one[key] for key in ("id", "gain", "p", "refused", "ties")} for one in step]
+            for step in report.trace["rounds"]
+        ],
         "contacts": len(report.selection) + len(report.locked),
         "seconds": seconds,
     }
@@ -284,6 +288,7 @@ def main(argv=None):
     args.add_argument("--more", type=int, default=6, help="contacts of each further round")
     args.add_argument("--rounds", type=int, default=3)
     args.add_argument("--pool", type=int, default=16, help="contacts that further rounds choose from")
+    args.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), metavar="ARM")
     args.add_argument("--share", default="0/1", help="i/n: every n-th laboratory from the i-th on")
     args.add_argument("--jobs", type=int, default=1, help="processes")
     args.add_argument("--minutes", type=float, default=60.0, help="with --jobs, after which it ends")
@@ -295,7 +300,7 @@ def main(argv=None):
     i, n = map(int, args.share.split("/"))
     paths = sorted(args.labs.glob("lab_*.sealed"))[i::n]
     there = {(row["lab"], row["arm"]) for row in rows}
-    tasks = [(path, arm) for arm in ARMS for path in paths]  # design first
+    tasks = [(path, arm) for path in paths for arm in args.arms]
     done([(path, arm) for path, arm in tasks if (path.stem, arm) not in there], args, rows)
     for name, counts in counted(rows).items():
         print(name, counts)

@@ -254,11 +254,8 @@ def late(e, k, change, share=0.35):
 
 
 @pytest.mark.slow
-def test_sign_and_order_under_load():
+def test_order_under_load():
     e, _, rng = pressed(6, seconds=120)
-    k = int(np.argmax(e.std(0)))
-    d = diagnose_recording(PlainRecording(noisy(late(e, k, lambda x, y: 2 * y.mean() - x), rng)))
-    assert ids(d)[0] == "flip" and d.findings[0].channels == (k,), d.verdict
     mixed = noisy(e, rng)
     start = len(e) * 2 // 5
     mixed[start:, [2, 9, 14]] = mixed[start:, [14, 2, 9]]

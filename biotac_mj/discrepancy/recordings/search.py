@@ -21,7 +21,7 @@ from .connected import part_connected
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
-from .detectors.order import ORDER, exchanged, reversed_sign, slipped
+from .detectors.order import slipped
 from .faults import as_candidates, as_log
 from .model import LEAST, WINDOW
 from .proof import prove, views
@@ -136,10 +136,9 @@ def _adopt(session, faults, weak):
 
 
 def _levels(session, named):
-    """Channels that are exchanged or reversed, jumps, and trends over time, the strongest first."""
-    for find in (slipped, exchanged, *((reversed_sign,) if session.recording.signed else ())):
-        if (finding := find(session)) is not None:
-            _take(session, finding, named)
+    """Channels that are exchanged, jumps, and trends over time, the strongest first."""
+    if (finding := slipped(session)) is not None:
+        _take(session, finding, named)
     for finding in jumped(session):
         _take(session, finding, named)
     refused = set()
@@ -247,10 +246,6 @@ def _checkup(session, protocol, named):
     parts = [
         (rows, diagnose_recording(r.part(rows), named=named).findings) for rows in stretches(r, protocol)
     ]
-    if parts:  # a side that was touched and one that was not say nothing of signs and places
-        own = [f for _, some in parts for f in some]
-        ordered = [f for f in session.findings if f.detector == ORDER]
-        session.take_back(*(f for f in ordered if not any(f.id == o.id and _alike(f, o) for o in own)))
     known, found = list(session.findings), []
     for rows, some in parts:
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
@@ -319,7 +314,7 @@ def _late(session, named):
 
 
 def _notes(recording, session, protocol):
-    loads = "saturation, the sign of an electrode"
+    loads = "saturation"
     out = [f"{recording.rate:.1f} Hz: {recording.rate_source}"]
     if recording.force is None:
         out.append("no force: how late the electrodes follow it")
