@@ -8,7 +8,7 @@ from test_discrepancy_recordings import ids
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.detectors.levels import levels
-from biotac_mj.discrepancy.recordings.detectors.order import slipped
+from biotac_mj.discrepancy.recordings.detectors.order import exchanged
 from biotac_mj.discrepancy.recordings.detectors.together import ahead
 from biotac_mj.discrepancy.recordings.rest import rest
 from biotac_mj.discrepancy.recordings.session import Session
@@ -149,12 +149,12 @@ def test_channels_exchanged_for_a_while_are_put_back():
     counts = noisy(counts, rng)
     wrong = counts.copy()
     wrong[1000:2200, [2, 7, 11]] = counts[1000:2200][:, [7, 11, 2]]
-    found = slipped(session(wrong))
+    found = exchanged(session(wrong))
     assert found.id == "swap" and set(found.channels) == {2, 7, 11}
     assert abs(found.start - 10) < 0.3 and abs(found.end - 22) < 0.3
     again = found.correct(wrong, np.arange(len(wrong)) / RATE)
     assert (again == counts).mean() > 0.998
-    assert slipped(session(counts)) is None
+    assert exchanged(session(counts)) is None
 
 
 @pytest.mark.slow

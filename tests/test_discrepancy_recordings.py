@@ -540,19 +540,6 @@ def test_what_the_part_kept_aside_contradicts_is_not_named():
     )
 
 
-@pytest.mark.slow  # quick: a sign that is wrong for long
-def test_a_sign_that_is_right_again_is_not_contradicted():
-    """Reversed from one row on, until shortly before the part kept aside: named, and over by then."""
-    e, _, rng = pressed(3, 60)
-    level = e[:, 12].mean() + 60
-    e[1300:3450, 12] = 2 * level - e[1300:3450, 12]
-    d = diagnose_recording(PlainRecording(noisy(e, rng)))
-    (flip,) = (f for f in d.findings if f.channels == (12,))
-    assert "flip" in (flip.id, *flip.ties) and flip.verified is not False, d.verdict
-    late = d.session.counts[3700:] - noisy(e, rng)[3700:]
-    assert np.abs(late[:, 12]).mean() < 10  # it is not taken out where it is over
-
-
 @pytest.mark.slow
 def test_the_report_leads_with_the_largest_gap(tmp_path):
     e, rng = unloaded(3)
@@ -604,12 +591,12 @@ def test_touches_not_separable_from_drift_ask_for_a_recording():
     assert "too short to tell touches from drift" in short and "not loaded" not in short
     seconds = int(re.search(r"record (\d+) s or more", short)[1])
     enough, less = (said(*pressed(seconds=s)) for s in (seconds, seconds - 1))
-    assert "too short" in less and "too short" not in enough and "sign of an electrode" not in enough
+    assert "too short" in less and "too short" not in enough and "saturation" not in enough
     e, rng = unloaded()
     rise = np.linspace(0, 1, len(e))[:, None] ** 2
     slow, none = (said(e + 60 * rise, size * rise * [0, 0, -1], rng) for size in (2, 0))
     assert "touches could not be told from drift, record some" in slow and "not loaded" not in slow
-    assert "not loaded: gains" in none
+    assert "not loaded: saturation" in none
 
 
 @pytest.mark.slow

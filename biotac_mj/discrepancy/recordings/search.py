@@ -21,7 +21,7 @@ from .connected import part_connected
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
-from .detectors.order import slipped
+from .detectors.order import ORDER, exchanged, slipped
 from .faults import as_candidates, as_log
 from .model import LEAST, WINDOW
 from .proof import prove, views
@@ -137,8 +137,9 @@ def _adopt(session, faults, weak):
 
 def _levels(session, named):
     """Channels that are exchanged, jumps, and trends over time, the strongest first."""
-    if (finding := slipped(session)) is not None:
-        _take(session, finding, named)
+    for find in (slipped, exchanged):
+        if (finding := find(session)) is not None:
+            _take(session, finding, named)
     for finding in jumped(session):
         _take(session, finding, named)
     refused = set()
@@ -246,6 +247,10 @@ def _checkup(session, protocol, named):
     parts = [
         (rows, diagnose_recording(r.part(rows), named=named).findings) for rows in stretches(r, protocol)
     ]
+    if parts:  # a side that was touched and one that was not say nothing of places
+        own = [f for _, some in parts for f in some]
+        ordered = [f for f in session.findings if f.detector == ORDER]
+        session.take_back(*(f for f in ordered if not any(f.id == o.id and _alike(f, o) for o in own)))
     known, found = list(session.findings), []
     for rows, some in parts:
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
