@@ -592,18 +592,23 @@ def test_a_tilting_fingertip_is_named_from_nine_presses():
     assert report.closed > 0.6
 
 
-@pytest.mark.parametrize("gain, times", [(1.0, 0), (10.0, 2), (60.0, 6)])
-def test_the_skin_is_solved_more_often_for_what_explains_much(gain, times, monkeypatch):
+@pytest.mark.parametrize("gain, more, times", [(1.0, 0.0, 0), (10.0, 0.0, 2), (10.0, 5.0, 4)])
+def test_the_skin_is_solved_until_a_fit_has_found_its_end(gain, more, times, monkeypatch):
     """Differences about where it was solved last lead on by a little each time."""
     from biotac_mj.discrepancy.trajectories import search
 
     effect, solved = by_id("misalign"), []
-    fit = types.SimpleNamespace(score=gain, effects=[(effect, effect.default())], nuisance=Nuisance())
-    monkeypatch.setattr(search, "fit_effects", lambda *args: fit)
-    sim = types.SimpleNamespace(bend=lambda *args: solved.append(args) is None)
+
+    def fit(score):
+        return types.SimpleNamespace(score=score, effects=[(effect, effect.default())], nuisance=Nuisance())
+
+    monkeypatch.setattr(search, "fit_effects", lambda *args: fit(gain + more * len(solved)))
+    sim = types.SimpleNamespace(bend=lambda *args: solved.append(args[-1]) is None)
     comparison = types.SimpleNamespace(sim=sim, fields=None)
-    search._solved(comparison, fit, effect, types.SimpleNamespace(score=0.0), np.arange(3))
-    assert len(solved) == times
+    search._solved(
+        comparison, fit(gain), effect, types.SimpleNamespace(score=0.0), np.arange(3), search._FURTHER, True
+    )
+    assert solved == ([True] + [False] * times)[:times]  # with its parameters changed first
 
 
 def test_signed_roots_have_the_rate_of_chance():

@@ -20,9 +20,13 @@ if typing.TYPE_CHECKING:
 __all__ = ["Candidate", "Search", "found", "screened"]
 
 _SURROGATES = 199
-_SOLVED, _FURTHER = 2, 6  # times that the skin is solved for an effect that moves the object,
-_WORTH, _MUCH = 5.0, 30.0  # [nats] if it has so much evidence; and more often if it has so much
-_KINS, _SOME = 2, 0.15  # effects whose rubber is solved for; their share of the best one's evidence
+_SOLVED, _FURTHER = 2, 4  # times that the skin is solved for an effect that moves the object; and again
+_WORTH, _MUCH = 5.0, 30.0  # [nats] of evidence that is worth it; that solving the rubber is worth
+_SETTLED = 1.0  # [nats] that a solution changes where a fit has found its end
+_KINS, _SOME = (
+    2,
+    0.15,
+)  # effects whose rubber is solved for; share of the best one's evidence that is worth it
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 # Of the evidence that an effect has beside nothing, that it has to have beside others, and beside one that it
 # is confused with.
@@ -185,10 +189,13 @@ def _round(comparison, search, usable, chosen, seed, bar):
         fit = _solved(comparison, fit, effect, current, chosen)
         out.append(_candidate(comparison, effect, fit, current, chance, usable, chosen))
         bar.update()
+    for k in _moving(out):
+        fit = _solved(comparison, out[k].fit, out[k].effect, current, chosen, _FURTHER, True)
+        out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable, chosen)
     for k in _remembering(out):
         fit = _remembered(comparison, out[k], current, chosen)
         if fit is not None:
-            out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable)
+            out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable, chosen)
     return sorted(out, key=lambda c: -c.gain)
 
 
@@ -256,23 +263,33 @@ def _little(comparison, effect, theta) -> bool:
     return bool((np.abs(size) * lever < limit).all())
 
 
-def _solved(comparison, fit, effect, current, chosen):
-    """The fit where the skin was solved with what moves the object, since differences do not reach far."""
+def _solved(comparison, fit, effect, current, chosen, times=_SOLVED, about=False):
+    """The fit where the skin was solved, so many times, with what moves the object, since differences do not
+    reach far. about: until it has found its end, first with each of its parameters changed as well."""
     if not effect.before_skin and effect.joining(fit.effects[-1][1]) is None:
         return fit
-    for k in range(_FURTHER):
-        if fit.score - current.score < (_WORTH if k < _SOLVED else _MUCH):
+    for k in range(times):
+        if fit.score - current.score < _WORTH:
             break
         work = effect.joining(fit.effects[-1][1])
         if work is not None:
             new = comparison.sim.stick(comparison.fields, work)
         else:
-            about = k == _SOLVED and len(effect.free) > 1  # each parameter is one solution more
-            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, about)
+            beside = about and not k and len(effect.free) > 1  # each parameter is one solution more
+            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, beside)
         if not new:
             break
+        before = fit.score
         fit = fit_effects(comparison, fit.effects, chosen, fit)
+        if about and k and abs(fit.score - before) < _SETTLED:
+            break
     return fit
+
+
+def _moving(out):
+    """Indices of Candidates that move the object and may be the likeliest where their fits end."""
+    least = max(_WORTH, _SOME * max((c.gain for c in out), default=0.0))
+    return [k for k, c in enumerate(out) if c.effect.before_skin and c.gain > least]
 
 
 def _remembering(out):
