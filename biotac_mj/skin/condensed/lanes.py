@@ -10,10 +10,13 @@ __all__ = [
     "block_max",
     "block_rank",
     "block_sum",
+    "begin_row",
     "dot_column",
     "dot_columns",
     "eliminate",
     "fill_row",
+    "fill_rows",
+    "sum_rows",
     "sync",
 ]
 
@@ -235,25 +238,41 @@ def block_rank(own: int) -> wp.vec2i:
             }}
         }}
         if (next == n) break;
-        for (int i = next; i < n; ++i) {{
-            float* mine = a + (long long)i * width;
-            const float* f = mine + first;
-            const float f0 = f[0], f1 = f[1], f2 = f[2], f3 = f[3];
-            const float f4 = f[4], f5 = f[5], f6 = f[6], f7 = f[7];
-            for (int k = next; k < width; ++k)
-                mine[k] -= (f0 * b[k] + f1 * b[width + k] + f2 * b[2 * width + k] + f3 * b[3 * width + k])
-                    + (f4 * b[4 * width + k] + f5 * b[5 * width + k] + f6 * b[6 * width + k]
-                    + f7 * b[7 * width + k]);
+        const float *b0 = b, *b1 = b0 + width, *b2 = b1 + width, *b3 = b2 + width;
+        const float *b4 = b3 + width, *b5 = b4 + width, *b6 = b5 + width, *b7 = b6 + width;
+        for (int i = next; i < n; i += 2) {{
+            float* __restrict even = a + (long long)i * width;
+            float* __restrict odd = i + 1 < n ? even + width : even;
+            const float f0 = even[first], f1 = even[first + 1], f2 = even[first + 2], f3 = even[first + 3];
+            const float f4 = even[first + 4], f5 = even[first + 5], f6 = even[first + 6];
+            const float f7 = even[first + 7];
+            const float g0 = odd[first], g1 = odd[first + 1], g2 = odd[first + 2], g3 = odd[first + 3];
+            const float g4 = odd[first + 4], g5 = odd[first + 5], g6 = odd[first + 6], g7 = odd[first + 7];
+            #pragma clang loop vectorize(assume_safety)
+            for (int k = next; k < width; ++k) {{
+                const float v = odd[k] - ((g0 * b0[k] + g1 * b1[k] + g2 * b2[k] + g3 * b3[k])
+                    + (g4 * b4[k] + g5 * b5[k] + g6 * b6[k] + g7 * b7[k]));
+                even[k] -= (f0 * b0[k] + f1 * b1[k] + f2 * b2[k] + f3 * b3[k])
+                    + (f4 * b4[k] + f5 * b5[k] + f6 * b6[k] + f7 * b7[k]);
+                if (odd != even) odd[k] = v;
+            }}
         }}
     }}
-    for (int j = n - 1; j >= 0; --j) {{
-        float* row = a + (long long)j * width;
-        for (int k = n; k < width; ++k) row[k] /= row[j];
-        for (int i = 0; i < j; ++i) {{
-            float* mine = a + (long long)i * width;
-            for (int k = n; k < width; ++k) mine[k] -= mine[j] * row[k];
+    // solutions are listed in the last row, whose factors nobody needs any more
+    float* x = a + (long long)(n - 1) * width;
+    const float last = x[n - 1];
+    for (int k = n; k < width; ++k)
+        for (int i = n - 1; i >= 0; --i) {{
+            float* row = a + (long long)i * width;
+            float part[8] = {{row[k]}};
+            int j = i + 1;
+            for (; j + 8 <= n; j += 8)
+                for (int b = 0; b < 8; ++b) part[b] -= row[j + b] * x[j + b];
+            for (; j < n; ++j) part[0] -= row[j] * x[j];
+            for (int b = 1; b < 8; ++b) part[0] += part[b];
+            row[k] = part[0] / (i == n - 1 ? last : row[i]);
+            x[i] = row[k];
         }}
-    }}
 #endif
     return 1;
 """)
@@ -263,15 +282,44 @@ def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
     ...
 
 
-# by one thread: a column after the other is read from few rows, so that several are handled at once
-@wp.func_native("""
+# By one thread, row by row, which a processor's vectors do many columns of at a time. `A` has rows of length
+# `wide`, of which the first `n` are meant; row `from_` of C has their entries at columns `column`.
+_ROWS = """
 #if !defined(__CUDA_ARCH__)
-    const int* at = column.data + (long long)world * column.shape[1];
-    float* a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
-    const float* c = C.data + (long long)from_ * C.shape[1];
-    for (int j = 0; j < n; ++j) a[j] += x * c[at[j]];
+    float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
+{what}
 #endif
-""")
+"""
+
+
+@wp.func_native(
+    _ROWS.format(
+        what="""
+    const float* __restrict b = push.data + (long long)world * push.shape[1];
+    for (int j = 0; j < n; ++j) a[j] = -held * b[j];"""
+    )
+)
+def begin_row(
+    A: wp.array2d(dtype=float),
+    world: int,
+    n: int,
+    wide: int,
+    row: int,
+    held: float,
+    push: wp.array2d(dtype=float),
+):
+    """Makes a row -held times push[world]."""
+    ...
+
+
+@wp.func_native(
+    _ROWS.format(
+        what="""
+    const int* __restrict at = column.data + (long long)world * column.shape[1];
+    const float* __restrict c = C.data + from_ * (long long)C.shape[1];
+    for (int j = 0; j < n; ++j) a[j] += x * c[at[j]];"""
+    )
+)
 def fill_row(
     A: wp.array2d(dtype=float),
     world: int,
@@ -283,7 +331,125 @@ def fill_row(
     from_: int,
     column: wp.array2d(dtype=int),
 ):
-    """Adds x times the entries C[from_, column[world]] to the first n of a row, whose length is `wide`."""
+    """Adds x times a row of C to a row."""
+    ...
+
+
+@wp.func_native(
+    _ROWS.format(
+        what="""
+    float *__restrict b = a + wide, *__restrict d = b + wide;
+    const int* __restrict at = column.data + (long long)world * column.shape[1];
+    const long long next = C.shape[1];
+    const float* __restrict c = C.data + from_ * next;
+    const float x0 = x.data[0][0], x1 = x.data[0][1], x2 = x.data[0][2];
+    const float y0 = x.data[1][0], y1 = x.data[1][1], y2 = x.data[1][2];
+    const float z0 = x.data[2][0], z1 = x.data[2][1], z2 = x.data[2][2];
+    for (int j = 0; j < n; ++j) {
+        const float u = c[at[j]], v = c[next + at[j]], w = c[2 * next + at[j]];
+        a[j] += x0 * u + x1 * v + x2 * w;
+        b[j] += y0 * u + y1 * v + y2 * w;
+        d[j] += z0 * u + z1 * v + z2 * w;
+    }"""
+    )
+)
+def fill_rows(
+    A: wp.array2d(dtype=float),
+    world: int,
+    n: int,
+    wide: int,
+    row: int,
+    x: wp.mat33,
+    C: wp.array2d(dtype=float),
+    from_: int,
+    column: wp.array2d(dtype=int),
+):
+    """Adds x times three rows of C to three rows."""
+    ...
+
+
+# By one thread the sums of `dot_column` or `dot_columns` of many columns at once, in the same order: 512 of
+# them after the other, which stay near.
+_SUMS = """
+#if !defined(__CUDA_ARCH__)
+    const int* __restrict at = listed.data + (long long)world * listed.shape[1];
+    const float* __restrict f = factor.data + (long long)world * factor.shape[1];
+    const long long wide = C.shape[1];
+    for (int first = 0; first < n; first += 512) {{
+        const int most = n - first < 512 ? n - first : 512;
+        float* __restrict total = sum.data + (long long)world * sum.shape[1] + first;
+        const {kind} *__restrict c0, *__restrict c1, *__restrict c2, *__restrict c3;
+        {columns}
+        for (int j = 0; j < most; ++j) total[j] = 0.0f;
+        int a = 0;
+        for (; a + 4 <= count; a += 4) {{
+            c0 = C.data + at[a] * wide, c1 = C.data + at[a + 1] * wide;
+            c2 = C.data + at[a + 2] * wide, c3 = C.data + at[a + 3] * wide;
+            const float f0 = {scale0}, f1 = {scale1}, f2 = {scale2}, f3 = {scale3};
+            for (int j = 0; j < most; ++j) {{
+                const float p = {entry0} * f0;
+                const float q = {entry1} * f1;
+                const float r = {entry2} * f2;
+                const float s = {entry3} * f3;
+                const float pq = p + q;
+                const float pqr = pq + r;
+                const float pqrs = pqr + s;
+                total[j] += pqrs;
+            }}
+        }}
+        for (; a < count; ++a) {{
+            c0 = C.data + at[a] * wide;
+            const float f0 = {scale0};
+            for (int j = 0; j < most; ++j) {{
+                const float p = {entry0} * f0;
+                total[j] += p;
+            }}
+        }}
+    }}
+#endif
+"""
+
+
+def _sums(kind, columns, scale, entry):
+    names = {f"scale{k}": scale.format(k=f"a + {k}") for k in range(4)}
+    names |= {f"entry{k}": entry.format(c=f"c{k}") for k in range(4)}
+    return _SUMS.format(kind=kind, columns=columns, **names)
+
+
+@wp.func_native(
+    _sums(
+        "float",
+        "const int* __restrict to = column.data + (long long)world * column.shape[1] + first;",
+        "f[{k}]",
+        "{c}[to[j]]",
+    )
+)
+def sum_rows(
+    C: wp.array2d(dtype=float),
+    world: int,
+    n: int,
+    column: wp.array2d(dtype=int),
+    count: int,
+    listed: wp.array2d(dtype=int),
+    factor: wp.array2d(dtype=float),
+    sum: wp.array2d(dtype=float),
+):
+    """Makes the first n of sum[world] `dot_column` of columns column[world]."""
+    ...
+
+
+@wp.func_native(_sums("wp::half", "", "f[{k}] * largest.data[at[{k}]]", "wp::half_to_float({c}[first + j])"))
+def sum_rows(  # noqa: F811
+    C: wp.array2d(dtype=wp.float16),
+    largest: wp.array(dtype=float),
+    world: int,
+    n: int,
+    count: int,
+    listed: wp.array2d(dtype=int),
+    factor: wp.array2d(dtype=float),
+    sum: wp.array2d(dtype=float),
+):
+    """The same by `dot_columns` of the first n columns."""
     ...
 
 

@@ -8,10 +8,10 @@ from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
-from .lanes import block_max, block_sum, dot_columns, eliminate, sync
+from .lanes import block_max, block_sum, dot_columns, eliminate, sum_rows, sync
 from .states import Linear
 from .structs import Constants, F, G, Remembered, Scratch
-from .system import coordinate_at, entry_of, gather_blocks
+from .system import coordinate_at, entry_of, fill_contact, gather_blocks
 
 __all__ = ["conclude", "correct", "place_nodes", "recall"]
 
@@ -38,8 +38,14 @@ def place_nodes(
     adds to the cavity's volume, and its linear part [m^3]."""
     linear = real(0.0)
     swollen = l.swell * pressure
+    if threads == 1:
+        sum_rows(c.row, c.largest, w, 3 * c.free.shape[0], count, s.loaded, s.load, s.sum)
     for i in range(t, c.free.shape[0], threads):
-        u = dot_columns(c.row, c.largest, 3 * i, w, count, s.loaded, s.load)
+        u = wp.vec3()
+        if threads == 1:
+            u = wp.vec3(s.sum[w, 3 * i], s.sum[w, 3 * i + 1], s.sum[w, 3 * i + 2])
+        else:
+            u = dot_columns(c.row, c.largest, 3 * i, w, count, s.loaded, s.load)
         v = c.free[i]
         d = l.scale * vec3(u) + swollen * c.give[i]
         x[v, w] = c.rest[v, 0] + d
@@ -224,7 +230,9 @@ def find_tangents(
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
-            for m in range(t, equations * equations, threads):
+            if threads == 1:
+                fill_contact(w, outer, inner, nnode, wide, 1.0, 1, l, c, s)
+            for m in range(t, wp.where(threads == 1, 0, equations * equations), threads):
                 i = m / equations
                 j = m % equations
                 cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]

@@ -101,6 +101,7 @@ class Scratch:
     coordinate: wp.array2d(dtype=int)
     loaded: wp.array2d(dtype=int)  # contact coordinates with a force, and it, of a product
     load: wp.array2d(dtype=float)
+    sum: wp.array2d(dtype=float)  # by one thread, of `lanes.sum_rows`, or of what the equations are pushed by
     vector: wp.array3d(dtype=real)
     on: wp.array2d(dtype=int)  # which touch
     stiff: wp.array2d(dtype=real)  # stiffness of inner coordinates, lumped [N/m]

@@ -6,7 +6,17 @@ import warp as wp
 from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3
 from .bodies import move_nodes, number_bodies, rigid_column
-from .lanes import block_rank, block_sum, dot_column, eliminate, fill_row, sync
+from .lanes import (
+    begin_row,
+    block_rank,
+    block_sum,
+    dot_column,
+    eliminate,
+    fill_row,
+    fill_rows,
+    sum_rows,
+    sync,
+)
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
@@ -14,6 +24,7 @@ __all__ = [
     "coordinate_at",
     "count_contacts",
     "entry_of",
+    "fill_contact",
     "gather_blocks",
     "gather_load",
     "multiply",
@@ -69,9 +80,15 @@ def multiply(
     push = l.bulk_stiffness * l.swell * l.scale * swollen
     if shifted == 1:
         push += l.bulk_stiffness * l.swell * l.bulge
+    if threads == 1:
+        sum_rows(c.compliance, w, n, s.coordinate, count, s.loaded, s.load, s.sum)
     for j in range(t, n, threads):
         cj = s.coordinate[w, j]
-        total = dot_column(c.compliance, cj, w, count, s.loaded, s.load)
+        total = float(0.0)
+        if threads == 1:
+            total = s.sum[w, j]
+        else:
+            total = dot_column(c.compliance, cj, w, count, s.loaded, s.load)
         s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
     sync()
     move_nodes(w, t, threads, nnode, p, out, shifted, s)
@@ -184,55 +201,67 @@ def entry_of(a: int, b: int, l: Linear, c: Constants):
 
 
 @wp.func
-def _fill_rows(
+def fill_contact(
     w: int,
     outer: int,
     inner: int,
     nnode: int,
     wide: int,
     soft: float,
-    scale: float,
-    pressed: float,
+    lumped: int,
+    l: Linear,
     c: Constants,
     s: Scratch,
 ):
-    """Contact's part of the matrix of `solve_system`, row by row, for one thread."""
+    """1 + D W over what touches, D being softer by a factor, row by row, for one thread. lumped: whether D is
+    diagonal, its blocks being the first of each node."""
     n = 3 * outer + inner
+    scale = soft * float(l.scale)
+    pressed = float(l.bulk_stiffness * l.swell * l.scale)
     for j in range(n):
-        s.column[w, j] = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
-    for i in range(n):
-        for j in range(n):
-            s.matrix[w, i * wide + j] = 0.0
+        at = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+        s.column[w, j] = at
+        s.sum[w, j] = pressed * float(c.give_at[at])
     for k in range(outer):
         p = s.node[w, s.touched[w, k]]
-        for e in range(c.ring_start[p], c.ring_start[p + 1]):
-            block = s.block[w, k, e - c.ring_start[p]]
-            for a in range(3):
-                for b in range(3):
-                    if block[a, b] != 0.0:
-                        row = 3 * c.ring[e] + b
-                        fill_row(s.matrix, w, n, wide, 3 * k + a, block[a, b], c.compliance, row, s.column)
-    for k in range(inner):
-        p = s.core_node[w, coordinate_at(w, 3 * outer + k, outer, nnode, s) - 3 * nnode]
-        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
-            stiff = s.core_block[w, k, e - c.inner_ring_start[p]]
-            if stiff != 0.0:
-                row = 3 * c.node.shape[0] + c.inner_ring[e]
-                fill_row(s.matrix, w, n, wide, 3 * outer + k, stiff, c.compliance, row, s.column)
-    for i in range(n):
-        held = float(0.0)
-        if i < 3 * outer:
-            held = s.swollen[w, i]
+        held = wp.vec3(s.swollen[w, 3 * k], s.swollen[w, 3 * k + 1], s.swollen[w, 3 * k + 2])
+        if lumped == 1:
+            q = 3 * p
+            give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
+            held = s.block[w, k, 0] * give
+        for a in range(3):
+            begin_row(s.matrix, w, n, wide, 3 * k + a, soft * held[a], s.sum)
+        if lumped == 1:
+            fill_rows(s.matrix, w, n, wide, 3 * k, scale * s.block[w, k, 0], c.compliance, 3 * p, s.column)
         else:
-            p = s.core_node[w, coordinate_at(w, i, outer, nnode, s) - 3 * nnode]
+            for e in range(c.ring_start[p], c.ring_start[p + 1]):
+                block = s.block[w, k, e - c.ring_start[p]]
+                if wp.ddot(block, block) > 0.0:
+                    row = 3 * c.ring[e]
+                    fill_rows(s.matrix, w, n, wide, 3 * k, scale * block, c.compliance, row, s.column)
+    for k in range(inner):
+        i = 3 * outer + k
+        place = coordinate_at(w, i, outer, nnode, s) - 3 * nnode
+        p = s.core_node[w, place]
+        first = 3 * c.node.shape[0]
+        push = float(0.0)
+        if lumped == 1:
+            stiff = float(s.stiff[w, place])
+            push = stiff * float(c.give_at[first + p])
+            begin_row(s.matrix, w, n, wide, i, soft * push, s.sum)
+            fill_row(s.matrix, w, n, wide, i, scale * stiff, c.compliance, first + p, s.column)
+        else:
             for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
-                stiff = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
-                held += stiff * float(c.give_at[3 * c.node.shape[0] + c.inner_ring[e]])
-        begin = i * wide
-        for j in range(n):
-            push = pressed * float(c.give_at[s.column[w, j]])
-            s.matrix[w, begin + j] = soft * (scale * s.matrix[w, begin + j] - held * push)
-        s.matrix[w, begin + i] = s.matrix[w, begin + i] + 1.0
+                one = s.core_block[w, k, e - c.inner_ring_start[p]]
+                push += one * float(c.give_at[first + c.inner_ring[e]])
+            begin_row(s.matrix, w, n, wide, i, soft * push, s.sum)
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                one = s.core_block[w, k, e - c.inner_ring_start[p]]
+                if one != 0.0:
+                    row = first + c.inner_ring[e]
+                    fill_row(s.matrix, w, n, wide, i, scale * one, c.compliance, row, s.column)
+    for i in range(n):
+        s.matrix[w, i * wide + i] = s.matrix[w, i * wide + i] + 1.0
 
 
 @wp.func
@@ -303,7 +332,7 @@ def solve_system(
         pressed = float(l.bulk_stiffness * l.swell * l.scale)
         first = int(0)  # column of a row that a thread of many forms
         if threads == 1:
-            _fill_rows(w, outer, inner, nnode, wide, soft, scale, pressed, c, s)
+            fill_contact(w, outer, inner, nnode, wide, soft, 0, l, c, s)
             first = equations
         count = wide - first
         for m in range(t, outer * count, threads):
