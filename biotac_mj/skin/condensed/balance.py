@@ -10,13 +10,12 @@ import functools
 
 import warp as wp
 
-from ..contact.broadphase import face_ball, geoms_within
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
-from .lanes import block_rank, block_sum, sync
+from .lanes import block_sum, sync
 from .states import BALANCED, EVALUATE, NEWTON, Linear, Newton
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system
@@ -116,25 +115,7 @@ def evaluation(shapes: str) -> wp.Function:
             x[i, w] = c.rest[i, 0] + u
         sync()
         several = s.bodies.compliance.shape[0] > 1
-        close = int(0)
-        for begin in range(0, nface, threads):
-            k = begin + t
-            count = int(0)
-            near = wp.int64(0)
-            f = int(0)
-            if k < nface:
-                f = s.face[w, k]
-                face = c.face[f]
-                touch.touching[f, w] = 0
-                center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-                count, near = geoms_within(center, radius, w, geoms)
-            rank = block_rank(wp.min(count, 1))
-            if count > 0:
-                s.close[w, close + rank[0]] = f
-                s.close_to[w, close + rank[0]] = near
-            close += rank[1]
-        sync()
-        touch_faces(w, t, threads, close, s.close, s.close_to, geoms, x, touch, coupled)
+        touch_faces(w, t, threads, nface, s.face, s.close_to, geoms, x, touch, coupled)
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]

@@ -4,6 +4,7 @@ import warp as wp
 
 from ..contact.broadphase import (
     ALL,
+    face_ball,
     face_clearance,
     geoms_within,
     has,
@@ -32,6 +33,7 @@ wp.set_module_options({"enable_backward": False})
 
 _MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
+_STILL = wp.constant(real(2e-4))  # so far, where the core's may be nearer than these tell [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
 _NEARLY = wp.constant(real(3e-5))  # more than the core's spline is off the distance [m]
 _ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
@@ -53,27 +55,38 @@ def _moved_since(w: int, k: int, near: wp.int64, geoms: Geoms, c: Constants, s: 
 
 
 @wp.func
+def _is_clear(w: int, view: int, travel: real, near: wp.int64, geoms: Geoms, c: Constants, s: Scratch):
+    """Whether no geom is too deep in the core, by a view and how far geoms have moved since it was taken."""
+    jump = real(0.0)  # of a mesh a bound is the distance here and less there
+    for g in range(geoms.count):
+        if has(near, g) and (geoms.kind[g] == _MESH or geoms.kind[g] == SKIN):
+            jump = wp.max(jump, TRILINEAR * geoms.grids.spacing[geoms.grid[g]])
+    return s.seen_depth[w, view] + real(2.0) * travel + jump <= c.core_depth
+
+
+@wp.func
 def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
-    """Which view of the skin at rest to use, and how far what geoms have there has moved since it was taken
-    [m]; where that is far, one is taken now. A skin that is several BioTacs' by turns has several views."""
+    """Which view of the skin at rest to use, how far what geoms have there has moved since it was taken [m],
+    and which geoms are near the skin; where that is far, one is taken now. A skin that is several BioTacs' by
+    turns has several views."""
     least = _REGION
     view = int(-1)
-    _count, near = geoms_within(c.center, c.radius + _AWAY, w, geoms)
+    _count, near = geoms_within(c.center, c.radius + _AWAY, w, geoms, ALL)
     for k in range(s.far.shape[1]):
         moved = _moved_since(w, k, near, geoms, c, s)
-        if moved < least:
+        if moved < least and (moved < _STILL or _is_clear(w, k, moved, near, geoms, c, s)):
             least = moved
             view = k
     if view >= 0:
-        return view, least
+        return view, least, near
     view = s.turn[w]
     sync()
     for f in range(t, c.face.shape[0], threads):
         face = c.face[f]
         s.far[w, view, f] = face_clearance(
-            c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms
+            c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms, near
         )
-    depth = _depth(w, t, threads, geoms, c)
+    depth = _depth(w, t, threads, near, geoms, c)
     for g in range(t, geoms.count, threads):
         s.seen_pos[view, g, w] = geoms.pos[g, w]
         s.seen_mat[view, g, w] = geoms.mat[g, w]
@@ -81,7 +94,7 @@ def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
         s.seen_depth[w, view] = depth
         s.turn[w] = (view + 1) % s.far.shape[1]
     sync()
-    return view, real(0.0)
+    return view, real(0.0), near
 
 
 @wp.func
@@ -107,6 +120,7 @@ def forget_faces(
     """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
     for f in range(t, c.face.shape[0], threads):
         s.near[w, f] = kept[f, w]
+        s.close_to[w, f] = wp.int64(0)
         touching[f, w] = 0
     for f in range(t, c.inner_face.shape[0], threads):
         loaded = int(0)
@@ -130,12 +144,22 @@ def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=v
 
 
 @wp.func
-def _meets(f: int, w: int, reach: real, room: real, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether a sample of a face comes nearer to a geom than a reach; it has to move by the room for it."""
+def _meets(
+    f: int,
+    w: int,
+    reach: real,
+    room: real,
+    near: wp.int64,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+):
+    """Whether a sample of a face comes nearer to a geom of a set than a reach; it has to move by the room for
+    it."""
     if room > real(0.0) and room * room > _ROOT3 * _ROOT3 * _moved(f, w, c.face, x, c):
         return 0
     t = c.face[f]
-    clearance = sample_clearance(x[t[0], w], x[t[1], w], x[t[2], w], c.sample, w, geoms, ALL, reach, reach)
+    clearance = sample_clearance(x[t[0], w], x[t[1], w], x[t[2], w], c.sample, w, geoms, near, reach, reach)
     return wp.where(clearance < reach, 1, 0)
 
 
@@ -203,23 +227,26 @@ def find_faces(
     travel: real,
     moved: real,
     fraction: real,
+    near: wp.int64,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
-    """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than
-    a fraction of their displacement; how many there are of each, and how many are new. Beyond capacity none
-    is listed. view, travel: those of `choose_view`. moved: how far the skin has at most [m]."""
-    near = reach + _ROOT3 * travel
-    most = near + _ROOT3 * moved
+    """Adds the faces within reach of a geom [m] and those geoms, and the inner faces that are nearer to the
+    core than a fraction of their displacement; how many there are of each, and how many are new, with the
+    faces that have a new geom. Beyond capacity none is listed. view, travel, near: those of `choose_view`.
+    moved: how far the skin has at most [m]."""
+    free = reach + _ROOT3 * travel
+    most = free + _ROOT3 * moved
     if most > _AWAY:  # so far nobody has looked
         most = real(wp.inf)
-        near = most
+        free = most
+        near = ALL
     new = int(0)  # those next to each other are near together: so they are looked at by different threads
     for f in range(t, c.face.shape[0], threads):
         if s.near[w, f] == 0 and s.far[w, view, f] < most:
-            if _meets(f, w, reach, s.far[w, view, f] - near, geoms, x, c) == 1:
+            if _meets(f, w, reach, s.far[w, view, f] - free, near, geoms, x, c) == 1:
                 s.near[w, f] = 1
                 new += 1
     for f in range(t, c.inner_face.shape[0], threads):
@@ -229,6 +256,14 @@ def find_faces(
     sync()
     nface = _list_marked(w, t, threads, 0, s.near, s.face)
     ncore = _list_marked(w, t, threads, 0, s.near_core, s.core_face)
+    for k in range(t, wp.min(nface, s.face.shape[1]), threads):
+        f = s.face[w, k]
+        face = c.face[f]
+        center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+        _count, within = geoms_within(center, radius + wp.max(reach, real(0.0)), w, geoms, near)
+        if within & s.close_to[w, f] != within:
+            s.close_to[w, f] = within | s.close_to[w, f]
+            new += 1
     return nface, ncore, block_rank(new)[1]
 
 
@@ -306,24 +341,33 @@ def measure_core(
 
 
 @wp.func
-def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
-    """How deep a geom is in the core, or has a vertex of it inside; less than nothing: it is clear [m]."""
+def _depth(w: int, t: int, threads: int, near: wp.int64, geoms: Geoms, c: Constants):
+    """How deep a geom of a set is in the core, or has a vertex of it inside; less than nothing: it is clear
+    [m]."""
     deep = real(-1.0)
     n = c.core_vert.shape[0]
     for i in range(t, wp.where(n > 0, n + 1, 0), threads):
         for g in range(geoms.count):
-            clearance = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], c.core, c.core_vert)
-            deep = wp.max(deep, -clearance)
+            if has(near, g):
+                clearance = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], c.core, c.core_vert)
+                deep = wp.max(deep, -clearance)
     return block_max(deep)
 
 
 @wp.func
-def is_deep(w: int, t: int, threads: int, view: int, travel: real, geoms: Geoms, c: Constants, s: Scratch):
-    """Whether a geom is deeper in the core than a skin has room for. view, travel: those of `choose_view`."""
-    jump = real(0.0)  # of a mesh a bound is the distance here and less there
-    for g in range(geoms.count):
-        if geoms.kind[g] == _MESH or geoms.kind[g] == SKIN:
-            jump = wp.max(jump, TRILINEAR * geoms.grids.spacing[geoms.grid[g]])
-    if s.seen_depth[w, view] + real(2.0) * travel + jump <= c.core_depth:
+def is_deep(
+    w: int,
+    t: int,
+    threads: int,
+    view: int,
+    travel: real,
+    near: wp.int64,
+    geoms: Geoms,
+    c: Constants,
+    s: Scratch,
+):
+    """Whether a geom is deeper in the core than a skin has room for. view, travel, near: those of
+    `choose_view`."""
+    if _is_clear(w, view, travel, near, geoms, c, s):
         return False
-    return _depth(w, t, threads, geoms, c) > c.core_depth
+    return _depth(w, t, threads, near, geoms, c) > c.core_depth

@@ -71,6 +71,7 @@ class Increment:
     passes: int  # how often pressure and softening were found
     view: int  # of `broadphase.choose_view`
     travel: real
+    near: wp.int64
     reach: real  # faces nearer than this are candidates [m]
     spent: real
     error: real

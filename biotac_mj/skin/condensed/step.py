@@ -192,7 +192,6 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
         ("near_core", ncore),
         ("face", faces),
         ("core_face", core_faces),
-        ("close", faces),
         ("place", nouter),
         ("core_place", ninner),
         ("node", nodes),
@@ -203,7 +202,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
         ("touched", touched),
     ):
         setattr(s, name, wp.zeros((nworld, count), dtype=int))
-    s.close_to = wp.zeros((nworld, faces), dtype=wp.int64)
+    s.close_to = wp.zeros((nworld, nface), dtype=wp.int64)
     s.force = wp.zeros((nworld, nouter), dtype=vec3)
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
     s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)

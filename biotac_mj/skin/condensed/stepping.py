@@ -245,14 +245,15 @@ def search(
         o.bulge = r.bulge[w]
         if p.known == 1:
             moved = real(2.0) * _largest_motion(w, geoms)
-        view, travel = choose_view(w, t, threads, geoms, c, s)
+        view, travel, near = choose_view(w, t, threads, geoms, c, s)
         o.view = view
         o.travel = travel
+        o.near = near
         o.reach = _REACH + moved
         if p.holds == 1:
             o.solved = r.solved[w]
             o.reach = real(-1.0)  # what touched
-        elif is_deep(w, t, threads, o.view, o.travel, geoms, c, s):
+        elif is_deep(w, t, threads, o.view, o.travel, o.near, geoms, c, s):
             o.deep = 1
             looking = 0
     if looking == 1:
@@ -261,7 +262,7 @@ def search(
         if first == 1 and p.holds == 0 and largest > real(0.0):
             fraction = wp.min(real(1.0), real(1.5) * moved / largest)
         nface, ncore, new = find_faces(
-            w, t, threads, o.reach, o.view, o.travel, largest, fraction, geoms, x, c, s
+            w, t, threads, o.reach, o.view, o.travel, largest, fraction, o.near, geoms, x, c, s
         )  # fmt: skip
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0

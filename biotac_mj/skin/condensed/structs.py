@@ -90,8 +90,7 @@ class Scratch:
     near_core: wp.array2d(dtype=int)  # which inner ones
     face: wp.array2d(dtype=int)  # their numbers
     core_face: wp.array2d(dtype=int)
-    close: wp.array2d(dtype=int)  # faces whose balls geoms reach, and these geoms
-    close_to: wp.array2d(dtype=wp.int64)
+    close_to: wp.array2d(dtype=wp.int64)  # which geoms may touch a face that is a candidate
     place: wp.array2d(dtype=int)  # of an outer node among the candidates; -1: it is none
     core_place: wp.array2d(dtype=int)
     force: wp.array2d(dtype=vec3)  # on all outer nodes, to begin with [N]

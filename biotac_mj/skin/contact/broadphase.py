@@ -46,13 +46,13 @@ def has(geom_set: wp.int64, g: int):
 
 
 @wp.func
-def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms):
-    """How many geoms may be nearer to a point than the reach [m], and their set."""
+def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms, geom_set: wp.int64):
+    """How many geoms of a set may be nearer to a point than the reach [m], and their set."""
     count = int(0)
     found = wp.int64(0)
     for g in range(geoms.count):
         y = place_on(geoms, g, w, center)
-        if touch_bound(geoms, g, y, bound_to(geoms, g, center, y), reach) < reach:
+        if has(geom_set, g) and touch_bound(geoms, g, y, bound_to(geoms, g, center, y), reach) < reach:
             count += 1
             if g < 63:
                 found = found | (wp.int64(1) << wp.int64(g))
@@ -70,14 +70,15 @@ def face_ball(x0: vec3, x1: vec3, x2: vec3):
 
 
 @wp.func
-def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
-    """Lower bound of a face's distance from all geoms [m], by its ball."""
+def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms, geom_set: wp.int64):
+    """Lower bound of a face's distance from all geoms of a set [m], by its ball."""
     center, radius = face_ball(x0, x1, x2)
     clearance = FREE
     for g in range(geoms.count):
-        y = place_on(geoms, g, w, center)
-        bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius)
-        clearance = wp.min(clearance, bound - radius)
+        if has(geom_set, g):
+            y = place_on(geoms, g, w, center)
+            bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius)
+            clearance = wp.min(clearance, bound - radius)
     return clearance
 
 
@@ -289,7 +290,7 @@ def list_near(
         x0 = x[t[0], w]
         x1 = x[t[1], w]
         x2 = x[t[2], w]
-        clearance = face_clearance(x0, x1, x2, w, geoms)
+        clearance = face_clearance(x0, x1, x2, w, geoms, ALL)
         if clearance < contact_range(contact.laws, w):
             near_out[f, w] = 1
             cache.near[wp.atomic_add(cache.count, 1, 1)] = cache.unknown[k]

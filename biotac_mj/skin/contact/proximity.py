@@ -15,7 +15,7 @@ from ...geometry.rigid import displace, displacement
 from ...launches import recorded
 from ..geoms import GeomSet
 from ..types import real, vec3
-from .broadphase import geoms_within, sample_clearance
+from .broadphase import ALL, geoms_within, sample_clearance
 from .meshes import TRILINEAR
 from .penetration import core_clearance
 from .posed import Geoms
@@ -54,7 +54,7 @@ def _measure_faces(
 ):
     """Clearance of the first count[0] numbered faces, where it is less than reach[0] [m]; below reach[1] any
     bound will do. All faces lie in the ball (centre, radius): most geoms are far from it."""
-    _count, near = geoms_within(center, radius + reach[0], 0, geoms)
+    _count, near = geoms_within(center, radius + reach[0], 0, geoms, ALL)
     for i in range(count[0]):
         t = face[number[i]]
         clearance_out[i] = sample_clearance(

@@ -364,7 +364,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         c: Contact,
         friction_mode: int,
     ):
-        """Evaluates the first `count` faces listed[w] with the geoms near[w] of each, by the threads of a
+        """Evaluates the first `count` faces listed[w], each with its geoms near[w, face], by the threads of a
         block: by one for each sample, where they are `BLOCK`; else by one alone."""
         nsample = c.sample.shape[0]
         abreast = int(1)
@@ -390,7 +390,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 share = c.area[f] / real(nsample)
                 touched, bond, _gap, force, K, stick, push = touch_sample(
                     i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], share, geoms, c, friction_mode,
-                    near[w, at],
+                    near[w, f],
                 )  # fmt: skip
                 c.trial_geom[i, w] = touched
                 c.bond[i, w] = bond
