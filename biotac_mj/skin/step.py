@@ -222,7 +222,7 @@ class SkinStep:
             if self.M.needs_torch:  # torch allocates its workspaces before a capture
                 self._warm_up()
         self._program = Program(model.device, self._record)
-        self._evaluation = self._second_solve = None
+        self._evaluation = self._second_solve = self._normal_forces = None
 
     def run(self) -> None:
         """Runs one step on the current stream."""
@@ -269,7 +269,9 @@ class SkinStep:
         Args:
           touched: (n,) indices of the faces that are evaluated; the others get 0.
         """
-        return faces.normal_force_of_faces(self._forces.contact, self.geoms.struct, self.d.x, touched)
+        if self._normal_forces is None:
+            self._normal_forces = faces.NormalForces(self._forces.contact, self.geoms.struct, self.d.x)
+        return self._normal_forces(touched)
 
     def _record_evaluation(self, program):
         self._launcher = program

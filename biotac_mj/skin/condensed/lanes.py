@@ -16,6 +16,7 @@ __all__ = [
     "eliminate",
     "fill_row",
     "fill_rows",
+    "gather_rows",
     "sum_rows",
     "sync",
 ]
@@ -228,7 +229,7 @@ def block_rank(own: int) -> wp.vec2i:
                 for (int k = j + 1; k < next; ++k) mine[k] -= mine[j] * row[k];
             }}
         }}
-        const float* b = a + (long long)first * width;
+        const float* __restrict b = a + (long long)first * width;
         for (int j = first + 1; j < next; ++j) {{
             float* mine = a + (long long)j * width;
             for (int r = first; r < j; ++r) {{
@@ -238,23 +239,27 @@ def block_rank(own: int) -> wp.vec2i:
             }}
         }}
         if (next == n) break;
-        const float *b0 = b, *b1 = b0 + width, *b2 = b1 + width, *b3 = b2 + width;
-        const float *b4 = b3 + width, *b5 = b4 + width, *b6 = b5 + width, *b7 = b6 + width;
-        for (int i = next; i < n; i += 2) {{
+        for (int i = next; i < n; i += 2) {{  // two rows at a time, for each value of b that is loaded
             float* __restrict even = a + (long long)i * width;
-            float* __restrict odd = i + 1 < n ? even + width : even;
+            float* __restrict odd = even + width;
             const float f0 = even[first], f1 = even[first + 1], f2 = even[first + 2], f3 = even[first + 3];
             const float f4 = even[first + 4], f5 = even[first + 5], f6 = even[first + 6];
             const float f7 = even[first + 7];
+            if (i + 1 == n) {{
+                for (int k = next; k < width; ++k)
+                    even[k] -= (f0 * b[k] + f1 * b[width + k] + f2 * b[2 * width + k] + f3 * b[3 * width + k])
+                        + (f4 * b[4 * width + k] + f5 * b[5 * width + k] + f6 * b[6 * width + k]
+                        + f7 * b[7 * width + k]);
+                break;
+            }}
             const float g0 = odd[first], g1 = odd[first + 1], g2 = odd[first + 2], g3 = odd[first + 3];
             const float g4 = odd[first + 4], g5 = odd[first + 5], g6 = odd[first + 6], g7 = odd[first + 7];
-            #pragma clang loop vectorize(assume_safety)
             for (int k = next; k < width; ++k) {{
-                const float v = odd[k] - ((g0 * b0[k] + g1 * b1[k] + g2 * b2[k] + g3 * b3[k])
-                    + (g4 * b4[k] + g5 * b5[k] + g6 * b6[k] + g7 * b7[k]));
-                even[k] -= (f0 * b0[k] + f1 * b1[k] + f2 * b2[k] + f3 * b3[k])
-                    + (f4 * b4[k] + f5 * b5[k] + f6 * b6[k] + f7 * b7[k]);
-                if (odd != even) odd[k] = v;
+                const float b0 = b[k], b1 = b[width + k], b2 = b[2 * width + k], b3 = b[3 * width + k];
+                const float b4 = b[4 * width + k], b5 = b[5 * width + k], b6 = b[6 * width + k];
+                const float b7 = b[7 * width + k];
+                even[k] -= (f0 * b0 + f1 * b1 + f2 * b2 + f3 * b3) + (f4 * b4 + f5 * b5 + f6 * b6 + f7 * b7);
+                odd[k] -= (g0 * b0 + g1 * b1 + g2 * b2 + g3 * b3) + (g4 * b4 + g5 * b5 + g6 * b6 + g7 * b7);
             }}
         }}
     }}
@@ -282,8 +287,8 @@ def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
     ...
 
 
-# By one thread, row by row, which a processor's vectors do many columns of at a time. `A` has rows of length
-# `wide`, of which the first `n` are meant; row `from_` of C has their entries at columns `column`.
+# By one thread, row by row, of which a processor's vectors do many columns at a time. A has rows of length
+# `wide`, of which the first n are meant.
 _ROWS = """
 #if !defined(__CUDA_ARCH__)
     float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
@@ -312,12 +317,35 @@ def begin_row(
     ...
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const int* __restrict to = row.data + (long long)world * row.shape[1];
+    const int* __restrict at = column.data + (long long)world * column.shape[1];
+    float* __restrict a = A.data + (long long)world * A.shape[1];
+    for (int i = 0; i < m; ++i, a += n) {
+        const float* __restrict c = C.data + to[i] * (long long)C.shape[1];
+        for (int j = 0; j < n; ++j) a[j] = c[at[j]];
+    }
+#endif
+""")
+def gather_rows(
+    C: wp.array2d(dtype=float),
+    world: int,
+    m: int,
+    row: wp.array2d(dtype=int),
+    n: int,
+    column: wp.array2d(dtype=int),
+    A: wp.array2d(dtype=float),
+):
+    """Makes A[world] the m x n entries of C at listed rows and columns, one row after another."""
+    ...
+
+
 @wp.func_native(
     _ROWS.format(
         what="""
-    const int* __restrict at = column.data + (long long)world * column.shape[1];
-    const float* __restrict c = C.data + from_ * (long long)C.shape[1];
-    for (int j = 0; j < n; ++j) a[j] += x * c[at[j]];"""
+    const float* __restrict c = C.data + (long long)world * C.shape[1] + (long long)from_ * n;
+    for (int j = 0; j < n; ++j) a[j] += x * c[j];"""
     )
 )
 def fill_row(
@@ -329,9 +357,8 @@ def fill_row(
     x: float,
     C: wp.array2d(dtype=float),
     from_: int,
-    column: wp.array2d(dtype=int),
 ):
-    """Adds x times a row of C to a row."""
+    """Adds x times a row of C[world] of `gather_rows` to a row."""
     ...
 
 
@@ -339,14 +366,12 @@ def fill_row(
     _ROWS.format(
         what="""
     float *__restrict b = a + wide, *__restrict d = b + wide;
-    const int* __restrict at = column.data + (long long)world * column.shape[1];
-    const long long next = C.shape[1];
-    const float* __restrict c = C.data + from_ * next;
+    const float* __restrict c = C.data + (long long)world * C.shape[1] + (long long)from_ * n;
     const float x0 = x.data[0][0], x1 = x.data[0][1], x2 = x.data[0][2];
     const float y0 = x.data[1][0], y1 = x.data[1][1], y2 = x.data[1][2];
     const float z0 = x.data[2][0], z1 = x.data[2][1], z2 = x.data[2][2];
     for (int j = 0; j < n; ++j) {
-        const float u = c[at[j]], v = c[next + at[j]], w = c[2 * next + at[j]];
+        const float u = c[j], v = c[n + j], w = c[2 * n + j];
         a[j] += x0 * u + x1 * v + x2 * w;
         b[j] += y0 * u + y1 * v + y2 * w;
         d[j] += z0 * u + z1 * v + z2 * w;
@@ -362,9 +387,8 @@ def fill_rows(
     x: wp.mat33,
     C: wp.array2d(dtype=float),
     from_: int,
-    column: wp.array2d(dtype=int),
 ):
-    """Adds x times three rows of C to three rows."""
+    """Adds x times three rows of C[world] to three rows."""
     ...
 
 

@@ -231,7 +231,7 @@ def find_tangents(
         solved = int(0)
         if most > real(0.0):
             if threads == 1:
-                fill_contact(w, outer, inner, nnode, wide, 1.0, 1, l, c, s)
+                fill_contact(w, outer, inner, nnode, nin, wide, 1.0, 1, l, c, s)
             for m in range(t, wp.where(threads == 1, 0, equations * equations), threads):
                 i = m / equations
                 j = m % equations

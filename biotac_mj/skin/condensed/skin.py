@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..bodies import BodyMotion
-from ..contact.faces import normal_force_of_faces
+from ..contact.faces import NormalForces
 from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
@@ -64,6 +64,7 @@ class CondensedSkin:
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
         self._tangent = tangent.numpy()
         self._run = Program("cpu", lambda program: step.launch(tangent, program)).run
+        self._normal_forces = NormalForces(step.touch, geoms.struct, self._data.x)
         self._recall = Program("cpu", step.recall).run
         self._state = StateArrays(self._data, geoms, CONDENSED, **step.holders)
         self._nodes, self._views = {}, self._view()
@@ -257,6 +258,6 @@ class CondensedSkin:
     def normal_force_of_faces(self, memory: Memory, touched: np.ndarray) -> np.ndarray:
         """(nface,) normal push of the geoms on the outer faces [N]; 0 on those that are not among `touched`,
         numbers of faces."""
-        self._load(memory)
-        self._views["pos"][:], self._views["mat"][:] = memory.geom_pos, memory.geom_mat
-        return normal_force_of_faces(self._step.touch, self.geoms.struct, self._data.x, touched)
+        v = self._views
+        v["x"][:], v["pos"][:], v["mat"][:] = self.nodes(memory), memory.geom_pos, memory.geom_mat
+        return self._normal_forces(touched)

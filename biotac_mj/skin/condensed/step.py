@@ -209,6 +209,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.load = wp.zeros((nworld, n), dtype=float)
     sums = 0 if model.device.is_cuda else max(n, 3 * len(model.free), 3 * touched)
     s.sum = wp.zeros((nworld, sums), dtype=float)
+    s.between = wp.empty((nworld, 0 if model.device.is_cuda else 3 * touched * n), dtype=float)
     s.swollen = wp.zeros((nworld, 3 * touched), dtype=float)
     s.stiff = wp.zeros((nworld, core_nodes), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))

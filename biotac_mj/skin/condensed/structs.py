@@ -111,6 +111,7 @@ class Scratch:
     block: wp.array3d(dtype=wp.mat33)  # stiffness of pairs of nodes [N/m]
     matrix: wp.array2d(dtype=float)
     column: wp.array2d(dtype=int)  # contact coordinates of the equations
+    between: wp.array2d(dtype=float)  # by one thread, compliance of candidates at what touches
     swollen: wp.array2d(dtype=float)  # of what touches, how it is held against the liquid's pressure
     solve: Solve
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]

@@ -14,6 +14,7 @@ from .lanes import (
     eliminate,
     fill_row,
     fill_rows,
+    gather_rows,
     sum_rows,
     sync,
 )
@@ -206,6 +207,7 @@ def fill_contact(
     outer: int,
     inner: int,
     nnode: int,
+    nin: int,
     wide: int,
     soft: float,
     lumped: int,
@@ -222,6 +224,7 @@ def fill_contact(
         at = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
         s.column[w, j] = at
         s.sum[w, j] = pressed * float(c.give_at[at])
+    gather_rows(c.compliance, w, 3 * nnode + nin, s.coordinate, n, s.column, s.between)
     for k in range(outer):
         p = s.node[w, s.touched[w, k]]
         held = wp.vec3(s.swollen[w, 3 * k], s.swollen[w, 3 * k + 1], s.swollen[w, 3 * k + 2])
@@ -232,13 +235,13 @@ def fill_contact(
         for a in range(3):
             begin_row(s.matrix, w, n, wide, 3 * k + a, soft * held[a], s.sum)
         if lumped == 1:
-            fill_rows(s.matrix, w, n, wide, 3 * k, scale * s.block[w, k, 0], c.compliance, 3 * p, s.column)
+            fill_rows(s.matrix, w, n, wide, 3 * k, scale * s.block[w, k, 0], s.between, 3 * s.touched[w, k])
         else:
             for e in range(c.ring_start[p], c.ring_start[p + 1]):
                 block = s.block[w, k, e - c.ring_start[p]]
                 if wp.ddot(block, block) > 0.0:
-                    row = 3 * c.ring[e]
-                    fill_rows(s.matrix, w, n, wide, 3 * k, scale * block, c.compliance, row, s.column)
+                    row = 3 * s.place[w, c.ring[e]]
+                    fill_rows(s.matrix, w, n, wide, 3 * k, scale * block, s.between, row)
     for k in range(inner):
         i = 3 * outer + k
         place = coordinate_at(w, i, outer, nnode, s) - 3 * nnode
@@ -249,7 +252,7 @@ def fill_contact(
             stiff = float(s.stiff[w, place])
             push = stiff * float(c.give_at[first + p])
             begin_row(s.matrix, w, n, wide, i, soft * push, s.sum)
-            fill_row(s.matrix, w, n, wide, i, scale * stiff, c.compliance, first + p, s.column)
+            fill_row(s.matrix, w, n, wide, i, scale * stiff, s.between, 3 * nnode + place)
         else:
             for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
                 one = s.core_block[w, k, e - c.inner_ring_start[p]]
@@ -258,8 +261,8 @@ def fill_contact(
             for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
                 one = s.core_block[w, k, e - c.inner_ring_start[p]]
                 if one != 0.0:
-                    row = first + c.inner_ring[e]
-                    fill_row(s.matrix, w, n, wide, i, scale * one, c.compliance, row, s.column)
+                    row = 3 * nnode + s.core_place[w, c.inner_ring[e]]
+                    fill_row(s.matrix, w, n, wide, i, scale * one, s.between, row)
     for i in range(n):
         s.matrix[w, i * wide + i] = s.matrix[w, i * wide + i] + 1.0
 
@@ -332,7 +335,7 @@ def solve_system(
         pressed = float(l.bulk_stiffness * l.swell * l.scale)
         first = int(0)  # column of a row that a thread of many forms
         if threads == 1:
-            fill_contact(w, outer, inner, nnode, wide, soft, 0, l, c, s)
+            fill_contact(w, outer, inner, nnode, nin, wide, soft, 0, l, c, s)
             first = equations
         count = wide - first
         for m in range(t, outer * count, threads):

@@ -7,6 +7,7 @@ left out by one distance of their centre."""
 import numpy as np
 import warp as wp
 
+from ..program import Program
 from ..types import mat33, real, sum_of_block, vec3
 from .posed import Geoms, Meeting, distance_to, meet, place_on
 
@@ -14,6 +15,7 @@ __all__ = [
     "Contact",
     "FaceSum",
     "Laws",
+    "NormalForces",
     "block_index",
     "commit_contacts",
     "commit_face",
@@ -21,7 +23,6 @@ __all__ = [
     "face_samples",
     "clear_bounds",
     "switch_off_touched",
-    "normal_force_of_faces",
     "partial_wrench",
     "normal_forces",
     "sum_normal_forces",
@@ -204,19 +205,28 @@ def normal_forces(
         corner_out[3 * f + c, w] = total[c]
 
 
-def normal_force_of_faces(contact: Contact, geoms: Geoms, x: wp.array, faces: np.ndarray) -> np.ndarray:
-    """(nface,) size of the normal push on some faces of the only world [N], 0 on the others.
+class NormalForces:
+    """Size of the normal force on faces of a single world, recorded once.
 
     Args:
-      x: nodes (nvert, 1) [m]. faces: numbers of those that may be touched.
+      contact, geoms, x: of the surface, what touches it and where its nodes (nvert, 1) are [m].
     """
-    device, count = x.device, len(contact.face)
-    near = np.zeros((count, 1), np.int32)
-    near[faces] = 1
-    near, on = (wp.array(a, dtype=int, device=device) for a in (near, np.ones(1, np.int32)))
-    corner = wp.zeros((3 * count, 1), dtype=real, device=device)
-    wp.launch(normal_forces, near.shape, [geoms, x, on, near, contact], [corner], device=device)
-    return corner.numpy().reshape(count, 3).sum(axis=1)
+
+    def __init__(self, contact: Contact, geoms: Geoms, x: wp.array):
+        count, device = len(contact.face), x.device
+        dim = count, 1
+        self._near = wp.zeros(dim, dtype=int, device=device)
+        corner = self._corner = wp.zeros((3 * count, 1), dtype=real, device=device)
+        given = [geoms, x, wp.ones(1, dtype=int, device=device), self._near, contact]
+        self._run = Program(device, lambda program: program.launch(normal_forces, dim, given, [corner])).run
+
+    def __call__(self, faces: np.ndarray) -> np.ndarray:
+        """(nface,) [N], 0 on what is not among `faces`, numbers of those that may be touched."""
+        near = np.zeros(self._near.shape, np.int32)
+        near[faces] = 1
+        self._near.assign(near)
+        self._run()
+        return self._corner.numpy().reshape(-1, 3).sum(axis=1)
 
 
 @wp.kernel

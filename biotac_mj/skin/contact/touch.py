@@ -180,7 +180,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
     law = "lawful" if lawful else "smooth" if smooth else "coulomb"
     module = f"{__name__}.{law}_{shapes}"
 
-    @wp.func
+    # inline: on the CPU a call copies all that Geoms and Contact hold, which takes as long as a sample does
+    @wp.func(inline=True)
     def touch_sample(
         i: int,
         w: int,
