@@ -8,8 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from blocks import four_nodes
+from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj import cli
+from biotac_mj.discrepancy import diagnose
+from biotac_mj.discrepancy.trajectories import search
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator, remember, solve_with_memory
@@ -124,6 +127,15 @@ def test_what_a_reduced_form_misses_is_kept_and_scales():
         (Simulator(), relax, clean | {"tau": 5.0}),  # the condensed tier's rubber cannot
     ):
         assert not remember(other, fields, effect, values)
+
+
+def test_a_fit_of_solved_rubber_is_judged_as_others_are(monkeypatch):
+    """The skin's own answer is put in place of the reduced form's where that has much evidence."""
+    effect, solved = by_id("relax"), []
+    data = measured([(effect, {**effect.default(), "g": 0.25, "tau": 0.5})], n=8)
+    monkeypatch.setattr(search, "remember", lambda *args: solved.append(args[2].id) is None)
+    report = diagnose(Springs(), data, effects=[effect], progress=False)
+    assert solved and [e.id for e in report.effects] == ["relax"]
 
 
 @pytest.mark.parametrize("solved", (True, False))
