@@ -2,13 +2,14 @@
 what stands in the page. What cannot run in a test is named, with the reason; its commands are understood."""
 
 import argparse
+import ast
+import functools
 import pathlib
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
+from _pytest.mark.expression import Expression
 from documents import BLOCK, agree, blocks, pictures, printed, run, with_output
 
 from biotac_mj import cli
@@ -173,40 +174,53 @@ def test_commands_that_prose_code_and_help_name_exist():
     assert seen > 200
 
 
-@pytest.mark.slow
-def test_scripts_and_tests_that_pages_name_exist():
-    """`python FILE ...` has the options that a page gives it, `pytest ... -k WORDS` finds a test."""
-    helps, found = {}, set()
-    for page in PAGES:
-        ours = r"(?:pytest|benchmarks|examples|scripts)\b[^`\n]*"
-        called = rf"(?:^    |`)(?:[A-Z_]+=\S+ )?(?:python (?:-m )?)?({ours})"
-        found |= set(re.findall(called, page.read_text(), re.M))
-    for line in sorted(found):
-        words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
-        if words[0] == "pytest":
-            files = [word for word in words if word.startswith("tests/")]
-            chosen = [*files, *(["-k", words[words.index("-k") + 1]] if "-k" in words else [])]
-            command = [
-                sys.executable,
-                "-m",
-                "pytest",
-                "-q",
-                "--collect-only",
-                "-m",
-                "slow or not slow",
-                *chosen,
+@functools.cache
+def arguments(path, alone=True):
+    """({options}, {required options}) of a script; what modules beside it add may be given."""
+    tree, taken, required = ast.parse(path.read_text()), set(), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom | ast.Import):
+            names = [node.module] if isinstance(node, ast.ImportFrom) else [name.name for name in node.names]
+            for beside in (path.parent / f"{name}.py" for name in filter(None, names)):
+                if alone and beside.is_file():
+                    taken |= arguments(beside, False)[0]
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
+            names = {one.value for one in node.args if isinstance(one, ast.Constant)}
+            needed = [
+                one for one in node.keywords if one.arg == "required" and ast.unparse(one.value) == "True"
             ]
-            done = subprocess.run(command, capture_output=True, text=True, cwd=REPO)
-            assert done.returncode == 0, f"{line}: no such test"
-        elif re.match(r"(benchmarks|examples|scripts)/\w+\.py", words[0]):
-            if words[0] not in helps:
-                command = [sys.executable, REPO / words[0], "--help"]
-                done = subprocess.run(command, capture_output=True, text=True, cwd=REPO)
-                assert done.returncode == 0, f"{words[0]}: {done.stderr[-500:]}"
-                helps[words[0]] = done.stdout
-            for option in (word for word in words if word.startswith("--")):
-                assert option in helps[words[0]], f"{line}: no {option}"
-    assert len(helps) > 20
+            taken |= {name for name in names if name.startswith("--")}
+            required |= names if needed else set()
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):  # added in a loop over names
+            taken |= {f"--{node.value}"} if re.fullmatch(r"[a-z-]+", node.value) else set()
+    return taken, required
+
+
+def test_scripts_and_tests_that_pages_name_exist():
+    """`python FILE ...` has the options that a page gives it and lacks none, `pytest ... -k WORDS` finds a
+    test."""
+    ours = r"(?:pytest|(?:benchmarks|examples|scripts)/\w+\.py)\b[^`\n]*"
+    called = rf"(?:^    |`)(?:[A-Z_]+=\S+ )?(python )?(?:-m )?({ours})"
+    found = {(page, *one) for page in PAGES for one in re.findall(called, page.read_text(), re.M)}
+    wrong = []
+    for page, python, line in found:
+        words = shlex.split(re.sub(r"[][]", "", line), comments=True)
+        where = f"{page.name}: {line}"
+        if words[0] == "pytest":
+            files = [REPO / word for word in words if word.startswith("tests/") and "*" not in word]
+            tests = [name for file in files for name in re.findall(r"def (test_\w+)", file.read_text())]
+            if "-k" in words:
+                chosen = Expression.compile(words[words.index("-k") + 1])
+                if not any(chosen.evaluate(lambda word, of=name: word in of) for name in tests):
+                    wrong.append(f"{where}: no such test")
+            continue
+        taken, required = arguments(REPO / words[0])
+        given = {word for word in words if word.startswith("--")}
+        wrong += [f"{where} has no {option}" for option in given - taken]
+        if python and len(words) > 1:
+            wrong += [f"{where} needs {option}" for option in required - given]
+    assert not wrong, "\n".join(wrong)
+    assert len(found) > 60
 
 
 @pytest.mark.slow
