@@ -96,7 +96,10 @@ def draw(found: dict, path: pathlib.Path) -> None:
     left on the other skin and sensor."""
     from matplotlib.figure import Figure
 
-    kinds, tasks = (list(dict.fromkeys(c[name] for c in found["policies"])) for name in ("observe", "task"))
+    from biotac_mj.tasks.batched import OBSERVE
+
+    there, tasks = (list(dict.fromkeys(c[name] for c in found["policies"])) for name in ("observe", "task"))
+    kinds = [kind for kind in OBSERVE if kind in there]
     groups = {"policies": found["policies"], "transfer": found.get("transfer", [])}
     figure = Figure(figsize=(2.6 * len(tasks) + 1.0, 3.2), layout="constrained")
     for axis, task in zip(figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0], tasks, strict=True):
