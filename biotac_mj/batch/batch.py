@@ -73,9 +73,13 @@ class Batch(Skins):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
             for name in ("straight", "travel", "drift", "moved", "full_wrench", "full_motion"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            for name in ("trial", "placed", "inside", "open", "passed"):
+            for name in ("trial", "placed", "open"):
+                setattr(r, name, wp.zeros(self.groups, dtype=int))
+            for name in ("inside", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
-            for name in ("gamma", "horizon", "square", "frequency", "left", "store", "most", "without"):
+            for name in ("left", "store", "most", "without"):
+                setattr(r, name, wp.zeros(self.groups, dtype=wp.float64))
+            for name in ("gamma", "horizon", "square", "frequency"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=wp.float64))
             self._step = wp.full(self.nworld, self.dt, dtype=wp.float64)
             self._power = wp.zeros((self.nworld, 6 * skin.ngroup), dtype=wp.vec2d)
@@ -211,7 +215,7 @@ class Batch(Skins):
         laws, geoms = skin.data.laws.struct, skin.geoms.struct
         self.place_geoms(r.here_pos, r.here_mat, m.geom_pos, m.geom_quat)
         clearance.found.fill_(wp.vec2d(math.inf, math.inf))
-        wp.copy(clearance.close, r.placed)
+        wp.copy(clearance.close, r.inside)
         clearance.measure(geoms, laws, skin.data.rest_vert)
         self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
 
@@ -299,12 +303,12 @@ class Batch(Skins):
         self._settle(energy.find_energy, taking_part, [self._last], [self._solid], out)
 
     def restrain(self, taking_part: Marks, going: Marks) -> None:
-        """Takes the push of skins that have not the energy for it, after `find_energy`, and marks their
+        """Takes the push on bodies that have not the energy for it, after `find_energy`, and marks their
         worlds."""
         self._settle(energy.restrain, taking_part, outputs=[going.struct])
 
     def scale_push(self) -> None:
-        """Gives those as much push as they have energy for, after `evaluate` without any."""
+        """Gives these as much push as they have energy for, after `evaluate` without any."""
         self._settle(energy.scale_push)
 
     def withhold(self, going: Marks, still_going: Marks) -> None:

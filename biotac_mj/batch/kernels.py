@@ -284,7 +284,7 @@ def write_sensors(
     error: wp.array(dtype=real),
     rounds: wp.array(dtype=int),
     load_factor: wp.array(dtype=real),
-    push: wp.array(dtype=real),
+    push: wp.array2d(dtype=real),
     tier: wp.array(dtype=int),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
@@ -322,4 +322,7 @@ def write_sensors(
         sensordata_out[w, address[6] + 4] = float(tier[w])
         sensordata_out[w, address[6] + 5] = float(rounds[w])
         sensordata_out[w, address[6] + 6] = float(load_factor[w])
-        sensordata_out[w, address[6] + 7] = float(real(1.0) - push[w])
+        least = real(1.0)
+        for g in range(push.shape[0]):
+            least = wp.min(least, push[g, w])
+        sensordata_out[w, address[6] + 7] = float(real(1.0) - least)

@@ -65,7 +65,7 @@ class Skins:
             self.failed, self.began = (wp.zeros(self.nworld, dtype=int) for _ in range(2))
             # how a step goes in which bodies and skin do not meet: one round, all of the push
             self._settled, self._rounds = (wp.ones(self.nworld, dtype=int) for _ in range(2))
-            self._push = wp.ones(self.nworld, dtype=wp.float64)
+            self._push = wp.ones(shape, dtype=wp.float64)
             self._valid = senses.film.valid if senses else wp.ones(self.nworld, dtype=int)
             self._no_state = wp.zeros((self.nworld, self._place.nstate), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)

@@ -16,7 +16,7 @@ from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.metric import Metric
 from .implicit.rules import EULER, LOSS_FREQUENCY, PATIENCE, gamma_of, stayed
-from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
+from .setup import CONVERGED, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
@@ -126,9 +126,10 @@ class Instance:
         is known that it may have led to, one without the rotations that each has."""
         bad = not math.isfinite(self.state.sum())
         if bad:
-            known = np.isfinite(self.state)
-            known[ENERGY] |= self.state[ENERGY] == np.inf
-            bad = not known.all()
+            state = self.state.copy()
+            energy = self.setup.parts(state)[1][:, 66]
+            energy[energy == np.inf] = 0.0
+            bad = not np.isfinite(state).all()
         if cause is not None and not bad:
             turned = self.setup.parts(self.state)[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
             bad = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) > 1e-6
@@ -164,26 +165,26 @@ class Instance:
         )
 
     def last_energy(self) -> tuple:
-        """Energy [J] that the last step left in the skin at most, and the poses (ngroup, 3), (ngroup, 3, 3)
-        at which it left the bodies; None instead of these before the first step. Where the bodies were out of
-        reach, these are about where they go."""
+        """Energy (ngroup,) [J] that the last step left to the bodies in the skin at most, and the poses
+        (ngroup, 3), (ngroup, 3, 3) at which it left them; None instead of these before the first step. Where
+        they were out of reach, these are about where they go."""
         head, models, *_ = self.setup.parts(self.state)
-        ends = (models[:, 54:57], models[:, 57:].reshape(-1, 3, 3)) if head[STARTED] else None
-        return float(head[ENERGY]), ends
+        ends = (models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)) if head[STARTED] else None
+        return models[:, 66], ends
 
     @property
     def was_out_of_reach(self) -> bool:
         """Whether nothing was in reach of the skin in the last step."""
         return self.setup.parts(self.state)[0][STARTED] == OUT_OF_REACH
 
-    def most_energy(self, wrench: np.ndarray) -> float:
-        """Upper bound [J] of the energy in a skin that pushes with wrenches (ngroup, 6): its force times the
-        distance to the core."""
-        if self.inertial or not wrench.any():
-            return np.inf if self.inertial else self.setup.surface_energy
+    def most_energy(self, wrench: np.ndarray) -> np.ndarray:
+        """(ngroup,) upper bounds [J] of the energy in a skin that pushes with wrenches (ngroup, 6): its force
+        times the distance to the core."""
+        if self.inertial:
+            return np.full(len(wrench), np.inf)
         squares = wrench * wrench
         force = np.sqrt(squares[:, :3].sum(axis=1)) + np.sqrt(squares[:, 3:].sum(axis=1)) / LEVER
-        return float(force.sum()) * self.setup.thickness + self.setup.surface_energy
+        return force * self.setup.thickness + self.setup.surface_energy
 
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
         """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
@@ -314,15 +315,15 @@ class Instance:
         )
 
     def concluded(
-        self, rounds: int, settled: bool, withheld: float, energy: float, ends: tuple, acting: np.ndarray
+        self, rounds: int, settled: bool, withheld: float, energy: np.ndarray, ends: tuple, acting: np.ndarray
     ) -> None:
         """Keeps for the readings and `commit_step` how the coupled step went.
 
         Args:
           rounds: through MuJoCo's solver and the skin.
           settled: whether the skin was solved where the bodies go.
-          withheld: share of the skin's push that it could not pay for.
-          energy: left in the skin at most [J].
+          withheld: share of the skin's push on a body at most that there was no energy for.
+          energy: (ngroup,) left to each body in the skin at most [J].
           ends: poses (ngroup, 3), (ngroup, 3, 3) where the step leaves the bodies.
           acting: wrenches (ngroup, 6) that the bodies get in this step; where it did not settle or push was
             withheld, not those of the skin's last solve.
@@ -334,7 +335,7 @@ class Instance:
         skin; None leaves the stored one."""
         self.step_gamma, self._frequency = gamma, frequency
 
-    def arrived(self, energy: float, ends: tuple, near: bool) -> None:
+    def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
         """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
         they were to go; asked only with Runge-Kutta, whose status is written when the step ends."""
         rounds, settled, withheld, _, _, acting = self._outcome
@@ -551,11 +552,11 @@ class Instance:
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach, frequency = REACHED if ends else OUT_OF_REACH, self._frequency
         frequency = head[FREQUENCY] if frequency is None else frequency
-        head[:] = head[FAILED] + (not good), good - steps, reach, energy, frequency
+        head[:] = head[FAILED] + (not good), good - steps, reach, frequency
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
-        models[:, 54:57], models[:, 57:] = ends[0], ends[1].reshape(n, 9)
+        models[:, 54:57], models[:, 57:66], models[:, 66] = ends[0], ends[1].reshape(n, 9), energy
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

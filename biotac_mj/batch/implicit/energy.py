@@ -4,7 +4,7 @@ once with one thread each, made after the `rounds`."""
 
 import warp as wp
 
-from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, withheld_further
+from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, lacking, spared, withheld_further
 from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
@@ -28,8 +28,8 @@ wp.set_module_options({"enable_backward": False})
 real = wp.float64
 vec6 = wp.spatial_vectord
 
-_in_store, _affordable, _withheld_further = (
-    wp.func(rule) for rule in (in_store, affordable, withheld_further)
+_in_store, _lacking, _spared, _affordable, _withheld_further = (
+    wp.func(rule) for rule in (in_store, lacking, spared, affordable, withheld_further)
 )
 mat66 = wp.spatial_matrixd
 
@@ -45,15 +45,12 @@ def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: i
 
 
 @wp.func
-def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
-    """Work of what acts on the bodies on their way [J]; not on what was lost before the step."""
-    work = real(0.0)
-    for g in range(r.pos.shape[0]):
-        motion = r.straight[g, w]
-        if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(motion, motion))):
-            continue
-        work += wp.dot(acting(r, model, wrench, g, w), r.travel[g, w])
-    return work
+def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
+    """Work of what acts on a body on its way [J]; not on what was lost before the step."""
+    motion = r.straight[g, w]
+    if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(motion, motion))):
+        return real(0.0)
+    return wp.dot(acting(r, model, wrench, g, w), r.travel[g, w])
 
 
 @wp.func
@@ -68,9 +65,34 @@ def most_energy(r: Rounds, force: real, solid: Solid, w: int):
 
 
 @wp.func
-def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
-    """Whether what acts gives more energy than there is, or is no number."""
-    return not given(r, model, wrench, w) <= wp.max(r.store[w], real(0.0))
+def draws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, slack: real):
+    """What the bodies of a skin lack together, and what they may leave to each other [J]. slack: of the most
+    that the skin can hold, by which each may get more."""
+    lacks = real(0.0)
+    spare = real(0.0)
+    for g in range(r.pos.shape[0]):
+        gets = given(r, model, wrench, g, w)
+        spare += _spared(r.left[g, w], r.store[g, w], gets)
+        if slack > real(0.0):
+            gets -= slack * r.most[g, w]
+        lacks += _lacking(r.store[g, w], gets)
+    return wp.vec2d(lacks, spare)
+
+
+@wp.func
+def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, slack: real):
+    """Whether what acts gives bodies more energy than they have, or is no number."""
+    both = draws(r, model, wrench, w, slack)
+    return not both[0] <= both[1]
+
+
+@wp.func
+def limit(r: Rounds, g: int, w: int, gets: real, both: wp.vec2d):
+    """Energy that a body may get, with its part of what others leave it [J]."""
+    part = real(0.0)
+    if both[0] > real(0.0):
+        part = _lacking(r.store[g, w], gets) * both[1] / both[0]
+    return wp.max(r.store[g, w], real(0.0)) + part
 
 
 @wp.kernel
@@ -87,33 +109,29 @@ def find_energy(
     greedy_out: wp.array(dtype=int),
     damped: MarkedWorlds,
 ):
-    """Finds the energy in the skins: that of the last step, and what those have put in who have moved bodies
-    since. Those that would give more are greedy while they have not yet made backward Euler's step, which
-    gives less: their worlds are marked."""
+    """Finds the energy that each body has in the skin: that of the last step, and what those have put in who
+    have moved it since. Skins that would give more are greedy while they have not yet made backward Euler's
+    step, which gives less: their worlds are marked."""
     w = wp.tid()
     greedy_out[w] = 0
     if taking_part[w] == 0:
         return
-    before = real(0.0)
-    now = real(0.0)
-    pushed = real(0.0)
-    pushes = real(0.0)
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         acts = acting(r, model, wrench, g, w)
-        before += wp.dot(last.wrench0[g, w], jump)
-        now += wp.dot(acts, jump)
-        pushed += force_of(last.wrench0[g, w])
-        pushes += force_of(acts)
+        before = wp.dot(last.wrench0[g, w], jump)
+        now = wp.dot(acts, jump)
+        pushes = force_of(acts)
         r.full_wrench[g, w] = acts
         r.full_motion[g, w] = r.travel[g, w]
-    # a solve that lost its way knows little of the force that was there before it
-    r.most[w] = most_energy(r, wp.max(pushed, pushes), solid, w)
-    store = _in_store(r.left[w], before, now, r.most[w])
-    if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with, and elsewhere nothing
-        store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
-    r.store[w] = store
-    if r.gamma[w] < real(EULER) and overdraws(r, model, wrench, w):
+        # a solve that lost its way knows little of the force that was there before it
+        most = most_energy(r, wp.max(force_of(last.wrench0[g, w]), pushes), solid, w)
+        store = _in_store(r.left[g, w], before, now, most)
+        if r.placed[g, w] == 1:  # who puts bodies into a skin puts in what it pushes with, elsewhere nothing
+            store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
+        r.most[g, w] = most
+        r.store[g, w] = store
+    if r.gamma[w] < real(EULER) and overdraws(r, model, wrench, w, real(0.0)):
         greedy_out[w] = 1
         mark(damped, w)
 
@@ -128,11 +146,13 @@ def restrain(
     r: Rounds,
     going: MarkedWorlds,
 ):
-    """Takes the push of skins that would give more energy than they have, and marks their worlds. What
+    """Takes the push on bodies that would get more energy than they have, and marks their worlds. What
     remains without it is the skin's tangent about the present pose: a damper."""
     w = wp.tid()
-    if taking_part[w] == 1 and overdraws(r, model, wrench, w):
-        r.push[w] = real(0.0)
+    if taking_part[w] == 1 and overdraws(r, model, wrench, w, real(0.0)):
+        for g in range(r.pos.shape[0]):
+            if not _lacking(r.store[g, w], given(r, model, wrench, g, w)) == real(0.0):
+                r.push[g, w] = real(0.0)
         mark(going, w)
 
 
@@ -144,22 +164,21 @@ def scale_push(
     # In and out:
     r: Rounds,
 ):
-    """As much push as there is energy for, of skins without any: what acts, and how bodies move, is linear in
-    it while no other contact changes."""
+    """As much push as there is energy for, on bodies without any: what acts, and how bodies move, is linear
+    in it while no other contact changes."""
     w = wp.tid()
-    if r.push[w] == real(1.0):
-        return
-    # of the work: without push, with all of it, and half of the curve between them
-    none = given(r, model, wrench, w)
-    full = real(0.0)
-    bend = real(0.0)
+    both = draws(r, model, wrench, w, real(0.0))
     for g in range(r.pos.shape[0]):
-        full += wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
+        if r.push[g, w] == real(1.0):
+            continue
+        # of the work: without push, with all of it, and half of the curve between them
+        none = given(r, model, wrench, g, w)
+        full = wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
         change = r.full_wrench[g, w] - acting(r, model, wrench, g, w)
-        bend += wp.dot(change, r.full_motion[g, w] - r.travel[g, w])
-    r.push[w] = _affordable(r.store[w], none, full, bend)
-    r.without[w] = none
-    r.trial[w] = 0
+        bend = wp.dot(change, r.full_motion[g, w] - r.travel[g, w])
+        r.push[g, w] = _affordable(limit(r, g, w, none, both), none, full, bend)
+        r.without[g, w] = none
+        r.trial[g, w] = 0
 
 
 @wp.kernel
@@ -172,19 +191,23 @@ def withhold(
     r: Rounds,
     still_going: MarkedWorlds,
 ):
-    """Withholds more where a share of the push still gives too much, at last all: also of a skin that gives
-    too much only now that another one of its world pushes less."""
+    """Withholds more where a share of the push still gives too much, at last all: also of a body that gets
+    too much only now that others get less."""
     w = wp.tid()
-    if going[w] == 0 or r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
+    if going[w] == 0 or not overdraws(r, model, wrench, w, real(0.0)):
         return
-    mark(still_going, w)
-    if r.push[w] == real(1.0):
-        r.push[w] = real(0.0)
-        return
-    r.push[w] = _withheld_further(r.push[w], r.store[w], r.without[w], given(r, model, wrench, w))
-    r.trial[w] = r.trial[w] + 1
-    if r.trial[w] == _TRIALS:
-        r.push[w] = real(0.0)
+    both = draws(r, model, wrench, w, real(0.0))
+    for g in range(r.pos.shape[0]):
+        gets = given(r, model, wrench, g, w)
+        if r.push[g, w] == real(0.0) or _lacking(r.store[g, w], gets) == real(0.0):
+            continue
+        mark(still_going, w)
+        if r.push[g, w] < real(1.0) and r.trial[g, w] < _TRIALS - 1:
+            most = limit(r, g, w, gets, both)
+            r.push[g, w] = _withheld_further(r.push[g, w], most, r.without[g, w], gets)
+            r.trial[g, w] = r.trial[g, w] + 1
+        else:
+            r.push[g, w] = real(0.0)
 
 
 @wp.kernel
@@ -199,8 +222,7 @@ def find_gain(
 ):
     """Marks worlds where a skin gives more than it has whatever is withheld, or what acts is no number."""
     w = wp.tid()
-    store = wp.max(r.store[w], real(0.0)) + _ROUNDING * r.most[w]
-    if taking_part[w] == 1 and not given(r, model, wrench, w) <= store:
+    if taking_part[w] == 1 and overdraws(r, model, wrench, w, _ROUNDING):
         mark(gains, w)
 
 
@@ -221,9 +243,9 @@ def withdraw(
         return
     for i in range(warmstart.shape[1]):
         warmstart[w, i] = float(0.0)
-    r.push[w] = real(0.0)
     r.settled[w] = 0
     for g in range(correction.shape[0]):
+        r.push[g, w] = real(0.0)
         model.wrench0[g, w] = vec6()
         model.tangent0[g, w] = mat66()
         correction[g, w] = vec6()
@@ -322,13 +344,21 @@ def conclude(
     if taking_part[w] == 0:
         return
     r.frequency[w] = _frequency(power, w)
-    # what is withheld is in the skin all the same
-    store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
-    if r.open[w] == 1 or r.inside[w] == 1:  # what was put in is not known before a balance is found
-        r.open[w] = wp.where(reason[w] == CONVERGED, 0, 1)
-        if r.open[w] == 1:
-            store = real(wp.inf)
-    r.left[w] = store
+    both = draws(r, model, wrench, w, real(0.0))
+    passed = wp.min(both[0], both[1])  # from some bodies to others
+    for g in range(r.pos.shape[0]):
+        gets = given(r, model, wrench, g, w)
+        left = r.store[g, w] - gets  # what is withheld is in the skin all the same
+        if passed > real(0.0):
+            left += passed * _lacking(r.store[g, w], gets) / both[0]
+            left -= passed * _spared(r.left[g, w], r.store[g, w], gets) / both[1]
+        left = wp.min(left, r.most[g, w])
+        if r.open[g, w] == 1 or (r.placed[g, w] == 1 and r.inside[w] == 1):
+            # what was put in is not known before a balance is found
+            r.open[g, w] = wp.where(reason[w] == CONVERGED, 0, 1)
+            if r.open[g, w] == 1:
+                left = real(wp.inf)
+        r.left[g, w] = left
 
 
 @wp.kernel
@@ -338,10 +368,10 @@ def pass_by(taking_part: wp.array(dtype=int), area: real, r: Rounds):
     w = wp.tid()
     if taking_part[w] == 1:
         return
-    r.left[w] = real(0.0)
-    if r.surface.shape[0] > 0:
-        r.left[w] = r.surface[w] * area
     r.passed[w] = 1
     for g in range(r.pos.shape[0]):
+        r.left[g, w] = real(0.0)
+        if r.surface.shape[0] > 0:
+            r.left[g, w] = r.surface[w] * area
         r.end_pos[g, w] = r.start_pos[g, w]
         r.end_mat[g, w] = r.start_mat[g, w]

@@ -79,19 +79,19 @@ class Rounds:
     rounds: wp.array(dtype=int)  # solves of the skin
     limit: int  # of these
     began: wp.array(dtype=int)  # a step was made since the reset
-    placed: wp.array(dtype=int)  # bodies were put where they are from outside
-    inside: wp.array(dtype=int)  # and into the skin
-    open: wp.array(dtype=int)  # what was put in so is not yet known
+    placed: wp.array2d(dtype=int)  # a body was put where it is from outside
+    inside: wp.array(dtype=int)  # and one of them into the skin
+    open: wp.array2d(dtype=int)  # what was put in so is not yet known
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
-    push: wp.array(dtype=real)  # of the wrench at the present pose that acts: less than 1 where not paid for
-    trial: wp.array(dtype=int)  # of shares of the push
-    without: wp.array(dtype=real)  # [J] work without any push
+    push: wp.array2d(dtype=real)  # of the wrench at the present pose that acts: less than 1 where not paid for
+    trial: wp.array2d(dtype=int)  # of shares of the push
+    without: wp.array2d(dtype=real)  # [J] work without any push
     # with all of the push: wrenches that act, and motions of the bodies
     full_wrench: wp.array2d(dtype=vec6)
     full_motion: wp.array2d(dtype=vec6)
-    left: wp.array(dtype=real)  # [J] energy that the last step left in the skin at most
-    store: wp.array(dtype=real)  # [J] and with what was put into it since
-    most: wp.array(dtype=real)  # [J] that the skin can hold
+    left: wp.array2d(dtype=real)  # [J] energy that the last step left a body in the skin at most
+    store: wp.array2d(dtype=real)  # [J] and with what was put into it since
+    most: wp.array2d(dtype=real)  # [J] that the skin can hold of it
     surface: wp.array(dtype=real)  # [J/m^2] of adhesion, of length zero without a law
 
 
@@ -139,7 +139,7 @@ def wrenches(
             _turns(r.drift[g, w]),
         )
         total = model.wrench0[g, w] + model.tangent0[g, w] * motion
-        push = r.push[w]
+        push = r.push[g, w]
         if push < real(1.0):
             # against the drift itself: the way from here to the pose is another one where bodies turn far
             total = push * total - (real(1.0) - push) * (model.tangent0[g, w] * r.drift[g, w])
@@ -167,21 +167,22 @@ def choose_gamma(step: real, delay: real, inertial: int, last: Model, r: Rounds)
 @wp.kernel
 def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     w = wp.tid()
-    r.placed[w] = 1 - r.began[w]
-    if r.began[w] == 0:
-        r.open[w] = 0
+    r.inside[w] = 1 - r.began[w]
     for g in range(r.pos.shape[0]):
+        r.placed[g, w] = 1 - r.began[w]
+        r.push[g, w] = real(1.0)
+        if r.began[w] == 0:
+            r.open[g, w] = 0
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.straight[g, w])):
-            r.placed[w] = 1
+            r.placed[g, w] = 1
+            r.inside[w] = 1
         if r.passed[w] == 1:  # where it ended is only about known, and nobody touched it
             r.end_pos[g, w] = r.here_pos[g, w]
             r.end_mat[g, w] = r.here_mat[g, w]
     r.passed[w] = 0
-    r.inside[w] = r.placed[w]
     r.settled[w] = 1
     r.rounds[w] = 1 - awake[w]
-    r.push[w] = real(1.0)
 
 
 @wp.kernel

@@ -1,7 +1,6 @@
 """A skin in two-way coupling during one step: its linear model, where its bodies go under this model, and the
 energy that it can give."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,17 @@ from ...skin.bodies import BodyMotion
 from ..instance import LEVER, STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
-from .rules import EULER, TRIALS, affordable, beta_of, in_store, share_that_pushes, withheld_further
+from .rules import (
+    EULER,
+    TRIALS,
+    affordable,
+    beta_of,
+    in_store,
+    lacking,
+    share_that_pushes,
+    spared,
+    withheld_further,
+)
 
 __all__ = ["TELEPORT", "Coupled", "size"]
 
@@ -20,17 +29,26 @@ __all__ = ["TELEPORT", "Coupled", "size"]
 _MOST = 0.9
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
+_TINY = np.finfo(float).tiny
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
 
 class _Energy(NamedTuple):
-    """What a skin can give and the most that it can hold, what acts on the bodies gives them on their way
-    [J], and the wrenches (n, 6) that act."""
+    """Of each body (n,) [J]: what the last step left of its work on the skin, that and what has been put in
+    since, the most that the skin can hold of it, what acts gives it on its way; and the wrenches (n, 6) that
+    act."""
 
-    store: float
-    most: float
-    given: float
+    left: np.ndarray
+    store: np.ndarray
+    most: np.ndarray
+    given: np.ndarray
     acting: np.ndarray
+
+    def draws(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) what each body lacks, and what it may leave to others, see `rules.lacking`."""
+        lacks = [lacking(*each) for each in zip(self.store.tolist(), self.given.tolist())]
+        spare = [spared(*each) for each in zip(*(a.tolist() for a in (self.left, self.store, self.given)))]
+        return np.array(lacks), np.array(spare)
 
 
 class Coupled:
@@ -50,7 +68,7 @@ class Coupled:
         skins at once.
       touching: numbers of the bodies that the skin holds: it has a stiffness against them.
       may_act: whether another solve is worth its cost: not after one that found no balance, which took long.
-      push: fraction of the wrench at the present pose that acts, see `World._restrain`.
+      push: (n,) fractions of the wrenches at the present pose that act, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
       compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
@@ -75,12 +93,14 @@ class Coupled:
             self.core = instance.touching.core_motion(data, instance.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
+        self.push = np.ones(len(self.wrench0))
         self.asked = self.result = self.compliance = None
         self.use_gamma(instance.gamma(len(self.touching) > 0))
         self.drifted = self.predicted_wrench = None
         self._account = None  # the `_Energy` of the present model and accelerations
+        self._trial = np.zeros(len(self.push), int)  # of shares of the push
         self.written, self.settled, self.forced = False, True, None
-        self.push, self.off, self.may_act, self._cost = 1.0, np.inf, True, 0.0
+        self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
 
     def use_gamma(self, gamma: float) -> None:
@@ -186,7 +206,8 @@ class Coupled:
     def force(self, wrench: np.ndarray, fraction: float) -> None:
         """Lets wrenches (n, 6) act in place of model and rows: what they would do with a share of the
         push."""
-        self.forced, self.push, self._account = wrench, fraction, None
+        self.forced, self._account = wrench, None
+        self.push = np.full(len(wrench), fraction)
         self.touching, self.written, self.settled = np.zeros(0, int), False, False
 
     def hold(self) -> None:
@@ -202,9 +223,9 @@ class Coupled:
     def equations(self, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """Wrenches (n, 6) without acceleration, with a share of the push, and how they fall as the bodies
         move on (n, 6, 6)."""
-        fraction, self.push = self.push, fraction
+        before, self.push = self.push, np.full(len(self.push), fraction)
         wrench = self._push()
-        self.push = fraction
+        self.push = before
         return wrench, self.tangent
 
     def _push(self):
@@ -213,10 +234,11 @@ class Coupled:
             start = *self.pose, self.here[0], self.drift[:, 3:]
             self.drifted = self.after(-displacement_at_once(*self.pose0, *start))
         wrench = self.drifted
-        if self.push == 1.0:
+        if (self.push == 1.0).all():
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
-        return self.push * wrench - (1.0 - self.push) * self._by_tangent(self.drift)
+        push = self.push[:, None]
+        return push * wrench - (1.0 - push) * self._by_tangent(self.drift)
 
     def acting(self) -> np.ndarray:
         """Wrenches (n, 6) that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
@@ -266,62 +288,95 @@ class Coupled:
 
     @property
     def store(self) -> float:
-        """The energy that the skin has to give [J]."""
-        return max(self._energy().store, 0.0)
+        """The energy that the skin has to give to bodies that it pushes [J]."""
+        return float(np.maximum(self._energy().store, 0.0)[self.push > 0.0].sum())
 
     def overdraws(self) -> bool:
-        """Whether what acts on the bodies on their way gives them more energy than the skin has."""
-        return self._energy().given > self.store
+        """Whether what acts gives bodies more energy on their way than they have in the skin."""
+        lacks, spare = self._energy().draws()
+        return lacks.sum() > spare.sum()
 
-    def fractions_of_push(self) -> Iterator[float]:
-        """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
-        asked for, the last of which it has the energy for."""
-        store, force = self._energy().store, self._energy().acting
-        motion = self.travel
-        yield 0.0
-        none = self._energy().given
-        change, further = force - self.acting(), motion - self.travel
-        push = affordable(store, none, float((force * motion).sum()), float((change * further).sum()))
-        for trial in range(TRIALS):
-            yield push
-            if push == 0.0 or not self.overdraws():
-                return
-            push = withheld_further(push, store, none, self._energy().given) if trial < TRIALS - 1 else 0.0
-        yield push
+    def release_greedy(self) -> bool:
+        """Takes the push on bodies that would get more than they have; returns whether there are any."""
+        if not self.overdraws():
+            return False
+        energy = self._energy()
+        self._full = energy.acting, self.travel
+        self.push = np.where(energy.draws()[0] > 0.0, 0.0, 1.0)
+        self._account = None
+        return True
+
+    def scale_push(self) -> None:
+        """As much of the push as there is energy for, of bodies without any."""
+        self._without, energy = self._energy().given, self._energy()
+        (force, motion), limit = self._full, self._limit()
+        change, further = force - energy.acting, motion - self.travel
+        for g in np.flatnonzero(self.push == 0.0):
+            work = float(force[g] @ motion[g]), float(change[g] @ further[g])
+            self.push[g] = affordable(limit[g], self._without[g], *work)
+        self._account = None
+
+    def withhold(self) -> bool:
+        """Withholds more of the push where a share of it still gives too much, at last all: also of a body
+        that gets too much only now that others get less. Returns whether it does."""
+        greedy = (self._energy().draws()[0] > 0.0) & (self.push > 0.0)
+        if not (self.overdraws() and greedy.any()):
+            return False
+        limit, given = self._limit(), self._energy().given
+        for g in np.flatnonzero(greedy):
+            if self.push[g] < 1.0 and self._trial[g] < TRIALS - 1:
+                self.push[g] = withheld_further(self.push[g], limit[g], self._without[g], given[g])
+                self._trial[g] += 1
+            else:
+                self.push[g] = 0.0
+        self._account = None
+        return True
+
+    def _limit(self):
+        """(n,) energy that each body may get, with its part of what others leave it [J]."""
+        energy = self._energy()
+        lacks, spare = energy.draws()
+        return np.maximum(energy.store, 0.0) + lacks * (spare.sum() / max(lacks.sum(), _TINY))
 
     def _energy(self):
         if self._account is None:
-            acting, most = self.acting(), self._most()
-            given = float((acting * self.travel).sum())
-            self._account = _Energy(self._store(acting, most), most, given, acting)
+            acting = self.acting()
+            most = self.instance.most_energy(self.instance.last_model()[0])
+            # a solve that lost its way knows little of the force that was there before it, and what is
+            # withheld is in the skin all the same
+            most = np.maximum(most, self.instance.most_energy(self._predicted_wrench()))
+            given = (acting * self.travel).sum(axis=1)
+            left = self.instance.last_energy()[0]
+            self._account = _Energy(left, self._store(left, acting, most), most, given, acting)
         return self._account
 
-    def _store(self, acting, most):
-        """What has been put into the skin so far, also by those who move bodies from outside [J]."""
-        store, ends = self.instance.last_energy()
-        jump = None if ends is None else displacement(*self.here, *ends)
-        self._placed = False
-        if jump is None or size(jump) > max(TELEPORT, size(self.straight)):
-            if self.instance.is_clear(*self.here):
-                return self.instance.most_energy(np.zeros_like(self.wrench0))
-            self._placed = True  # into the skin, by somebody: that puts energy in
-            return self.instance.most_energy(self._predicted_wrench())
-        if self.instance.was_out_of_reach:  # who moved them by so little did not push them in
-            return min(store, most)
-        last = self.instance.last_model()[0]
-        before, now = (float((w * jump).sum()) for w in (last, acting))
-        return in_store(store, before, now, most)
-
-    def _most(self):
-        """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
-        there before it, and what is withheld is in the skin all the same."""
-        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._predicted_wrench())))
+    def _store(self, left, acting, most):
+        """(n,) what the bodies have put into the skin so far, also by those who move them from outside
+        [J]."""
+        ends = self.instance.last_energy()[1]
+        if ends is None:
+            jump, placed = None, np.ones(len(left), bool)
+        else:
+            jump = displacement(*self.here, *ends)
+            placed = sizes(jump) > np.maximum(TELEPORT, sizes(self.straight))
+        store, self._placed = np.minimum(left, most), placed
+        if jump is not None and not self.instance.was_out_of_reach:
+            # who moved them by little out of reach did not push them in
+            before, now = ((w * jump).sum(axis=1) for w in (self.instance.last_model()[0], acting))
+            store = np.array([in_store(*each) for each in zip(left, before, now, most)])
+        if placed.any():
+            clear = self.instance.is_clear(*self.here)
+            self._placed = placed & (not clear)
+            pushes = np.zeros_like(acting) if clear else self._predicted_wrench()
+            # into the skin, by somebody: that puts energy in
+            store = np.where(placed, self.instance.most_energy(pushes), store)
+        return store
 
     def conclude(self, rounds: int, frequency: float | None) -> None:
         """Tells the instance how the step went; frequency: of `SkinGroup.frequencies`."""
         energy = self._energy()
         self.instance.concluded(
-            rounds, self.settled, 1.0 - self.push, self._left(energy.given), self.target, energy.acting
+            rounds, self.settled, 1.0 - self.push.min(initial=1.0), self._left(energy.given), self.target, energy.acting
         )
         self.instance.bounced(self.gamma, frequency)
 
@@ -331,14 +386,22 @@ class Coupled:
         ends, travel = self.instance.touching.predict(self.data, 0.0), self.passed @ moved
         if not self.instance.by_stages:  # they went by the velocity after the step
             travel = travel + self.straight - self.travel
-        given = float((self._energy().acting * travel).sum())
+        given = (self._energy().acting * travel).sum(axis=1)
         self.instance.arrived(self._left(given), ends, size(travel - self.travel) < near)
 
     def _left(self, given):
-        """Energy that is in the skin after it gave some [J]."""
-        if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
-            return np.inf  # what was put in is not known before a balance is found
-        return min(self._energy().store - given, self._energy().most)
+        """(n,) energy that is in the skin after it gave bodies some (n,) [J]."""
+        energy = self._energy()._replace(given=given)
+        lacks, spare = energy.draws()
+        all_lack, all_spare = lacks.sum(), spare.sum()
+        passed = min(all_lack, all_spare)  # from some to others
+        left = energy.store - given
+        if passed > 0.0:
+            left = left + passed * (lacks / all_lack - spare / all_spare)
+        left = np.minimum(left, energy.most)
+        if not self.result.converged:  # what was put in is not known before a balance is found
+            left = np.where(self._placed | np.isinf(energy.left), np.inf, left)
+        return left
 
 
 def _touching(tangent):
@@ -346,6 +409,11 @@ def _touching(tangent):
     return np.flatnonzero(tangent.any(axis=(1, 2)))
 
 
+def sizes(motion: np.ndarray) -> np.ndarray:
+    """(n,) of motions (n, 6) the largest entry each, of turns at a lever [m]."""
+    return np.abs(motion * _SCALE).max(axis=1)
+
+
 def size(motion: np.ndarray) -> float:
-    """Of motions (n, 6) the largest entry, of turns at a lever [m]."""
+    """The largest of these."""
     return float(np.abs(motion * _SCALE).max(initial=0.0))

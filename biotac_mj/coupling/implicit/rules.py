@@ -1,6 +1,7 @@
 """Formulas for how the rounds of a coupled step go on, shared by `world.py` and `batch/`: functions of plain
 numbers, for Python and Warp."""
 
+import math
 from typing import Any
 
 __all__ = [
@@ -14,8 +15,10 @@ __all__ = [
     "beta_of",
     "gamma_of",
     "in_store",
+    "lacking",
     "poorly_corrected",
     "share_that_pushes",
+    "spared",
     "stayed",
     "withheld_further",
 ]
@@ -30,6 +33,7 @@ LOSS_FREQUENCY = 50.0  # [Hz] at which the rubber has its loss factor
 TRIALS = 4  # to find how much of its push a skin can pay for
 _BISECTIONS = 12  # of that share
 _CAUTION = 0.9
+_UNKNOWN = math.inf  # [J] of energy
 
 
 def gamma_of(pace: Any, delay: Any, touches: Any) -> Any:
@@ -59,13 +63,31 @@ def beta_of(gamma: Any) -> Any:
 
 
 def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:
-    """Energy that a skin can give, of what the last step left in it, at most what it can hold: those who have
-    moved bodies since put in what its forces then, or those now, did against them; all [J]."""
+    """Energy that a skin can give a body, of what the last step left, at most what it can hold: who has moved
+    the body since put in what the forces then, or those now, did against that; all [J]."""
     return min(store - min(before, now), most)
 
 
+def lacking(store: Any, given: Any) -> Any:
+    """What a body gets more from a skin than it has put in [J]. Of skins that several bodies touch each has
+    its own account: who presses a finger does not pay for what others get, except where his push moves
+    them. So this much may come from what others have put in during the step itself (`spared`)."""
+    lacks = given - max(store, type(store)(0.0))
+    if lacks < type(store)(0.0):
+        return type(store)(0.0)
+    return lacks
+
+
+def spared(left: Any, store: Any, given: Any) -> Any:
+    """By how much a body's account grows in a step [J], from `left` before it."""
+    growth = store - given - left
+    if growth > type(store)(0.0) and growth < type(store)(_UNKNOWN):
+        return growth
+    return type(store)(0.0)
+
+
 def affordable(store: Any, none: Any, full: Any, bend: Any) -> Any:
-    """Share of a skin's push that it has the energy for. none, full: work of what acts without any push, with
+    """Share of a skin's push on a body that there is the energy for. none, full: work of what acts without any push, with
     all of it; bend: half of the curve between them: forces and ways are linear in the push while no other
     contact changes; all [J]."""
     low = type(store)(0.0)

@@ -329,7 +329,7 @@ class World:
         return self._find_balance(skins, outside)
 
     def _restrain(self, skins, outside):
-        """Withholds so much of a skin's push that it does not give more energy than it has.
+        """Withholds so much of the push on each body that this gets no more energy than it has put in.
 
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
@@ -337,11 +337,17 @@ class World:
         """
         self._group.predict_wrenches()
         by_rows = all(skin.forced is None for skin in skins)
-        for skin in [s for s in skins if by_rows and s.overdraws()]:
-            for fraction in skin.fractions_of_push():
-                skin.push = fraction
-                acceleration = self._accelerations(skins, outside)
-                self._group.evaluate(acceleration)
+        greedy = [skin for skin in skins if by_rows and skin.release_greedy()]
+        if greedy:
+            self._group.evaluate(self._accelerations(skins, outside))
+            self._group.predict_wrenches()
+            for skin in greedy:
+                skin.scale_push()
+            withholds = True
+            while withholds:
+                self._group.evaluate(self._accelerations(skins, outside))
+                self._group.predict_wrenches()
+                withholds = any([skin.withhold() for skin in skins])
         if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
@@ -363,7 +369,7 @@ class World:
             return True
         if all(skin.forced is None or skin.turning < _FAR for skin in skins):
             return False
-        return self._kinetic(skins) > self._kinetic_without + sum(s.store for s in skins if s.push > 0.0)
+        return self._kinetic(skins) > self._kinetic_without + sum(skin.store for skin in skins)
 
     def _kinetic(self, skins):
         """Energy of the bodies at the end of the step [J]."""
