@@ -77,11 +77,10 @@ class Batch(Skins):
                 setattr(r, name, wp.zeros(self.groups, dtype=int))
             for name in ("inside", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
-            for name in ("left", "store", "most", "without"):
+            numbers = "gamma", "horizon", "square", "frequency", "left", "store", "most", "without"
+            for name in numbers:
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.float64))
-            for name in ("gamma", "horizon", "square", "frequency"):
-                setattr(r, name, wp.zeros(self.nworld, dtype=wp.float64))
-            self._step = wp.full(self.nworld, self.dt, dtype=wp.float64)
+            self._step = wp.full(self.groups, self.dt, dtype=wp.float64)
             self._power = wp.zeros((self.nworld, 6 * skin.ngroup), dtype=wp.vec2d)
             self._greedy = wp.zeros(self.nworld, dtype=int)
         view = ModelView(mjm._address)
@@ -119,7 +118,7 @@ class Batch(Skins):
         if self.moving:
             inertial = int(self.skin.inertial)
             by = [self.dt, self._delay, inertial, self.model]
-            self._launch(rounds.choose_gamma, self.nworld, by, [r])
+            self._launch(rounds.choose_gamma, self.groups, by, [r])
             self._find_drift(m, d)
             self._correction_force.zero_()
             r.amiss.zero_()
@@ -130,13 +129,13 @@ class Batch(Skins):
             )
 
     def _advance(self, m, d, horizon):
-        """Finds where the bodies go in a horizon (nworld,) [s] without acceleration."""
+        """Finds where the bodies go in a horizon [group, world] [s] without acceleration."""
         r = self._of_step
         going = [self._core, self._body, horizon, m.body_rootid, d.xpos, d.xmat, d.subtree_com, d.cvel]
         self._launch(dynamics.advance_groups, self.groups, going, [r.start_pos, r.start_mat])
 
     def _find_drift(self, m, d):
-        """Finds where they go so to where the skins are solved, of the worlds' gamma."""
+        """Finds where they go so to where the skins are solved, of their gamma."""
         r = self._of_step
         self._advance(m, d, r.horizon)
         known = [self.dt, r.horizon, self._jacobian, d.qvel]

@@ -16,7 +16,7 @@ from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.metric import Metric
 from .implicit.rules import EULER, LOSS_FREQUENCY, PATIENCE, gamma_of, stayed
-from .setup import CONVERGED, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
+from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
@@ -48,7 +48,7 @@ class Instance:
 
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
-      step_gamma: Newmark's gamma of the last step that was solved.
+      step_gamma: (ngroup,) Newmark's gamma of the bodies in the last step that was solved.
       state_address: of its plugin state, which stays where it is.
       sensed: whether the readings of this step are written.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
@@ -90,7 +90,7 @@ class Instance:
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved, self.sensed = {}, False
         self._error, self._outcome = False, _ALONE
-        self.step_gamma, self._frequency = EULER, None
+        self.step_gamma, self._frequency = np.full(setup.ngroup, EULER), None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
         self.skins_met = ()
@@ -107,14 +107,15 @@ class Instance:
         """How far ahead [s] the skin is solved: to the end of the step."""
         return self.model.opt.timestep
 
-    def gamma(self, touches: bool) -> float:
-        """Newmark's, of the step that begins. A skin with inertia steps itself to the end of the step.
-        touches: whether it had contact in the last step."""
+    def gamma(self, touches: np.ndarray) -> np.ndarray:
+        """(ngroup,) Newmark's, of the bodies in the step that begins. A skin with inertia steps itself to the
+        end of the step. touches: (ngroup,) whether it held them in the last step."""
         if self.inertial:
-            return EULER - 0.5 * self.by_stages
+            return np.full(len(touches), EULER - 0.5 * self.by_stages)
         step = self.horizon
         delay = self.setup.config.loss / (2 * np.pi * LOSS_FREQUENCY * step)
-        return gamma_of(float(self.state[FREQUENCY]) * step, delay, touches)
+        pace = step * self.setup.parts(self.state)[1][:, FREQUENCY]
+        return np.array([gamma_of(p, delay, t) for p, t in zip(pace.tolist(), touches.tolist())])
 
     @property
     def by_stages(self) -> bool:
@@ -127,7 +128,7 @@ class Instance:
         bad = not math.isfinite(self.state.sum())
         if bad:
             state = self.state.copy()
-            energy = self.setup.parts(state)[1][:, 66]
+            energy = self.setup.parts(state)[1][:, ENERGY]
             energy[energy == np.inf] = 0.0
             bad = not np.isfinite(state).all()
         if cause is not None and not bad:
@@ -146,7 +147,7 @@ class Instance:
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         self.sensed = False
-        self.step_gamma, self._frequency = EULER, None
+        self.step_gamma, self._frequency = np.full(self.setup.ngroup, EULER), None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
@@ -170,7 +171,7 @@ class Instance:
         they were out of reach, these are about where they go."""
         head, models, *_ = self.setup.parts(self.state)
         ends = (models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)) if head[STARTED] else None
-        return models[:, 66], ends
+        return models[:, ENERGY], ends
 
     @property
     def was_out_of_reach(self) -> bool:
@@ -330,9 +331,9 @@ class Instance:
         """
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
-    def bounced(self, gamma: float, frequency: float | None) -> None:
-        """Stores Newmark's gamma of the step, and the angular frequency [rad/s] at which bodies bounce on the
-        skin; None leaves the stored one."""
+    def bounced(self, gamma: np.ndarray, frequency: np.ndarray | None) -> None:
+        """Stores Newmark's gamma of the step and the angular frequency [rad/s] at which bodies bounce on the
+        skin, (ngroup,) each; None leaves the stored one."""
         self.step_gamma, self._frequency = gamma, frequency
 
     def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
@@ -550,13 +551,14 @@ class Instance:
         _, settled, _, energy, ends, _ = self._outcome
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
-        reach, frequency = REACHED if ends else OUT_OF_REACH, self._frequency
-        frequency = head[FREQUENCY] if frequency is None else frequency
-        head[:] = head[FAILED] + (not good), good - steps, reach, frequency
+        reach = REACHED if ends else OUT_OF_REACH
+        head[:] = head[FAILED] + (not good), good - steps, reach
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
-        models[:, 54:57], models[:, 57:66], models[:, 66] = ends[0], ends[1].reshape(n, 9), energy
+        models[:, 54:57], models[:, 57:66], models[:, ENERGY] = ends[0], ends[1].reshape(n, 9), energy
+        if self._frequency is not None:
+            models[:, FREQUENCY] = self._frequency
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

@@ -18,6 +18,7 @@ from .touching import Touching, forget_notes
 
 __all__ = [
     "CONVERGED",
+    "ENERGY",
     "FAILED",
     "FREQUENCY",
     "OUT_OF_REACH",
@@ -32,13 +33,15 @@ __all__ = [
 
 # head of the plugin state: steps that did not converge; whether the last committed step did, or less the
 # steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
-# reach of the skin in it; the angular frequency [rad/s] at which bodies bounce on it
-_HEAD = 4
-FAILED, CONVERGED, STARTED, FREQUENCY = range(_HEAD)
+# reach of the skin in it
+_HEAD = 3
+FAILED, CONVERGED, STARTED = range(_HEAD)
 REACHED, OUT_OF_REACH = 1.0, 2.0
-# of a touching body: wrench, tangent, the pose they belong to, the pose at the end of the step, and the energy
-# that the body has in the skin at most [J], infinite where that is not known
-_MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1
+# of a touching body: wrench, tangent, the pose they belong to, the pose at the end of the step, the energy
+# that it has in the skin at most [J], infinite where that is not known, and the angular frequency [rad/s] at
+# which it bounces
+_MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1 + 1
+ENERGY, FREQUENCY = _MODEL - 2, _MODEL - 1
 
 
 class _Skin:
@@ -120,7 +123,7 @@ class Setup:
         return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state: np.ndarray) -> tuple:
-        """Head, linear models of the last step (ngroup, 67), the skin's and the readings' parts of a plugin
+        """Head, linear models of the last step (ngroup, 68), the skin's and the readings' parts of a plugin
         state, as views."""
         a = _HEAD + _MODEL * self.ngroup
         b = a + self.skin.stepper.nstate

@@ -110,9 +110,9 @@ class Touching:
                 parts.append(g.vert.tobytes() + g.face.tobytes())
         return b"|".join(parts)
 
-    def predict(self, data: DataView, horizon: float) -> tuple:
+    def predict(self, data: DataView, horizon: float | np.ndarray) -> tuple:
         """Poses of the touching bodies in the BioTac frame when everything goes on at its present velocity
-        for `horizon` [s].
+        for `horizon` [s], for all bodies or (ngroup,) for each.
 
         Returns:
           (ngroup, 3) positions [m], (ngroup, 3, 3) rotations.
@@ -120,9 +120,18 @@ class Touching:
         Raises:
           ValueError: a pose or a velocity is not finite, or huge.
         """
-        pos, mat = self._ahead(data, self._body, self._root, horizon)
-        frame = mat[0]
-        pos, mat = (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
+        if np.ndim(horizon) and (horizon == horizon[:1]).all():
+            horizon = horizon[0] if len(horizon) else 0.0
+        if np.ndim(horizon):  # the BioTac is elsewhere for each
+            core = np.zeros(len(horizon), int)
+            origin, frame = self._ahead(data, self._body[core], self._root[core], horizon)
+            pos, mat = self._ahead(data, self._body[1:], self._root[1:], horizon)
+            pos = ((pos - origin)[:, None] @ frame)[:, 0]
+            mat = frame.transpose(0, 2, 1) @ mat
+        else:
+            pos, mat = self._ahead(data, self._body, self._root, horizon)
+            frame = mat[0]
+            pos, mat = (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
         self._check(pos, mat)
         return pos, mat
 
@@ -135,7 +144,8 @@ class Touching:
     @staticmethod
     def _ahead(data, body, root, horizon):
         pos, mat = data.xpos[body], data.xmat[body].reshape(-1, 3, 3)
-        if horizon:
+        if np.any(horizon):
+            horizon = np.reshape(horizon, (-1, 1))
             velocity = data.cvel[body]  # rotation, then translation of the point at the tree's centre of mass
             spin = velocity[:, :3]
             pos = pos + horizon * (velocity[:, 3:] + cross(spin, pos - data.subtree_com[root]))

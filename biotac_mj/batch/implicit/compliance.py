@@ -142,7 +142,7 @@ def give(
 def move(
     # In:
     going: wp.array(dtype=int),
-    square: wp.array(dtype=real),
+    square: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     response: wp.array3d(dtype=real),
     # Out:
@@ -155,8 +155,10 @@ def move(
     groups = jacobian.shape[0]
     for g in range(groups):
         m = vec6()
+        # of two bodies whose steps differ the mean, so that it stays symmetric
+        both = wp.sqrt(square[g, w] * square[c / 6, w])
         for i in range(response.shape[2]):
-            m += (square[w] * response[w, c, i]) * jacobian[g, w, i]
+            m += (both * response[w, c, i]) * jacobian[g, w, i]
         for b in range(6):
             compliance_out[groups * g + c / 6, w, b, c % 6] = m[b]
 
@@ -250,7 +252,8 @@ class Response:
 
         Args:
           going: (nworld,) of int, 1 where it is to be done.
-          square: (nworld,) by which an acceleration moves bodies to where the skin is solved [m per m/s^2].
+          square: [group, world] by which an acceleration moves bodies to where the skin is solved [m per
+            m/s^2].
         """
         groups, n, device = jacobian.shape[0], len(self.response), self.response.device
         entries = wp.array(

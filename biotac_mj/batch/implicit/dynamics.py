@@ -57,7 +57,7 @@ def advance_groups(
     # In:
     core: int,
     body: wp.array(dtype=int),
-    horizon: wp.array(dtype=real),
+    horizon: wp.array2d(dtype=real),
     rootid: wp.array(dtype=int),
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
@@ -70,7 +70,7 @@ def advance_groups(
     """Poses of the touching bodies after a horizon [s] at present velocities [group, world]."""
     g, w = wp.tid()
     b = body[g]
-    h = horizon[w]
+    h = horizon[g, w]
     frame = wp.transpose(_ahead_mat(core, w, h, xmat, cvel))
     origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
     pos_out[g, w] = frame * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
@@ -114,7 +114,7 @@ def relative_jacobians(
 def find_drift(
     # In:
     h: real,
-    horizon: wp.array(dtype=real),
+    horizon: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qvel: wp.array2d(dtype=float),
     # Out:
@@ -128,7 +128,7 @@ def find_drift(
     for i in range(jacobian.shape[2]):
         velocity += real(qvel[w, i]) * jacobian[g, w, i]
     straight_out[g, w] = h * velocity
-    drift_out[g, w] = horizon[w] * velocity
+    drift_out[g, w] = horizon[g, w] * velocity
 
 
 @wp.kernel
@@ -174,7 +174,7 @@ def advance_core(
 def follow(
     # In:
     h: real,
-    square: wp.array(dtype=real),
+    square: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
     here: wp.array2d(dtype=vec3),
@@ -196,7 +196,7 @@ def follow(
     gain = vec6()
     for i in range(jacobian.shape[2]):
         gain += real(qacc[w, i]) * jacobian[g, w, i]
-    m = square[w] * gain
+    m = square[g, w] * gain
     moved_out[g, w] = m
     travel_out[g, w] = straight[g, w] + real(0.5) * h * h * gain
     spin = wp.spatial_bottom(drift[g, w])
@@ -226,7 +226,7 @@ def add_forces(
 @wp.kernel
 def acting_wrenches(
     # In:
-    square: wp.array(dtype=real),
+    square: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
     wrench: wp.array2d(dtype=vec6),
@@ -243,7 +243,7 @@ def acting_wrenches(
     if reason[w] != NOT_FINITE:  # what is lost has no force, and no accelerations
         moved = vec6()
         for i in range(jacobian.shape[2]):
-            moved += square[w] * real(qacc[w, i]) * jacobian[g, w, i]
+            moved += square[g, w] * real(qacc[w, i]) * jacobian[g, w, i]
         total -= tangent[g, w] * moved
     acting_out[g, w] = total
 
@@ -268,21 +268,10 @@ def find_rows(
     row_out[s, w] = row
 
 
-@wp.func
-def tangent_diagonal(
-    tangent: wp.array2d(dtype=mat66), group_slot: wp.array(dtype=int), s: int, w: int, k: int
-):
-    total = real(0.0)
-    for g in range(tangent.shape[0]):
-        if group_slot[g] == s:
-            total += tangent[g, w][k, k]
-    return total
-
-
 @wp.kernel
 def write_rows(
     # In:
-    square: wp.array(dtype=real),
+    square: wp.array2d(dtype=real),
     group_slot: wp.array(dtype=int),
     row: wp.array2d(dtype=int),
     jacobian: wp.array3d(dtype=vec6),
@@ -308,19 +297,20 @@ def write_rows(
     group = int(0)
     for g in range(tangent.shape[0]):
         if group_slot[g] == s:  # bodies that are welded together move as one: their stiffnesses add
-            S += tangent[g, w]
+            S += square[g, w] * tangent[g, w]
             group = g
+    whole = wp.get_diag(S)
     for k in range(6):
         pivot = wp.float64(0.0)
         column = vec6()
-        if S[k, k] > _PIVOT * wp.abs(tangent_diagonal(tangent, group_slot, s, w, k)):
+        if S[k, k] > _PIVOT * wp.abs(whole[k]):
             pivot = S[k, k]
             for i in range(k, 6):
                 column[i] = S[i, k] / pivot
             S -= pivot * wp.outer(column, column)
         r = first + k
         if n == 0:
-            D_out[w, r] = float(wp.max(square[w] * pivot, _NEGLIGIBLE))
+            D_out[w, r] = float(wp.max(pivot, _NEGLIGIBLE))
             aref_out[w, r] = 0.0
             pos_out[w, r] = 0.0
         if sparse == 0:

@@ -131,7 +131,10 @@ def find_energy(
             store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
         r.most[g, w] = most
         r.store[g, w] = store
-    if r.gamma[w] < real(EULER) and overdraws(r, model, wrench, w, real(0.0)):
+    least = real(EULER)
+    for g in range(r.pos.shape[0]):
+        least = wp.min(least, r.gamma[g, w])
+    if least < real(EULER) and overdraws(r, model, wrench, w, real(0.0)):
         greedy_out[w] = 1
         mark(damped, w)
 
@@ -318,10 +321,10 @@ def add_powers(
 
 
 @wp.func
-def _frequency(power: wp.array2d(dtype=wp.vec2d), w: int):
+def _frequency(power: wp.array2d(dtype=wp.vec2d), g: int, w: int):
     """As `SkinGroup.frequencies`."""
     total = wp.vec2d()
-    for c in range(power.shape[1]):
+    for c in range(6 * g, 6 * g + 6):
         total += power[w, c]
     if total[0] > real(0.0) and total[1] > real(0.0):
         return wp.sqrt(wp.sqrt(total[1] / total[0]))
@@ -343,10 +346,10 @@ def conclude(
     w = wp.tid()
     if taking_part[w] == 0:
         return
-    r.frequency[w] = _frequency(power, w)
     both = draws(r, model, wrench, w, real(0.0))
     passed = wp.min(both[0], both[1])  # from some bodies to others
     for g in range(r.pos.shape[0]):
+        r.frequency[g, w] = _frequency(power, g, w)
         gets = given(r, model, wrench, g, w)
         left = r.store[g, w] - gets  # what is withheld is in the skin all the same
         if passed > real(0.0):

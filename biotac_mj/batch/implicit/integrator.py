@@ -110,7 +110,7 @@ def begin_correction(going: wp.array(dtype=int), c: Correction):
 def find_amiss(
     # In:
     first: int,
-    square: wp.array(dtype=real),
+    square: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     found: wp.array2d(dtype=float),
     moved: wp.array2d(dtype=float),
@@ -127,7 +127,7 @@ def find_amiss(
         k = first + g
         motion = vec6()
         for i in range(jacobian.shape[2]):
-            motion += square[w] * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
+            motion += square[g, w] * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
         excess = model.tangent0[g, w] * motion
         lacks = excess - c.force[k, w]
         c.amiss[k, w] = -lacks
@@ -205,7 +205,7 @@ def respond(
 def write_slope(
     # In:
     first: int,
-    square: wp.array(dtype=real),
+    square: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     model: Model,
     acts: int,
@@ -221,7 +221,7 @@ def write_slope(
     lacks = vec6()
     if acts == 1:
         for i in range(jacobian.shape[2]):
-            motion += square[w] * (c.found[w, column, i] - c.moved[w, column, i]) * jacobian[g, w, i]
+            motion += square[g, w] * (c.found[w, column, i] - c.moved[w, column, i]) * jacobian[g, w, i]
         motion = model.tangent0[g, w] * motion
         lacks = -c.amiss[first + g, w]
     for b in range(6):

@@ -64,10 +64,10 @@ class Rounds:
     travel: wp.array2d(dtype=vec6)
     drift: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
-    gamma: wp.array(dtype=real)  # Newmark's, with which the step is made
-    horizon: wp.array(dtype=real)  # [s] after which the skin is solved, without acceleration
-    square: wp.array(dtype=real)  # beta h^2, [m per m/s^2]
-    frequency: wp.array(dtype=real)  # angular, at which bodies bounce on the skin [rad/s]
+    gamma: wp.array2d(dtype=real)  # Newmark's, with which the step is made
+    horizon: wp.array2d(dtype=real)  # [s] after which the skin is solved, without acceleration
+    square: wp.array2d(dtype=real)  # beta h^2, [m per m/s^2]
+    frequency: wp.array2d(dtype=real)  # angular, at which bodies bounce on the skin [rad/s]
     amiss: wp.array2d(dtype=vec6)  # what the correction for it still lacks: it acts on the bodies too
     asked_pos: wp.array2d(dtype=vec3)
     asked_mat: wp.array2d(dtype=mat33)
@@ -83,7 +83,7 @@ class Rounds:
     inside: wp.array(dtype=int)  # and one of them into the skin
     open: wp.array2d(dtype=int)  # what was put in so is not yet known
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
-    push: wp.array2d(dtype=real)  # of the wrench at the present pose that acts: less than 1 where not paid for
+    push: wp.array2d(dtype=real)  # of the wrench at the present pose that acts: below 1 where not paid for
     trial: wp.array2d(dtype=int)  # of shares of the push
     without: wp.array2d(dtype=real)  # [J] work without any push
     # with all of the push: wrenches that act, and motions of the bodies
@@ -147,21 +147,20 @@ def wrenches(
 
 
 @wp.func
-def _set_gamma(r: Rounds, w: int, step: real, gamma: real):
-    r.gamma[w] = gamma
-    r.horizon[w] = (gamma - real(0.5)) * step
-    r.square[w] = _beta_of(gamma) * step * step
+def _set_gamma(r: Rounds, g: int, w: int, step: real, gamma: real):
+    r.gamma[g, w] = gamma
+    r.horizon[g, w] = (gamma - real(0.5)) * step
+    r.square[g, w] = _beta_of(gamma) * step * step
 
 
 @wp.kernel
 def choose_gamma(step: real, delay: real, inertial: int, last: Model, r: Rounds):
     """Newmark's gamma of the step, as `Instance.gamma`; delay: of the rubber's force, in steps."""
-    w = wp.tid()
+    g, w = wp.tid()
     touches = bool(False)
-    for g in range(last.tangent0.shape[0]):
-        if inertial == 0 and wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0):
-            touches = True
-    _set_gamma(r, w, step, _gamma_of(r.frequency[w] * step, delay, touches))
+    if inertial == 0 and wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0):
+        touches = True
+    _set_gamma(r, g, w, step, _gamma_of(r.frequency[g, w] * step, delay, touches))
 
 
 @wp.kernel
@@ -191,7 +190,8 @@ def use_euler(step: real, greedy: wp.array(dtype=int), r: Rounds):
     w = wp.tid()
     if greedy[w] == 1:
         r.settled[w] = 0
-        _set_gamma(r, w, step, real(EULER))
+        for g in range(r.gamma.shape[0]):
+            _set_gamma(r, g, w, step, real(EULER))
 
 
 @wp.kernel

@@ -56,8 +56,9 @@ class Coupled:
 
     Attributes:
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
-      gamma: Newmark's, of this step: the skin is solved where its bodies come after `horizon` [s] without
-        acceleration, and by `square` times an acceleration [m per m/s^2] further.
+      gamma: (n,) Newmark's, of this step: the skin is solved where its bodies come after `horizon` (n,) [s]
+        without acceleration, and by `square` (n,) times an acceleration [m per m/s^2] further. Each body has
+        its own: one that arrives beside others that the skin holds makes backward Euler's step.
       off: [m] how far the bodies go from where the skin was last solved.
       straight: (n, 6) how its bodies move in the step without acceleration. travel: how they move by the mean
         of the velocities before and after it, so that a force's work is a change of kinetic energy.
@@ -95,7 +96,7 @@ class Coupled:
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.push = np.ones(len(self.wrench0))
         self.asked = self.result = self.compliance = None
-        self.use_gamma(instance.gamma(len(self.touching) > 0))
+        self.use_gamma(instance.gamma(self.tangent.any(axis=(1, 2))))
         self.drifted = self.predicted_wrench = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self._trial = np.zeros(len(self.push), int)  # of shares of the push
@@ -103,13 +104,14 @@ class Coupled:
         self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
 
-    def use_gamma(self, gamma: float) -> None:
-        """Makes the step that of another member of Newmark's family; `SkinGroup.find_drift` has to follow."""
+    def use_gamma(self, gamma: np.ndarray) -> None:
+        """Makes the bodies' step (n,) that of another member of Newmark's family; `SkinGroup.find_drift` has
+        to follow."""
         instance = self.instance
         self.gamma, self.horizon = gamma, (gamma - 0.5) * instance.horizon
         if instance.by_stages:  # positions go by the mean velocity, as those of others half a step before
-            self.horizon += 0.5 * instance.horizon
-        self.square = beta_of(gamma) * instance.horizon**2
+            self.horizon = self.horizon + 0.5 * instance.horizon
+        self.square = np.array([beta_of(g) for g in gamma.tolist()]) * instance.horizon**2
         self.pose = instance.touching.predict(self.data, self.horizon)
         self.written, self.drifted = False, None
 
@@ -251,7 +253,7 @@ class Coupled:
         if self.forced is not None:
             return self.forced
         rows = self.instance.metric.excess(self.data, acceleration) - self._by_tangent(
-            self.square * (self.jacobian @ acceleration)
+            self.square[:, None] * (self.jacobian @ acceleration)
         )
         return self.correction + self._push() + rows
 
@@ -279,7 +281,7 @@ class Coupled:
     @property
     def euler(self) -> bool:
         """Whether no member of the family damps more than that of its step."""
-        return self.gamma >= EULER or self.instance.inertial
+        return self.instance.inertial or bool((self.gamma >= EULER).all())
 
     @property
     def turning(self) -> float:
@@ -372,11 +374,11 @@ class Coupled:
             store = np.where(placed, self.instance.most_energy(pushes), store)
         return store
 
-    def conclude(self, rounds: int, frequency: float | None) -> None:
+    def conclude(self, rounds: int, frequency: np.ndarray | None) -> None:
         """Tells the instance how the step went; frequency: of `SkinGroup.frequencies`."""
-        energy = self._energy()
+        energy, withheld = self._energy(), 1.0 - self.push.min(initial=1.0)
         self.instance.concluded(
-            rounds, self.settled, 1.0 - self.push.min(initial=1.0), self._left(energy.given), self.target, energy.acting
+            rounds, self.settled, withheld, self._left(energy.given), self.target, energy.acting
         )
         self.instance.bounced(self.gamma, frequency)
 

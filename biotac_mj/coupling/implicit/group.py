@@ -27,11 +27,12 @@ class SkinGroup:
         self.find_drift()
 
     def find_drift(self) -> None:
-        """Finds where the bodies go without acceleration, of the skins' gamma."""
+        """Finds where the bodies go without acceleration, of their gamma."""
         self._pose = self._poses("pose")
-        horizon, self._square = np.empty((2, len(self._jacobian), 1))
-        for skin, part in self._all:
-            horizon[part], self._square[part] = skin.horizon, skin.square
+        horizon, self._square = (
+            np.concatenate([getattr(skin, name) for skin, _ in self._all])[:, None]
+            for name in ("horizon", "square")
+        )
         drift, self._straight = horizon * self._velocity, self._step * self._velocity
         self._spin = drift[:, 3:]
         for skin, part in self._all:
@@ -89,11 +90,13 @@ class SkinGroup:
         for (skin, part), own in zip(self._all, numbers):
             n = part.stop - part.start
             A = give(damped, slice(6 * part.start, 6 * part.stop), own).reshape(n, 6, n, 6)
-            skin.compliance = skin.square * np.ascontiguousarray(A.transpose(0, 2, 1, 3))
+            # of two bodies whose steps differ the mean, so that it stays symmetric
+            square = np.sqrt(skin.square[:, None] * skin.square)[:, :, None, None]
+            skin.compliance = square * np.ascontiguousarray(A.transpose(0, 2, 1, 3))
 
-    def frequencies(self) -> list[float | None]:
-        """Of each skin the angular frequency [rad/s] at which its bodies bounce in the stiffest mode that it
-        holds, with all other skins; None where that is not known anew."""
+    def frequencies(self) -> list[np.ndarray | None]:
+        """Of each skin (n,) angular frequencies [rad/s] at which its bodies bounce in the stiffest mode in
+        which it holds them, with all other skins; None where that is not known anew."""
         if self._response is None:
             return [None] * len(self._all)
         tangent = np.concatenate([skin.tangent for skin, _ in self._all])
@@ -101,13 +104,10 @@ class SkinGroup:
         modes = modes.reshape(self._response.shape)
         # by traces of powers, in which the largest square of a frequency outweighs all others
         second = modes @ modes
-        low, high = ((power * power.T).sum(axis=1).tolist() for power in (modes, second))
-        out = []
-        for _, part in self._all:
-            own = slice(6 * part.start, 6 * part.stop)
-            weight, largest = sum(low[own]), sum(high[own])
-            out.append((largest / weight) ** 0.25 if weight > 0.0 and largest > 0.0 else 0.0)
-        return out
+        low, high = ((power * power.T).sum(axis=1).reshape(-1, 6).sum(axis=1) for power in (modes, second))
+        known = (low > 0.0) & (high > 0.0)
+        frequency = np.where(known, np.where(known, high, 0.0) / np.where(known, low, 1.0), 0.0) ** 0.25
+        return [frequency[part] for _, part in self._all]
 
     def apply(self) -> np.ndarray:
         """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""

@@ -159,23 +159,24 @@ class Metric:
         if self.slot:
             self._filled, self._written = dict.fromkeys(self._rows, False), {}
 
-    def write(self, jacobian: np.ndarray, tangent: np.ndarray, square: float) -> None:
+    def write(self, jacobian: np.ndarray, tangent: np.ndarray, square: np.ndarray) -> None:
         """Puts the stiffness of tangents (ngroup, 6, 6) into the rows, of bodies that accelerations move by
-        `square` [m per m/s^2] in the step."""
+        `square` (ngroup,) [m per m/s^2] in the step."""
         if not self.slot:
             return
         total, group_of = {}, {}
         self._written = {}
-        for group in np.flatnonzero(tangent.any(axis=(1, 2))) if square else ():
+        stiff = square[:, None, None] * tangent
+        for group in np.flatnonzero(stiff.any(axis=(1, 2))):
             root = self.root[group]
             if root in self.slot:  # bodies that are welded together move as one: their stiffnesses add
-                total[root] = (jacobian[group], tangent[group] + (total[root][1] if root in total else 0.0))
+                total[root] = (jacobian[group], stiff[group] + (total[root][1] if root in total else 0.0))
                 group_of[root] = group
         for root in self._rows:
             if root in total:
                 relative, stiff = total[root]
                 stiffness, basis = self._modes(root, stiff)
-                value = np.maximum(square * stiffness, _MINVAL)
+                value = np.maximum(stiffness, _MINVAL)
                 rows = basis.T @ relative
                 self._fill(root, rows, value)
                 self._written[root] = group_of[root], basis, value, rows

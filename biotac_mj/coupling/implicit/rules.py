@@ -87,9 +87,9 @@ def spared(left: Any, store: Any, given: Any) -> Any:
 
 
 def affordable(store: Any, none: Any, full: Any, bend: Any) -> Any:
-    """Share of a skin's push on a body that there is the energy for. none, full: work of what acts without any push, with
-    all of it; bend: half of the curve between them: forces and ways are linear in the push while no other
-    contact changes; all [J]."""
+    """Share of a skin's push on a body that there is the energy for. none, full: work of what acts without
+    any push, with all of it; bend: half of the curve between them: forces and ways are linear in the push
+    while no other contact changes; all [J]."""
     low = type(store)(0.0)
     high = type(store)(1.0)
     for _ in range(_BISECTIONS):

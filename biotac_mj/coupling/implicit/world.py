@@ -324,7 +324,7 @@ class World:
         if not greedy:
             return 0
         for skin in greedy:
-            skin.use_gamma(EULER)
+            skin.use_gamma(np.full(len(skin.gamma), EULER))
         self._group.find_drift()
         return self._find_balance(skins, outside)
 
@@ -343,11 +343,11 @@ class World:
             self._group.predict_wrenches()
             for skin in greedy:
                 skin.scale_push()
-            withholds = True
-            while withholds:
+            going = True
+            while going:
                 self._group.evaluate(self._accelerations(skins, outside))
                 self._group.predict_wrenches()
-                withholds = any([skin.withhold() for skin in skins])
+                going = [skin for skin in skins if skin.withhold()]
         if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
@@ -385,7 +385,7 @@ class World:
         response = self.data.moved_by(jacobian)
         if self._damped:
             response = self.integrator.integrated(response)
-        squares = np.concatenate([np.full(6 * len(skin.wrench0), skin.square) for skin in skins])
+        squares = np.repeat(np.concatenate([skin.square for skin in skins]), 6)
         compliance = squares[:, None] * (response @ jacobian.T)
         moved = np.concatenate([skin.moved for skin in skins])
         for fraction, own in zip(fractions, parts):
@@ -431,9 +431,7 @@ class World:
             for name in ("jacobian", "tangent", "correction")
         )
         largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
-        stiffness = (
-            np.repeat([s.square for s in skins], [len(s.touching) for s in skins])[:, None, None] * tangent
-        )
+        stiffness = np.concatenate([s.square[s.touching] for s in skins])[:, None, None] * tangent
         own = np.concatenate([skin.instance.metric.numbers() for skin in skins])
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)

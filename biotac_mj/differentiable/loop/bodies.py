@@ -136,8 +136,8 @@ class Bodies:
 
         Args:
           start: of the step. after: (nv,) velocities when it ended.
-          gammas: for each skin, Newmark's of the step, in which it was solved for velocities of both ends;
-            None: it was solved for those when the step began.
+          gammas: for each skin, Newmark's (ngroup,) of the step, in which it was solved for velocities of
+            both ends; None: it was solved for those when the step began.
           names: of what else slopes are wanted by.
 
         Returns:
@@ -155,8 +155,7 @@ class Bodies:
             mujoco.mj_comVel(self.model, data)
             return one.touching.geom_pose(*one.touching.predict(self._view, one.horizon))
 
-        out = []
-        for one, gamma in zip(self.instances, gammas):
+        def slopes_of(one, gamma):
             weight = {"qvel": 1.0}  # of velocities, in where the skin was solved
             if gamma is not None:
                 weight = {"after": beta_of(gamma), "qvel": gamma - 0.5 - beta_of(gamma)}
@@ -184,5 +183,15 @@ class Bodies:
                     )
                     columns.append(np.concatenate([p1 - p0, turn], 1).ravel() / (2 * _EPS))
                 slopes[name] = np.array(columns).T if columns else np.zeros((6 * ngeom, 0))
+            return slopes
+
+        out = []
+        for one, gamma in zip(self.instances, gammas):
+            members = [None] if gamma is None else np.unique(gamma).tolist() or [None]
+            slopes = slopes_of(one, members[0])
+            for other in members[1:]:  # of bodies that step otherwise
+                rows = np.repeat((gamma == other)[one.touching.group], 6)
+                for name, value in slopes_of(one, other).items():
+                    slopes[name][rows] = value[rows]
             out.append(slopes)
         return out

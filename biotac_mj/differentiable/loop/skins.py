@@ -29,7 +29,8 @@ class Kept:
 
     Attributes:
       state: its state. wrench: (ngroup, 6) on the bodies that touch, as it acts.
-      idle: whether nothing was in its reach. resting: whether it is at rest. gamma: Newmark's, of the step.
+      idle: whether nothing was in its reach. resting: whether it is at rest. gamma: (ngroup,) Newmark's, of
+        the step.
       begun: poses (ngeom, 3), (ngeom, 3, 3) from which the step took its geoms, None: where it took them;
         whole: whether these are where the step before left them.
     """
@@ -38,7 +39,7 @@ class Kept:
     wrench: np.ndarray
     idle: bool
     resting: bool
-    gamma: float
+    gamma: np.ndarray
     begun: tuple | None
     whole: bool
 
