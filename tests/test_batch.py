@@ -18,6 +18,7 @@ from biotac_mj import batch as batches
 from biotac_mj.geometry import SkinGeometry, load_skin
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.readings import PhysicsReadings
+from biotac_mj.skin import SkinOptions
 from biotac_mj.skin.rubber.material import material as preset
 
 DT = 2e-3
@@ -429,7 +430,7 @@ def test_finger_and_ball_exchange_momentum_and_lose_none():
     np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=2e-3 * np.abs(before[:, 3:]).max())
 
 
-def thrown(speeds, spins, mass, timestep, steps, neighbours=0):
+def thrown(speeds, spins, mass, timestep, steps, neighbours=0, **settings):
     """Steps a ball thrown at a fixed finger in each world, and a quiet one in as many worlds more; yields
     kinetic energies (nworld,) [J], then the model, its Data and velocities at the start."""
     spec = mujoco.MjSpec()
@@ -438,7 +439,7 @@ def thrown(speeds, spins, mass, timestep, steps, neighbours=0):
     ball.add_freejoint()
     ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=mass)
     nworld = len(speeds) + neighbours
-    mjm, m, d, _ = make(spec, nworld, readings=False)
+    mjm, m, d, _ = make(spec, nworld, readings=False, **settings)
     velocity = np.zeros((nworld, 6))
     velocity[: len(speeds), 1], velocity[: len(speeds), 3:] = speeds, spins
     velocity[len(speeds) :, 1] = 0.02
@@ -450,17 +451,8 @@ def thrown(speeds, spins, mass, timestep, steps, neighbours=0):
     yield 0.5 * (weight * d.qvel.numpy().astype(float) ** 2).sum(axis=1), mjm, d, velocity
 
 
-# such a ball misses the bound by 2 % there
-ON_4 = pytest.mark.xfail(
-    mujoco.__version__ >= "4",
-    strict=True,
-    reason="what a solve without a balance leaves is limited in mj_step, and not in batches",
-)
-
-
 @pytest.mark.parametrize(
-    "middle, fastest",
-    [(0.15, 0.25), (0.15, 0.4), (0.3, 0.5), *(pytest.param(m, 0.6, marks=ON_4) for m in (0.15, 0.3))],
+    "middle, fastest", [(0.15, 0.25), (0.15, 0.4), (0.3, 0.5), (0.15, 0.6), (0.3, 0.6)]
 )
 def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest):
     speeds, timestep, steps = [0.05, middle, fastest], 2e-3, 14
@@ -474,7 +466,8 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
         ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.011, 0.001])
         ball.add_freejoint()
         ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.02)
-        biotac_mj.attach(spec, body="world", skin=shell(), readings="none")
+        work = {"skin": {"max_work": SkinOptions().max_work}}  # as much as in batches
+        biotac_mj.attach(spec, body="world", skin=shell(), readings="none", options=work)
         model = spec.compile()
         data = mujoco.MjData(model)
         data.qvel[:] = v
@@ -486,7 +479,8 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
 
 @pytest.mark.parametrize("speed", [0.35, 0.5, 0.6])
 def test_a_step_without_a_balance_pulls_no_ball(speed):
-    """Of 100 g, in `mj_step`, whose solves are cut off as it leaves skin that lay on the core."""
+    """Of 100 g, in `mj_step` and in a batch, whose solves are cut off as it leaves skin that lay on the
+    core."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = 2e-3, [0, 0, 0]
     ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.011, 0.001])
@@ -500,8 +494,16 @@ def test_a_step_without_a_balance_pulls_no_ball(speed):
         mujoco.mj_step(model, data)
         push.append(biotac.read(data, "contact_force")[1])
         settled.append(biotac.read(data, "status")[0])
-    assert not all(settled) and max(push) > 5 and min(push) > -1e-3 * max(push)
-    assert -speed < data.qvel[1] < -0.5 * speed
+    batch_push, batch_settled = [], []  # with the work that mj_step has
+    for _, mjm, d, _ in thrown([speed], 0.0, 0.1, 2e-3, 14, options={"skin": {"max_work": 145}}):  # noqa: B007
+        batch_push.append(read(mjm, d, "contact_force")[0, 1])
+        batch_settled.append(read(mjm, d, "status")[0, 0])
+    for force, good, after in (
+        (push, settled, data.qvel[1]),
+        (batch_push[1:], batch_settled[1:], d.qvel.numpy()[0, 1]),
+    ):
+        assert not all(good) and max(force) > 5 and min(force) > -1e-3 * max(force)
+        assert -speed < after < -0.5 * speed
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,12 @@ def finger_under(thrown, timestep, free=None, integrator="implicitfast", gravity
     return model, mujoco.MjData(model), handle
 
 
+# a ball that presses 0.9 mm deep, and a box that flies beside it and turns
+BESIDE_A_PRESS = """<body name="ball" mocap="true" pos="0 0 .01241"><geom size=".005" contype="0"/></body>
+<body name="box" pos="-.008 0 .0176" quat=".4 .7 -.5 .3"><freejoint/><geom type="box" size=".005 .004 .0045"
+mass="{mass}" contype="0"/></body>"""
+
+
 def kinetic(model, data):
     mujoco.mj_energyVel(model, data)
     return data.energy[1]
@@ -612,3 +618,36 @@ def test_a_ball_that_comes_to_rest_takes_few_iterations(mass):
             iterations.append(handle.read(data, "status")[2])
     assert handle.read(data, "status")[1] == 0 and len(iterations) > 50
     assert np.mean(iterations) < 3
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mass, speed", [(0.28e-3, 0.33), (0.17e-3, 0.47), (0.11e-3, 0.29)])
+def test_a_light_box_gains_nothing_beside_a_press(mass, speed, tier):
+    """What a fixed ball that presses has put into the skin is not for a box that hits beside it."""
+    model, data, _ = finger_under(BESIDE_A_PRESS.format(mass=mass), 0.004, skin="coarse", tier=tier)
+    data.qvel[2] = -speed
+    mujoco.mj_forward(model, data)
+    start, most = kinetic(model, data), 0.0
+    for _ in range(14):
+        mujoco.mj_step(model, data)
+        most = max(most, kinetic(model, data))
+    assert kinetic(model, data) < 0.9 * start and most < 1.01 * start
+
+
+def test_a_box_that_sank_beside_a_press_comes_up_with_it():
+    """Nothing of its push is withheld: what it did while it sank is in the skin."""
+    box = '<body name="box" pos="-.007 0 .0118"><joint type="slide" axis="0 0 1" damping="1"/>'
+    box += '<geom type="box" size=".003 .004 .003" mass=".02"/></body>'
+    model, data, handle = finger_under(
+        '<body name="ball" mocap="true" pos=".003 0 .0146"><geom size=".006"/></body>' + box,
+        0.002, gravity="0 0 -9.81", skin="coarse", tier="condensed",
+    )  # fmt: skip
+    mujoco.mj_step(model, data, 120)
+    height, withheld = [], 0.0
+    for speed in [-0.03] * 20 + [0.03] * 20 + [0.0] * 80:
+        data.mocap_pos[0, 2] += speed * model.opt.timestep
+        mujoco.mj_step(model, data)
+        height.append(data.qpos[0])
+        withheld = max(withheld, handle.read(data, "status")[7])
+    assert withheld == 0.0
+    assert min(height) < height[0] - 1e-4 and height[-1] == pytest.approx(height[0], abs=2e-6)

@@ -6,6 +6,8 @@ unless something else is said."""
 
 import warp as wp
 
+from ..coupling.implicit.rules import share_that_pushes
+from ..geometry.rigid_warp import LEVER, motion
 from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
@@ -31,6 +33,8 @@ vec3 = wp.vec3d
 mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
+
+_share_that_pushes = wp.func(share_that_pushes)
 
 
 @wp.struct
@@ -128,6 +132,8 @@ def accept_models(
     tangent: wp.array2d(dtype=mat66),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
+    free_pos: wp.array2d(dtype=vec3),
+    free_mat: wp.array2d(dtype=mat33),
     geoms: Geoms,
     last: Model,
     # Out:
@@ -135,7 +141,7 @@ def accept_models(
 ):
     """The linear models of skins that were asked for poses pos, mat: where their geoms came to; the last
     step's, where they came nowhere; of the first one, which came from outside, where it was to end; no force
-    on what is nowhere."""
+    on what is nowhere. free_pos, free_mat: where the bodies go without the skins."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return
@@ -161,6 +167,10 @@ def accept_models(
         model.tangent0[g, w] = tangent[g, w]
     model.pos0[g, w] = p
     model.mat0[g, w] = R
+    if reason[w] != CONVERGED:
+        way = motion(free_pos[g, w], free_mat[g, w], p, R)
+        share = _share_that_pushes(model.wrench0[g, w], model.tangent0[g, w], way, real(LEVER))
+        model.tangent0[g, w] = share * model.tangent0[g, w]
 
 
 @wp.kernel

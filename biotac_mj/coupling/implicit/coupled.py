@@ -144,15 +144,6 @@ class Coupled:
         """Solves the skin where its bodies are sure to come."""
         self._solve(self.target)
 
-    def _shares_that_push(self):
-        """(n,) of the stiffness of a model without a balance, see `share_that_pushes`."""
-        way = displacement(*self._let_go, *self.pose0)
-        fall, shares = self._by_tangent(way), np.ones(len(way))
-        for along in (way, self.wrench0 / _SCALE**2):
-            of_push, of_fall = (self.wrench0 * along).sum(axis=1), (fall * along).sum(axis=1)
-            shares = np.minimum(shares, [share_that_pushes(*pair) for pair in zip(of_push, of_fall)])
-        return shares
-
     def _solve(self, pose, bodies=None):
         self._let_go = pose if bodies is None else bodies.without(np.arange(len(self.wrench0)), *pose)
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
@@ -177,7 +168,9 @@ class Coupled:
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
         if not result.converged:
-            self.tangent = self._shares_that_push()[:, None, None] * self.tangent
+            model = self.wrench0, self.tangent, displacement(*self._let_go, *self.pose0)
+            shares = np.array([share_that_pushes(*each, LEVER) for each in zip(*model)])
+            self.tangent = shares[:, None, None] * self.tangent
         self.written = False
         self.drifted = self.predicted_wrench = self._account = None
         self.touching, correction = _touching(self.tangent), np.zeros_like(self.wrench0)

@@ -114,16 +114,30 @@ def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> An
     return wrong > tolerance * max(excess, wrench)
 
 
-def share_that_pushes(push: Any, fall: Any) -> Any:
+def share_that_pushes(wrench: Any, tangent: Any, way: Any, lever: Any) -> Any:
     """Share of its stiffness with which a model of no balance still pushes where its body goes without the
     skin, so that it holds nobody back who leaves: it knows nothing of skin that parts.
 
     Args:
-      push: of its wrench along a direction; fall: what all of the stiffness takes from that on the way there.
+      wrench: (6,) of the model. tangent: (6, 6) its stiffness. way: (6,) from where it holds to where the
+        body goes. lever: [m] at which turning compares with going.
     """
-    if push > type(push)(0.0) and fall > push:
-        return push / fall
-    return type(push)(1.0)
+    share = type(lever)(1.0)
+    for direction in range(2):  # along the way, and along the wrench itself
+        push = type(lever)(0.0)
+        fall = type(lever)(0.0)
+        for i in range(6):
+            along = way[i]
+            if direction == 1:
+                along = wrench[i]
+                if i > 2:
+                    along = along / (lever * lever)
+            push += wrench[i] * along
+            for j in range(6):
+                fall += along * tangent[i, j] * way[j]
+        if push > type(lever)(0.0) and fall > push:
+            share = min(share, push / fall)
+    return share
 
 
 def stayed(before: Any, reached: Any) -> Any:
