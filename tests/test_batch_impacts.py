@@ -444,3 +444,21 @@ def test_skin_and_core_are_reported_together(cone):
     for took, told, _, _, (torque, reported) in rows:
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 5e-3)
         np.testing.assert_allclose(reported, torque, atol=1e-4 * np.linalg.norm(torque) + 1e-4)
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_a_light_box_gains_nothing_beside_a_press(tier):
+    """What a fixed ball that presses has put into the skin is not for a box that hits beside it."""
+    bodies = (
+        '<body name="ball" mocap="true" pos="0 0 .01241"><geom size=".005" contype="0"/></body>'
+        '<body name="box" pos="-.008 0 .0176" quat=".4 .7 -.5 .3"><freejoint/>'
+        '<geom type="box" size=".005 .004 .0045" mass=".28e-3" contype="0"/></body>'
+    )
+    quat = np.array([0.4, 0.7, -0.5, 0.3])
+    qpos = np.tile([-0.008, 0, 0.0176, *(quat / np.linalg.norm(quat))], (4, 1))
+    qvel = np.zeros((4, 6))
+    qvel[:, 2] = -0.2, -0.28, -0.33, -0.5
+    seen, _ = in_batch(scene(bodies, 0.004, 'gravity="0 0 0"'), qpos, qvel, 14, TIP, skin="coarse", tier=tier)
+    for world in seen:
+        assert world.size.min() > 0.1  # the ball presses all the time
+        assert world.growth < 0.01 and world.energy[-1] < 0.9 * world.energy[0]

@@ -9,7 +9,9 @@ from biotac_mj.coupling.implicit.rules import (
     beta_of,
     gamma_of,
     in_store,
+    lacking,
     poorly_corrected,
+    spared,
     withheld_further,
 )
 
@@ -71,3 +73,11 @@ def test_newmarks_steps_are_stable(delay):
             assert pace < 20 or damping or growth < 0.7
     assert gamma_of(0.1, delay, False) == 1.5 and beta_of(1.5) == 1.0
     assert gamma_of(0.1, 0.0, True) == 0.5 and beta_of(0.5) == pytest.approx(1 / 12)
+
+
+def test_a_body_gets_what_it_put_in_and_what_others_do_now():
+    """Of 3 J that a press left nothing, of what it puts in now as much as there is."""
+    assert lacking(store=0.0, given=0.5) == 0.5 and spared(left=3.0, store=3.0, given=0.0) == 0.0
+    assert spared(left=3.0, store=3.4, given=-0.1) == pytest.approx(0.5)
+    assert lacking(store=-1.0, given=-0.5) == 0.0  # owes, and gives
+    assert spared(left=np.inf, store=np.inf, given=-0.1) == 0.0  # not known
