@@ -60,7 +60,7 @@ def corrected(steps):
             tangent = np.ascontiguousarray(stiffness[None, :, k])
             models[k].tangent0 = wp.array(tangent, dtype=wp.spatial_matrixd)
             models[k].wrench0 = wp.zeros((1, WORLDS), dtype=wp.spatial_vectord)
-        again, square = wp.zeros(1, dtype=int), wp.full(WORLDS, H2, dtype=wp.float64)
+        again, square = wp.zeros(1, dtype=int), wp.full((1, WORLDS), H2, dtype=wp.float64)
         wp.launch(integrator.begin_correction, WORLDS, [wp.ones(WORLDS, dtype=int), c])
         for left in range(steps, -1, -1):
             force = np.einsum("wkni,kwi->wn", jacobian, c.force.numpy())
@@ -111,9 +111,9 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
             values = {"straight": ways, "travel": ways + missing, "moved": missing}
             values = values.get(name, np.zeros((1, n, 6)))
             setattr(r, name, wp.array(values, dtype=wp.spatial_vectord))
-        r.store, r.most = (wp.array(np.full(n, x), dtype=wp.float64) for x in (1e-4, 1e-3))
-        r.trial = wp.zeros(n, dtype=int)
-        r.push, r.settled = wp.ones(n, dtype=wp.float64), wp.ones(n, dtype=int)
+        r.left, r.store, r.most = (wp.full((1, n), x, dtype=wp.float64) for x in (1e-4, 1e-4, 1e-3))
+        r.trial = wp.zeros((1, n), dtype=int)
+        r.push, r.settled = wp.ones((1, n), dtype=wp.float64), wp.ones(n, dtype=int)
         wrench = np.zeros((1, n, 6))
         wrench[0, :, 0] = 5.0, 0.05, 0.05  # [N]: 5 mJ and 0.05 mJ of 0.1
         pushes = wp.array(wrench, dtype=wp.spatial_vectord)
@@ -124,14 +124,14 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
         model_before = model.tangent0.numpy()[0, 1]
         # one that gives too much only now, as another pushes less, is withheld too
         wp.launch(energy.withhold, n, [every, model, pushes, r], [going.struct])
-        assert r.push.numpy().tolist() == [0, 1, 0] and going.world.numpy().tolist() == [1, 0, 1]
+        assert r.push.numpy().tolist() == [[0, 1, 0]] and going.world.numpy().tolist() == [1, 0, 1]
         r.push.fill_(1.0)
         wp.launch(energy.find_gain, n, [every, model, pushes, r], [gains.struct])
         assert gains.world.numpy().tolist() == [1, 0, 1] and gains.any.numpy()[0] == 1
         start = wp.array(np.full((n, 4), np.nan), dtype=float)
         wp.launch(energy.withdraw, n, [gains.world, model, r, correction, start])
     assert np.isnan(start.numpy()[1]).all() and not start.numpy()[[0, 2]].any()
-    assert r.push.numpy().tolist() == [0, 1, 0] and r.settled.numpy().tolist() == [0, 1, 0]
+    assert r.push.numpy().tolist() == [[0, 1, 0]] and r.settled.numpy().tolist() == [0, 1, 0]
     for array in (model.wrench0, model.tangent0, correction):
         assert not array.numpy()[0, [0, 2]].any()
     np.testing.assert_array_equal(model.tangent0.numpy()[0, 1], model_before)
