@@ -219,7 +219,7 @@ def tables():
     yield Row("recording import --out out.h5", "the following arguments are required: FILE")
     yield Row(TWO, "e.txt has 420 rows and f.txt has 419", "f.txt", lines(lambda v: v[1:]))
     yield Row(TWO, "these look like mN", "f.txt", lines(lambda v: [row.replace("-", "-9999") for row in v]))
-    yield Row(TWO, "could be anything: give 19 columns", "f.txt", lines(lambda v: ["1 2 3 4 5 6 7 8"] * 420))
+    yield Row(TWO, "could be anything: give the", "f.txt", lines(lambda v: ["1 2 3 4 5 6 7 8"] * 420))
     yield Row(TWO, "f.txt, line 2: Fy is 'x'", "f.txt", lines(lambda v: [v[0], "1 x 3", *v[2:]]))
 
 

@@ -63,6 +63,13 @@ def test_other_numbers_of_electrodes_are_refused_by_name(tmp_path):
         load_one(path)
 
 
+def test_an_sp_s_missing_columns_are_named(tmp_path):
+    names = [f"e{k + 1}" for k in range(24) if k != 6]
+    path = write(tmp_path / "log.csv", names, np.delete(COUNTS, 6, axis=1))
+    with pytest.raises(ValueError, match="no columns e7: its header must name e1..e24"):
+        load_one(path)
+
+
 def test_diagnose_takes_one_finger_and_says_which_it_is(tmp_path):
     rng, n = np.random.default_rng(0), 400
     columns = [f"{finger}_biotac_{k}" for finger in ("ff", "mf") for k in range(1, 25)]

@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 
-from ...geometry.design import design_of_channels, designs
+from ...geometry.design import designs
 from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
-from ...sensor.channels import NELECTRODE, NPAC
+from ...sensor.channels import NPAC
 from ..recording import CHANNELS, FIELDS, Recording
 from .names import is_stamp, is_time, place_of, unit_of
 
@@ -95,7 +95,8 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         names = ", ".join(list(columns)[:8])
         raise ValueError(
             f"{source} has nothing that is known of a BioTac ({names or 'no columns'}): name the columns "
-            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/howto/file_formats.md has all names"
+            "e1, e2, ..., pdc, pac1, pac2, ..., tdc, tac, Fx, Fy, Fz, time; "
+            "docs/howto/file_formats.md has all names"
         )
     notes += [f"{source}: {', '.join(names)} are read as {unit}" for unit, names in units.items()]
     parts, own = [], {} if clock else _own_clocks(columns, found)
@@ -142,7 +143,7 @@ def _without_gaps(part):
         least = int(np.isfinite(electrodes).sum(0).argmin())
         raise ValueError(
             f"{part.source}: {some.sum()} of {len(there)} rows lack an electrode, mostly e{least + 1}: a gap "
-            "cannot be guessed; all 19 are needed in a row"
+            f"cannot be guessed; all {electrodes.shape[1]} are needed in a row"
         )
     part.notes.append(f"{part.source}: left out {(~there).sum()} rows that lack an electrode")
     others = []
@@ -233,16 +234,17 @@ def _whole(source, field, pieces):
             out[:, k] = place[number]
         return out, [] if len(order) == NPAC else [f"{source}: PAC has {len(order)} of 22 samples of a frame"]
     if field == "electrodes":
-        missing = [f"e{i + 1}" for i in range(NELECTRODE) if i + base not in place]
-        if missing:
-            raise ValueError(f"{source} has no columns {', '.join(missing)}: its header must name e1..e19")
-        design = design_of_channels(len(place))
-        if design is None or set(place) != set(range(base, base + len(place))):
-            # the electrodes cannot be identified among them
+        last, known = max(place) - base + 1, sorted(design.nelectrode for design in designs())
+        if last > known[0] and last not in known:  # the electrodes cannot be identified
             raise ValueError(
                 f"{source} has {len(place)} columns of electrodes, e{min(place)} to e{max(place)}: "
-                f"{_known()}; rename or remove the others"
+                f"{_known()}; name all of one of them, and no others"
             )
+        count = max(last, known[0])
+        missing = [f"e{i + 1}" for i in range(count) if i + base not in place]
+        if missing:
+            missing = ", ".join(missing)
+            raise ValueError(f"{source} has no columns {missing}: its header must name e1..e{count}")
         return np.stack([place[i + base] for i in range(len(place))], 1), []
     if set(place) != set(range(width)):
         return None, [f"{source}: left out {field}, of which only {len(place)} of {width} columns are there"]

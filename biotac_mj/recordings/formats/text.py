@@ -194,19 +194,25 @@ def _role(path, n, width):
             if fits(names):
                 return kind
     raise ValueError(
-        f"{path}: a table of {n} rows and {width} columns without names could be anything: give 19 columns "
-        "(electrodes; 24 of a BioTac SP), 3 (force [N]), the clock before them if you like, or name all "
-        "columns in a header, as e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time"
+        f"{path}: a table of {n} rows and {width} columns without names could be anything: give the "
+        f"electrodes ({_known()}), 3 columns (force [N]), the clock before them if you like, or name all "
+        "columns in a header, as e1, e2, ..., pdc, pac1, pac2, ..., tdc, tac, Fx, Fy, Fz, time"
     )
 
 
 def _wrong_width(table, names):
     where = f"{table.path}, line {table.lines[0]}"
     said = f"{where}: {table.width} columns, {len(names)} are needed ({_range(names)})"
+    if names == ELECTRODES:
+        said = f"{said}, as of one of: {_known()}"
     if table.names:
         named = ", ".join([name for name in table.names if not is_time(name)][:8])
         return f"{said}; nothing in its header is known of a BioTac ({named}): name them {_range(names)}"
     return f"{said}; or name all columns in a header"
+
+
+def _known():
+    return ", ".join(design.title for design in designs())
 
 
 def _range(names):
