@@ -13,7 +13,8 @@ from biotac_mj.sensor.own_design import PadShape, new_design
 
 SIX = [[0, 0, -6], [2, 0, -5.6], [-2, 0, -5.6], [0, 2, -5.6], [0, -2, -5.6], [3, 3, -4]]
 GROUND = [[5, 0, -3], [-5, 0, -3]]
-DOME = PadShape(dome=(9.0, 9.0, 9.0), core=(6.0, 6.0, 6.0), edge=2.4)
+DOMED = {"dome": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}
+DOME = PadShape(**DOMED, edge=2.4)
 
 
 def pushed(folder, start, depth, **more):
@@ -87,7 +88,9 @@ def test_a_flat_pad_without_electrodes_gives_force_and_depth(tmp_path, capsys):
         ({"block": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}, (), "a block is solid and has no core"),
         ({"dome": (9.0, 9.0, 9.0), "core": (8.0, 8.0, 8.0)}, (), "no liquid fits"),
         ({"block": (20.0, 20.0, 6.0)}, (SIX, GROUND), "electrodes feel the liquid .*, and this pad is solid"),
-        ({"dome": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}, (SIX, ()), "6 electrodes and 0 of excitation"),
+        (DOMED, (SIX, ()), "6 electrodes and 0 of excitation"),
+        (DOMED, ([*SIX[:5], [40, 0, -5]], GROUND), "E6 is 34.3 mm off the core, and a disc is 1 mm wide"),
+        (DOMED, ([*SIX, [0, 0.6, -6]], GROUND), "E1 and E7 are 0.6 mm apart, and a disc is 1 mm wide"),
         ({"block": (2.0, 2.0, 2.0)}, (), "is 2 mm, not between 5 and 100 mm"),
     ],
 )

@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.distance import pdist, squareform
 
 from ..files import replacing
 from ..geometry.assembly import EMPTY, assemble, fixed_nodes
@@ -16,7 +17,9 @@ from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.tet_mesh import TetMesh, enclosed_volume
 from .channels import counts_from_impedance
+from .core_surface import CoreSurface
 from .film import FilmConduction
+from .film.conduction import ELECTRODE_RADIUS
 
 __all__ = ["PadShape", "new_design", "pad_skin"]
 
@@ -148,6 +151,7 @@ def new_design(
     design = Design(**known, **places, **ideal, sources={"all": "biotac design new"})
     skin = pad_skin(shape, design)
     if n:
+        _check_places(skin)
         film = FilmConduction(skin, sensor=None)
         rest = np.clip(counts_from_impedance(film.rest), 1.0, 4094.0).round(1).tolist()
         design = dataclasses.replace(design, sensors={"ideal": {"rest": rest}})
@@ -157,6 +161,26 @@ def new_design(
     with replacing(folder / "design.json") as temporary:
         temporary.write_text(json.dumps(json.loads(design.text), indent=1))
     return design
+
+
+def _check_places(skin):
+    """Raises a ValueError where an electrode is not on the core, or two of them would touch."""
+    design, disc = skin.design, 2e3 * ELECTRODE_RADIUS  # [mm]
+    place = design.in_biotac_frame(np.array([*design.electrodes_mm, *design.excitation]))
+    off = 1e3 * CoreSurface(skin.core_vert, skin.core_face).closest(1e-3 * place)[0]
+    worst = int(off.argmax())
+    if off[worst] > disc:
+        raise ValueError(
+            f"{design.discs[worst]} is {off[worst]:.3g} mm off the core, and a disc is {disc:.3g} mm wide: "
+            "give places on the core in mm, x to the fingertip, z out of the nail"
+        )
+    pair = squareform(pdist(place)) + np.diag(np.full(len(place), np.inf))
+    i, k = np.unravel_index(pair.argmin(), pair.shape)
+    if pair[i, k] <= disc:
+        raise ValueError(
+            f"{design.discs[i]} and {design.discs[k]} are {pair[i, k]:.3g} mm apart, and a disc is "
+            f"{disc:.3g} mm wide: move them apart, or leave one out"
+        )
 
 
 def _xyz(lengths):

@@ -68,6 +68,7 @@ EXCITATION = BIOTAC.excitation
 CONDUCTIVITY = 0.367
 # [m], published cylinder about the x axis; only a start for the search of the core's surface
 _CORE_RADIUS = 5.325e-3
+ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
 _FOOTPRINT = 0.8e-3  # [m], radius of the disc that injects into the sheet: resolved by 0.8 mm edges
 # [m], tangential motion of the skin over an electrode for which the candidate faces suffice
 _SLACK = 2.0e-3
@@ -84,6 +85,7 @@ class FilmConduction:
     Args:
       geometry: the skin, its core and its electrodes.
       conductivity: of the liquid [S/m].
+ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
       residual_film: thickness where the skin touches the core, kept by the asperities of its inner face [m]
         (chosen; catalogue range 20-100 um).
       electrode_radius: of all discs [m] (chosen: not published).
@@ -109,7 +111,7 @@ class FilmConduction:
         geometry: SkinGeometry,
         conductivity: float = CONDUCTIVITY,
         residual_film: float = 50e-6,
-        electrode_radius: float = 0.5e-3,
+        electrode_radius: float = ELECTRODE_RADIUS,
         excitation: ArrayLike | None = None,
         sensor: str | Sensor | None = "",
     ):
