@@ -190,7 +190,7 @@ def test_rivals_find_what_is_linear_and_planted():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="a latency in data of the other tier is named and not added", strict=True)
+@pytest.mark.xfail(reason="a latency in data of the other tier has no name", strict=True)
 def test_a_csv_with_poses_is_diagnosed(tmp_path):
     """From a CSV (synthetic: this project's skin, a hidden latency, another modulus) to the verdict."""
     from biotac_mj.cli import main

@@ -39,6 +39,7 @@ def verdict_of(diagnosis: TrajectoryDiagnosis, folder: pathlib.Path | str = "REP
         verdict=diagnosis.verdict,
         significant=significant,
         effects=[_proved(one, diagnosis, gaps) for one in diagnosis.effects],
+        not_named=diagnosis.refuted,
         gap=gaps,
         warnings=[line] if (line := scattered(c)) else [],
         aside=f"{len(diagnosis.locked)} trajectories that took no part in the search, errors of their poses "

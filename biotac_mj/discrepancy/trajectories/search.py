@@ -102,7 +102,11 @@ def found(
         little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance"}]
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         # where the likeliest adds what another's law lacks, so do those that are less likely
-        if not able or _shared(comparison, able[0], out, chosen):
+        if not able:
+            break
+        if _shared(comparison, able[0], out, chosen):
+            if _in_place_of(able[0], out):
+                continue
             break
         best = able[0] = _other_shapes(comparison, able[0], out.fit, chosen)
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
@@ -156,6 +160,17 @@ def _shared(comparison, one, search, chosen) -> bool:
         for c in search.found
     )
     return one.gain < (_ALIKE if alike else _ALONE) * alone
+
+
+def _in_place_of(one, search) -> bool:
+    """Puts an effect in the place of all that was found where it alone explains more."""
+    null, fit = search.fits[frozenset()], search.fits[frozenset({one.effect.id})]
+    if fit.score <= search.fit.score or one.effect.rejection_reason(fit.effects[-1][1]):
+        return False
+    new = dataclasses.replace(one, fit=fit, gain=float(fit.score - null.score))
+    new.ties = [c.effect.id for c in search.found if _tied(new, c)]
+    search.found, search.fit = [new], fit
+    return True
 
 
 def _without_needless(comparison, search, usable, chosen):

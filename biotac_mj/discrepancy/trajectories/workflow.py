@@ -49,7 +49,8 @@ class TrajectoryDiagnosis:
       before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
         them.
       isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
-      fit: Fit, with the effects that are added: those named but for what makes locked trajectories worse.
+      fit: Fit, with the effects that are named and added. refuted: Findings that explain what was fitted and
+        that locked trajectories contradict.
       comparison, selection, locked: what it was made of. residuals: (before, after), of every
         locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
         file can hold them. beside: BaseCandidates, which `effects` names too. beliefs: how likely which
@@ -75,6 +76,7 @@ class TrajectoryDiagnosis:
     trace: dict = dataclasses.field(default_factory=dict)
     beside: list = dataclasses.field(default_factory=list)
     beliefs: Beliefs | None = None
+    refuted: list[Finding] = dataclasses.field(default_factory=list)
 
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with them;
@@ -241,28 +243,45 @@ def _tie_aliases(current, found, names):
         item.ties = [*item.ties, *(i for i in item.effect.alias(theta) if i in names and i not in known)]
 
 
-def _in_words(comparison, current, effects, named, chosen):
-    """Verdict, and what is said of the remainder, where something disagrees."""
+def _in_words(comparison, current, effects, named, chosen, refuted):
+    """Verdict, and what is said of the remainder, where something disagrees; refuted: what is said of effects
+    that have no name."""
     parts = [
         e.name + (f" (or {' or '.join(e.ties.values())}: not told apart)" if e.ties else "") for e in effects
     ]
     if effects and named:
         return ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts), ""
-    remainder = "" if effects else jumps(comparison, current)
+    remainder = refuted or ("" if effects else jumps(comparison, current))
     remainder = remainder or depends_on(comparison, current, chosen)
     if not effects:
         return f"unknown ({remainder})", remainder
     return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder
 
 
-def _not_added(found, added):
-    """Notes of effects that have a name and are not added."""
-    stay = {e.id for e, _ in added.effects}
-    out = [one.effect for one in found if one.effect.id not in stay]
-    if not out:
-        return []
-    what = " and ".join(e.name for e in out)
-    return [f"named, not added: trajectories kept aside are further off with {what} than without"]
+def _upheld(comparison, null, current, found, search, chosen, aside):
+    """Fit and Candidates of what trajectories kept aside do not contradict, one effect after another, and the
+    Candidates that they do: what explains the fitted ones alone has no name."""
+    best, upheld = null, []
+    for k in range(1, len(found) + 1):
+        some = found[:k]
+        pairs = [pair for pair in current.effects if pair[0].id in {one.effect.id for one in some}]
+        fit = search.fits.get(frozenset(e.id for e, _ in pairs))
+        if k == len(found):
+            fit = current
+        elif fit is None:
+            fit = fit_effects(comparison, pairs, chosen, null)
+        starts = [null] if best is null else [best, null]
+        if all(proved(comparison, start, fit, aside).fit is fit for start in starts):
+            best, upheld = fit, some
+    return best, upheld, [one for one in found if one not in upheld]
+
+
+def _refuted(found):
+    """What is said of effects that trajectories kept aside contradict; nothing without any."""
+    if not found:
+        return ""
+    what = " and ".join(one.effect.name for one in found)
+    return f"{what} would explain what was fitted, and trajectories kept aside contradict it"
 
 
 def _settle(comparison, null, search, chosen, aside, notes, usable):
@@ -270,6 +289,8 @@ def _settle(comparison, null, search, chosen, aside, notes, usable):
     current, found, explained, why = _named(comparison, null, search)
     names = {e.id: e.name for e in usable}
     _tie_aliases(current, found, names)
+    fitted = current
+    current, found, refuted = _upheld(comparison, null, current, found, search, chosen, aside)
     named = not _wrong(comparison, current)
     # What the base is off by has a name where it is all that is left: else it may be a part of what is not
     # known.
@@ -283,25 +304,25 @@ def _settle(comparison, null, search, chosen, aside, notes, usable):
     doubts = [f"{', '.join(alike)} may be as good"] if alike else []
     if not named:
         doubts.append("a part of what is missed has no name")
-    if found and not proof.fit.effects:
-        doubts.append("trajectories kept aside contradict it")
+    if refuted:
+        doubts.append(_refuted(refuted))
     beliefs = believed(comparison, search, doubts, chosen)
     effects = [_described(item, current, _sure(beliefs, item), names) for item in found]
     effects += [dataclasses.replace(one.finding, confidence=_SURE) for one in beside]
     stray = ""
     if seen:
-        verdict, remainder = _in_words(comparison, current, effects, named, chosen)
+        verdict, remainder = _in_words(comparison, current, effects, named, chosen, _refuted(refuted))
         few = few_off(null.mean_square(comparison)[chosen])
         stray = "" if effects or not few else strays(comparison, null, chosen, aside, search.rounds[0])
         verdict, remainder = (f"unknown ({stray})", stray) if stray else (verdict, remainder)
     else:
         stray = strays(comparison, null, chosen, aside, search.rounds[0])
-        stray = stray or jumps(comparison, null) or beliefs.against_none
+        stray = stray or jumps(comparison, null) or _refuted(refuted) or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     table = isolability(comparison, current, usable, effects, chosen)
     more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
-    notes = [*notes, *why, *_not_added(found, proof.fit), *of_base(comparison, current, chosen)]
+    notes = [*notes, *why, *of_base(comparison, current, chosen)]
     trace = {
         "before": dict(zip(("level", "peak"), _off(comparison, null))),
         "after": dict(zip(("level", "peak"), _off(comparison, current))),
@@ -330,6 +351,7 @@ def _settle(comparison, null, search, chosen, aside, notes, usable):
         trace,
         beside,
         beliefs,
+        [_described(item, fitted, _sure(beliefs, item), names, False) for item in refuted],
     )
 
 
@@ -338,7 +360,7 @@ def _sure(beliefs, item) -> float:
     return _SURE * sum(one.weight for one in beliefs.explanations if item.effect.id in one.ids)
 
 
-def _described(item, current, certain, names) -> Finding:
+def _described(item, current, certain, names, confirmed=None) -> Finding:
     """A Candidate as it is reported; names: id -> name of the effects that were looked for."""
     effect = item.effect
     theta = next(th for e, th in current.effects if e.id == effect.id)
@@ -355,5 +377,6 @@ def _described(item, current, certain, names) -> Finding:
         evidence=item.gain,
         p=item.p,
         confidence=certain,
+        confirmed=confirmed,
         ties={i: names[i] for i in item.ties},
     )
