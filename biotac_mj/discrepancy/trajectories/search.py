@@ -302,9 +302,10 @@ def _solved(comparison, fit, effect, current, chosen, times=_SOLVED, about=False
 
 
 def _moving(out):
-    """Indices of Candidates that move the object and may be the likeliest where their fits end."""
+    """Indices of the likeliest Candidates that move the object: where their fits end they may lead."""
     least = max(_WORTH, _SOME * max((c.gain for c in out), default=0.0))
-    return [k for k, c in enumerate(out) if c.effect.before_skin and c.gain > least]
+    some = [k for k, c in enumerate(out) if c.effect.before_skin and c.gain > least]
+    return sorted(some, key=lambda k: -out[k].gain)[:_KINS]
 
 
 def _remembering(out):
