@@ -1,5 +1,5 @@
-"""`calibrate` by gradients: one press gives the forces and their derivatives by all parameters, where
-differences take a press for each."""
+"""`calibrate` by gradients: one press gives the forces and their derivatives by all parameters; finite
+differences need a press for each."""
 
 import dataclasses
 import functools
@@ -19,16 +19,16 @@ from .sweep import Inputs, push_forward
 
 __all__ = ["Forces", "calibrate", "forces_of"]
 
-_PRECISION = 1e-4  # of the slopes, which only steer
+_PRECISION = 1e-4  # of derivatives, which only set the direction
 
 
 @dataclasses.dataclass
 class _Press:
-    """One that the next begins near.
+    """The last press, as initial guess of the next.
 
     Attributes:
-      skin, indentation, parameters: of what.
-      scaled: (p,) parameters. steps: records. slopes: (p, 1, nstep, nvert, 3) of their nodes.
+      skin, indentation, parameters: identify it.
+      scaled: (p,) parameters. steps: records. slopes: (p, 1, nstep, nvert, 3) derivatives of their nodes.
     """
 
     skin: Skin
@@ -39,24 +39,24 @@ class _Press:
     slopes: np.ndarray
 
     def of(self, skin: Skin, indentation: Indentation, parameters: list) -> bool:
-        """Whether it is one of these."""
+        """Whether it belongs to these."""
         return self.skin is skin and self.indentation is indentation and self.parameters == parameters
 
     def guesses(self, scaled: np.ndarray) -> list[torch.Tensor | None]:
-        """Nodes (nvert, 1, 3) of each step with other parameters, to first order; None where none was found,
-        or a step may have several balances: which one is found there depends on the press alone, and not on
-        those before."""
+        """First-order guess of the nodes (nvert, 1, 3) of each step for other parameters. None if the step
+        did not converge or may have several equilibria: which one is found must depend on the press only, not
+        on earlier ones."""
         moved = np.tensordot(scaled - self.scaled, self.slopes, 1)[0, :, :, None]
         unsure = [step.on_core or step.changes[0].sharp or step.changes[0].lost for step in self.steps]
         return [None if no else step.x + dx for step, dx, no in zip(self.steps, moved, unsure)]
 
 
 class Forces:
-    """What `calibration.fit.forces_and_jacobian` gives, by gradients. Keeps the skin from call to call,
-    and the last press, near which the next one is looked for.
+    """`calibration.fit.forces_and_jacobian` by gradients. Caches the skin between calls, and the last press
+    as a guess.
 
     Raises:
-      ValueError: a parameter by which there is no gradient.
+      ValueError: a parameter without gradient.
     """
 
     def __init__(self):
@@ -71,7 +71,8 @@ class Forces:
         indentation: Indentation,
         device: str = "cpu",
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Forces (n, 3) [N], their derivatives by the scaled parameters (n, 3, p), steps that were lost."""
+        """Forces (n, 3) [N], their derivatives by the scaled parameters (n, 3, p), number of steps without
+        convergence."""
         names = [p.name for p in parameters]
         steps, skin = self.prepare(configuration, material, parameters, indentation)
         values = torch.tensor(values, dtype=torch.float64)
@@ -117,7 +118,7 @@ class Forces:
         parameters: list[FitParameter],
         indentation: Indentation,
     ) -> tuple[Steps, Skin]:
-        """The way in steps, and the skin that goes it."""
+        """The path in steps, and its skin."""
         missing = sorted({p.name for p in parameters} - {"friction", *PARAMETERS})
         if missing:
             raise ValueError(
@@ -145,8 +146,8 @@ def forces_of(
     indentation: Indentation,
     device: str = "cpu",
 ) -> tuple[Forces | None, str]:
-    """What `calibration.calibrate` takes as its forces, and what its slopes are by: gradients, or where these
-    are not there, None and differences with the reason."""
+    """Argument `forces` of `calibration.calibrate`, and the name of its method for derivatives: gradients,
+    or, if they are not available, None and finite differences with the reason."""
     if device != "cpu":
         return None, f"differences (gradients on {device} are not there)"
     forces = Forces()
@@ -167,14 +168,14 @@ def calibrate(
     progress: bool = False,
     starts: int = 1,
 ) -> Calibration:
-    """`calibration.calibrate` by gradients, on the CPU: Gauss and Newton's method from the start.
+    """`calibration.calibrate` by gradients, on the CPU: Gauss-Newton from the start.
 
     Args:
       configuration, material, indentation, max_iterations, progress, starts: see there.
       parameters: E, nu, mu, fill_volume, bulk_modulus, contact_stiffness.
 
     Raises:
-      ValueError: what `calibration.calibrate` and `Skin` raise, or a parameter by which there is no gradient.
+      ValueError: as `calibration.calibrate` and `Skin`, or a parameter without gradient.
     """
     return calibrate_with(
         configuration,

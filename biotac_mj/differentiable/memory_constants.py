@@ -1,4 +1,4 @@
-"""The constants of rubber that remembers, one after another, as gradients take them."""
+"""Constants of rubber with memory as one vector, for gradients."""
 
 import numpy as np
 
@@ -8,20 +8,20 @@ __all__ = ["constants_of", "relaxed", "split_constants", "write_constants"]
 
 
 def constants_of(material: Material) -> np.ndarray:
-    """(c,) one after another: share and time [s] of each Prony term, Mullins' three, share and strain of each
-    friction element; of what the material does not have, none."""
+    """(c,) concatenated: fraction and time [s] of each Prony term, three of Mullins, fraction and strain of
+    each friction element; only those that the material has."""
     parts = material.prony, material.mullins or (), material.hysteresis
     return np.concatenate([np.ravel(np.array(part, float)) for part in parts])
 
 
 def relaxed(material: Material, constants: np.ndarray) -> np.ndarray:
-    """The constants of the same rubber after any time, without softening or friction."""
+    """Constants of the fully relaxed rubber, without softening or friction."""
     prony, mullins, branch = split_constants(material, constants)
     return np.concatenate([(prony * [0.0, 1.0]).ravel(), 0 * mullins, 0 * branch.ravel()])
 
 
 def write_constants(data: SkinData, constants: np.ndarray) -> None:
-    """Gives the rubber of `SkinData` of one world these constants."""
+    """Sets the constants of the rubber of a `SkinData` with one world."""
     prony, mullins, branch = split_constants(data.model.material, constants)
     for array, value in (
         (data.rubber.prony, prony[:, None]),

@@ -1,4 +1,4 @@
-"""A press as a function that PyTorch differentiates."""
+"""A press as a differentiable PyTorch function."""
 
 import dataclasses
 import math
@@ -23,19 +23,19 @@ from .tensors import real_tensor, skew
 
 __all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
 
-# of the skin, which `press` takes; what is not given is the skin's own
+# parameters of `press`; default: the skin's own
 PARAMETERS = ("youngs_modulus", "poissons_ratio", "fill_volume", "bulk_modulus", "contact_stiffness")
 
 
 @dataclasses.dataclass
 class Pressed:
-    """What a press gives, as tensors of double precision that know their gradients.
+    """Result of a press, as differentiable tensors of double precision.
 
     Attributes:
       nodes: (..., nstep, nvert, 3) in the BioTac frame [m].
       wrench: (..., nstep, ngroup, 6) of the skin on the geoms, torque about the frame's origin [N, N m].
       pressure: (..., nstep) of the liquid above rest [Pa].
-      changes: for each world a list of `Changes`, one for each step: where a gradient holds on one side only.
+      changes: per world a list of `Changes`, one per step: where a gradient is one-sided.
     """
 
     nodes: torch.Tensor
@@ -45,7 +45,7 @@ class Pressed:
 
     @property
     def counts(self) -> Changes:
-        """Changes of all steps of all worlds together."""
+        """Changes summed over all steps of all worlds."""
         steps = [dataclasses.astuple(change) for world in self.changes for change in world]
         return Changes(*np.sum(steps, 0).tolist())
 
@@ -66,45 +66,44 @@ def press(
     together: str | None = None,
     **parameters: torch.Tensor,
 ) -> Pressed:
-    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
-    dt, smoothing and together, backwards and, by `torch.autograd.forward_ad`, forwards.
+    """Moves geoms along a path against a skin at rest; differentiable by every argument except the first, dt,
+    smoothing and `together`, in reverse mode and, by `torch.autograd.forward_ad`, in forward mode.
 
-    Worlds are walked one after another on the CPU, where what comes out lies, or, dry and elastic ones,
-    `together` on a device; tensors of another device are brought there and their gradients back. What a
-    backward pass needs of a step is kept, some hundred kilobytes; no step is solved twice.
+    Worlds are solved one after another on the CPU, or, without liquid and memory, in parallel on the device
+    `together`. Results are on that device; tensors of other devices are copied to it, and their gradients
+    back. Each step saves some hundred kilobytes for the backward pass; no step is solved twice.
 
     Args:
       skin: the skin and its geoms.
       pos: (nstep, ngeom, 3) or (nworld, nstep, ngeom, 3), of the geoms [m].
-      quat: the same of 4, w x y z; of any length but zero.
-      core_pos, core_quat: (..., nstep, 3) [m] and (..., nstep, 4) pose of the BioTac, in the frame in which
-        those of the geoms are; None: they are in the BioTac frame.
-      friction: (ngeom,) or (nworld, ngeom) Coulomb's coefficients; None: the skin's.
-      rest_nodes: (nnode, 3) or (nworld, nnode, 3) rest positions [m], of the geometry's nodes (those that it
-        gets on its edges lie in the middle) or of all that are solved, `skin.rest`; None: the skin's. Rubber,
-        fixed nodes, contact areas, those on the core too, and the liquid's room follow; the core stays, and
-        so does which inner faces can meet it, a choice of whole faces. `impedance` takes them as well. A
-        fill_volume is beyond what this shape holds.
-      dt: time of a step, or (nstep,) of the steps [s]; needed by a Prony series. A skin with memory begins
-        relaxed and virgin, as its filling leaves it.
-      prony: (nterm, 2) or (nworld, nterm, 2) of share and time [s]; mullins: (3,) or (nworld, 3);
-        hysteresis: (nbranch, 2) or (nworld, nbranch, 2), as `skin.Material` has them and as many as the
-        skin's has; None: the skin's.
-      smoothing: half width [m] over which first touch and the change from stick to slip are smooth: another
-        law, whose gradient has no kink there. It pushes from this gap on, at no gap as Coulomb's law does at
-        a quarter of it, and friction gives way earlier by as much. Contact with the core keeps its kinks. 0:
-        Coulomb's law.
-      together: "cpu" or a CUDA device, as "cuda:0", where all worlds are solved at once and what comes out
-        lies. None: one after another. Refused: liquid, rubber that remembers, rest_nodes,
-        smoothing.
+      quat: likewise with 4, w x y z; of any norm except zero.
+      core_pos, core_quat: (..., nstep, 3) [m] and (..., nstep, 4) pose of the BioTac, in the frame of the
+        geoms' poses; None: these are in the BioTac frame.
+      friction: (ngeom,) or (nworld, ngeom) Coulomb coefficients; None: the skin's.
+      rest_nodes: (nnode, 3) or (nworld, nnode, 3) rest positions [m], of the geometry's nodes (nodes added on
+        edges are in the middle) or of all solved ones, `skin.rest`; None: the skin's. Rubber, fixed nodes,
+        contact areas, including those on the core, and the liquid's volume follow; the core does not, nor
+        does the set of inner faces that can touch it. `impedance` takes them as well. A fill_volume is in
+        addition to the volume of this shape.
+      dt: time of a step, or (nstep,) of the steps [s]; required for a Prony series. A skin with memory starts
+        relaxed and virgin, after its filling.
+      prony: (nterm, 2) or (nworld, nterm, 2) of fraction and time [s]; mullins: (3,) or (nworld, 3);
+        hysteresis: (nbranch, 2) or (nworld, nbranch, 2), as in `skin.Material` and as many as the skin's;
+          None: the skin's.
+      smoothing: half width [m] over which first contact and the transition from stick to slip are smooth:
+        another law without these kinks in its gradient. It pushes from this gap on, at zero gap as Coulomb's
+        law at a quarter of it, and slip begins earlier by as much. Contact with the core keeps its kinks. 0:
+          Coulomb's law.
+      together: "cpu" or a CUDA device, such as "cuda:0", on which all worlds are solved in parallel. None:
+        one after another. Not available for liquid, rubber with memory, rest_nodes, smoothing.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
-        (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
-        contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
+        (liquid in addition to the unstressed skin's) [m^3], bulk_modulus (of the liquid) [Pa],
+        contact_stiffness [Pa/m], default 180 E per millimetre unless the skin's options set it.
 
     Raises:
-      ValueError: shapes that do not fit, what is no number, a smoothing that cannot be, an unknown parameter,
-        one that the skin has no use for, no time step for a Prony series, rest positions at which a
-        tetrahedron is inverted, or what worlds that go together cannot have.
+      ValueError: incompatible shapes, values that are not finite, an invalid smoothing, an unknown or unused
+        parameter, no time step for a Prony series, rest positions with an inverted tetrahedron, or features
+        that parallel worlds lack.
     """
     if together is not None:
         _refuse_together(skin, together, rest_nodes, smoothing)
@@ -158,11 +157,11 @@ def press(
 
 
 def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -> dict:
-    """`skin.NUMBERS` as tensors, of the skin's material with other PARAMETERS, and rest positions (nvert, 3)
-    [m] if it is given any.
+    """`skin.NUMBERS` as tensors, for the skin's material with other PARAMETERS, and rest positions (nvert, 3)
+    [m] if given.
 
     Raises:
-      ValueError: an unknown parameter, one of the liquid of a dry skin, or a value that cannot be.
+      ValueError: an unknown parameter, one of the liquid for a dry skin, or an invalid value.
     """
     model, options = skin.model, skin.model.options
     unknown = set(parameters) - set(PARAMETERS)
@@ -177,7 +176,7 @@ def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -
         raise ValueError("the skin's liquid is incompressible: make the skin with a finite bulk_modulus")
     values = {name: float(torch.as_tensor(value).detach()) for name, value in parameters.items()}
     rubber = {name: values[name] for name in ("youngs_modulus", "poissons_ratio") if name in values}
-    dataclasses.replace(model.material, **rubber)  # raises for what no rubber has
+    dataclasses.replace(model.material, **rubber)  # raises for invalid values
     for name in {"contact_stiffness", "bulk_modulus"} & set(values):
         if not 0 < values[name] < math.inf:
             raise ValueError(f"{name} is {values[name]}: give a positive number")
@@ -192,7 +191,7 @@ def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -
     own = types.SimpleNamespace(**own | parameters)
     as_is = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in skin.own.items()}
     if {"youngs_modulus", "poissons_ratio"} & set(parameters):
-        # the material's own formulas, of tensors
+        # the material's own formulas, on tensors
         as_is["mu"] = Material.mu.fget(own)
         as_is["lam"] = (Material.bulk if model.law == LAWS["neo_hookean"] else Material.lame).fget(own)
     if own.contact_stiffness is None:
@@ -215,7 +214,7 @@ def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -
 def relative_pose(
     core_pos: torch.Tensor, core_quat: torch.Tensor, pos: torch.Tensor, quat: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Poses of geoms (..., ngeom, 3), (..., ngeom, 4) as seen from the BioTac at (..., 3), (..., 4)."""
+    """Poses of geoms (..., ngeom, 3), (..., ngeom, 4) relative to the BioTac at (..., 3), (..., 4)."""
     core_quat = core_quat / core_quat.norm(dim=-1, keepdim=True)
     turn = _matrix(core_quat).transpose(-1, -2)[..., None, :, :]
     w, v = core_quat[..., None, :1], -core_quat[..., None, 1:]
@@ -233,7 +232,7 @@ def _matrix(quat):
 
 
 def _rest_of(skin, nodes, nworld):
-    """Rest positions (nvert, 3) of each world, None where they are the skin's."""
+    """Rest positions (nvert, 3) of each world, None if they are the skin's."""
     if nodes is None:
         return [None] * nworld
     nodes, n, given = real_tensor("rest_nodes", nodes).cpu(), len(skin.rest), skin.given
@@ -253,7 +252,7 @@ def _rest_of(skin, nodes, nworld):
 
 
 def _refuse_together(skin, device, rest_nodes, smoothing):
-    """What only worlds that go one after another can have, or a device that is not there."""
+    """Raises ValueError for features that parallel worlds lack, or a missing device."""
     missing = "is not there for worlds that go together: leave `together` out"
     if skin.model.has_liquid:
         raise ValueError(f"liquid {missing}, or take liquid=False")
@@ -270,7 +269,7 @@ def _refuse_together(skin, device, rest_nodes, smoothing):
 
 
 def _refuse_smoothing(skin, width):
-    """Of a mesh the distance is exact near its surface alone."""
+    """Checks the width; for a mesh the distance is exact only near its surface."""
     spacing = skin.geoms.struct.grids.spacing.numpy()
     most = 0.4 * spacing.min() if len(spacing) else 1e-3
     if isinstance(width, torch.Tensor) and width.requires_grad:
@@ -280,7 +279,7 @@ def _refuse_smoothing(skin, width):
 
 
 def _times_of(skin, dt, nstep):
-    """(nstep,) [s], or None where nobody asks."""
+    """(nstep,) [s], or None if unused."""
     if dt is None:
         if skin.model.material.prony:
             raise ValueError("skin with a Prony series relaxes in time: give press a dt [s]")
@@ -306,14 +305,14 @@ def _constants_of(skin, given, nworld):
         elif not len(own):
             raise ValueError(f"the skin's material has no {name}: leave it out, or give the material some")
         parts.append(_of_worlds(name, value, nworld, tuple(own.shape)).reshape(nworld, -1))
-        for w in range(nworld):  # raises for what no rubber has
+        for w in range(nworld):  # raises for invalid values
             value = parts[-1][w].detach().reshape(own.shape).tolist()
             dataclasses.replace(material, **{name: value or getattr(material, name)})
     return torch.cat(parts, 1)
 
 
 def _shape_of(skin, rest):
-    """Rest positions and areas that follow, of outer faces and of those that can meet the core."""
+    """Rest positions and the resulting areas, of outer faces and of those that can touch the core."""
     if rest is None:
         return None, None, None
     core = skin.data.core
@@ -322,21 +321,21 @@ def _shape_of(skin, rest):
 
 
 def _of_worlds(name, value, nworld, shape):
-    value = real_tensor(name, value).cpu()  # where skins are solved; its gradient goes back
+    value = real_tensor(name, value).cpu()  # device of the solves; autograd copies the gradient back
     if value.shape not in (shape, (nworld, *shape)):
         raise ValueError(f"{name} has shape {tuple(value.shape)}: pass {shape} or {(nworld, *shape)}")
     return value.expand(nworld, *shape)
 
 
 class _Press(torch.autograd.Function):
-    """All worlds of a skin. Rotations are matrices here: their cotangents lie along rotations."""
+    """All worlds of a skin. Rotations are matrices here: their cotangents are along rotations."""
 
     @staticmethod
     def forward(context, skin, changes, dt, smoothing, pos, mat, friction, numbers, constants, *shape):
         context.skin, rest = skin, shape[0]
         path = (a.detach().numpy() for a in (pos, mat, friction))
         numbers = dict(zip(NUMBERS, numbers.detach().T))
-        # a copy: who moves the nodes in place afterwards moves no checkpoint
+        # a copy, so that in-place changes of the nodes do not change checkpoints
         vert = None if rest is None else rest.detach().numpy().copy()
         with skin.lock, skin.stream():
             context.trajectory = trajectory = follow(

@@ -1,5 +1,5 @@
-"""A press of all worlds of a skin step by step, with all that its gradient needs: the state in which every
-step began, and where it ended. No step is solved a second time."""
+"""Records of a press of all worlds of a skin, step by step, with all data for its gradient: the initial and
+final state of every step. No step is solved twice."""
 
 import dataclasses
 import math
@@ -18,22 +18,22 @@ from .touching import Anchors, at_sharp_edges, find_touching, rows, touching_sam
 
 __all__ = ["Changes", "Record", "Trajectory", "advance", "follow", "hold_pressure", "restore"]
 
-_NOTHING = 1e-15  # of the largest energy density that rubber has borne
-_WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds`, as a step had them
+_NOTHING = 1e-15  # of the largest energy density of the rubber
+_WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds` in a step
 
 
 @dataclasses.dataclass(frozen=True)
 class Changes:
-    """Where the force of a step has a kink, at which a gradient holds on one side alone, or a jump.
+    """Number of kinks of a step's force, where a gradient is one-sided, or jumps.
 
     Attributes:
-      touched, parted: samples that began, ceased to touch. slipped, stuck: began, ceased to slip.
-      yielded: friction elements of the rubber's points that began or ceased to slip. softened: points that
-        began or ceased to bear more than ever.
-      sharp: samples that touch an edge which is not rounded (`touching.at_sharp_edges`): the step may have
-        several balances, and the gradient is that of the one that was found.
-      lost: 1 where the step found no balance, or only in parts, of which friction remembers the last: its
-        gradient means little.
+      touched, parted: samples that began, ended contact. slipped, stuck: began, ended slip.
+      yielded: friction elements of the rubber's points that began or ended slip. softened: points that began
+        or ended to exceed their largest energy.
+      sharp: samples in contact with an edge that is not rounded (`touching.at_sharp_edges`): the step may
+        have several equilibria, and the gradient is for the one found.
+      lost: 1 if the step found no equilibrium, or only by load increments, of which friction remembers the
+        last: its gradient is unreliable.
     """
 
     touched: int = 0
@@ -48,23 +48,23 @@ class Changes:
 
 @dataclasses.dataclass
 class Record:
-    """One step of all worlds; tensors lie where the skin does.
+    """One step of all worlds; tensors are on the skin's device.
 
     Attributes:
-      geoms: what touched: the skin's, or nothing.
-      x, x_last: (nvert, nworld, 3) nodes when it ended and began [m].
-      begun: state of a single world on the CPU when it began; with a largest energy below any in the step in
-        which a filling comes to rest, which leaves rubber that has borne no more than that. Else None.
-      anchors: what stuck then.
+      geoms: in contact: the skin's, or none.
+      x, x_last: (nvert, nworld, 3) nodes at its end and start [m].
+      begun: initial state of a single world on the CPU; in the step to equilibrium of a filling its largest
+        energy is below any in the step, so that the rubber is virgin. Else None.
+      anchors: at its start.
       poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, nworld, ...).
       numbers: of the worlds, (nworld,).
       wrench: (nworld, ngroup, 6) of the skin on the geoms. pressure: (nworld,) of the liquid above the
         surroundings [Pa].
-      touches, slips: samples that touch, that slip, when it ends.
-      yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped in it, (n,) points
-        that bore more than ever; empty without memory.
-      on_core: samples that touch the core, when it ends.
-      changes: of each world, against the step before. smoothing: half width of first touch [m].
+      touches, slips: samples in contact, slipping, at its end.
+      yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped, (n,) points that
+        exceeded their largest energy; empty without memory.
+      on_core: samples in contact with the core, at its end.
+      changes: of each world, relative to the step before. smoothing: half width of first contact [m].
       dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`.
     """
 
@@ -90,8 +90,8 @@ class Record:
 
 @dataclasses.dataclass
 class Trajectory:
-    """Records of a press: of the skin at rest on its filling, None of a dry one, and of the steps; rest
-    positions of its nodes (nvert, 3) [m]."""
+    """Records of a press: of the filled skin at rest, None for a dry one, and of the steps; rest positions of
+    its nodes (nvert, 3) [m]."""
 
     rest: Record | None
     steps: list
@@ -110,18 +110,18 @@ def follow(
     smoothing: float = 0.0,
     guesses: Sequence[torch.Tensor | None] | None = None,
 ) -> Trajectory:
-    """Takes the geoms along paths, from skins at rest.
+    """Moves the geoms along paths, from skins at rest.
 
     Args:
       skin: the worlds.
       pos, mat: (nworld, nstep, ngeom, 3) [m], (nworld, nstep, ngeom, 3, 3) in the BioTac frame.
       friction: (ngeom,) or (nworld, ngeom). numbers: of NUMBERS, each of all worlds or (nworld,).
       vert: (nvert, 3) rest positions of the nodes [m]; None: the skin's.
-      dt: (nstep,) times of the steps [s]; needed by a Prony series.
+      dt: (nstep,) times of the steps [s]; required for a Prony series.
       constants: of the rubber's memory; None: the skin's.
-      smoothing: half width of first touch, see `press` [m].
-      guesses: for each step nodes (nvert, nworld, 3) at which it begins to look for its balance [m], None:
-        where the step before leads. Then the press ends with the first step that is lost.
+      smoothing: half width of first contact, see `press` [m].
+      guesses: for each step an initial guess of the nodes (nvert, nworld, 3) [m], None: from the step before.
+        The press then ends at the first step without equilibrium.
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
@@ -135,7 +135,7 @@ def follow(
     rest = None
     if skin.model.has_liquid:
         hold_pressure(skin)
-        # filled slowly, as `skin.fill` does: after any time, and virgin
+        # filled slowly, as in `skin.fill`: fully relaxed and virgin
         settled = relaxed(skin.model.material, constants)
         write_constants(data, settled)
         rest = advance(skin, skin.nothing, None, 1.0, settled)
@@ -160,7 +160,7 @@ def follow(
 
 
 def hold_pressure(skin: SkinWorlds) -> None:
-    """The pressure of a liquid that keeps its volume is an unknown of its own."""
+    """Makes the pressure of an incompressible liquid an unknown."""
     incompressible = math.isinf(skin.model.options.bulk_modulus)
     kappa, keeps_volume = (wp.to_torch(getattr(skin.data.worlds, name)) for name in ("kappa", "keeps_volume"))
     keeps_volume.copy_((kappa == 0) | incompressible)
@@ -169,8 +169,8 @@ def hold_pressure(skin: SkinWorlds) -> None:
 def advance(
     skin: SkinWorlds, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray
 ) -> Record:
-    """Makes a step of dt [s] from the state that the skin has, to where the geoms are now. before: the step
-    before, None: there is none. constants: of the rubber's memory."""
+    """Solves a step of dt [s] from the skin's current state to the geoms' current poses. before: the step
+    before, or None. constants: of the rubber's memory."""
     data, outer, struct = skin.data, skin.data.outer, geoms.struct
     begun = skin.state(geoms).save() if skin.model.has_liquid or data.memory else None
     anchors, x_last = Anchors.of(outer), wp.to_torch(data.x).clone()
@@ -178,7 +178,7 @@ def advance(
     poses = {name: wp.to_torch(getattr(struct, name)).clone() for name in names}
     step(skin.model, data, geoms, dt)
     x = wp.to_torch(data.x).clone()
-    _put_poses(geoms, poses)  # the step makes the last poses these
+    _put_poses(geoms, poses)  # the step overwrites the last poses
     seen = find_touching(outer, skin.sample_weights, struct, x, x_last, anchors)
     sharp = seen.sample[at_sharp_edges(struct, seen)]
     geoms.advance()
@@ -212,8 +212,8 @@ def advance(
 
 
 def _kink_branches(skin, geoms, begun, before, moved):
-    """Which of the rubber's friction elements slipped in a step, and which points bore more than ever, by
-    what they remember now and did when it began; rubber that lies still is on the side where it was."""
+    """Friction elements of the rubber that slipped in a step, and points that exceeded their largest energy,
+    by their memory before and after; rubber at rest stays on its side."""
     if not skin.data.memory:
         return np.zeros(0, bool), np.zeros(0, bool)
     n, material = skin.data.memory.npoint, skin.model.material
@@ -224,14 +224,14 @@ def _kink_branches(skin, geoms, begun, before, moved):
     if material.hysteresis:
         slipped = (now.slip != begun.slip).reshape(-1, 6).any(1)
     if material.mullins is not None:
-        # what has borne nothing but rounding has nothing to fall short of
+        # points with energy of rounding size cannot fall below their largest
         virgin = begun.worst <= _NOTHING * now.worst.max()
         loads = (now.worst > begun.worst) | virgin
     return slipped, loads
 
 
 def restore(skin: SkinWorlds, record: Record) -> None:
-    """Puts the skin where a step ended, with the contact and the liquid of there."""
+    """Puts the skin into the final state of a step, with its contact and liquid."""
     data = skin.data
     skin.write(record.numbers)
     skin.smooth(record.smoothing)
@@ -250,6 +250,6 @@ def restore(skin: SkinWorlds, record: Record) -> None:
 
 
 def _put_poses(geoms: GeomSet, poses: dict) -> None:
-    """Gives geoms what a record's `poses` has."""
+    """Sets the geoms to a record's `poses`."""
     for name, value in poses.items():
         wp.to_torch(getattr(geoms.struct, name)).copy_(value)

@@ -1,4 +1,4 @@
-"""Skins and their geoms that gradients can pass through, steps solved tightly."""
+"""Differentiable skins and their geoms, with steps solved to a small tolerance."""
 
 import contextlib
 import dataclasses
@@ -23,12 +23,12 @@ from .memory_constants import constants_of
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "SkinWorlds", "refuse_beyond"]
 
-# of a step: the gradient is that of a balance, and wrong by as much as that is missed
+# tolerance of a step: the gradient is that of an equilibrium, so the residual is its error
 TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
-FINEST = 1e-9  # precision of linear solves, below which a step's own rounding is felt
+FINEST = 1e-9  # least precision of linear solves, below which a step's own rounding matters
 
-# what a skin is made of, as its kernels take it: shear modulus and second constant of the law [Pa], stiffness
-# of the contact [Pa/m], volume of the liquid without pressure [m^3], its bulk modulus over that [Pa/m^3]
+# constants of a skin in its kernels: shear modulus and second constant of the law [Pa], stiffness of the
+# contact [Pa/m], volume of the liquid without pressure [m^3], its bulk modulus over that [Pa/m^3]
 NUMBERS = ("mu", "lam", "contact_stiffness", "natural", "kappa")
 
 
@@ -41,7 +41,7 @@ def _sum_corners(
     # Out:
     sum_out: wp.array2d(dtype=vec3),
 ):
-    """At the nodes, of what the elements' corners have."""
+    """Sums the elements' corner values at the nodes."""
     i, w = wp.tid()
     total = vec3()
     for k in range(start[i], start[i + 1]):
@@ -50,8 +50,8 @@ def _sum_corners(
 
 
 class _Replayed:
-    """A program, recorded when it first runs. On CUDA it is a graph from its second run on: the first
-    compiles its kernels and makes PyTorch's workspaces, which no capture may."""
+    """A program, recorded on its first run. On CUDA it is a graph from its second run on: the first one
+    compiles its kernels and allocates PyTorch's workspaces, which is not allowed in a capture."""
 
     def __init__(self, device, record):
         self._device, self._record, self._program, self._graph = device, record, None, None
@@ -72,25 +72,24 @@ class _Replayed:
 
 
 class SkinWorlds:
-    """A skin in several worlds on one device, and what may touch it.
+    """A skin in several worlds on one device, and its geoms.
 
     Args:
       model: of the skin. made_with: arguments of `skin.GeomSet`. nworld: number of worlds.
       precision: of the linear solves of a gradient.
       preconditioner: of the steps, see `SkinData`.
-      smooths: whether first touch can be smooth.
-      owner: of the model, where it is another skin's, which moves its rest positions.
+      smooths: whether first contact can be smooth.
+      owner: another skin that owns the model and changes its rest positions, or None.
 
     Attributes:
-      model, data, geoms: SkinModel, SkinData, GeomSet. nothing: a GeomSet of none. nworld, device: of them.
-      weights: (s, 3) barycentric, of the samples of a face; sample_weights: the same, a tensor of the device.
-      surfaces: numbers of outer faces, and of those that can meet the core.
-      factors: of its stiffness, for linear solves on the CPU. products: that these took since
-        `begin_solves`.
-      constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
-      rest: (nvert, 3) rest positions of all nodes that are solved [m].
-      smoothing: half width of first touch of what is pressed now [m].
-      lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
+      model, data, geoms: SkinModel, SkinData, GeomSet. nothing: an empty GeomSet. nworld, device: of them.
+      weights: (s, 3) barycentric, of the samples of a face; sample_weights: the same, a tensor on the device.
+      surfaces: numbers of outer faces, and of those that can touch the core.
+      factors: of its stiffness, for linear solves on the CPU. products: number since `begin_solves`.
+      constants: of its memory, see `memory_constants.constants_of`; empty without memory.
+      rest: (nvert, 3) rest positions of all solved nodes [m].
+      smoothing: half width of first contact in the current press [m].
+      lock: held during a press or a gradient: the skin's state serves one thread at a time.
     """
 
     def __init__(
@@ -109,7 +108,7 @@ class SkinWorlds:
         self._lies, self._owner = self.rest, owner
         self.data = data = SkinData(model, nworld, preconditioner=preconditioner)
         self.smoothing, self._smoothing = 0.0, None
-        if smooths:  # before a step is recorded, which takes the kernels that know of it
+        if smooths:  # before a step is recorded, which then uses kernels with smoothing
             self._smoothing = wp.zeros(nworld, dtype=real, device=self.device)
             data.laws.struct.smoothing = self._smoothing
         self.geoms = GeomSet(**made_with, nworld=nworld, device=self.device)
@@ -124,12 +123,12 @@ class SkinWorlds:
             direction, at_nodes = (wp.zeros_like(data.x) for _ in range(2))
         self._direction, self._at_nodes = (wp.to_torch(array) for array in (direction, at_nodes))
         self.sample_weights = torch.as_tensor(self.weights, device=self.torch_device).double()
-        # one for its own use; the other is that of the steps, where these are in double, and knows the shape
-        # in which they left it
+        # a separate preconditioner; the steps' one, if it has double precision, belongs to the shape in which
+        # they left it
         parts = model.elements, data.rubber, data.options, DOUBLE
         self._elements, steps = ElementForces(*parts), self.solver(self.geoms)
         self._stepped = steps.k.elements if data.precision is DOUBLE else self._elements
-        # recorded: packing their arguments takes as long as what they do
+        # recorded, because packing their arguments takes as long as their work
         x, on, p, total = data.x, self._on, direction, at_nodes
         elements, stepped, inverted = self._elements, self._stepped, data.worlds.inverted
         lists = [elements.start, elements.slot]
@@ -148,7 +147,7 @@ class SkinWorlds:
         self._push, self._collect, self._multiply = (
             _Replayed(self.device, record) for record in (push, collect, multiply)
         )
-        # of steps: into the preconditioner what is in `touching` and `block` of the surfaces; k.z of k.r
+        # inputs of the steps' preconditioner: `touching` and `block` of the surfaces; k.r; its output k.z
         self.precondition = _Replayed(self.device, steps.put_preconditioner)
         self.invert = _Replayed(self.device, lambda program: steps.put_inverse(program, steps.k.r))
 
@@ -156,7 +155,7 @@ class SkinWorlds:
 
     @property
     def torch_device(self) -> torch.device:
-        """As PyTorch names it."""
+        """The device in PyTorch's form."""
         return torch.device(str(self.device))
 
     def tensor(self, array: np.ndarray) -> torch.Tensor:
@@ -165,7 +164,7 @@ class SkinWorlds:
 
     @contextlib.contextmanager
     def stream(self) -> Iterator[None]:
-        """PyTorch launches where Warp does."""
+        """Makes PyTorch launch on Warp's stream."""
         if not self.device.is_cuda:
             yield
             return
@@ -177,11 +176,11 @@ class SkinWorlds:
     # --- the skin ---
 
     def rest_at(self, vert: np.ndarray) -> None:
-        """Lies at other rest positions (nvert, 3) [m], until it is told otherwise; a filled skin begins a
-        press as far from them as from its own.
+        """Changes the rest positions to (nvert, 3) [m]; a filled skin starts a press as far from them as from
+        its own.
 
         Raises:
-          ValueError: a tetrahedron would be inverted, degenerate or folded; then nothing has changed.
+          ValueError: a tetrahedron would be inverted, degenerate or folded; the skin is then unchanged.
         """
         if self._owner:
             self._owner.rest_at(vert)
@@ -203,11 +202,11 @@ class SkinWorlds:
             self._smoothing.fill_(width)
 
     def solver(self, geoms: GeomSet) -> SkinStep:
-        """The step of the skin under `self.geoms` or `self.nothing`."""
+        """The step of the skin with `self.geoms` or `self.nothing`."""
         return prepare_step(self.model, self.data, geoms)
 
     def state(self, geoms: GeomSet) -> StateArrays:
-        """Of the skin under `self.geoms` or `self.nothing`."""
+        """State of the skin with `self.geoms` or `self.nothing`."""
         if id(geoms) not in self._states:
             self._states[id(geoms)] = StateArrays(self.data, geoms)
         return self._states[id(geoms)]
@@ -217,26 +216,26 @@ class SkinWorlds:
         return {name: wp.to_torch(getattr(self.data.worlds, name)).clone() for name in names}
 
     def write(self, numbers: dict) -> None:
-        """The inverse of `read`; numbers are of all worlds."""
+        """Inverse of `read`; numbers are common to all worlds or (nworld,)."""
         for name, value in numbers.items():
             wp.to_torch(getattr(self.data.worlds, name)).copy_(torch.as_tensor(value))
 
     # --- linear algebra ---
 
     def begin_solves(self) -> None:
-        """Before a gradient, which does not depend on those before."""
+        """Call before a gradient, which must not depend on earlier ones."""
         self.products = 0
         if self.factors:
             self.factors.begin()
 
     def count_products(self, count: int, x: torch.Tensor) -> None:
-        """After a solve that took so many products with the tangent at x (nvert, nworld, 3) [m]."""
+        """Call after a solve that took so many products with the tangent at x (nvert, nworld, 3) [m]."""
         self.products += count
         if self.factors and self.nworld == 1:
             self.factors.count(count, x[:, 0].numpy())
 
     def multiply_rubber(self, p: torch.Tensor) -> torch.Tensor:
-        """Tangent of the rubber where forces were evaluated last (`record.restore`), times p (nvert, nworld,
+        """Tangent of the rubber at the last evaluation of forces (`record.restore`), times p (nvert, nworld,
         3)."""
         self._direction.copy_(p)
         return self._found(self._multiply)
@@ -247,8 +246,8 @@ class SkinWorlds:
 
     @contextlib.contextmanager
     def another_lam(self) -> Iterator[torch.Tensor]:
-        """With another second constant of the law (nworld,), which is told, on the same side of
-        `Tetrahedra.cap`."""
+        """Temporarily sets another second constant of the law (nworld,), which is returned, on the same side
+        of `Tetrahedra.cap`."""
         mu, array = wp.to_torch(self.data.rubber.mu), wp.to_torch(self.data.rubber.lam)
         lam = array.clone()
         half = 0.5 * torch.where(lam == 0, mu, lam)
@@ -258,12 +257,11 @@ class SkinWorlds:
         array.copy_(lam)
 
     def rubber_slopes(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Slopes of the rubber's forces (nvert, nworld, 3) by both its constants, where they were evaluated
-        last.
+        """Derivatives of the rubber's forces (nvert, nworld, 3) by both its constants, at the last
+        evaluation.
 
-        They are homogeneous in both, and linear in the second on either side of where points feel no more of
-        it (`Tetrahedra.cap`): two evaluations are exact. What is not, its past and its softening, is left to
-        `linear.memory`."""
+        Forces are homogeneous in both constants, and linear in the second on either side of `Tetrahedra.cap`:
+        two evaluations are exact. `linear.memory` has the derivatives of history and softening."""
         mu, lam = (wp.to_torch(getattr(self.data.rubber, name)).clone() for name in ("mu", "lam"))
         with self.another_lam() as other:
             there = self._push_virgin()
@@ -275,7 +273,7 @@ class SkinWorlds:
         return self._stepped is not self._elements and not self.data.memory
 
     def _push_virgin(self):
-        """Forces of rubber whose points have no past stress and do not soften [N]."""
+        """Forces of rubber without past stress and softening [N]."""
         rubber = self.data.rubber
         past = [getattr(rubber, "past", None), rubber.mullins] if self.data.memory else []
         kept = [(a, wp.clone(a)) for a in past if a is not None]
@@ -287,32 +285,30 @@ class SkinWorlds:
         return force
 
     def point_slopes(self, change: np.ndarray) -> tuple[np.ndarray, ...]:
-        """See `ElementForces.point_slopes`, where the nodes are."""
+        """See `ElementForces.point_slopes`, at the current nodes."""
         return self._elements.point_slopes(self.data.x, change)
 
 
 class Skin(SkinWorlds):
-    """A skin and what may touch it, in a single world on the CPU.
+    """A skin and its geoms, in a single world on the CPU.
 
     Args:
       geometry: of the skin.
       material: a preset's name or a Material.
-      options: SkinOptions; tolerance and limits are made at least as good as TOLERANCE, MAX_NEWTON and
-        MAX_WORK.
-      types, sizes, friction, groups, rounding, grids: of the geoms, as `skin.GeomSet` has them.
-      modulus: factors on Young's modulus, as `skin.SkinModel` has them.
-      precision: of the linear solves of a gradient; None: a hundredth of the steps' tolerance, which bounds
-        what a gradient is worth, and FINEST at least.
+      options: SkinOptions; tolerance and limits are tightened to TOLERANCE, MAX_NEWTON and MAX_WORK.
+      types, sizes, friction, groups, rounding, grids: of the geoms, as in `skin.GeomSet`.
+      modulus: factors on Young's modulus, as in `skin.SkinModel`.
+      precision: of the linear solves of a gradient; None: a hundredth of the steps' tolerance, which limits
+        the gradient's accuracy, and at least FINEST.
 
     Attributes:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet; others see `SkinWorlds`.
-      rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
-        others lie on its edges.
-      own: NUMBERS of its material and filling. friction: (ngeom,) Coulomb's coefficients that a press has
-        unless it is given others.
+      rest: (nvert, 3) rest positions of all solved nodes [m]; the first `given` are the geometry's, others
+        are on its edges.
+      own: NUMBERS of its material and filling. friction: (ngeom,) default Coulomb coefficients of a press.
 
     Raises:
-      ValueError: an option whose gradient is not there, see `refuse_beyond`, or what the parts raise.
+      ValueError: an option without gradient, see `refuse_beyond`, or errors of the parts.
     """
 
     def __init__(
@@ -351,7 +347,7 @@ class Skin(SkinWorlds):
         self._together = None, None
 
     def together(self, nworld: int, device: str) -> SkinWorlds:
-        """The same skin in several worlds on "cpu" or a CUDA device; the last ones are kept."""
+        """The skin in several worlds on "cpu" or a CUDA device; the last ones are cached."""
         with self.lock:
             if self._together[0] != (nworld, device):
                 model, owner = self.model, self
@@ -366,8 +362,7 @@ class Skin(SkinWorlds):
 
 
 def refuse_beyond(model: SkinModel) -> None:
-    """Raises ValueError, which names the option and what to do, where a skin has what no gradient is there
-    for."""
+    """Raises ValueError with the option and a remedy if a skin has a feature without gradient."""
     o = model.options
     if o.dynamics != "quasistatic":
         raise ValueError("gradients of implicit dynamics are not there: take dynamics='quasistatic'")

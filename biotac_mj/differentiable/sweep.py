@@ -1,8 +1,7 @@
-"""The gradient of a whole press: cotangents from its end to its beginning, tangents from its beginning to
-its end.
+"""Gradient of a whole press: cotangents from its end to its start, tangents from its start to its end.
 
-The records of the steps are the checkpoints: memory grows with their number, and each step is made linear
-again when it is its turn."""
+The records of the steps are the checkpoints: memory grows with their number, and each step is linearised when
+it is needed."""
 
 import dataclasses
 
@@ -19,7 +18,7 @@ __all__ = ["Inputs", "Outputs", "no_memory", "pull_back", "pull_pressure", "push
 
 @dataclasses.dataclass
 class Outputs:
-    """What a press gives, or cotangents or tangents of it.
+    """Outputs of a press, or cotangents or tangents of them.
 
     Attributes:
       nodes: (nworld, nstep, nvert, 3) [m]. wrench: (nworld, nstep, ngroup, 6) of the skin on the geoms
@@ -33,7 +32,7 @@ class Outputs:
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> "Outputs":
-        """What a press gave out, on the skin's device."""
+        """Outputs of a press, on the skin's device."""
         steps, rest = trajectory.steps, trajectory.rest
         begin = rest.pressure if rest else 0.0
         return cls(
@@ -51,9 +50,9 @@ class Inputs:
       pose: (nworld, nstep, ngeom, 6) translations [m] and rotation vectors about the geoms' origins [rad], in
         the BioTac frame.
       friction: (nworld, ngeom). numbers: of `skin.NUMBERS`, (nworld,).
-      vert: (nvert, 3) rest positions [m], which move rubber and fixed nodes; area, core_area: (nface,) of
-        outer faces and of those that can meet the core, which move contact [m^2]. None: they stay.
-      constants: (c,) of the rubber's memory, see `memory_constants.constants_of`. None: they stay.
+      vert: (nvert, 3) rest positions [m], for rubber and fixed nodes; area, core_area: (nface,) of outer
+        faces and of those that can touch the core, for contact [m^2]. None: zero.
+      constants: (c,) of the rubber's memory, see `memory_constants.constants_of`. None: zero.
     """
 
     pose: np.ndarray
@@ -66,7 +65,7 @@ class Inputs:
 
 
 def pull_back(skin: SkinWorlds, trajectory: Trajectory, outputs: Outputs, shape: bool = False) -> Inputs:
-    """Cotangents of the inputs from those of the outputs; shape: of rest positions and areas too."""
+    """Cotangents of the inputs from those of the outputs; shape: also of rest positions and areas."""
     skin.rest_at(trajectory.vert)
     steps, w, ngeom = trajectory.steps, skin.nworld, skin.geoms.count
     nodes, wrench, pressures = (
@@ -109,7 +108,7 @@ def pull_back(skin: SkinWorlds, trajectory: Trajectory, outputs: Outputs, shape:
     found = Inputs(
         pose.permute(2, 0, 1, 3).cpu().numpy(), friction.T.cpu().numpy(), numbers, constants=constants
     )
-    if shape:  # a press begins at rest
+    if shape:  # a press starts at rest
         found.vert = vert + x[:, 0].numpy()
         found.area, found.core_area = area[:, 0].numpy(), core_area[:, 0].numpy()
     return found
@@ -118,13 +117,13 @@ def pull_back(skin: SkinWorlds, trajectory: Trajectory, outputs: Outputs, shape:
 def push_forward(
     skin: SkinWorlds, trajectory: Trajectory, inputs: Inputs, guess: np.ndarray | None = None
 ) -> Outputs:
-    """Tangents of the outputs from those of the inputs, k of them at once.
+    """Tangents of the outputs from k tangents of the inputs.
 
     Args:
       inputs: with arrays of a leading k: pose (k, nworld, nstep, ngeom, 6), friction (k, nworld, ngeom),
         numbers (k, nworld), ...
-      guess: (k, nworld, nstep, nvert, 3) nodes' tangents of nearly the same press, from which less is left to
-        find.
+      guess: (k, nworld, nstep, nvert, 3) initial guess of the nodes' tangents, such as those of a similar
+        press.
 
     Returns:
       Outputs with a leading k, arrays of the host.
@@ -178,19 +177,20 @@ def push_forward(
 
 
 def pull_pressure(skin: SkinWorlds, record: Record, given: dict) -> torch.Tensor:
-    """(nworld,) cotangent of the pressure when a step began, from those of what the step was given."""
+    """(nworld,) cotangent of the pressure at the start of a step, from those of the step's inputs."""
     keeps_volume = torch.as_tensor(skin.data.worlds.keeps_volume.numpy(), device=skin.torch_device)
     return given["reference"] * _slope_of_reference(record) + keeps_volume * given["offset"]
 
 
 def _push_pressure(skin: SkinWorlds, record: Record, pressure: torch.Tensor) -> dict:
-    """Tangents of what a step was given by the pressure (nworld,) when it began."""
+    """Tangents of a step's inputs by the pressure (nworld,) at its start."""
     keeps_volume = torch.as_tensor(skin.data.worlds.keeps_volume.numpy(), device=skin.torch_device)
     return {"reference": pressure * _slope_of_reference(record), "offset": pressure * keeps_volume}
 
 
 def _slope_of_reference(record: Record) -> float:
-    """Of `newton.worlds.Worlds.reference` by the last pressure: its size, but for a least one."""
+    """Derivative of `newton.worlds.Worlds.reference`, the last pressure's size above a least one, by that
+    pressure."""
     if record.begun is None:
         return 0.0
     pressure = record.begun.last_pressure
@@ -198,5 +198,5 @@ def _slope_of_reference(record: Record) -> float:
 
 
 def no_memory(skin: SkinWorlds) -> Memory | None:
-    """A press begins at a state without any, and what that remembers stays as it is."""
+    """Zero memory: a press starts without any, and its initial memory is constant."""
     return Memory.none(skin.model.material, skin.data.memory.npoint) if skin.data.memory else None

@@ -1,4 +1,4 @@
-"""Arguments as tensors, or one line that says why not; PyTorch in numpy's place."""
+"""Arguments as tensors, with one-line errors; PyTorch in numpy's place."""
 
 import math
 import types
@@ -10,7 +10,7 @@ from ..short_repr import short_repr
 
 __all__ = ["TORCH", "add_rows", "real_tensor", "skew"]
 
-# names that `sensor.formulas` ask of numpy
+# numpy names in `sensor.formulas`
 TORCH = types.SimpleNamespace(
     float64=float, pi=math.pi, exp=torch.exp, log=torch.log, where=torch.where, pow=torch.pow
 )
@@ -26,20 +26,20 @@ def skew(v: torch.Tensor) -> torch.Tensor:
 
 
 def add_rows(into: torch.Tensor, at: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    """Adds value (m, ...) to the rows `at` (m,) of `into`, some of them more than once; returns that."""
+    """Adds value (m, ...) to the rows `at` (m,) of `into`, with repetitions; returns it."""
     return into.index_add_(0, at.reshape(-1), value.reshape(-1, *into.shape[1:]))
 
 
 def real_tensor(
     name: str, value: object, wanted: str = "give real numbers, as a tensor or an array of one shape"
 ) -> torch.Tensor:
-    """A tensor of double precision, on the device where it is.
+    """A tensor of double precision, on its device.
 
     Raises:
-      ValueError: `value` is none, in one line that begins with `name` and ends with what is wanted.
+      ValueError: `value` is no real tensor, in one line that begins with `name` and ends with `wanted`.
     """
     try:
-        # PyTorch would leave imaginary parts out
+        # PyTorch would drop imaginary parts
         if not (isinstance(value, _ARRAYS) and torch.as_tensor(value).is_complex()):
             return torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):

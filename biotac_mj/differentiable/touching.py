@@ -1,7 +1,7 @@
-"""Which samples of a surface touch, where they are in their geom's frame, and where they stick.
+"""Samples of a surface in contact, their positions in their geom's frame, and their anchors.
 
-Samples, geoms and nodes of all worlds have the numbers that they have in arrays [item, world] read row by
-row, item * nworld + world. All tensors lie where the skin does."""
+Samples, geoms and nodes of all worlds are numbered by rows of arrays [item, world], item * nworld + world.
+All tensors are on the skin's device."""
 
 import dataclasses
 import typing
@@ -16,14 +16,12 @@ from ..skin.types import real, vec3
 
 __all__ = ["Anchors", "Touching", "at_sharp_edges", "find_touching", "rows", "touching_samples"]
 
-_NEARER = (
-    0.25  # of a sample's spacing, by which another side of a geom is nearer: 90 degrees, no tessellation
-)
+_NEARER = 0.25  # of a sample's spacing, distance to another side of a geom: finds 90 degrees, no tessellation
 
 
 @dataclasses.dataclass(frozen=True)
 class Anchors:
-    """What a surface remembers when a step begins.
+    """Anchors of a surface at the start of a step.
 
     Attributes:
       sample, geom: (n,) samples and the geoms they touched. anchor: (n, 3) in those geoms' frames [m].
@@ -41,12 +39,12 @@ class Anchors:
 
     @classmethod
     def of(cls, state: ContactState) -> typing.Self:
-        """What the surface remembers now."""
+        """The surface's current anchors."""
         sample, geom = touching_samples(state.anchor_geom)
         return cls(sample, geom, rows(state.anchor)[sample])
 
     def give(self, state: ContactState) -> None:
-        """The inverse of `of`."""
+        """Inverse of `of`."""
         geoms = rows(state.anchor_geom)
         geoms.fill_(-1)
         geoms[self.sample] = (self.geom // state.anchor_geom.shape[1]).int()
@@ -54,12 +52,12 @@ class Anchors:
 
 
 def rows(array: wp.array) -> torch.Tensor:
-    """An array [item, world] row by row: a view."""
+    """View of an array [item, world], row by row."""
     return wp.to_torch(array, requires_grad=False).flatten(0, 1)
 
 
 def touching_samples(geom: wp.array) -> tuple[torch.Tensor, torch.Tensor]:
-    """Samples (n,) that have a geom in an array [sample, world], which has -1 for none, and these geoms."""
+    """Samples (n,) with a geom in an array [sample, world], which has -1 for none, and these geoms."""
     found, nworld = rows(geom), geom.shape[1]
     sample = torch.nonzero(found >= 0).ravel()
     return sample, found[sample].long() * nworld + sample % nworld
@@ -67,16 +65,16 @@ def touching_samples(geom: wp.array) -> tuple[torch.Tensor, torch.Tensor]:
 
 @dataclasses.dataclass(frozen=True)
 class Touching:
-    """m samples that touch, as the last evaluation of the forces found them.
+    """m samples in contact, from the last evaluation of the forces.
 
     Attributes:
-      sample, geom: (m,). nworld: of the skin. face: (m,) that each is on. node: (m, 3) of it. weight: (m, 3)
-        barycentric, of where they push. area: (m,) that each stands for [m^2].
-      plane: (m, 4) normal and offset [m], in the geom's frame, of what they meet of an edge; else zeros.
-      point, last: (m, 3) where they push, and where they were when the step began [m].
+      sample, geom: (m,). nworld: of the skin. face: (m,) of each. node: (m, 3) of the face. weight: (m, 3)
+        barycentric coordinates of the contact point. area: (m,) of each [m^2].
+      plane: (m, 4) normal and offset [m], in the geom's frame, of the touched part of an edge; else zeros.
+      point, last: (m, 3) contact points at the end and start of the step [m].
       local: (m, 3) in the geom's frame.
-      old: (m,) number in `Anchors` of those that touched the same geom when the step began, else -1.
-      stick: (m, 3) where they stick if they do, in the geom's frame.
+      old: (m,) number in `Anchors` of those with the same geom at the start of the step, else -1.
+      stick: (m, 3) anchors while sticking, in the geom's frame.
     """
 
     sample: torch.Tensor
@@ -95,12 +93,12 @@ class Touching:
 
     @property
     def world(self) -> torch.Tensor:
-        """(m,) of each sample."""
+        """(m,) world of each sample."""
         return self.sample % self.nworld
 
     @property
     def kind(self) -> torch.Tensor:
-        """(m,) numbers of the geoms, whatever the world."""
+        """(m,) numbers of the geoms, independent of the world."""
         return self.geom // self.nworld
 
 
@@ -112,12 +110,12 @@ def find_touching(
     x_last: torch.Tensor,
     anchors: Anchors,
 ) -> Touching:
-    """Finds them.
+    """Finds the samples in contact.
 
     Args:
       state: of the surface, after an evaluation. weights: (s, 3) of the samples of a face.
-      geoms: with poses of the end and of the beginning of the step.
-      x, x_last: (nvert, nworld, 3) nodes then [m]. anchors: when the step began.
+      geoms: with poses at the end and the start of the step.
+      x, x_last: (nvert, nworld, 3) nodes then [m]. anchors: at the start of the step.
     """
     nworld, s = state.trial_geom.shape[1], len(weights)
     sample, geom = touching_samples(state.trial_geom)
@@ -173,8 +171,8 @@ def _meet(
 
 
 def _meet_edges(geoms, geom, local, weight, corner):
-    """Where samples push (m, 3), the planes (m, 4) of edges that they meet, and the fraction of their area
-    that does (m,)."""
+    """Contact points of samples (m, 3), the planes (m, 4) of touched edges, and the fraction of their area in
+    contact (m,)."""
     m = len(geom)
     at, plane, fraction = weight.clone(), weight.new_zeros((m, 4)), weight.new_ones(m)
     if m and geoms.window.numpy().any():
@@ -206,11 +204,11 @@ def _look_behind(
     # Out:
     sharp_out: wp.array(dtype=int),
 ):
-    """Whether a sample that goes its spacing deeper comes out on another side."""
+    """Whether a sample that moves deeper by its spacing leaves on another side."""
     i = wp.tid()
     g = geom[i]
     reach = spacing[i]
-    if geoms.kind[g] == 7:  # of a mesh the distance is exact near its surface alone
+    if geoms.kind[g] == 7:  # for a mesh the distance is exact only near its surface
         reach = wp.min(reach, real(0.4) * geoms.grids.spacing[geoms.grid[g]])
     kind, size, rounding, grid = geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grid[g]
     here = distance(kind, size, rounding, geoms.grids, grid, local[i])
@@ -220,8 +218,9 @@ def _look_behind(
 
 
 def at_sharp_edges(geoms: Geoms, at: Touching) -> torch.Tensor:
-    """(m,) whether samples touch where their geom is finer than they lie apart: at an edge that is not
-    rounded. There the push jumps from one of its sides to another, and a step may have several balances."""
+    """(m,) whether samples touch their geom where it is finer than their spacing: at an edge that is not
+    rounded. There the contact force jumps from one side to another, and a step may have several
+    equilibria."""
     sharp = torch.zeros(len(at.sample), dtype=torch.int32, device=at.sample.device)
     if len(sharp):
         arrays = (at.local, vec3), (at.area.sqrt(), real)

@@ -1,4 +1,4 @@
-"""Functions of PyTorch's tensors as functions of JAX's arrays, with their gradients."""
+"""PyTorch functions as JAX functions with gradients."""
 
 import collections
 import hashlib
@@ -10,32 +10,32 @@ import torch
 
 __all__ = ["for_jax"]
 
-_KEPT = 4  # last calls whose graphs a backward pass finds
+_KEPT = 4  # number of last calls whose graphs are kept for a backward pass
 
 
 def for_jax(function: Callable, *shapes: Sequence[int]) -> Callable:
-    """The function for JAX: `jax.grad`, `jacrev`, `jit` and `vmap` (one world after another) go through it,
-    `jvp` does not. It is computed on the CPU in double precision; arrays come in and out in JAX's own, which
-    is single unless `jax_enable_x64` is set: nodes then lose what is below a nanometre.
+    """The function for JAX: supports `jax.grad`, `jacrev`, `jit` and `vmap` (one world after another), but
+    not `jvp`. It is computed on the CPU in double precision; arrays have JAX's own precision, which is single
+    unless `jax_enable_x64` is set: nodes are then accurate to a nanometre.
 
     Args:
-      function: of tensors, as `press` and `impedance` are put together to one; gives a tensor or a tuple of
-        tensors. The same tensors have to give the same: JAX may call it more or less often.
-      shapes: of what it gives, one for each tensor. They have to be known before: JAX compiles with them.
+      function: of tensors, for example composed of `press` and `impedance`; returns a tensor or a tuple of
+        tensors. It must be deterministic: JAX may call it more or less often.
+      shapes: of its results, one for each tensor, because JAX compiles with them.
 
     Returns:
-      a function of as many arrays; it gives an array, or a tuple where there are several shapes.
+      a function of as many arrays; returns an array, or a tuple for several shapes.
 
     Raises:
       ImportError: JAX is missing.
-      ValueError: no shapes. When it is called: what the function gives has others.
+      ValueError: no shapes; or, when called, results of other shapes.
     """
     import jax
 
     if not shapes:
         raise ValueError("no shapes: give that of each tensor which the function gives, as (19,)")
     shapes = [tuple(shape) for shape in shapes]
-    # graphs of the last calls: a backward pass need not press again what its forward pass has pressed
+    # graphs of the last calls, so that a backward pass need not repeat the forward pass
     kept, lock = collections.OrderedDict(), threading.Lock()
 
     def run(*arrays):
@@ -72,7 +72,7 @@ def for_jax(function: Callable, *shapes: Sequence[int]) -> Callable:
         ]
         slopes = [None] * len(given)
         if pairs:
-            with lock:  # a graph goes back once at a time
+            with lock:  # a graph supports one backward pass at a time
                 slopes = _slopes(pairs, given)
         return tuple(
             (torch.zeros_like(one) if slope is None else slope).detach().numpy().astype(_real(jax))

@@ -1,1 +1,1 @@
-"""Contact from electrodes: `biotac lab estimate`, which inverts the simulator by its gradients."""
+"""Contact from electrodes: `biotac lab estimate`, which inverts the simulator by gradients."""

@@ -1,9 +1,9 @@
-"""What is believed of a sensor: how its own constants change what its electrodes read, before and after
-touches whose force is known.
+"""Prior and posterior of a sensor's constants, and their effect on its electrodes.
 
-A sensor's answer is that of the simulated one plus constants times slopes: gains, cross-talk, a common share,
-places of the electrodes, residual film, fill and the gain of its pressure. They are normally distributed over
-sensors, so what touches teach of them is linear regression. The modulus scales the force, lognormal."""
+A sensor's response is the simulated one plus constants times sensitivities: gains, cross-talk, a common mode,
+positions of the electrodes, residual film, fill and the gain of its pressure. The constants are normally
+distributed over sensors, so learning them from touches with known force is linear regression. The modulus
+scales the force, lognormal."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,38 +15,38 @@ from .presses import Presses
 
 __all__ = ["AWAY", "FORCE", "PLACE", "TILT", "Belief", "Posterior", "Touch", "believe", "learn", "likelihood"]
 
-# Spread of sensors, and what is left of a press that constants do not explain: fitted by the likelihood of
-# 80 presses of 4 synthetic sensors (docs/lab/differentiable.md, A contact from electrodes), where no source
-# is named
+# Standard deviations over sensors, and of the residual of a press: maximum likelihood for 80 presses of 4
+# synthetic sensors (docs/lab/differentiable.md, A contact from electrodes), unless another source is given
 _GAIN = 0.42  # of each electrode
-_NEAR, _NEAR_MEAN, _REACH = 0.22, 0.1, 4e-3  # cross-talk of neighbours, and how far it goes [m]
+_NEAR, _NEAR_MEAN, _REACH = 0.22, 0.1, 4e-3  # cross-talk of neighbours, and its range [m]
 _SHARE = 0.63  # of the mean of all
-_SHIFT, _EACH = 0.55, 0.75  # [mm] of the electrodes, together and each
+_SHIFT, _EACH = 0.55, 0.75  # [mm] of the electrodes' positions, in common and each
 _FLOOR = 0.85  # of ln of the residual film
 _FILL = 0.75  # [ul]
 _PRESSURE, _PRESSURE_MEAN = 0.2, -0.23  # of the pressure's gain
 _MODULUS, _MODULUS_MEAN = 0.353, 0.049  # of ln of the force
-TILT = 0.18  # [rad] of a press from the normal, in each of two directions: to 25 degrees, evenly
-# Of an electrode's change, and of the RMS of all. CHOSEN: the likeliest, 0.43 and 0.08, times 1.6, with which
+TILT = 0.18  # [rad] of a press from the normal, in each of two directions: uniform to 25 degrees
+# Residual over an electrode's change, and over the RMS of all. CHOSEN: the most likely values, 0.43 and 0.08,
+# times 1.6,
 # intervals need less widening
 _OFF, _LEVEL = 0.68, 0.126
-_ALIKE = 0.4  # the part of both that neighbours share
-_ABSOLUTE, _COMMON = 0.006, 0.007  # of ln Z: of each, of all together
-_KILOPASCAL = 0.2  # of the pressure
-# CHOSEN, of ln of the force and of the centre [m]: the likeliest for forces, 0.11, leaves out those far off
+_ALIKE = 0.4  # correlation of both between neighbours
+_ABSOLUTE, _COMMON = 0.006, 0.007  # residual of ln Z: of each, common to all
+_KILOPASCAL = 0.2  # residual of the pressure
+# CHOSEN, of ln of the force and of the centre [m]: the most likely value for forces, 0.11, excludes outliers
 FORCE, PLACE = 0.3, 0.3e-3
-_LABEL = 0.5e-3  # [m] of the centres that are given
-AWAY = 1.5e-3  # [m] presses further off are not the touch
-_ROUNDS, _LIKELY = 3, 8  # of learning; presses that a touch may be
+_LABEL = 0.5e-3  # [m] error of given centres
+AWAY = 1.5e-3  # [m] largest distance of a press from the touch
+_ROUNDS, _LIKELY = 3, 8  # iterations of learning; candidate presses per touch
 
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
-    """A touch of the sensor that is to be known.
+    """A touch of the unknown sensor.
 
     Attributes:
-      change: (nelectrode,) of ln Z from rest. pressure: its change [kPa], NaN: not known.
-      force: its size [N]. centre: (3,) of the contact on the resting skin, in the BioTac frame [m].
+      change: (nelectrode,) of ln Z from rest. pressure: its change [kPa], NaN: unknown.
+      force: norm [N]. centre: (3,) of the contact on the skin at rest, in the BioTac frame [m].
     """
 
     change: np.ndarray
@@ -56,7 +56,7 @@ class Touch:
 
     @property
     def signal(self) -> np.ndarray:
-        """Changes of the electrodes, and of the pressure where it is known."""
+        """Changes of the electrodes, and of the pressure if known."""
         return np.append(self.change, self.pressure) if np.isfinite(self.pressure) else self.change
 
 
@@ -72,7 +72,7 @@ class Belief:
 
 
 def believe(n: int) -> Belief:
-    """Of any sensor with n electrodes."""
+    """Prior of a sensor with n electrodes."""
     parts = (
         (n, 0, _GAIN), (1, _NEAR_MEAN, _NEAR), (1, 0, _SHARE), (2, 0, _SHIFT), (2 * n, 0, _EACH),
         (1, 0, _FLOOR), (1, 0, _FILL), (1, _PRESSURE_MEAN, _PRESSURE),
@@ -82,11 +82,11 @@ def believe(n: int) -> Belief:
 
 
 class Posterior:
-    """Which of some presses it was, for a sensor of which something is believed.
+    """Posterior over presses, given a belief about the sensor.
 
     Args:
-      presses: all. geometry: of the skin. belief: of the sensor. pressed: whether pressures are known.
-      among: (k,) numbers of the presses in question; None: all.
+      presses: all. geometry: of the skin. belief: about the sensor. pressed: whether pressures are known.
+      among: (k,) numbers of the candidate presses; None: all.
     """
 
     def __init__(
@@ -130,22 +130,22 @@ class Posterior:
         self.variance = np.einsum("nko,nkl,nlo->no", turned[:, :2], left, turned[:, :2])
 
     def __call__(self, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """ln of the likelihood of each press (n,), and what it would have come to (n, 7), `variance` off, of
-        a signal (nelectrode + 1,), one less without pressure."""
+        """ln of the likelihood of each press (n,), and its expected outcome (n, 7) with variance `variance`,
+        for a signal (nelectrode + 1,), one less without pressure."""
         missed = np.einsum("nij,nj->ni", self._inverse, signal - self._expected)
         tilt = np.einsum("nik,ni->nk", self._tilt, missed)
         outcome = self._outcome + np.einsum("nk,nko->no", tilt, self._outcome_by)
         return self._scale - 0.5 * (missed**2).sum(1), outcome
 
     def unexplained(self, press: int, signal: np.ndarray) -> float:
-        """Share of the electrodes' change, RMS, that a press leaves."""
+        """Fraction of the electrodes' change, RMS, that a press does not explain."""
         n = self._n
         return float(np.linalg.norm(signal[:n] - self._expected[press, :n]) / np.linalg.norm(signal[:n]))
 
 
 def likelihood(posterior: Posterior, touch: Touch, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
-    """ln of the likelihood of each press (n,), as what the touch was, and ln of the touch's force over that
-    of each (n,)."""
+    """ln of the likelihood (n,) that the touch was each press, and ln of the touch's force over that of each
+    (n,)."""
     likely, outcome = posterior(touch.signal)
     force = np.log(touch.force) - outcome[:, 0]
     spread = posterior.variance[:, :4] + np.array([FORCE**2 + belief.force_variance, *3 * [_LABEL**2]])
@@ -154,11 +154,11 @@ def likelihood(posterior: Posterior, touch: Touch, belief: Belief) -> tuple[np.n
 
 
 def learn(presses: Presses, geometry: SkinGeometry, touches: Sequence[Touch]) -> Belief:
-    """What is believed of a sensor after touches. Which press each was is as likely as its force, its place
-    and what is believed so far say.
+    """Belief about a sensor after touches. The likelihood of a press for each follows from its force, its
+    position and the belief so far.
 
     Raises:
-      ValueError: no touch is where there are presses.
+      ValueError: no touch is near a simulated press.
     """
     before = belief = believe(geometry.design.nelectrode)
     off = [np.linalg.norm(presses.outcome[:, 1:4] - touch.centre, axis=1) for touch in touches]
@@ -193,6 +193,6 @@ def learn(presses: Presses, geometry: SkinGeometry, touches: Sequence[Touch]) ->
 
 
 def _nearness(geometry):
-    """(nelectrode, nelectrode) 1 at home, less with the distance."""
+    """(nelectrode, nelectrode) proximity: 1 on the diagonal, decreasing with distance."""
     place = geometry.electrode_pos
     return np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / _REACH)

@@ -1,10 +1,9 @@
-"""Contact from electrodes: which press makes the simulated sensor read what was measured.
+"""Contact from electrodes: the press for which the simulated sensor has the measured readings.
 
-Where the sensor is the simulated one, a press is fitted (`fitting.py`). Where it is unknown:
-
-Of presses all over the skin it is asked how likely each is, given what is believed of the sensor and given
-that it may come tilted. Means and spreads over them are the answer. So what the electrodes leave open, what
-the sensor's own constants leave open and what nobody knows of sensors is in the intervals."""
+If the sensor is the simulated one, a press is fitted (`fitting.py`). If it is unknown, the likelihood of
+presses all over the skin is computed, given the belief about the sensor and a possible tilt. The estimate is
+the posterior mean and spread, so the intervals include the ambiguity of the electrodes, the uncertainty of
+the sensor's constants and the variation between sensors."""
 
 import dataclasses
 import functools
@@ -26,14 +25,14 @@ from .presses import Presses
 
 __all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "touch_of"]
 
-# Half widths of 95 % intervals over standard deviations, of ln of the force and of the centre: FITTED, those
-# that hold for 110 presses of 11 synthetic sensors. A normal distribution's 2 are too few: models miss some
-# presses by far
+# Ratio of half widths of 95 % intervals to standard deviations, of ln of the force and of the centre: FITTED
+# to the coverage of 110 presses of 11 synthetic sensors. A normal distribution's 2 is too small: some presses
+# have large model errors
 WIDE = 3.4, 3.0
-# The same of a fit. FITTED, those that hold for nine presses of the simulated sensor, tilted, with noise
-# (docs/lab/differentiable.md): signals have kinks, which a normal distribution has not
+# The same for a fit. FITTED to the coverage of nine presses of the simulated sensor, tilted, with noise
+# (docs/lab/differentiable.md): signals have kinks, so errors are not normal
 OWN_WIDE = 3.2, 5.0
-_PRECISION = 1e-4  # of slopes
+_PRECISION = 1e-4  # of gradients
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +40,10 @@ class Estimate:
     """One contact; errors are half widths of 95 % intervals.
 
     Attributes:
-      centre, centre_error: (3,) of the contact on the resting skin, on the force's line [m].
-      force: (3,) of the geom on the skin [N]. size: its size, most likely; low, high: its interval.
-      unexplained: share of the electrodes' change that the likeliest press leaves. deepest: whether that is
-        the deepest one that is simulated at its place, so that the true one may be deeper.
+      centre, centre_error: (3,) of the contact on the skin at rest, on the line of force [m].
+      force: (3,) of the geom on the skin [N]. size: its norm, most likely; low, high: its interval.
+      unexplained: fraction of the electrodes' change that the most likely press does not explain. deepest:
+        whether that is the deepest simulated press there, so that the true one may be deeper.
     """
 
     centre: np.ndarray
@@ -61,7 +60,7 @@ def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """(nelectrode,) change of ln Z from rest.
 
     Raises:
-      ValueError: shapes, or an electrode at its end.
+      ValueError: wrong shapes, or a saturated electrode.
     """
     counts, rest = np.asarray(counts, float), np.asarray(rest, float)
     for name, value in (("counts", counts), ("rest", rest)):
@@ -78,10 +77,10 @@ def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def touch_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """`change_of` electrodes that are touched.
+    """`change_of` electrodes in contact.
 
     Raises:
-      ValueError: as `change_of`, or counts that hardly differ from rest, or alike at all electrodes.
+      ValueError: as `change_of`, or counts that hardly differ from rest, or equally at all electrodes.
     """
     change, rest = change_of(counts, rest), np.asarray(rest, float)
     noise = electrode_noise(rest) * 0.5 * np.abs(log_impedance(rest + 1) - log_impedance(rest - 1))
@@ -91,7 +90,8 @@ def touch_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
             f"ln Z differs from rest by {changed:.4f}, which may be noise: choose a row under load, or "
             "another rest"
         )
-    # touches differ by 0.8 of their mean and more, a warm-up by 0.3 at most (docs/lab/differentiable.md)
+    # the spread over electrodes is at least 0.8 of their mean for touches, at most 0.3 for warm-up
+    # (docs/lab/differentiable.md)
     if change.std() < min(least, 0.5 * abs(change.mean())):
         raise ValueError(
             f"ln Z differs from rest by {change.mean():.4f}, and alike at all electrodes, as of a sensor "
@@ -104,11 +104,11 @@ class Estimator:
     """Inverts one skin under one geom.
 
     Args:
-      geometry: of the skin. indenter: as `biotac press --indenter`, one geom or mesh.
-      material, options: of the skin: force goes with its modulus.
+      geometry: of the skin. indenter: as in `biotac press --indenter`, one geom or mesh.
+      material, options: of the skin; force scales with its modulus.
 
     Raises:
-      ValueError: what `Skin` refuses.
+      ValueError: as for `Skin`.
     """
 
     def __init__(
@@ -125,11 +125,11 @@ class Estimator:
 
     @functools.cached_property
     def presses(self) -> Presses:
-        """All over the skin; simulated when first asked for, or from disk."""
+        """Presses all over the skin; simulated on first use, or read from disk."""
         return Presses(self.skin, self.geometry, self.indenter)
 
     def learn(self, touches: Sequence[Touch]) -> Belief:
-        """What is believed of the sensor after touches that are known, see `belief.learn`."""
+        """Belief about the sensor after known touches, see `belief.learn`."""
         return learn(self.presses, self.geometry, touches)
 
     def fit(
@@ -140,11 +140,12 @@ class Estimator:
         rows: int = 1,
         film: dict | None = None,
     ) -> Estimate:
-        """The contact at which the simulated sensor itself reads counts (nelectrode,), and untouched rest.
+        """The contact for which the simulated sensor itself reads counts (nelectrode,), and `rest` without
+        contact.
 
         Args:
-          pdc: counts of it, and untouched; None: not known. rows: whose mean is the rest.
-          film: settings of `sensor.film.FilmConduction` that are not its own.
+          pdc: its counts, with and without contact; None: unknown. rows: number of rows averaged for `rest`.
+          film: settings of `sensor.film.FilmConduction`, if changed.
 
         Raises:
           ValueError: shapes, counts that hardly differ from rest, or a press that cannot be simulated.
@@ -175,11 +176,11 @@ class Estimator:
         pdc: tuple[float, float] | None = None,
         belief: Belief | None = None,
     ) -> Estimate:
-        """The contact at which electrodes read counts (nelectrode,), and untouched rest (nelectrode,).
+        """The contact for counts (nelectrode,) of the electrodes, with rest (nelectrode,) without contact.
 
         Args:
-          pdc: counts of it, and untouched; None: not known.
-          belief: of `learn`; None: of any sensor.
+          pdc: its counts, with and without contact; None: unknown.
+          belief: of `learn`; None: prior.
 
         Raises:
           ValueError: shapes, or counts that hardly differ from rest.
@@ -210,7 +211,7 @@ class Estimator:
         )
 
     def _posterior(self, belief, pressed):
-        """Made once for many rows of a sensor."""
+        """Posterior, cached for many rows of a sensor."""
         if self._last is None or self._last[:2] != (belief, pressed):
             made = Posterior(
                 self.presses, self.geometry, belief or believe(self.geometry.design.nelectrode), pressed
@@ -220,5 +221,5 @@ class Estimator:
 
 
 def pressure_change(pdc: float, rest: float) -> float:
-    """Of the liquid [kPa], from counts of PDC."""
+    """Change of the liquid's pressure [kPa], from counts of PDC."""
     return 1e-3 * float(pressure_from_counts(pdc) - pressure_from_counts(rest))

@@ -1,7 +1,7 @@
-"""A contact of a sensor that is known: the press that makes the simulator read what was measured.
+"""Contact of a known sensor: fits a press such that the simulator has the measured readings.
 
-Gauss and Newton's method moves and tilts a press. Its slopes come from the simulator, its start from the
-table of presses."""
+A Gauss-Newton method moves and tilts the press. The simulator supplies its gradients, the table of presses
+its start."""
 
 import dataclasses
 import functools
@@ -20,18 +20,18 @@ from .presses import Presses, frame_of, outcome_of, slopes_of_film
 
 __all__ = ["Fit", "fit", "noise_of"]
 
-_STARTS, _SPACING = 3, 2e-3  # places of the table to begin at, and how far they are apart [m]
-_ITERATIONS, _LONGEST = 20, 0.5  # of a start; longest move of one [mm]
-_CONVERGED = 0.1  # gain of ln of the likelihood below which a start is done: far inside the interval
+_STARTS, _SPACING = 3, 2e-3  # starting positions from the table, and their least distance [m]
+_ITERATIONS, _LONGEST = 20, 0.5  # per start; longest move of an iteration [mm]
+_CONVERGED = 0.1  # least gain of ln of the likelihood per iteration: well inside the interval
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """What a touch was.
+    """Fitted contact.
 
     Attributes:
-      outcome: (7,) of `outcome_of`, mean of the presses that were found. covariance: (7, 7) of it.
-      unexplained: fraction of the electrodes' change, RMS, that the likeliest press misses.
+      outcome: (7,) of `outcome_of`, mean of the fitted presses. covariance: (7, 7) of it.
+      unexplained: fraction of the electrodes' change, RMS, that the most likely press does not explain.
     """
 
     outcome: np.ndarray
@@ -41,8 +41,8 @@ class Fit:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Press:
-    """What was simulated of a press: its outcome, what it misses in standard deviations (k,), slopes of both
-    by its five coordinates, and ln of its likelihood, times -2."""
+    """A simulated press: its outcome, residuals in standard deviations (k,), derivatives of both by its five
+    coordinates, and -2 ln of its likelihood."""
 
     outcome: np.ndarray
     outcome_by: np.ndarray
@@ -60,16 +60,16 @@ def noise_of(rest: np.ndarray, rows: int) -> np.ndarray:
 
 
 def fit(presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.ndarray) -> Fit:
-    """The presses that read signal (nelectrode + 1,), or (nelectrode,) without pressure, with such noise.
+    """Fits presses to a signal (nelectrode + 1,), or (nelectrode,) without pressure, with that noise.
 
     Raises:
-      ValueError: no press at which the search begins can be simulated.
+      ValueError: no starting press can be simulated.
     """
     searches = (_Search(presses, film, signal, noise, start) for start in _starts(presses, signal, noise))
     found = [press for press in (search.run() for search in searches) if press is not None]
     if not found:
         raise ValueError("no press near what was read can be simulated: choose a row under less load")
-    # several presses may read alike: each counts as much as it is likely
+    # several presses may fit: they are weighted by their likelihood
     best = min(found, key=lambda press: press.cost)
     likely = np.exp(-0.5 * (np.array([press.cost for press in found]) - best.cost))
     likely /= likely.sum()
@@ -84,7 +84,7 @@ def fit(presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.nd
 
 
 def _covariance(press, size):
-    """(7, 7) of a press's outcome; the noise is scaled to what the press misses of `size` numbers."""
+    """(7, 7) covariance of a press's outcome, with the noise scaled to the residual of `size` numbers."""
     scale = max(1.0, press.missed @ press.missed / (size - len(_PRIOR)))
     own = np.linalg.inv(press.missed_by.T @ press.missed_by / scale + np.diag(_PRIOR))
     return press.outcome_by @ own @ press.outcome_by.T
@@ -94,7 +94,7 @@ _PRIOR = np.array([0, 0, 0, 1, 1]) / TILT**2  # precisions of three moves [mm], 
 
 
 def _starts(presses, signal, noise):
-    """Numbers of the presses of the table that are most like it, at several places."""
+    """Numbers of the table's presses with the most similar signal, at several positions."""
     far = (((presses.signal[:, : len(signal)] - signal) / noise) ** 2).sum(1)
     chosen, place = [], presses.outcome[:, 1:4]
     for k in np.argsort(far):
@@ -106,7 +106,7 @@ def _starts(presses, signal, noise):
 
 
 class _Search:
-    """From one press of the table."""
+    """Search from one press of the table."""
 
     def __init__(self, presses, film, signal, noise, start):
         self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
@@ -114,8 +114,8 @@ class _Search:
         self._axes = frame_of(self._steps, presses.at[start, 1])
 
     def run(self) -> _Press | None:
-        """Levenberg and Marquardt's steps. The scale of the noise is estimated with the press. So the prior
-        of the tilts holds them while the press is far from the measured one."""
+        """Levenberg-Marquardt iterations. The scale of the noise is estimated with the press, so the prior
+        limits the tilts while the residual is large."""
         at, damping = np.zeros(5), 1e-2
         try:
             here = self._simulate(at)
@@ -129,7 +129,7 @@ class _Search:
             move *= min(1.0, _LONGEST / np.linalg.norm(move[:3]))
             try:
                 there = self._simulate(at + move)
-            except NoFilmError:  # deeper than the skin is thick
+            except NoFilmError:  # deeper than the film allows
                 there = None
             if there is None or there.cost >= here.cost:
                 damping = max(1e-2, 10 * damping)
@@ -142,7 +142,7 @@ class _Search:
         return here
 
     def _simulate(self, at):
-        """A press that is moved by the first three [mm], and tilted by the others [rad]."""
+        """Simulates a press moved by the first three coordinates [mm] and tilted by the others [rad]."""
         skin, presses, start = self._presses.skin, self._presses, self._steps.pos[0]
         turn = Rotation.from_rotvec(at[3:] @ self._axes).as_matrix()
         pos = start + (self._steps.pos - start) @ turn.T + 1e-3 * at[:3]

@@ -1,8 +1,8 @@
-"""Presses of a geom all over a skin: what the sensor tells of each, what there is to be told, and the slopes
-of both.
+"""Table of presses of a geom all over a skin: sensor signals, contact quantities, and derivatives of both.
 
-Places lie on a capsule about the finger, moved to the skin. Every press goes along the inward normal, and at
-most so deep that the core stays clear. They are simulated once and kept on disk; between them are splines."""
+Positions are on a capsule about the finger, projected to the skin. Every press follows the inward normal, to
+a depth that leaves the core clear. They are simulated once and cached on disk; values between them are
+interpolated by splines."""
 
 import dataclasses
 import functools
@@ -30,22 +30,22 @@ from ..sweep import Inputs, push_forward
 
 __all__ = ["Capsule", "Presses", "capsule_of", "deepest", "frame_of", "outcome_of", "slopes_of_film"]
 
-_TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a clamped finger's skin, roughly
-_ROUND = np.radians([85, 64, 43, 21])  # of an end
+_TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that approximates a clamped finger
+_ROUND = np.radians([85, 64, 43, 21])  # angles on an end
 _FRACTIONS = np.linspace(0, 1, 8)  # of the deepest press
-_DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] of a press, from the core: as `data.generation.plan` presses
-_FINER = 2  # points for each of the table's
-_LIGHTEST = 1 / 32  # fraction at which the lightest press is
-_FILL = 1e-9  # [m^3] the unit of slopes by the fill
-_FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, moves of the electrodes
+_DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] largest depth, least distance from the core, as `data.generation`
+_FINER = 2  # interpolated points per point of the table
+_LIGHTEST = 1 / 32  # fraction of the depth of the lightest press
+_FILL = 1e-9  # [m^3] unit of the fill in derivatives
+_FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, shifts of the electrodes
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Capsule:
-    """About the x axis, a skin's shape roughly: presses are at points of it.
+    """Capsule about the x axis that approximates a skin's shape, with presses at points on it.
 
     Attributes:
-      tip, base: where its round ends begin [m]. radius: [m].
+      tip, base: centres of its ends [m]. radius: [m].
       along: of the points, arc length from x = 0, to the base [m]. around: from the pad's midline [rad].
     """
 
@@ -56,7 +56,7 @@ class Capsule:
     around: np.ndarray
 
     def turn(self, along: np.ndarray) -> np.ndarray:
-        """Angle [rad] by which the normal leans to the tip; negative: to the base."""
+        """Angle [rad] of the normal towards the tip; negative: to the base."""
         return (np.maximum(0, self.tip - along) - np.maximum(0, along - self.base)) / self.radius
 
     def at(self, along: float, around: float) -> np.ndarray:
@@ -67,7 +67,7 @@ class Capsule:
 
 
 def capsule_of(geometry: SkinGeometry) -> Capsule:
-    """Of a finger that a clamp ends, or else of a dome on a backing."""
+    """Capsule of a finger that ends at a clamp, or else of a dome on a backing."""
     if len(geometry.clamp_face):
         along = np.concatenate([_TIP - _RADIUS * _ROUND, np.linspace(_TIP, 3e-3, 7)])
         return Capsule(_TIP, np.inf, _RADIUS, along, np.radians(np.linspace(-92, 92, 8)))
@@ -92,8 +92,8 @@ def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
 
 
 def deepest(indentation: Indentation, core: wp.array) -> float:
-    """How deep an indenter may go until the core is 0.6 mm away [m], 2.4 mm at most. All of its surface
-    counts: a finger may stand in a ring.
+    """Depth at which an indenter is 0.6 mm from the core [m], at most 2.4 mm. All of its surface counts: a
+    finger may be inside a ring.
 
     Args:
       indentation: a press of 2.4 mm. core: points of its surface, vec3 [m].
@@ -108,7 +108,7 @@ def deepest(indentation: Indentation, core: wp.array) -> float:
 
 
 def frame_of(steps: Steps, around: float) -> np.ndarray:
-    """(2, 3) axes about which a press tilts: one round the finger, one along it, both across its path."""
+    """(2, 3) tilt axes of a press: one around the finger, one along it, both orthogonal to its path."""
     out = steps.pos[0, 0] - steps.pos[-1, 0]
     out = out / np.linalg.norm(out)
     first = np.array([0, np.sin(around), np.cos(around)])
@@ -120,8 +120,8 @@ def frame_of(steps: Steps, around: float) -> np.ndarray:
 def slopes_of_film(
     film: FilmConduction, x: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """ln Z (19,) of a film under nodes x (nvert, 3) [m], and its slopes (k, 19) along directions (k, nvert,
-    3) of them."""
+    """ln Z (19,) of a film under nodes x (nvert, 3) [m], and its derivatives (k, 19) along directions (k,
+    nvert, 3) of them."""
     nodes, slopes = torch.from_numpy(x.copy()), []
     for direction in directions:
         with forward_ad.dual_level():
@@ -132,20 +132,20 @@ def slopes_of_film(
 
 
 class Presses:
-    """n presses, at the table's points and between them.
+    """n presses, at the table's points and interpolated between them.
 
     Args:
-      skin: under one geom. geometry: of it. indenter: the geom, as `biotac press --indenter`.
+      skin: with one geom. geometry: of it. indenter: the geom, as in `biotac press --indenter`.
 
     Attributes:
       at: (n, 3) along [m] and around [rad] the capsule, fraction of the deepest press there.
       signal: (n, nelectrode + 1), changes of ln Z, and of the liquid's pressure [kPa]. by_press: (n, 3,
-        nelectrode + 1) of it by two tilts of the path [rad] and the fill [ul].
-      by_sensor: (n, 3, nelectrode + 1) by ln of the residual film, and by electrodes that lie further along
-        and across the finger [mm].
-      outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) of it by tilts and fill.
-      weight: (n,) ln of the fraction of the skin that each stands for. deepest: (n,) whether none is deeper
-        at its place.
+        nelectrode + 1) derivatives by two tilts of the path [rad] and the fill [ul].
+      by_sensor: (n, 3, nelectrode + 1) derivatives by ln of the residual film, and by shifts of the
+        electrodes along and across the finger [mm].
+      outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) derivatives by tilts and fill.
+      weight: (n,) ln of the fraction of the skin's area. deepest: (n,) whether it is the deepest at its
+        position.
     """
 
     def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str):
@@ -170,12 +170,12 @@ class Presses:
         self.weight = np.log(np.cos(capsule.turn(at[:, 0])))
 
     def simulate(self, along: float, around: float, fraction: float = 1.0) -> tuple[Trajectory, Steps]:
-        """A press at a place [m], [rad]: its steps, and their path."""
+        """Simulates a press at a position [m], [rad]: its steps, and their path."""
         steps, skin = self.path(along, around, fraction), self.skin
         return follow(skin, steps.pos[None], steps.mat[None], skin.friction, skin.own), steps
 
     def path(self, along: float, around: float, fraction: float = 1.0) -> Steps:
-        """The steps of a press at a place [m], [rad]."""
+        """The steps of a press at a position [m], [rad]."""
         point = self._capsule.at(along, around)
 
         def plan(depth):
@@ -185,15 +185,15 @@ class Presses:
         return steps_of(plan(fraction * deepest(plan(_DEEPEST), self._core_samples)))[0]
 
     def middle(self, touches: torch.Tensor) -> np.ndarray:
-        """(3,) of samples by number, on the resting skin [m]."""
+        """(3,) mean of samples given by number, on the skin at rest [m]."""
         skin, touches = self.skin, touches.numpy()
         face, weight = touches // len(skin.weights), skin.weights[touches % len(skin.weights)]
         corner = self.geometry.vert[skin.data.outer.surface.face_np[face]]
         return np.einsum("ma,mak->mk", weight, corner).mean(0)
 
     def _make(self):
-        """The table: (along, around, fraction, ...) of each attribute, the force of the outcome over the
-        fraction."""
+        """The table: (along, around, fraction, ...) of each attribute, with the outcome's force divided by
+        the fraction."""
         capsule, width = self._capsule, self.geometry.design.nelectrode + 1
         shape = len(capsule.along), len(capsule.around), len(_FRACTIONS)
         widths = {
@@ -215,7 +215,7 @@ class Presses:
                     record, here = trajectory.steps[end], (i, j, k)
                     try:
                         read = films.read(record.x[:n, 0].numpy(), ahead.nodes[:, 0, end, :n])
-                    except NoFilmError:  # beyond what can be read, as deep as it can
+                    except NoFilmError:  # deeper than the film allows: use the deepest valid one
                         read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
                     for name, value in zip(widths, read):
                         table[name][here][..., :-1] = value
@@ -233,7 +233,7 @@ class Presses:
         return table
 
     def _tangents(self, steps, around):
-        """Two tilts of the path about its beginning, and the fill."""
+        """Tangents of the path for two tilts about its start, and of the fill."""
         pose = np.zeros((3, 1, len(steps.pos), 1, 6))
         for k, axis in enumerate(frame_of(steps, around)):
             pose[k, 0, :, 0] = np.concatenate(
@@ -247,7 +247,8 @@ class Presses:
 
 
 class _Films:
-    """What a skin's electrodes read, and other sensors' would; rest: (nvert, 3) nodes untouched [m]."""
+    """Electrode readings of a skin, for its own sensor and changed ones; rest: (nvert, 3) nodes without
+    contact [m]."""
 
     def __init__(self, geometry, rest):
         core, at = CoreSurface(geometry.core_vert, geometry.core_face), geometry.electrode_pos
@@ -264,8 +265,8 @@ class _Films:
         self._steps_apart = steps_apart[:, None]
 
     def read(self, x: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Changes of ln Z from rest (nelectrode,), their slopes by directions (k, nvert, 3) of the nodes (k,
-        nelectrode), and by what is other (3, nelectrode)."""
+        """Changes of ln Z from rest (nelectrode,), their derivatives along directions (k, nvert, 3) of the
+        nodes (k, nelectrode), and by changes of the sensor (3, nelectrode)."""
         value, slopes = slopes_of_film(self._own, x, directions)
         others = [np.log(film.impedance(x)) - rest for film, rest in zip(self._others, self._rest[1:])]
         by_other = (np.array(others[1::2]) - others[::2]) / self._steps_apart

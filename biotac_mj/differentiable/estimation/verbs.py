@@ -1,4 +1,4 @@
-"""What `biotac lab estimate` does with its arguments."""
+"""Runs `biotac lab estimate`."""
 
 import argparse
 import csv
@@ -24,11 +24,11 @@ __all__ = ["estimate_verb"]
 
 _VECTORS = "centre", "centre_error", "force"
 _ADDED = "sensor", "randomise", "effects", "signal", "friction", "thermal"  # keywords of a press
-_TOUCHING = 0.1  # [N] of a touch that teaches
+_TOUCHING = 0.1  # [N] least force of a labelled touch
 
 
 def estimate_verb(args: argparse.Namespace) -> None:
-    """`biotac lab estimate`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac lab estimate`; raises ValueError or FileNotFoundError for invalid input."""
     recording, notes = load_one(
         args.file, args.recording, rate=args.rate, scale=args.scale, object_name=args.object
     )
@@ -41,7 +41,7 @@ def estimate_verb(args: argparse.Namespace) -> None:
             f"the first {args.rest} are (--rest): leave it out"
         )
     rest, rows = _rest(args, counts), _rows(args, recording, counts)
-    for row in rows:  # refused before the work
+    for row in rows:  # check before the work
         try:
             touch_of(counts[row], rest)
         except ValueError as error:
@@ -87,8 +87,8 @@ def estimate_verb(args: argparse.Namespace) -> None:
 
 
 def _is_the_simulated_one(args, pressed):
-    """Whether a press is of the sensor that is inverted: its own skin under its own geom, and readings by
-    physics to which nothing was added."""
+    """Whether a press is of the simulated sensor itself: its own skin under its own geom, with readings by
+    physics and without effects."""
     asked = [name for name in ("skin", "indenter", "material", "options", "known") if getattr(args, name)]
     added = [name for name in _ADDED if pressed.get(name) is not None]
     added += [f"options['{name}']" for name in ("readings", "modulus") if name in pressed["options"]]
@@ -101,7 +101,7 @@ def _is_the_simulated_one(args, pressed):
 
 
 def _inverted(args, pressed, design):
-    """Skin, geom, settings and film of the press where nothing else is asked for, else the defaults."""
+    """Skin, geom, settings and film: those of the press by default, else general defaults."""
     own = {name: value for name, value in (pressed or {}).items() if value is not None}
     options = own.pop("options", {})
     if args.options:

@@ -1,1 +1,1 @@
-"""A step at its balance, linear in all that it depends on."""
+"""Linearisation of a step at its equilibrium with respect to all its inputs."""

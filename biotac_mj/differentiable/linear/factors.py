@@ -1,4 +1,4 @@
-"""The sparse factor by which linear solves on the CPU are preconditioned."""
+"""Sparse factor that preconditions linear solves on the CPU."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ from ...skin.model import SkinModel
 
 __all__ = ["Factors"]
 
-# products too many after which a factor, which costs 75 and saves two to four a step, is made
+# excess products at which a new factor, which costs 75 products and saves two to four per step, is worthwhile
 _FACTOR = 150
 _FEW = 16
 
 
 class Factors:
-    """The factor of a skin's stiffness, made anew in the present shape where solves take too long: the steps
-    of a press have much the same shape.
+    """Factor of a skin's stiffness, recomputed in the current shape if solves take too long: the steps of a
+    press have similar shapes.
 
     Attributes:
       now: a `skin.precondition.sparse.SparseFactor`. dof: free coordinates, in the order of its rows.
@@ -25,11 +25,11 @@ class Factors:
         self.begin()
 
     def begin(self) -> None:
-        """Begins with the factor at rest: a gradient does not depend on those before."""
+        """Resets to the factor at rest, so that a gradient does not depend on earlier ones."""
         self.now, self._products = self._model.factor, 0
 
     def count(self, products: int, x: np.ndarray) -> None:
-        """After solves that took so many products with the tangent at x (nvert, 3) [m]."""
+        """Call after solves that took so many products with the tangent at x (nvert, 3) [m]."""
         self._products += max(products - _FEW, 0)
         if self._products > _FACTOR:
             self.now, self._products = self._model.factor_at(x), 0

@@ -1,5 +1,5 @@
-"""Linear systems with the consistent tangent, of all worlds of a skin at once: GMRES, made short by an
-approximate inverse that knows contact and liquid as they are, unsymmetric."""
+"""Linear systems with the consistent tangent, for all worlds of a skin: GMRES with an approximate inverse
+that includes the unsymmetric contact and liquid terms."""
 
 import typing
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from .factors import Factors
 
 __all__ = ["FaceBlocks", "FactorInverse", "StepInverse", "solve_by_gmres"]
 
-_CANCELLED = 0.1  # of a vector's length: less is left of it beside the basis, and rounding is felt
+_CANCELLED = 0.1  # fraction of a vector's length below which it is orthogonalised again, against rounding
 _MOST = 400  # products of a solve
-# what products with a single-precision inverse reduce a residual by, before it is measured anew; vectors of
-# the basis then, after which it begins anew
+# reduction of a residual by a single-precision inverse before it is recomputed; size of the basis then,
+# before a restart
 _DIGITS, _BASIS = 1e-4, 40
-# blocks that the skin's surfaces keep of a face's nine: of two of its corners
+# blocks of a face's nine that the skin's surfaces store: of two of its corners
 _PAIRS = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
 
 
@@ -36,7 +36,7 @@ class FaceBlocks:
 
     @classmethod
     def of(cls, face: torch.Tensor, node: torch.Tensor, block: torch.Tensor) -> typing.Self:
-        """Blocks of samples, several of one face (m,), summed up."""
+        """Sum of blocks of samples, several per face (m,)."""
         which, place = torch.unique(face, return_inverse=True)
         nodes = node.new_zeros((len(which), 3))
         nodes[place] = node
@@ -44,7 +44,7 @@ class FaceBlocks:
 
     @classmethod
     def together(cls, parts: list[typing.Self]) -> typing.Self:
-        """The sum of several."""
+        """Sum of several matrices."""
         return cls(
             *(torch.cat([getattr(part, name) for part in parts]) for name in ("face", "node", "block"))
         )
@@ -59,14 +59,14 @@ class FaceBlocks:
 
 
 class FactorInverse:
-    """(A - B + a b')^-1 of each world by Woodbury's identity, on the CPU; A is the stiffness of the factor
+    """(A - B + a b')^-1 of each world by the Woodbury identity, on the CPU; A is the stiffness of the factor
     over `softness`.
 
     Args:
       factors: of the skin. softness: (nworld,), see `newton.worlds.Worlds`.
-      blocks: B, of faces that touch. free: (nvert,) bool, of nodes.
-      a, b: (nvert, nworld, 3), zero at fixed nodes; None: there are none.
-      transpose: of the matrix with B' and b a'.
+      blocks: B, of faces in contact. free: (nvert,) bool, of nodes.
+      a, b: (nvert, nworld, 3), zero at fixed nodes; None: zero.
+      transpose: of the matrix, with B' and b a'.
     """
 
     digits, restart = 0.0, _MOST
@@ -103,7 +103,7 @@ class FactorInverse:
             stiff[m, m] = 1.0
             dof = (3 * nodes[:, None] + np.arange(3)).ravel()
             columns, along = np.zeros((m + 1, size)), np.zeros(size)
-            # the factor keeps its inverse's rows, and nodes touch for many steps
+            # the factor caches columns of its inverse, and nodes stay in contact for many steps
             columns[:m, factors.dof] = soft * self._factor.rows(nodes)
             if a is not None:
                 columns[m] = soft * self._factor.solve(a[:, w : w + 1].numpy()).ravel()
@@ -112,7 +112,7 @@ class FactorInverse:
             self._worlds.append((dof, along, columns, np.linalg.solve(np.eye(m + 1) + stiff @ felt, stiff)))
 
     def __call__(self, v: torch.Tensor) -> torch.Tensor:
-        """Times v (nvert, nworld, 3), zero at fixed nodes."""
+        """Product with v (nvert, nworld, 3), zero at fixed nodes."""
         out = self._soft[:, None] * self._factor.solve(v.numpy())
         for w, (dof, along, columns, small) in enumerate(self._worlds):
             y = out[:, w].ravel()
@@ -122,11 +122,11 @@ class FactorInverse:
 
 
 class StepInverse:
-    """The approximate inverse that steps on the skin's device have, with contact as it is in a gradient. The
-    skin has no liquid, and lies where a step ended (`record.restore`).
+    """The steps' approximate inverse on the skin's device, with the contact terms of a gradient. The skin has
+    no liquid, and is in the state at the end of a step (`record.restore`).
 
     Args:
-      skin: the worlds. outer, core: blocks of the faces of both surfaces that touch. transpose: of the
+      skin: the worlds. outer, core: blocks of the faces of both surfaces in contact. transpose: of the
         transposed matrix.
     """
 
@@ -136,7 +136,7 @@ class StepInverse:
         for flag in (st.active, st.running):
             flag.fill_(1)
         st.viscosity.zero_()
-        k.norms.fill_(1.0)  # of no account: an update has no residual here
+        k.norms.fill_(1.0)  # unused: an update has no residual here
         k.r.zero_()
         for state, blocks in ((skin.data.outer, outer), (skin.data.core, core)):
             if state is None:
@@ -146,7 +146,7 @@ class StepInverse:
             if blocks is None:
                 continue
             touching.view(-1)[blocks.face] = 1
-            # the same of both orders of two corners: contact is felt at points between them
+            # equal for both orders of two corners: contact acts at points between them
             own = blocks.block.transpose(1, 2) if transpose else blocks.block
             own = own.reshape(-1, 3, 3, 3, 3)
             face, world = blocks.face // skin.nworld, blocks.face % skin.nworld
@@ -159,9 +159,10 @@ class StepInverse:
         self.digits, self.restart = (_DIGITS, _BASIS) if single else (0.0, _MOST)
 
     def __call__(self, v: torch.Tensor) -> torch.Tensor:
-        """Times v (nvert, nworld, 3), zero at fixed nodes, in the precision of the step's directions."""
+        """Product with v (nvert, nworld, 3), zero at fixed nodes, in the precision of the step's
+        directions."""
         self._r.copy_(v)
-        squares = self._part[0].zero_()  # of a right-hand side by chunks of nodes, by which it is scaled
+        squares = self._part[0].zero_()  # of a right-hand side by chunks of nodes, for scaling
         add_rows(squares, self._chunk, (self._r.double() ** 2).sum(2))
         self._skin.invert.run()
         return self._z.clone()
@@ -177,23 +178,22 @@ def solve_by_gmres(
     digits: float = 0.0,
     restart: int = _MOST,
 ) -> tuple[torch.Tensor, int]:
-    """Solutions of A x = right of all worlds, each with its own A, and how many products they took.
+    """Solutions of A x = right of all worlds, each with its own A, and the number of products.
 
-    The residual is measured after the inverse, so that `precision` is of x: a skin is a million times stiffer
-    against some motions than against others, and a small residual would say little. The basis has the
-    precision of what the inverse gives.
+    The residual is preconditioned, so that `precision` refers to x: a skin is a million times stiffer against
+    some motions than against others, so a small plain residual says little. The basis has the precision of
+    the inverse's result.
 
     Args:
       product, inverse: A and its approximate inverse times a tensor (n, nworld, 3).
       right: (n, nworld, 3).
-      precision: error of x to end at, of its size in each world.
-      start: solutions of nearly the same systems, from which less is left to find.
-      most: products.
-      digits: how far a residual is reduced before it is measured anew; 0: all the way.
-      restart: vectors of the basis, after which it begins anew.
-
+      precision: relative error of x in each world.
+      start: initial guess, such as solutions of similar systems.
+      most: largest number of products.
+      digits: reduction of a residual before it is recomputed; 0: never.
+      restart: size of the basis.
     Raises:
-      ValueError: not solved with so many: a matrix is next to singular.
+      ValueError: no convergence within `most`: a matrix is nearly singular.
     """
     x, left = torch.zeros_like(right), right
     if start is not None and start.any():
@@ -218,8 +218,8 @@ def solve_by_gmres(
 
 
 def _cycle(product, inverse, z, beta, going, goal, most):
-    """One basis, begun with z (n, nworld, 3) of lengths beta: the changes of x, the products that it took,
-    and what the worlds still miss."""
+    """One basis, started with z (n, nworld, 3) of lengths beta: changes of x, number of products, and
+    remaining residuals of the worlds."""
     nworld = len(beta)
     v = _rows(z)
     basis = v.new_empty((nworld, most + 1, v.shape[1]))
@@ -229,7 +229,7 @@ def _cycle(product, inverse, z, beta, going, goal, most):
     for j in range(most):
         w = _rows(inverse(product(_nodes(basis[:, j], z).to(torch.float64))))
         column, length = _project(w, basis[:, : j + 1])
-        # Givens' rotations keep what is along the basis triangular
+        # Givens rotations keep the projected matrix triangular
         for i, (c, s) in enumerate(turns):
             above, below = column[:, i].copy(), column[:, i + 1].copy()
             column[:, i], column[:, i + 1] = c * above + s * below, c * below - s * above
@@ -259,8 +259,8 @@ def _cycle(product, inverse, z, beta, going, goal, most):
 
 
 def _project(w, basis):
-    """Takes what w (nworld, n) has of a basis (nworld, k, n) from it: how much that is (nworld, k), and the
-    lengths of what is left."""
+    """Removes the projection of w (nworld, n) on a basis (nworld, k, n): returns its coefficients (nworld, k)
+    and the lengths of the remainder."""
     along = torch.zeros_like(basis[:, :, 0])
     double = w.dtype == torch.float64
     length = torch.linalg.vector_norm(w, dim=1) if double else None
@@ -270,7 +270,7 @@ def _project(w, basis):
         w -= (part[:, None] @ basis)[:, 0]
         before, length = length, torch.linalg.vector_norm(w, dim=1)
         if not double or (length > _CANCELLED * before).all():
-            break  # else once more for what rounding left
+            break  # else again, to remove rounding errors
     felt = torch.cat([along, length[:, None]], 1).double().cpu().numpy()
     return felt[:, :-1], felt[:, -1]
 
@@ -291,7 +291,7 @@ def _lengths(v):
 
 
 def _over(length, like):
-    """(nworld, 1) one over lengths; of nothing, nothing."""
+    """(nworld, 1) inverse lengths; 0 for length 0."""
     safe = np.where(length > 0, length, 1.0)
     return torch.from_numpy(np.where(length > 0, 1 / safe, 0.0)).to(like)[:, None]
 

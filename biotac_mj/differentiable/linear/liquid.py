@@ -1,9 +1,9 @@
-"""The liquid's volume and the area vectors by which its pressure pushes the skin, as functions of what the
-core pushes: Warp's adjoint of `skin.liquid.wet_faces`.
+"""The liquid's volume and the area vectors on which its pressure acts, as functions of the core's contact
+forces: Warp's adjoint of `skin.liquid.wet_faces`.
 
-The volume is one number: one backward pass gives its gradient. The nine numbers of a face that lies on the
-core have a world each, so that one pass gives all Jacobians. That its area vectors turn with its corners is
-written out: how much of a face is wet depends on the core's pushes alone."""
+The volume is a scalar: one backward pass gives its gradient. The nine components of a face on the core use
+one world each, so that one pass gives all Jacobians. The rotation of the area vectors with the corners is
+explicit: the wet area of a face depends on the core's contact forces only."""
 
 import dataclasses
 
@@ -27,15 +27,15 @@ _adjoint = wp.kernel(wet_faces.func, module=f"{__name__}.adjoint", enable_backwa
 
 
 class LinearLiquid:
-    """The liquid of a single world where a step ended (`record.restore`), linear. Its pressure is
-    p = offset - kappa (V - natural), and pushes by the area vectors G of what is wet.
+    """Linearised liquid of a single world at the end of a step (`record.restore`). Its pressure is
+    p = offset - kappa (V - natural), and acts on the area vectors G of the wet surface.
 
     Args:
-      core: samples that touch the core, None without any; what they push on nodes gets what they dry.
+      core: samples in contact with the core, or None; their forces on nodes include the loss of wet area.
 
     Attributes:
-      push: (nvert, 1, 3) G [m^2]. by_node: (nvert, 1, 3) slope of the pressure [Pa/m].
-      turn: blocks by which the pushes turn with the faces, where what is wet stays.
+      push: (nvert, 1, 3) G [m^2]. by_node: (nvert, 1, 3) derivative of the pressure [Pa/m].
+      turn: blocks of the pressure force's rotation with the faces, for constant wet area.
     """
 
     def __init__(self, skin: Skin, record: Record, core: LinearSurface | None):
@@ -56,7 +56,7 @@ class LinearLiquid:
         )
         self._by = {"contact_stiffness": own.by_stiffness, "reference": own.by_reference}
         by_area = np.zeros(0)
-        if data.core:  # pressures alone count: a larger area is as a smaller force
+        if data.core:  # only pressures matter: a larger area is like a smaller force
             lost = (own.by_force * np.where(none[1][:, None] >= 0, none[0], 0.0)).sum(1)
             by_area = -lost.reshape(len(area), -1).sum(1) / area.numpy()
         self._by_area = torch.from_numpy(by_area)
@@ -70,7 +70,7 @@ class LinearLiquid:
         self.turn = self._turning(skin, record, x)
 
     def _dry(self, skin, x, stiffness, reference):
-        """What the pressure pushes less where the core dries more of the skin."""
+        """Loss of pressure force where the core dries the skin."""
         state, at, s = skin.data.core, self._core.at, len(skin.weights)
         face, place = np.unique(at.face.numpy(), return_inverse=True)
         samples = s * face[:, None] + np.arange(s)
@@ -82,7 +82,7 @@ class LinearLiquid:
         )
         own = by_force[place, :, at.sample.numpy() % s]
         self._core.spread = self._core.spread + self._pressure * torch.from_numpy(own)
-        by_area = -np.einsum("mnsk,msk->mn", by_force, forces) / area[:, None]  # as of the volume
+        by_area = -np.einsum("mnsk,msk->mn", by_force, forces) / area[:, None]  # as for the volume
         self._dry_face, self._dry_node = torch.from_numpy(face), torch.from_numpy(node.astype(np.int64))
         self._dry_by_area = self._pressure * torch.from_numpy(by_area)
         self._dry_by_reference = torch.zeros_like(self.push)
@@ -100,9 +100,8 @@ class LinearLiquid:
         return FaceBlocks(torch.arange(len(face)), node, torch.from_numpy(turn))
 
     def pull(self, pressure: torch.Tensor, balance: torch.Tensor, given: dict) -> torch.Tensor | None:
-        """Adds to cotangents of what a step was given, see `step.GIVEN`, those by the pressure (1,), with
-        what the balance (nvert, 1, 3) adds to that. Returns those of the forces of the core's samples (m, 3)
-        by the volume."""
+        """Adds to cotangents of the step's inputs, see `step.GIVEN`, those through the pressure (1,) and the
+        balance (nvert, 1, 3). Returns cotangents of the core samples' forces (m, 3) through the volume."""
         given["offset"] += pressure
         given["kappa"] += pressure * self._lacks
         given["natural"] += pressure * self._kappa
@@ -118,8 +117,8 @@ class LinearLiquid:
         return by_volume * self._by_force
 
     def change(self, given: dict, core_force: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Tangents of the pressure (1,), and of what it pushes on nodes (nvert, 1, 3) where these stay, by
-        those of what a step was given and of the forces of the core's samples."""
+        """Tangents of the pressure (1,) and of its force on nodes (nvert, 1, 3) at fixed nodes, from those of
+        the step's inputs and of the core samples' forces."""
         volume = sum(given[name] * slope for name, slope in self._by.items())
         volume = volume + (given["core_area"][:, 0] * self._by_area).sum()
         if self._core:
@@ -136,11 +135,11 @@ class LinearLiquid:
 
 @dataclasses.dataclass(frozen=True)
 class VolumeSlopes:
-    """Of the liquid's volume.
+    """Derivatives of the liquid's volume.
 
     Attributes:
-      by_node: (nvert, 3) [m^2]. by_force: (nsample, 3) by what the core pushes at each sample [m^3/N].
-      by_stiffness: of the contact. by_reference: by the pressure at which skin and core part.
+      by_node: (nvert, 3) [m^2]. by_force: (nsample, 3) by the core's force on each sample [m^3/N].
+      by_stiffness: of the contact. by_reference: by the pressure at which skin and core separate.
     """
 
     by_node: np.ndarray
@@ -160,13 +159,13 @@ def differentiate_volume(
     stiffness: float,
     reference: float,
 ) -> VolumeSlopes:
-    """Slopes of the volume under the inner faces.
+    """Derivatives of the volume under the inner faces.
 
     Args:
       x: (nvert, 3) nodes [m].
-      face, slot: (nface,) inner faces and their numbers among those that can meet the core.
+      face, slot: (nface,) inner faces and their numbers among those that can touch the core.
       area: (ncore,) of these at rest [m^2]. sample: (s,) barycentric coordinates.
-      force: (ncore s, 3) of the core on their samples [N]; geom: (ncore s,) -1 where none touches.
+      force: (ncore s, 3) of the core on their samples [N]; geom: (ncore s,) -1 without contact.
       stiffness: of the contact [Pa/m]. reference: `Worlds.reference` [Pa].
     """
     n = len(face)
@@ -189,7 +188,7 @@ def differentiate_push(
     stiffness: float,
     reference: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of the area vectors of faces that lie on the core.
+    """Derivatives of the area vectors of faces on the core.
 
     Args:
       corner: (m, 3, 3) positions [m]. area: (m,) at rest [m^2].
@@ -208,12 +207,12 @@ def differentiate_push(
         slot, area = wp.array(np.arange(m), dtype=int), wp.array(area, dtype=real)
         inputs.pull(m, face, slot, area, sample, corner=wp.array(seed.reshape(3 * m, k, 3), dtype=vec3))
     by_force = inputs.force.grad.numpy().reshape(m, s, k, 3).swapaxes(1, 2).copy()
-    # doubling pushes and reference together leaves what is wet
+    # scaling forces and reference together does not change the wet area
     return by_force, -np.einsum("mnsk,msk->mn", by_force, force) / reference
 
 
 class _Inputs:
-    """A copy for each of k numbers."""
+    """Copies of the inputs, one per output number."""
 
     def __init__(self, k, x, force, geom, s, stiffness, reference):
         def copies(value, dtype):
@@ -229,8 +228,8 @@ class _Inputs:
         )
 
     def pull(self, n, face, slot, area, sample, volume=None, corner=None):
-        """Gradients of the inputs from those of volumes (1, n, k) or corners (3n, k), each face a chunk of
-        its own. The adjoint runs the kernel forwards itself: a tape would do so once before."""
+        """Gradients of the inputs from those of volumes (1, n, k) or corners (3n, k), one chunk per face. The
+        adjoint kernel includes the forward pass, which a tape would repeat."""
         k = self.k
         with wp.ScopedDevice("cpu"):
             shapes = ((1, n, k), real), ((n, k), vec3), ((3 * n, k), vec3)

@@ -1,11 +1,9 @@
-"""Rubber that remembers, made linear at the end of a step: what its points push by their past, and what they
-remember from then on.
+"""Linearised memory of the rubber at the end of a step: stress from the history, and the new history.
 
-`skin.rubber.points` has the equations. The implicit function theorem takes the past as given, as the step
-did, so that memory stands beside the balance as anchors of friction do: with F the deformation gradient of a
-point, what it remembers is a function of F and of what it remembered, and so is its stress. Friction elements
-that slip, and softening that begins or ends, are kinks; the slopes are those of the side where the step
-ended."""
+`skin.rubber.points` has the equations. The implicit function theorem takes the history as an input, like the
+step, so memory enters like the anchors of friction: with F the deformation gradient of a point, the new
+memory and the stress are functions of F and the old memory. Slipping friction elements, and softening that
+begins or ends, are kinks; derivatives are those of the side where the step ended."""
 
 import dataclasses
 
@@ -20,13 +18,13 @@ from ..skin import SkinWorlds
 
 __all__ = ["LinearMemory", "Memory"]
 
-_KINK = 1e-9  # of the size at which friction elements slip, or of what rubber has borne: on a kink
-_SHORT = 1e-4  # of a step over a time of relaxation, below which `share_of_term` is its series
+_KINK = 1e-9  # relative distance from slip of friction elements, or from the largest energy, taken as a kink
+_SHORT = 1e-4  # step over relaxation time below which `share_of_term` uses its series
 
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """What the n points of a skin remember, or cotangents or tangents of it.
+    """Memory of the n points of a skin, or cotangents or tangents of it.
 
     Attributes:
       overstress: (nterm, n, 3, 3) of the Prony series [Pa]. last: (n, 3, 3) the stress that relaxes [Pa].
@@ -47,7 +45,7 @@ class Memory:
 
 
 class LinearMemory:
-    """The points of a skin that lies where a step ended (`record.restore`).
+    """The points of a skin in the state at the end of a step (`record.restore`).
 
     Args:
       skin: of one world, with memory.
@@ -70,7 +68,7 @@ class LinearMemory:
             for name in ("overstress", "last", "slip")
         )
         last = last[0] if len(last) else np.zeros((n, 3, 3))
-        # as it was when the step began: what is loaded again for it has seen that beginning
+        # state at the start of the step, which a further load increment continued
         worst = getattr(record.begun, "worst", np.zeros(n))
         self.before = Memory(overstress.copy(), last.copy(), worst, slip.copy())
         prony, mullins, branch = split_constants(material, record.constants)
@@ -98,8 +96,8 @@ class LinearMemory:
         self._gain = self._step_weight.sum()
 
     def _moduli(self, numbers):
-        """Stress and energy density of what remembers, and how they depend on the law's constants: linearly,
-        see `LinearStep`."""
+        """Stress and energy density of the rubber with memory, and their linear dependence on the law's
+        constants, see `LinearStep`."""
         skin, mu, lam = self._skin, float(numbers["mu"]), float(numbers["lam"])
         memory, x, none = skin.data.memory, skin.data.x, np.zeros_like(self._F)
         with skin.another_lam() as other:
@@ -111,7 +109,7 @@ class LinearMemory:
         self._mu, self._by = mu, {"mu": mus, "lam": lams}
 
     def _soften(self, mullins):
-        """eta, and its slopes by energy, by the largest energy, and by Mullins' constants."""
+        """eta, and its derivatives by energy, by the largest energy, and by the Mullins constants."""
         W, worst, n = self._W, self.before.worst, len(self._W)
         self._eta, self._by_energy, self._by_worst = np.ones(n), np.zeros(n), np.zeros(n)
         self._by_mullins = np.zeros((len(mullins), n))
@@ -131,7 +129,7 @@ class LinearMemory:
         self._by_mullins = np.array([(1 - self._eta) / r, bell * s / width, bell * s * worst / width])
 
     def _slip(self, branch):
-        """Trial strains of the friction elements, their sizes, and the factors by which slip returns them."""
+        """Trial strains of the friction elements, their norms, and the factors of the return mapping."""
         self._strength, most = branch.T[0][:, None, None, None], 1.5**0.5 * branch.T[1][:, None]
         self._trial = _deviator(self._strain() - self.before.slip)
         size = np.sqrt((self._trial**2).sum((-2, -1)))
@@ -143,8 +141,8 @@ class LinearMemory:
         self._sliding = self._slips[..., None, None]
 
     def _fix_branches(self):
-        """Rubber where nothing moves after a step in which it slipped, or bore the most, lies on a kink to
-        rounding, and on which side the elements' tangent puts it must be known here."""
+        """Rubber at rest after a step in which it slipped, or had its largest energy, is on a kink up to
+        rounding: this decides the side for the elements' tangent."""
         rubber, before = self._skin.data.rubber, self.before
         for array, value in ((rubber.slip, before.slip), (rubber.worst, before.worst)):
             if array.size:
@@ -175,7 +173,7 @@ class LinearMemory:
         return dE
 
     def _push_forward(self, Q):
-        """The transpose of `_strain_change`."""
+        """Transpose of `_strain_change`."""
         if self._linear:
             return Q
         P = self._F @ Q
@@ -184,7 +182,7 @@ class LinearMemory:
         return P
 
     def _turn(self, T):
-        """Derivative of a returned trial strain by the trial strain, times T: its own transpose."""
+        """Derivative of the return mapping by the trial strain, times T; symmetric."""
         along = (self._trial * T).sum((-2, -1), keepdims=True) / self._size**2 * self._trial
         return self._return_factor * (T - np.where(self._sliding, along, 0.0))
 
@@ -192,7 +190,7 @@ class LinearMemory:
         return self._skin.data.memory.point_slopes(self._skin.data.x, change)[1]
 
     def _of_nodes(self, stress):
-        """(nvert, 3) of what each point (n, 3, 3) gives its nodes."""
+        """(nvert, 3) sum over points (n, 3, 3) at their nodes."""
         out = np.zeros((self._skin.model.nvert, 3))
         parts = np.einsum("eqij,eqaj->eai", stress.reshape(*self._shape, 3, 3), self._gradient)
         np.add.at(out, self._elem, parts)
@@ -201,14 +199,14 @@ class LinearMemory:
     # --- backwards ---
 
     def _felt(self, after):
-        """Cotangents of the second Piola stress, of the first, and of eta, from those of what is
-        remembered."""
+        """Cotangents of the second Piola-Kirchhoff stress, of the first, and of eta, from those of the
+        memory."""
         sigma = _symmetric(after.last + np.tensordot(self._step_weight, after.overstress, 1))
         tau = sigma if self._linear else _t(self._inverse) @ sigma
         return sigma, tau, _dot(tau, self._P)[:, 0, 0]
 
     def pull_deformation(self, after: Memory) -> np.ndarray:
-        """(n, 3, 3) cotangents of the deformation gradients from those of what is remembered afterwards."""
+        """(n, 3, 3) cotangents of the deformation gradients from those of the new memory."""
         sigma, tau, eta = self._felt(after)
         out = self._eta[:, None, None] * self._derivative(tau)
         if not self._linear:
@@ -220,16 +218,17 @@ class LinearMemory:
         return out
 
     def pull_nodes(self, deformation: np.ndarray) -> np.ndarray:
-        """(nvert, 3) of the nodes from those of deformation gradients (n, 3, 3)."""
+        """(nvert, 3) cotangents of the nodes from those of deformation gradients (n, 3, 3)."""
         return self._of_nodes(deformation)
 
     def pull_rest(self, deformation: np.ndarray) -> np.ndarray:
-        """(nvert, 3) of rest positions from those of deformation gradients (n, 3, 3), see `rest`."""
+        """(nvert, 3) cotangents of rest positions from those of deformation gradients (n, 3, 3), see
+        `rest`."""
         return self._of_nodes(-_t(self._F) @ deformation)
 
     def pull(self, after: Memory, balance: np.ndarray) -> tuple[Memory, np.ndarray, dict]:
-        """Cotangents of what was remembered, of the memory's constants (c,), and by name of mu and lam where
-        `LinearStep` has not got them, from those of what is remembered afterwards and from the balance."""
+        """Cotangents of the old memory, of the memory's constants (c,), and, by name, of mu and lam (those
+        that `LinearStep` lacks), from those of the new memory and from the balance."""
         _, tau, eta = self._felt(after)
         force = -self._volume[:, None, None] * self._gradient_of(balance)
         stiff, before = 1 + self._gain, self.before
@@ -263,7 +262,7 @@ class LinearMemory:
     # --- forwards ---
 
     def push_force(self, before: Memory, constants: np.ndarray, moduli: dict) -> np.ndarray:
-        """(nvert, 3) by which the forces of the rubber change where it is, but for what `LinearStep` has."""
+        """(nvert, 3) change of the rubber's forces at fixed nodes, without the terms of `LinearStep`."""
         prony, mullins, branch = split_constants(self._skin.model.material, constants)
         step_weight, decay = self._changes(prony)
         eta = self._eta_change(before, mullins, moduli)[:, None, None]
@@ -297,8 +296,7 @@ class LinearMemory:
         x: np.ndarray,
         vert: np.ndarray | None = None,
     ) -> Memory:
-        """Tangents of what is remembered afterwards; x (nvert, 3) those of the nodes, vert of rest
-        positions."""
+        """Tangents of the new memory; x (nvert, 3): of the nodes, vert: of rest positions."""
         prony, mullins, branch = split_constants(self._skin.model.material, constants)
         F = self._gradient_of(x)
         if vert is not None:
@@ -329,8 +327,7 @@ class LinearMemory:
         return self._by_worst * before.worst + mullins @ self._by_mullins + self._by_energy * W
 
     def _branch_change(self, before, branch):
-        """Of the trial strains that slip returns, where the strains stay: by slips, and by what is borne at
-        most."""
+        """Tangents of the returned trial strains at fixed strains, by slips and by the largest energy."""
         most = 1.5**0.5 * branch.T[1][:, None, None, None] / self._size * self._trial
         return -self._turn(_deviator(before.slip)), np.where(self._sliding, most, 0.0)
 

@@ -1,14 +1,14 @@
-"""What moves when a skin's nodes have other rest positions: thickness and shape.
+"""Derivatives by the rest positions of a skin's nodes: thickness and shape.
 
-Rest positions X enter the rubber by the maps of its elements, contact by the areas that samples stand for,
-the liquid by the volume that it has without pressure, and fixed nodes lie where they rest. Areas and volume
-are functions of X alone and PyTorch's own; here are the forces of the rubber. With G = d(dX)/dX, where dX is
-how far the rest of a point moves,
+Rest positions X enter the rubber through the maps of its elements, contact through the samples' areas, the
+liquid through its volume without pressure, and fixed nodes are at their rest positions. Areas and volume
+depend on X only and use PyTorch's own gradients; here are the forces of the rubber. With G = d(dX)/dX, where
+dX is the change of a point's rest position,
 
     dF = -F G,   dw = w tr G,   d(grad N) = -G' grad N,
 
-F the deformation gradient, w the volume that it stands for and N the shape functions. Stress and its
-derivative are the elements' own (`skin.rubber.element_kernels`)."""
+where F is the deformation gradient, w the point's volume and N the shape functions. Stress and its derivative
+are the elements' own (`skin.rubber.element_kernels`)."""
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ __all__ = ["areas_at", "cavity_at", "pull_rest", "push_rest"]
 
 
 def pull_rest(skin: SkinWorlds, x: np.ndarray, balance: np.ndarray) -> np.ndarray:
-    """(nvert, 3) slopes of balance . f by rest positions, f the forces of the rubber.
+    """(nvert, 3) derivatives of balance . f by rest positions, f the forces of the rubber.
 
     Args:
       x: (nvert, 3) nodes [m]. balance: (nvert, 3).
@@ -40,7 +40,7 @@ def pull_rest(skin: SkinWorlds, x: np.ndarray, balance: np.ndarray) -> np.ndarra
 
 
 def push_rest(skin: SkinWorlds, x: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """(nvert, 3) by which the forces of the rubber change when rest positions do by change (nvert, 3) [m]."""
+    """(nvert, 3) change of the rubber's forces for a change (nvert, 3) of rest positions [m]."""
     points = _Points(skin, x)
     G = np.einsum("eai,eqaj->eqij", change[points.elem], points.gradient)
     P, dP, theta, direction = points.slopes(-points.F @ G)
@@ -58,9 +58,9 @@ class _Points:
     """Integration points at x (nvert, 3).
 
     Attributes:
-      elem, gradient: of `Tetrahedra`. F: (nelem, npoint, 3, 3). stiff_volume: (nelem, npoint) volume, times
+      elem, gradient: of `Tetrahedra`. F: (nelem, npoint, 3, 3). stiff_volume: (nelem, npoint) volume times
         the factor on the modulus. volume: (nelem,) [m^3].
-      averaged: the part of the law's second constant that the mean dilatation of an element feels [Pa].
+      averaged: part of the law's second constant that acts on the mean dilatation of an element [Pa].
     """
 
     def __init__(self, skin, x):
@@ -77,7 +77,7 @@ class _Points:
         return self._skin.point_slopes(change)
 
     def of_mean(self, theta, direction):
-        """(nelem, npoint, 3, 3) slope by G of an element's mean dilatation times its volume."""
+        """(nelem, npoint, 3, 3) derivative by G of an element's mean dilatation times its volume."""
         mean = (self._weight * theta).sum(1) / self.volume
         own = (theta - mean[:, None])[..., None, None] * np.eye(3)
         return self._weight[..., None, None] * (own - np.swapaxes(self.F, 2, 3) @ direction)

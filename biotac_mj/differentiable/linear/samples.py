@@ -1,9 +1,9 @@
-"""What the samples of a surface feel, as a function of what it depends on, linear.
+"""Linearised contact of the samples of a surface.
 
-In the geom's frame a sample's force and its new anchor depend on where it is and on where it sticks, on the
-coefficient of friction and on the stiffness of its springs: Warp's adjoint of the contact's own functions.
-All six numbers of a sample have copies of these side by side, so that one backward pass gives all slopes.
-Turning and moving the geom is written out."""
+In the geom's frame a sample's force and its new anchor depend on its position, its old anchor, the
+coefficient of friction and the contact stiffness: Warp's adjoint of the contact's own functions. The six
+output numbers of a sample have copies of these inputs, so that one backward pass gives all derivatives.
+Rotation and translation of the geom are explicit."""
 
 import dataclasses
 
@@ -39,7 +39,7 @@ def _feel(
     # Out:
     felt_out: wp.array2d(dtype=real),
 ):
-    """One of the numbers of a sample [sample, number]: force [N], anchor [m]."""
+    """One of the six outputs of a sample [sample, number]: force [N], anchor [m]."""
     i, o = wp.tid()
     g = geom[i]
     y = local[i, o]
@@ -76,7 +76,7 @@ class SampleJacobians:
 
     Attributes:
       force: (m, 3) [N]. anchor: (m, 3) [m].
-      by_local, by_stick: (m, 6, 3). by_friction, by_stiffness: (m, 6), the latter by the sample's springs.
+      by_local, by_stick: (m, 6, 3). by_friction, by_stiffness: (m, 6), the latter by the sample's stiffness.
     """
 
     force: torch.Tensor
@@ -98,13 +98,13 @@ def differentiate_samples(
     stick_ratio: float,
     smoothing: float = 0.0,
 ) -> SampleJacobians:
-    """Force and anchor of samples that touch, with their derivatives.
+    """Force and anchor of samples in contact, with their derivatives.
 
     Args:
-      geoms: struct of the geoms; tensors lie on its device.
-      kind: (m,) which one each sample touches, whatever the world. plane: (m, 4), see `Touching`.
-      local: (m, 3) where it is, stick: (m, 3) where it sticks, in the geom's frame [m].
-      friction: (m,). stiffness: (m,) of its springs [N/m].
+      geoms: struct of the geoms; tensors are on its device.
+      kind: (m,) geom of each sample, independent of the world. plane: (m, 4), see `Touching`.
+      local: (m, 3) position, stick: (m, 3) anchor, in the geom's frame [m].
+      friction: (m,). stiffness: (m,) of the sample [N/m].
       stick_ratio: `SkinOptions.stick_ratio`. smoothing: half width of first touch, see `press` [m].
     """
     m, types = len(kind), (vec3, vec3, real, real)
@@ -119,7 +119,8 @@ def differentiate_samples(
         which = wp.from_torch(kind.int(), dtype=wp.int32)
         met = wp.from_torch(plane.contiguous(), dtype=wp.vec4d)
         constants, device = [stick_ratio, smoothing, which, geoms, met], geoms.size.device
-        # forwards, then backwards: as a tape would, which takes longer to find out what to do than this takes
+        # forward and backward launches as a tape would do them, whose bookkeeping takes longer than the
+        # launches
         wp.launch(_feel, felt.shape, [*constants, *inputs], ends[:1], device=device)
         wp.launch(
             _feel, felt.shape, [*constants, *inputs], ends[:1], device=device, adjoint=True,
@@ -130,15 +131,15 @@ def differentiate_samples(
 
 @dataclasses.dataclass(frozen=True)
 class SampleSlopes:
-    """Derivatives of what m samples feel, their force in the BioTac frame and their anchor in the geom's, by
-    what moves there. Blocks of six rows: force, anchor.
+    """Derivatives of m samples' force in the BioTac frame and anchor in the geom's frame. Blocks of six rows:
+    force, anchor.
 
     Attributes:
-      by_point: (m, 6, 3) by where the sample is. by_springs: (m, 6) by the stiffness of its springs.
-      by_pose: (m, 6, 6) by the geom's translation and rotation vector about its origin. by_friction:
-        (m, 6). by_stick: (m, 6, 3) by where it sticks, in the geom's frame.
-      old, new: numbers of samples that touched the same geom when the step began, and of the k others, which
-        stick to where they were then. by_last: (k, 6, 3), by_pose_last: (k, 6, 6) of these.
+      by_point: (m, 6, 3) by the sample's position. by_springs: (m, 6) by its stiffness.
+      by_pose: (m, 6, 6) by the geom's translation and rotation vector about its origin. by_friction: (m, 6).
+        by_stick: (m, 6, 3) by the old anchor, in the geom's frame.
+      old, new: numbers of samples with the same geom as at the start of the step, and of the k others, which
+        are anchored at their position then. by_last: (k, 6, 3), by_pose_last: (k, 6, 6) of these.
       collect: (m, 6, 3) wrench on the geom by force. wrench_by_node: (m, 6, 9) by the corners of its face.
     """
 
@@ -158,7 +159,7 @@ class SampleSlopes:
 def slopes_of_samples(
     at: Touching, geoms: Geoms, springs: torch.Tensor, stick_ratio: float, smoothing: float = 0.0
 ) -> SampleSlopes:
-    """Of samples that touch, with springs (m,) [N/m]."""
+    """Derivatives of samples in contact, with stiffness springs (m,) [N/m]."""
     pos, R, pos_last, R_last, friction = (
         rows(getattr(geoms, name))[at.geom] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
     )
@@ -170,7 +171,7 @@ def slopes_of_samples(
 
     by_local, by_stick = outward(own.by_local), outward(own.by_stick)
     by_point = by_local @ RT
-    # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
+    # if the geom moves, the sample moves the opposite way in its frame, and the outputs rotate with it
     by_pose = by_local @ torch.cat([-RT, RT @ skew(at.point - pos)], 2)
     force = torch.einsum("mij,mj->mi", R, own.force)
     by_pose[:, :3, 3:] -= skew(force)
@@ -190,21 +191,22 @@ def slopes_of_samples(
 
 
 def _of_corners(weight, block):
-    """(m, r, 9) by the corners of faces, of blocks (m, r, 3) by a point that has weights (m, 3) on them."""
+    """(m, r, 9) derivatives by the corners of faces, from those (m, r, 3) by a point with weights (m, 3) on
+    them."""
     return (block[:, :, None, :] * weight[:, None, :, None]).reshape(*block.shape[:2], 9)
 
 
 class LinearSurface:
-    """The samples of a surface that touch when a step ends, linear in all that they depend on.
+    """Linearised samples of a surface in contact at the end of a step.
 
     Args:
-      at: them. geoms: what they touch. state: of the surface.
+      at: the samples. geoms: what they touch. state: of the surface.
       stiffness: (nworld,) of contact [Pa/m].
       stick_ratio, smoothing: see `differentiate_samples`.
-      core: whether it is the inner surface, whose geom is the core: that is no input, and has no friction.
+      core: whether it is the inner surface, whose geom, the core, is no input and has no friction.
 
     Attributes:
-      slopes: of the samples. by_node: (m, 6, 9) what they feel by the nodes of their faces.
+      slopes: of the samples. by_node: (m, 6, 9) by the nodes of their faces.
       spread: (m, 9, 3) forces on these nodes by the samples' forces.
     """
 
@@ -227,20 +229,20 @@ class LinearSurface:
         self.spread = (at.weight[:, :, None, None] * one).reshape(-1, 9, 3)
 
     def blocks(self) -> FaceBlocks:
-        """Forces on nodes by nodes, summed up by faces."""
+        """Derivatives of nodal forces by nodes, summed by faces."""
         return FaceBlocks.of(self.at.face, self.at.node, self.spread @ self.by_node[:, :3])
 
     def at_samples(self, nodal: torch.Tensor) -> torch.Tensor:
-        """(m, 3) cotangents of the samples' forces from those of forces on nodes (nvert, nworld, 3)."""
+        """(m, 3) cotangents of the samples' forces from those of nodal forces (nvert, nworld, 3)."""
         felt = nodal.reshape(-1, 3)[self.at.node].reshape(-1, 9)
         return torch.einsum("mij,mi->mj", self.spread, felt)
 
     def at_nodes(self, force: torch.Tensor, nodal: torch.Tensor) -> None:
-        """Adds forces of the samples (m, 3) to those on nodes (nvert, nworld, 3)."""
+        """Adds forces of the samples (m, 3) to nodal forces (nvert, nworld, 3)."""
         add_rows(nodal.view(-1, 3), self.at.node, torch.einsum("mij,mj->mi", self.spread, force))
 
     def pull(self, force: torch.Tensor, anchor: torch.Tensor | None, given: dict) -> None:
-        """Adds to cotangents of what a step was given, see `step.GIVEN`, those by forces and anchors of the
+        """Adds to cotangents of the step's inputs, see `step.GIVEN`, those from forces and anchors of the
         samples (m, 3)."""
         s, at = self.slopes, self.at
         rows = 3 if anchor is None else 6
@@ -261,8 +263,8 @@ class LinearSurface:
         add_rows(given["x_last"].view(-1, 3), at.node[s.new], last)
 
     def push(self, given: dict) -> tuple[torch.Tensor, torch.Tensor]:
-        """Tangents of the samples' forces and anchors (m, 3) by those of what a step was given; its nodes
-        stay."""
+        """Tangents of the samples' forces and anchors (m, 3) from those of the step's inputs, at fixed
+        nodes."""
         s, at = self.slopes, self.at
         springs = at.area * given["contact_stiffness"][at.world]
         springs = springs + self._by_area * given[self._area].reshape(-1)[at.face]

@@ -1,14 +1,14 @@
-"""A step at its balance, linear in all that it depends on: the implicit function theorem.
+"""Linearised step at its equilibrium, by the implicit function theorem.
 
-At the end of a step the forces f on the free nodes balance, f(x, u) = 0, with u all that the step was given.
-So dx = K^-1 (df/du) du with the tangent K = -df/dx, and what the step gives out follows. Conjugate
-gradients of a forward step take a symmetric tangent; here it is the consistent one, with the friction that
-follows the normal force, the curvature of the geoms and the pressure that follows what lies dry on the core.
-It is not symmetric, so a cotangent is solved with its transpose, by GMRES (`inverse` makes it short).
+At the end of a step the forces f on the free nodes balance, f(x, u) = 0, with u all inputs of the step. So
+dx = K^-1 (df/du) du with the tangent K = -df/dx, and the outputs follow. The conjugate gradients of a forward
+step use a symmetric tangent; here it is the consistent one, with friction that depends on the normal force,
+the curvature of the geoms and the pressure's dependence on the wet area. It is not symmetric, so cotangents
+are solved with its transpose, by GMRES (preconditioned by `inverse`).
 
-All worlds of a skin are linear at once; tensors lie where the skin does, [item, world]. Of a single world on
-the CPU there are liquid (`liquid`), rubber that remembers (`memory`) and other rest positions (`rest`) as
-well."""
+All worlds of a skin are linearised in parallel; tensors are on the skin's device, [item, world]. A single
+world on the CPU may also have liquid (`liquid`), rubber with memory (`memory`) and other rest positions
+(`rest`)."""
 
 import torch
 import warp as wp
@@ -25,24 +25,25 @@ from .samples import LinearSurface
 
 __all__ = ["GIVEN", "LinearStep"]
 
-# what a step is given, besides rest positions and what the rubber remembers: nodes when it began (nvert,
-# nworld, 3); anchors of all samples then (nsample nworld, 3); poses of the geoms when it ended and began
-# (ngeom, nworld, 6), a translation and a rotation vector about the geom's own origin, in the BioTac frame;
-# frictions (ngeom, nworld); areas at rest of outer faces and of those that can meet the core (nface, nworld);
-# and (nworld,) `skin.NUMBERS` and the pressures `offset` and `reference` of `newton.worlds.Worlds`
+# inputs of a step, besides rest positions and memory of the rubber: nodes at its start (nvert, nworld, 3);
+# anchors of all samples then (nsample nworld, 3); poses of the geoms at its end and start (ngeom, nworld, 6),
+# a translation and a rotation vector about the geom's own origin, in the BioTac frame; frictions (ngeom,
+# nworld); areas at rest of outer faces and of those that can touch the core (nface, nworld); and (nworld,)
+# `skin.NUMBERS` and the pressures `offset` and `reference` of `newton.worlds.Worlds`
 _SCALARS = (*NUMBERS, "offset", "reference")
 GIVEN = ("x_last", "anchor", "pose", "pose_last", "friction", "area", "core_area", *_SCALARS)
 
 
 class LinearStep:
-    """The step of a record, see the module's docstring. It gives nodes (nvert, nworld, 3), wrenches of the
-    groups (ngroup, nworld, 6), pressures of the liquid (nworld,) and anchors of the samples that touch.
+    """The linearised step of a record, see the module's docstring. Outputs: nodes (nvert, nworld, 3),
+    wrenches of the groups (ngroup, nworld, 6), pressures of the liquid (nworld,) and anchors of the samples
+    in contact.
 
     Attributes:
-      touching: samples of the outer surface that do. memory: a LinearMemory, None without.
+      touching: samples of the outer surface in contact. memory: a LinearMemory, or None.
 
     Raises:
-      ValueError: a linear solve did not come to its end.
+      ValueError: a linear solve did not converge.
     """
 
     def __init__(self, skin: SkinWorlds, record: Record):
@@ -82,7 +83,7 @@ class LinearStep:
         return self._free * self._whole_tangent(self._free * v, transpose)
 
     def _whole_tangent(self, v, transpose=False):
-        """The same with the fixed nodes."""
+        """The consistent tangent including rows of the fixed nodes."""
         found = self._skin.multiply_rubber(v) - self._all_blocks.multiply(v, transpose)
         if self._liquid:
             left, right = self._liquid.push, self._liquid.by_node
@@ -92,7 +93,7 @@ class LinearStep:
         return found
 
     def _inverse(self, transpose):
-        """The approximate inverse, made when first asked for."""
+        """The approximate inverse, made on first use."""
         if transpose not in self._inverses:
             skin, (outer, *core) = self._skin, self._blocks
             if skin.device.is_cuda:
@@ -110,7 +111,7 @@ class LinearStep:
     def solve(
         self, r: torch.Tensor, transpose: bool = False, start: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """K^-1 r, or K^-T r, of r (nvert, nworld, 3), from a `start` near it; zero at fixed nodes."""
+        """K^-1 r or K^-T r for r (nvert, nworld, 3), from an initial guess `start`; zero at fixed nodes."""
         with single_thread():
             inverse = self._inverse(transpose)
             found, count = solve_by_gmres(
@@ -128,7 +129,7 @@ class LinearStep:
     # --- what comes out by what goes in ---
 
     def none(self) -> dict:
-        """Zeros of what is given, by name."""
+        """Zeros for the inputs, by name."""
         skin, like = self._skin, self.record.x
         w, ngeom, (outer, core) = skin.nworld, self.record.geoms.count, skin.surfaces
         shapes = {"x_last": (*like.shape[:2], 3), "anchor": (outer * len(skin.weights) * w, 3)}
@@ -145,14 +146,14 @@ class LinearStep:
         shape: bool = False,
         memory: Memory | None = None,
     ) -> dict:
-        """Cotangents of what the step was given, by the names of GIVEN, from those of what it gives.
+        """Cotangents of the step's inputs, by the names of GIVEN, from those of its outputs.
 
         Args:
           x: (nvert, nworld, 3). wrench: (ngroup, nworld, 6). pressure: (nworld,).
-          anchor: (nsample nworld, 3), of samples that do not touch of no account.
-          shape: of rest positions too, "vert" (nvert, 3).
-          memory: of the rubber when the step has ended; None where it has none. Gives "memory" when it began,
-            and "constants" of it.
+          anchor: (nsample nworld, 3), ignored for samples without contact.
+          shape: also of rest positions, "vert" (nvert, 3).
+          memory: of the rubber at the end of the step; None without memory. Adds "memory" at its start, and
+            "constants" of it.
         """
         outer, core, liquid, given = self._outer, self._core, self._liquid, self.none()
         at, s = self.touching, outer.slopes
@@ -197,9 +198,9 @@ class LinearStep:
         constants: torch.Tensor | None = None,
         guess: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, Memory | None]:
-        """Tangents of what the step gives, as `pull` names them, from those of what it was given, of rest
-        positions (nvert, 3), of what the rubber remembered and of that memory's constants; what is not named
-        does not change. guess: (nvert, nworld, 3) a guess of the nodes' tangents."""
+        """Tangents of the step's outputs, as named in `pull`, from those of its inputs, of rest positions
+        (nvert, 3), of the old memory and of the memory's constants; omitted ones are zero. guess: (nvert,
+        nworld, 3) initial guess of the nodes' tangents."""
         given = self.none() | given
         outer, core, at, s = self._outer, self._core, self.touching, self._outer.slopes
         felt, anchor = outer.push(given)

@@ -1,1 +1,1 @@
-"""MuJoCo's steps with BioTacs in them, backwards: `rollout`."""
+"""Reverse mode of MuJoCo's steps with BioTacs: `rollout`."""

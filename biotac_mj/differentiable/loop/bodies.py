@@ -1,7 +1,7 @@
-"""MuJoCo's own part of a step, with what the skins push given: its slopes by central differences.
+"""Derivatives of MuJoCo's own part of a step, for given skin wrenches, by central differences.
 
-The model is stepped without the plugin, which costs microseconds, so that no skin is solved for a
-difference. Positions are moved along tangents, as `mj_integratePos` does."""
+The model is stepped without the plugin, which takes microseconds, so no skin is solved for a difference.
+Positions are perturbed along tangents, like `mj_integratePos`."""
 
 import copy
 
@@ -14,12 +14,12 @@ from ...coupling.structs import DataView, ModelView, c_structs
 
 __all__ = ["Bodies", "Start"]
 
-_EPS = 1e-6  # of a central difference: rounding and curvature are both some 1e-10 then
-_SOLVED = 1e-13, 200  # tolerance and iterations of MuJoCo's solver at least: a difference sees what is left
+_EPS = 1e-6  # central difference: rounding and curvature errors are then both about 1e-10
+_SOLVED = 1e-13, 200  # least tolerance and iterations of MuJoCo's solver, whose residual enters differences
 
 
 class Start:
-    """What a step begins with: arrays by the names of mjData. `skins` are wrenches (ngroup, 6) of each."""
+    """Initial state of a step: arrays by the names of mjData. `skins`: wrenches (ngroup, 6) of each."""
 
     NAMES = ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat")
 
@@ -45,7 +45,7 @@ class Bodies:
             max(option.iterations, _SOLVED[1]),
         )
         self.data = mujoco.MjData(bare)
-        # MuJoCo's bindings make no model without its plugins: it steps as many as it counts
+        # MuJoCo makes no model without its plugins: the step runs with a plugin count of zero
         struct = c_structs("mjModel").from_address(bare._address)
         struct.nplugin = 0
         self._view = DataView(self.data._address, ModelView(bare._address))
@@ -58,7 +58,7 @@ class Bodies:
         self._slots = np.array(slots, int)
 
     def _put(self, start, moved):
-        """Sets the data to where a step begins, moved by tangents by name."""
+        """Sets the data to the initial state, perturbed by tangents by name."""
         data = self.data
         for name in Start.NAMES:
             getattr(data, name)[:] = getattr(start, name)
@@ -67,7 +67,7 @@ class Bodies:
             start.eq_active,
             start.time,
         )
-        data.eq_active[self._slots] = 0  # what the skins push is given
+        data.eq_active[self._slots] = 0  # wrenches of the skins are given
         for name, value in moved.items():
             if name == "qpos":
                 mujoco.mj_integratePos(self.model, data.qpos, value, 1.0)
@@ -79,7 +79,7 @@ class Bodies:
                 into += value.reshape(into.shape)
 
     def _step(self, start, wrenches, moved):
-        """Steps; leaves the end in the data."""
+        """Steps; the result is in the data."""
         self._put(start, moved)
         data = self.data
         mujoco.mj_kinematics(self.model, data)
@@ -100,14 +100,15 @@ class Bodies:
         return np.concatenate([out, *(a - b for a, b in zip(one[1:], other[1:]))])
 
     def amiss(self, start: Start, wrenches: list, qvel: np.ndarray) -> float:
-        """How far velocities (nv,) after a step are from those that given wrenches lead to [m/s, rad/s]."""
+        """Largest difference between the velocities (nv,) after a step and those that given wrenches produce
+        [m/s, rad/s]."""
         self._step(start, wrenches, {})
         return float(np.abs(self.data.qvel - qvel).max(initial=0.0))
 
     def step_slopes(self, start: Start, wrenches: list, names: tuple) -> tuple[dict, list]:
-        """Slopes of the step's end (qpos, qvel, act and sensordata, tangents one after another) by what it
-        begins with: {name: (ny + nsensordata, size)}, and by the skins' wrenches: for each
-        (ny + nsensordata, 6 ngroup)."""
+        """Derivatives of the step's result (qpos, qvel, act and sensordata, concatenated tangents) by its
+        initial state: {name: (ny + nsensordata, size)}, and by the skins' wrenches: for each (ny +
+        nsensordata, 6 ngroup)."""
         out = {}
         for name in {*names, "qpos", "qvel", "act", "qfrc_applied"}:
             columns = []
@@ -132,18 +133,18 @@ class Bodies:
         return out, by_wrench
 
     def pose_slopes(self, start: Start, after: np.ndarray, gammas: list, names: tuple) -> list:
-        """Slopes of where skins see their geoms in a step.
+        """Derivatives of the geom poses at which skins are solved in a step.
 
         Args:
-          start: of the step. after: (nv,) velocities when it ended.
-          gammas: for each skin, Newmark's (ngroup,) of the step, in which it was solved for velocities of
-            both ends; None: it was solved for those when the step began.
-          names: of what else slopes are wanted by.
+          start: of the step. after: (nv,) velocities at its end.
+          gammas: Newmark's gamma (ngroup,) of the step for each skin that was solved for velocities at both
+            ends; None: it was solved for those at the start.
+          names: of further variables.
 
         Returns:
           for each skin {name: (6 ngeom, size)}: translations [m] and rotation vectors about the geoms'
-          origins, in the BioTac frame, by the name of what moves them; "after" are velocities when
-          the step ended.
+          origins, in the
+            BioTac frame, by the name of the variable; "after" are velocities at the end of the step.
         """
 
         def seen(qvel, moved, one):
@@ -156,7 +157,7 @@ class Bodies:
             return one.touching.geom_pose(*one.touching.predict(self._view, one.horizon))
 
         def slopes_of(one, gamma):
-            weight = {"qvel": 1.0}  # of velocities, in where the skin was solved
+            weight = {"qvel": 1.0}  # of velocities in the pose of the solve
             if gamma is not None:
                 weight = {"after": beta_of(gamma), "qvel": gamma - 0.5 - beta_of(gamma)}
             speed = weight["qvel"] * start.qvel + weight.get("after", 0.0) * after

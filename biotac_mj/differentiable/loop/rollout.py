@@ -1,4 +1,4 @@
-"""`rollout`: steps of MuJoCo with BioTacs in them, as a function that PyTorch differentiates."""
+"""`rollout`: steps of MuJoCo with BioTacs as a differentiable PyTorch function."""
 
 import copy
 import dataclasses
@@ -18,29 +18,29 @@ from .skins import Cotangent, LoopSkin
 
 __all__ = ["Rolled", "rollout"]
 
-AGREE = 1e-8  # [m] of bodies and skins, see `rollout`
+AGREE = 1e-8  # [m] between bodies and skins, see `rollout`
 _STATE, _DRIVEN = ("qpos", "qvel", "act"), ("ctrl", "qfrc_applied", "mocap_pos", "mocap_quat")
-_RANK = 1e-10  # of the largest: ways in which wrenches move no body that a skin feels
-_NONE = 1e-15  # length of what is no quaternion
-_LEVER = np.array([1.0] * 3 + [100.0] * 3)  # 1 / m: compares torques with forces
+_RANK = 1e-10  # of the largest: wrenches that move no body in contact with a skin
+_NONE = 1e-15  # norm of an invalid quaternion
+_LEVER = np.array([1.0] * 3 + [100.0] * 3)  # 1 / m: converts torques to forces for comparison
 
 
 @dataclasses.dataclass
 class Rolled:
-    """What a rollout gives, as tensors of double precision that know their gradients; all (..., nstep, ...).
+    """Result of a rollout, as differentiable tensors of double precision; all (..., nstep, ...).
 
     Attributes:
-      qpos, qvel, act: MuJoCo's state when each step has ended.
-      sensordata: MuJoCo's own sensors, which belong to the beginning of each step, as after `mj_step`. Places
-        of the BioTacs' own hold their counts and have no gradient.
-      nodes: of each BioTac, by its name as `handles` has it, (nvert, 3) in its frame [m].
+      qpos, qvel, act: MuJoCo's state at the end of each step.
+      sensordata: MuJoCo's own sensors at the start of each step, as after `mj_step`. The BioTacs' own sensors
+        have their counts and no gradient.
+      nodes: of each BioTac, by its name in `handles`, (nvert, 3) in its frame [m].
       wrench: of each, (ngroup, 6) of the skin on each body that may touch it, `Handle.linear_model`'s bodies:
         torque about the frame's origin, in its frame [N, N m].
       pressure: of each, of the liquid above rest [Pa].
-      lost: for each world, steps in which bodies and skins did not agree. amiss: for each world the largest
-        difference of a velocity to what MuJoCo makes of these wrenches [m/s, rad/s]: what the gradient does
-        not know of.
-      readings: of each BioTac, as its model has them.
+      lost: per world, number of steps in which bodies and skins did not agree. amiss: per world, the largest
+        difference between a velocity and MuJoCo's result for these wrenches [m/s, rad/s], which the gradient
+        ignores.
+      readings: of each BioTac, as in its model.
     """
 
     qpos: torch.Tensor
@@ -55,8 +55,8 @@ class Rolled:
     readings: dict
 
     def electrodes(self, name: str = "biotac_", step: int = -1) -> torch.Tensor:
-        """(..., 19) counts of a BioTac's electrodes after a step, without noise, rounding and what acts in
-        time.
+        """(..., 19) counts of a BioTac's electrodes after a step, without noise, rounding and time-dependent
+        effects.
 
         Raises:
           ValueError: its readings have no film.
@@ -86,44 +86,46 @@ def rollout(
     mocap_quat: torch.Tensor | None = None,
     agree: float = AGREE,
 ) -> Rolled:
-    """Steps a model with BioTacs by `mj_step`; differentiable, backwards, by all tensors.
+    """Steps a model with BioTacs by `mj_step`; reverse-mode differentiable by all tensors.
 
     What is differentiated, and how:
-      The skins by the implicit function theorem: each step's balance is found again to a tolerance of 1e-6
-      where it ended, and made linear with friction, core, liquid and what the rubber remembers (`press`).
-      Bodies and skins together: a step is v' = v + h a(W), with skins solved where Newmark's formula takes
-      the bodies by v and v', and so is its adjoint. Newmark's gamma is a constant: where a step is too long
-      for its contact (docs/design.md), how it follows from stiffness is left out.
+      The skins by the implicit function theorem: each step's equilibrium is solved again from its result to a
+      tolerance of 1e-6, and linearised with friction, core, liquid and memory of the rubber (`press`).
+      Bodies and skins jointly: a step is v' = v + h a(W), with skins solved at the pose of Newmark's formula
+        in v and
+      v', and so is its adjoint. Newmark's gamma is a constant: for a step that is too long for its contact
+      (docs/design.md), its dependence on stiffness is ignored.
       MuJoCo's part, its own contacts and constraints, actuators, integrator and sensors, by central
-      differences of 1e-6 with the skins' wrenches given: exact where it is smooth, one side's or a mean of
-      both at a kink. The solver's `tolerance` should be fine (1e-10).
+      differences of 1e-6 for given skin wrenches: exact where it is smooth, one-sided or a mean of both sides
+      at a kink. The solver's `tolerance` should be small (1e-10).
 
-    What is not: rounding, noise and what acts in time in the readings; heat and PAC; the skin's state in
-    `data`, a constant; numbers of the skins and of the model; what withholds a skin's push so that it gives
-    no energy, which `amiss` shows; of a skin at rest that geoms reach in a stride of more than 0.5 mm, where
-    on the way they first touch. Callbacks, plugins of others and sleep are not looked at.
+    Not differentiated: rounding, noise and time-dependent effects in the readings; heat and PAC; the skin's
+    state in `data`, a constant; constants of the skins and of the model; the limit of a skin's energy, which
+    `amiss` shows; for a skin at rest reached by geoms that move more than 0.5 mm per step, the point of first
+    contact. Callbacks, other plugins and sleep are ignored.
 
-    Bodies that spin are stepped a little otherwise than by `mj_step`, whose wrenches differ from the skin's
-    by its stiffness times turn times way and so have no gradient: 0.2 % of the spin of a ball that comes to
-    roll at 11 rad/s. Where nothing turns, steps are those of `mj_step`. Held against central differences:
-    slides, hinges, free and mocap bodies, one and two BioTacs; not one-way skins, nor rubber that remembers.
+    Spinning bodies are stepped slightly differently from `mj_step`, whose wrenches contain a term of
+    stiffness times rotation times displacement that has no gradient: 0.2 % of the spin of a ball that starts
+    to roll at 11 rad/s. Without rotation, steps equal those of `mj_step`. Verified against central
+    differences: slides, hinges, free and mocap bodies, one and two BioTacs; not one-way skins, nor rubber
+    with memory.
 
     Args:
-      model: with BioTacs of the full tier, on the CPU. Their skins should be solved finely: attach with
-        options={"skin": {"tolerance": 1e-6}}.
-      data: what the rollout begins with, skins and all that is not given; it stays as it is.
-      nstep: number of steps; None: that of what drives.
-      qpos, qvel, act: (nq,), (nv,), (na,) at the beginning, or with nworld before. A quaternion's cotangent
-        lies along rotations.
+      model: with BioTacs of the full tier, on the CPU. Their skins should be solved to a small tolerance:
+        attach with options={"skin": {"tolerance": 1e-6}}.
+      data: initial state of skins and of all that is not given; it is not changed.
+      nstep: number of steps; None: that of the controls.
+      qpos, qvel, act: (nq,), (nv,), (na,) initial values, or with a leading nworld. A quaternion's cotangent
+        is along rotations.
       ctrl, qfrc_applied: (nstep, nu), (nstep, nv), or (nworld, nstep, ...). mocap_pos, mocap_quat: (nstep,
         nmocap, 3), (nstep, nmocap, 4), likewise. None: those of data.
-      agree: [m] how far bodies may go from where skins are solved for them: finer than in a simulation
-        (2e-6), of whose error a gradient would know nothing. More rounds are taken for it.
+      agree: [m] largest difference between the bodies and the poses of the skins' solves: smaller than in a
+        simulation (2e-6), since a gradient ignores it. This takes more rounds.
 
     Raises:
-      ValueError: shapes that do not fit, what is not finite, no BioTac, or what has no gradient: the
-        condensed tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a contact_law,
-        a rest_pressure, Runge-Kutta, a skin of one's own.
+      ValueError: incompatible shapes, values that are not finite, no BioTac, or features without gradient:
+        the condensed tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a
+        contact_law, a rest_pressure, Runge-Kutta, a custom skin.
     """
     if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
         raise ValueError("model and data are needed: an MjModel and its MjData")
@@ -177,7 +179,7 @@ def rollout(
 
 
 class _Run:
-    """One world's steps, and what their adjoint needs of them."""
+    """One world's steps, with the data for their adjoint."""
 
     def __init__(self, model, data, nstep, agree):
         self.model, self.nstep = model, nstep
@@ -196,13 +198,13 @@ class _Run:
         self.lost, self.amiss = 0, 0.0
 
     def step(self, given):
-        """Makes all steps; returns what each left."""
+        """Runs all steps; returns their results."""
         data, out = self.data, []
         self.starts, self.kept, self.qvel = [], [], []
         for name in set(_STATE) & set(given):
             getattr(data, name)[:] = given[name]
         self.begin, self.qpos = [s.stepper.used(s.part()) for s in self.skins], data.qpos.copy()
-        self.long = []  # lengths of mocap quaternions as they were given
+        self.long = []  # norms of the given mocap quaternions
         for t in range(self.nstep):
             for name in set(_DRIVEN) & set(given):
                 getattr(data, name)[:] = given[name][t]
@@ -226,7 +228,7 @@ class _Run:
         return [np.array(one) for one in zip(*out)]
 
     def back(self, names, cotangents):
-        """Cotangents of what was given, by name, from those of what came out."""
+        """Cotangents of the inputs, by name, from those of the outputs."""
         model, bodies, nv = self.model, self.bodies, self.model.nv
         qpos, qvel, act, sensors, *own = cotangents
         y = np.zeros(bodies.ny)
@@ -257,7 +259,8 @@ class _Run:
         return driven | {name: state[name] for name in names if name in state}
 
     def _back(self, t, end, wrenches, skins, names):
-        """One step: of its beginning (ny,), of what drove it by name, and of the skins."""
+        """Adjoint of one step: cotangents of its initial state (ny,), of its controls by name, and of the
+        skins."""
         bodies, kept, start, nv = self.bodies, self.kept[t], self.starts[t], self.model.nv
         by, by_wrench = bodies.step_slopes(start, [k.wrench for k in kept], names)
         solved_at_end = [s.instance.two_way and not k.idle for s, k in zip(self.skins, kept)]
@@ -278,7 +281,7 @@ class _Run:
             pushed = wrenches[i].ravel() + by_wrench[i].T @ end
             linear.append(one)
             base.append(one.pull(skins[i], pushed.reshape(-1, 6)))
-            # ways in which velocities' cotangents come back as wrenches
+            # directions in which cotangents of velocities return as wrenches
             back = by_wrench[i][nv : 2 * nv].T if solved_at_end[i] else np.zeros((len(pushed), 0))
             scale = np.tile(_LEVER, len(pushed) // 6)[:, None]
             left, size, _ = np.linalg.svd(scale * back, full_matrices=False)
@@ -286,7 +289,7 @@ class _Run:
             bases.append(np.linalg.lstsq(left, back, rcond=None)[0])
             zero = Cotangent.none(s.skin)
             units.append([one.pull(zero, column.reshape(-1, 6)) for column in left.T])
-        # of the velocities at the end, w = what the poses there say, in which w itself comes back
+        # cotangents w of the final velocities satisfy a linear system, as the poses depend on them
         w, loop = np.zeros(nv), np.eye(nv)
         for i, one in enumerate(linear):
             if not solved_at_end[i]:
@@ -334,7 +337,7 @@ class _Rollout(torch.autograd.Function):
 
 
 def _quats(model):
-    """Where positions hold quaternions, and where their turns are among velocities."""
+    """Indices of quaternions in positions, and of their rotations in velocities."""
     for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr):
         free = int(kind == mujoco.mjtJoint.mjJNT_FREE)
         if free or kind == mujoco.mjtJoint.mjJNT_BALL:
@@ -342,7 +345,7 @@ def _quats(model):
 
 
 def _plain(model):
-    """Numbers of other positions and their velocities."""
+    """Indices of other positions and their velocities."""
     for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr):
         count = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}.get(mujoco.mjtJoint(kind), 1)
         for i in range(count):
@@ -350,7 +353,7 @@ def _plain(model):
 
 
 def _along(model, qpos, cotangent):
-    """(nv,) along tangents of a cotangent (nq,)."""
+    """(nv,) cotangent along tangents from a cotangent (nq,)."""
     out = np.zeros(model.nv)
     for q, v in _plain(model):
         out[v] = cotangent[q]
@@ -360,7 +363,7 @@ def _along(model, qpos, cotangent):
 
 
 def _from_along(model, qpos, tangent):
-    """The inverse of `_along`: that which lies along rotations, for quaternions of any length."""
+    """Inverse of `_along`: the cotangent along rotations, for quaternions of any norm."""
     out = np.zeros(model.nq)
     for q, v in _plain(model):
         out[q] = tangent[v]

@@ -1,5 +1,5 @@
-"""A skin's part of MuJoCo's steps, backwards: what a step left in the plugin's state is solved again, finely
-and from where it ended, and made linear there."""
+"""Adjoint of a skin in MuJoCo's steps: the result in the plugin's state is solved again to a small tolerance,
+starting from itself, and linearised there."""
 
 import dataclasses
 import typing
@@ -25,14 +25,14 @@ __all__ = ["Cotangent", "Kept", "LoopSkin", "Pulled"]
 
 @dataclasses.dataclass(frozen=True)
 class Kept:
-    """What is kept of a skin when a step has ended.
+    """Saved data of a skin at the end of a step.
 
     Attributes:
-      state: its state. wrench: (ngroup, 6) on the bodies that touch, as it acts.
-      idle: whether nothing was in its reach. resting: whether it is at rest. gamma: (ngroup,) Newmark's, of
-        the step.
-      begun: poses (ngeom, 3), (ngeom, 3, 3) from which the step took its geoms, None: where it took them;
-        whole: whether these are where the step before left them.
+      state: its state. wrench: (ngroup, 6) on the bodies in contact, as applied.
+      idle: whether nothing was in reach. resting: whether it is at rest. gamma: (ngroup,) Newmark's, of the
+        step.
+      begun: initial poses (ngeom, 3), (ngeom, 3, 3) of the geoms in the step, None: the final ones; whole:
+        whether these are the final ones of the step before.
     """
 
     state: SavedState
@@ -46,8 +46,8 @@ class Kept:
 
 @dataclasses.dataclass
 class Cotangent:
-    """Of a skin's state between two steps: nodes (nvert, 1, 3), pressure (1,), poses of the geoms
-    (ngeom, 1, 6), anchors of all samples (nsample, 3) and what its rubber remembers."""
+    """Cotangent of a skin's state between two steps: nodes (nvert, 1, 3), pressure (1,), poses of the geoms
+    (ngeom, 1, 6), anchors of all samples (nsample, 3) and memory of the rubber."""
 
     x: torch.Tensor
     pressure: torch.Tensor
@@ -64,12 +64,12 @@ class Cotangent:
 
 
 class Pulled:
-    """What a step's adjoint gives: `pose` (6 ngeom,) of where it took its geoms, and what goes to the step
-    before; linear, so that answers to several cotangents add up.
+    """Result of a step's adjoint: `pose` (6 ngeom,) cotangent of the geoms' poses, and cotangents for the
+    step before. It is linear, so results for several cotangents add.
 
     Args:
-      pose, pose_last, x, pressure, anchor: cotangents of what the step was given. memory: of what its rubber
-        remembers, a dataclass of arrays, or None.
+      pose, pose_last, x, pressure, anchor: cotangents of the step's inputs. memory: of the rubber, a
+        dataclass of arrays, or None.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Pulled:
         return self.parts[0].numpy().ravel()
 
     def plus(self, others: Iterable["Pulled"], weights: Iterable[float]) -> "Pulled":
-        """Adds shares of others."""
+        """Adds weighted others."""
         for other, weight in zip(others, weights):
             self.parts = [a + weight * b for a, b in zip(self.parts, other.parts)]
         return self
@@ -100,7 +100,7 @@ class LoopSkin:
     """A BioTac's skin in a rollout.
 
     Raises:
-      ValueError: what has no gradient, by its name.
+      ValueError: a feature without gradient; the text has its name.
     """
 
     def __init__(self, name: str, instance: Instance):
@@ -124,7 +124,7 @@ class LoopSkin:
 
     @property
     def skin(self) -> Skin:
-        """One that gradients can pass through; made when first asked for, and shared by all of its kind."""
+        """A differentiable skin, made on first use and shared by skins of the same kind."""
         if self.stepper not in _skins:
             geometry, (material, options, modulus), geoms = self.stepper.made_of
             meshes = self.stepper.grids
@@ -135,15 +135,15 @@ class LoopSkin:
 
     @property
     def nvert(self) -> int:
-        """Nodes of what it gives out."""
+        """Number of output nodes."""
         return self.stepper.made_of[0].nvert
 
     def part(self) -> np.ndarray:
-        """The skin's part of the plugin's state now."""
+        """The skin's segment of the plugin's current state."""
         return self.instance.setup.parts(self.instance.state)[2]
 
     def keep(self, before: np.ndarray) -> Kept:
-        """After a step from a state (nstate,)."""
+        """Data after a step from a state (nstate,)."""
         head, models, now, _ = self.instance.setup.parts(self.instance.state)
         ends, begun, whole = self.stepper.came_to(now), None, False
         resting = self.stepper.resting(now)
@@ -161,7 +161,7 @@ class LoopSkin:
         return state.x[: self.nvert]
 
     def pressure(self, state: SavedState) -> float:
-        """Of the liquid above rest [Pa]."""
+        """Pressure of the liquid above rest [Pa]."""
         return state.last_pressure - self.stepper.model.rest.pressure
 
     # --- backwards ---
@@ -188,12 +188,12 @@ class LoopSkin:
         return advance(skin, geoms, None, dt, skin.constants)
 
     def linear(self, before: SavedState, kept: Kept, dt: float) -> "LinearLoopStep":
-        """A step of dt [s] from a state, made linear."""
+        """Linearised step of dt [s] from a state."""
         return LinearLoopStep(self.skin, self.record(before, kept, dt), kept)
 
 
 class LinearLoopStep:
-    """A step whose state is handed on as MuJoCo's plugin does."""
+    """A linearised step between states of the MuJoCo plugin."""
 
     def __init__(self, skin: Skin, record: Record, kept: Kept):
         self.skin, self.kept, self.record, self.step = skin, kept, record, LinearStep(skin, record)
@@ -206,12 +206,12 @@ class LinearLoopStep:
         pose, last = given["pose"] + after.pose, given["pose_last"]
         if (
             not self.kept.whole
-        ):  # it began where it ends, or by what the skin at rest was met on the way there
+        ):  # the initial poses are the final ones, or those of first contact with the skin at rest
             pose, last = pose + last, 0.0 * last
         return Pulled(pose, last, given["x_last"], pressure, given["anchor"], given.get("memory"))
 
     def before(self, pulled: Pulled) -> Cotangent:
-        """Of the state when the step began."""
+        """Cotangent of the state at the start of the step."""
         _, last, x, pressure, anchors, *memory = pulled.parts
         return Cotangent(x, pressure, last, anchors, Memory(*memory) if memory else None)
 

@@ -1,1 +1,1 @@
-"""What a sensor reads, as functions that PyTorch differentiates: film, counts, heat."""
+"""Readings of a sensor as differentiable PyTorch functions: film, counts, heat."""

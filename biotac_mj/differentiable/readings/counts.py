@@ -1,8 +1,7 @@
-"""Counts without rounding, as functions that PyTorch differentiates: what a sensor reads when nothing changes
-any more.
+"""Steady-state counts without rounding, as differentiable PyTorch functions.
 
-What acts in time, warm-up, relaxation, loss, drift, low-pass and latency of `Sensor`, is not in them, nor is
-noise."""
+Time-dependent effects of `Sensor` (warm-up, relaxation, loss, drift, low-pass and latency) and noise are not
+included."""
 
 import torch
 
@@ -27,7 +26,7 @@ def electrode_counts(
 
     Args:
       impedance: (..., 19) of the film [ohm]. rest: (19,) of the film at rest [ohm].
-      sensor: whose own rest counts, mixing, power and saturation count; None: `Sensor()`.
+      sensor: for rest counts, mixing, power and saturation; None: `Sensor()`.
     """
     sensor = Sensor() if sensor is None else sensor
     base = torch.tensor(sensor.rest, dtype=torch.float64)
@@ -50,6 +49,6 @@ def tdc_counts(temperature: torch.Tensor) -> torch.Tensor:
 
 
 def tac_counts(rate: torch.Tensor) -> torch.Tensor:
-    """Counts (...) of TAC at a rate of the thermistor [C/s] that lasts; constant where the circuit is
+    """Counts (...) of TAC at a constant rate of the thermistor [C/s]; constant where the circuit is
     saturated."""
     return _thermistor_counts(_heating_exponent(torch.as_tensor(rate, dtype=torch.float64)))

@@ -1,7 +1,7 @@
-"""The film's impedances as a function that PyTorch differentiates: the equations of `sensor.film` on tensors.
+"""The film's impedances as a differentiable PyTorch function: the equations of `sensor.film` on tensors.
 
-Which triangle of the core is nearest to a node and which faces lie over a disc is asked of the film itself;
-between two such changes impedances are smooth."""
+The film itself finds the core triangle nearest to a node and the faces over a disc. Impedances are smooth
+between changes of these."""
 
 import functools
 
@@ -15,9 +15,9 @@ from ..tensors import TORCH, real_tensor
 
 __all__ = ["impedance"]
 
-_INSIDE = 1e-9  # barycentric coordinate from which a point is on a triangle's edge
+_INSIDE = 1e-9  # barycentric coordinate below which a point is on a triangle's edge
 _formulas = formulas_by_name(film_formulas, functools.partial(with_names, names=TORCH))
-_ON_EDGE = 1e-9  # as `sensor.film.kernels`: both faces take a sample on their edge
+_ON_EDGE = 1e-9  # as in `sensor.film.kernels`: both faces accept a sample on their edge
 
 
 def impedance(
@@ -33,15 +33,15 @@ def impedance(
 
     Args:
       film: of the skin.
-      nodes: (nvert, 3) in the BioTac frame [m]; of a skin with edge nodes those of the film come first.
+      nodes: (nvert, 3) in the BioTac frame [m]; edge nodes are last.
       conductivity [S/m], electrode_radius [m], residual_film [m], cell_constant (nelectrode,): constants of
-        the sensor; None: the film's own.
-      rest_nodes: (nvert, 3) rest positions, as those of `press`: at these the sensor reads what the film's
-        does at rest, so that cell constants follow from them, and a rough film's thickness at rest. None: the
-        film's own.
+      the sensor;
+        None: the film's own.
+      rest_nodes: (nvert, 3) rest positions, as in `press`: cell constants are such that the readings there
+        are the film's at rest, and a rough film has its thickness at rest there. None: the film's own.
 
     Raises:
-      NoFilmError: an electrode that no film covers.
+      NoFilmError: an electrode without film.
       ValueError: both rest_nodes and cell_constant, which follows from them; nodes that are not finite, or of
         another shape.
     """
@@ -62,7 +62,7 @@ def impedance(
     if rest_nodes is not None:
         at_rest = _nodes_of(film, "rest_nodes", rest_nodes)
         middle, rest = _lay(film, at_rest, least)
-        # a rough film at rest is a smooth one
+        # a rough film at rest equals a smooth one
         cell = torch.from_numpy(film.rest) / _solve(film, middle, rest, sigma, radius)
     middle, thickness = _lay(film, _nodes_of(film, "nodes", nodes), least)
     if film._power != 1.0:
@@ -71,7 +71,7 @@ def impedance(
 
 
 def _nodes_of(film, name, value):
-    """Those of the film, (n, 3), of a skin's nodes."""
+    """The film's nodes (n, 3) of a skin's nodes."""
     nodes, n = real_tensor(name, value).cpu(), film.geometry.nvert
     if nodes.ndim != 2 or len(nodes) < n or nodes.shape[-1] != 3:
         raise ValueError(
@@ -84,7 +84,7 @@ def _nodes_of(film, name, value):
 
 
 def _solve(film, middle, thickness, sigma, radius):
-    """Impedances (nelectrode,) but for the cell constants."""
+    """Impedances (nelectrode,) without the cell constants."""
     face = torch.as_tensor(film.face.astype(np.int64))
     system = _laplacian(middle, thickness, face, sigma)
     weights, local = _cover(film, middle, thickness, face)
@@ -116,7 +116,8 @@ def _lay(film, point, least):
 
 
 def _projection(corner, foot):
-    """(n, 3, 3) onto what a foot moves along: the triangle, its edge, or nothing at a corner."""
+    """(n, 3, 3) projection onto the directions in which a foot point moves: the triangle, its edge, or none
+    at a corner."""
     a, b, c = np.moveaxis(corner, 1, 0)
     normal = np.cross(b - a, c - a)
     size = (normal**2).sum(1)
@@ -131,7 +132,7 @@ def _projection(corner, foot):
 
 
 def _laplacian(middle, thickness, face, sigma):
-    """Of the sheet, (n, n); the first diagonal doubled, which holds the free constant."""
+    """Laplacian of the sheet, (n, n); the first diagonal is doubled, which fixes the free constant."""
     a, b, c = (middle[face[:, k]] for k in range(3))
     side = c - b, a - c, b - a
     area = torch.linalg.cross(side[0], side[1]).norm(dim=-1)
@@ -178,7 +179,7 @@ def _cover(film, middle, thickness, face):
 
 
 def _near(film, local, radius, sigma):
-    """Resistance near a disc that the mesh does not see."""
+    """Resistance near a disc that the mesh does not resolve."""
     step, table = spreading_table()
     ratio = local / radius
     s = ratio / (1 + ratio) / step

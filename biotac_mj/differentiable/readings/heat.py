@@ -1,8 +1,8 @@
-"""The sensor's temperatures as a function that PyTorch differentiates: the equations of
-`sensor.heat_formulas` on tensors, one sensor.
+"""The sensor's temperatures as a differentiable PyTorch function: the equations of `sensor.heat_formulas` on
+tensors, for one sensor.
 
-All bodies go side by side. Temperatures are smooth in everything but areas: where one ceases to grow, and
-where the pad has no more room, slopes are those of one side."""
+All bodies are processed in parallel. Temperatures are smooth except in areas: where one stops growing, and
+where the pad is full, derivatives are one-sided."""
 
 import dataclasses
 import functools
@@ -20,7 +20,7 @@ from ..tensors import TORCH, real_tensor
 __all__ = ["temperatures"]
 
 _SURFACE, _STORE, _TAKEN = 1 + own.NCELL, 2 + own.NCELL, own.MADE + 3
-_LEAST = 1e-12  # [m^2], as `sensor.heat` has it
+_LEAST = 1e-12  # [m^2], as in `sensor.heat`
 _formulas = formulas_by_name(heat_formulas, functools.partial(with_names, names=TORCH))
 _UNITS = {
     "area": "square metres, 0 or more",
@@ -33,19 +33,19 @@ _CONSTANTS = [field.name for field in dataclasses.fields(HeatParameters)][1:]
 def temperatures(
     area: torch.Tensor, force: torch.Tensor, dt: float, begin: torch.Tensor, constants: dict | None = None
 ) -> torch.Tensor:
-    """States (nstep, nstate) of a sensor's heat after each step, laid out as `sensor.heat` says: TDC is of
-    [:, THERMISTOR], the electrodes' factor of [:, ABOVE].
+    """States (nstep, nstate) of a sensor's heat after each step, with the layout of `sensor.heat`: TDC from
+    [:, THERMISTOR], the electrodes' factor from [:, ABOVE].
 
     Args:
-      area, force: (nstep, nbody) that each body touches [m^2], and with what normal force [N].
+      area, force: (nstep, nbody) contact area [m^2] and normal force [N] of each body.
       dt: of a step [s].
-      begin: (nstate,) state before the first, as `HeatParameters.rest` or `begin_heat` makes it; power and
-        what bodies are of stand in it.
-      constants: numbers by the names of `HeatParameters`, but its power; what is not given is its default.
+      begin: (nstate,) initial state, from `HeatParameters.rest` or `begin_heat`; it includes power and
+        materials of the bodies.
+      constants: numbers by the names of `HeatParameters`, except its power; omitted ones have their defaults.
 
     Raises:
-      ValueError: shapes that do not fit, what is no number or negative, an unknown constant, one that no
-        sensor has, or a time that is not positive.
+      ValueError: incompatible shapes, values that are not finite or negative, an unknown or invalid constant,
+        or a time step that is not positive.
     """
     constants = constants or {}
     given = {"area": area, "force": force, "begin": begin}
@@ -66,7 +66,7 @@ def temperatures(
     if unknown:
         raise ValueError(f"no constants {', '.join(sorted(unknown))}: choose from {', '.join(_CONSTANTS)}")
     values = {name: float(torch.as_tensor(value).detach()) for name, value in constants.items()}
-    q = dataclasses.asdict(HeatParameters(**values)) | constants  # raises for what no sensor has
+    q = dataclasses.asdict(HeatParameters(**values)) | constants  # raises for invalid values
     q = {name: torch.as_tensor(value, dtype=torch.float64, device="cpu") for name, value in q.items()}
     states = []
     for a, f in zip(area, force):
@@ -76,8 +76,8 @@ def temperatures(
 
 
 def _step(q, state, area, force, dt):
-    """`sensor.heat.step_heat`: layers are eliminated into the one inside, the core is solved for, and the
-    layers follow."""
+    """`sensor.heat.step_heat`: layers are eliminated into the one inside, the core is solved, then the layers
+    are back-substituted."""
     n = own.NCELL
     bodies = state[own.BODIES :].reshape(-1, own.BODY)
     effusivity, temperature, conductivity = bodies[:, own.MADE : _TAKEN].unbind(1)
@@ -85,7 +85,7 @@ def _step(q, state, area, force, dt):
     store = q["capacity"] * q["thickness"] / n / dt
     touched = area * _formulas.fitting(q["area"], area.sum())
 
-    # what parted stays for a while, then skin and bodies change hands
+    # separated areas stay for a while, then skin and bodies change columns
     had, skin = bodies[:, 0], bodies[:, 1:_SURFACE]
     late = _formulas.lingering(q["capacity"], q["thickness"], q["gap"], q["conductivity"], dt)
     over = (had - touched).clamp(min=0.0)
@@ -114,7 +114,7 @@ def _step(q, state, area, force, dt):
     free, free_fraction, known, pull = _inwards(free, store, inlets, outside * q["ambient"], outside)
     liquid_known, liquid_pull = bare * known, bare * pull
 
-    # skin on bodies: what flows through the touching area is shared by all of a column
+    # skin on bodies: all of a column shares the flux through its touching area
     on = patch > 0
     rate, branch, fast, slow = half_space()
     rate, branch = torch.from_numpy(rate), torch.from_numpy(branch)
@@ -164,16 +164,16 @@ def _step(q, state, area, force, dt):
 
 
 def _mix(old, area, new, added):
-    """(nbody, k) with what is new on an added area (nbody,); where none is, as it was."""
+    """(nbody, k) with new values on an added area (nbody,); unchanged without one."""
     grows = (added > 0)[:, None]
     area = torch.where(grows, area[:, None], 1.0)
     return torch.where(grows, _formulas.mixed(old, area, new, added[:, None]), old)
 
 
 def _inwards(layers, store, inner, known, pull):
-    """Cells of a column, inside first, each eliminated into the one inside it: what they are without it,
-    their share of it, and what the innermost leaves to know and pulls. `inner`: conductances to the next one
-    inside, outermost first."""
+    """Cells of a column, inside first, each eliminated into the one inside it: their constant terms and
+    factors, and `known` and `pull` of the innermost. `inner`: conductances to the next cell inside, outermost
+    first."""
     cells, fractions = [], []
     for cell, conductance in zip(reversed(layers.unbind(0)), inner):
         cell, fraction, known, pull = _formulas.eliminate(store, cell, known, pull, conductance)
