@@ -89,11 +89,11 @@ def press(
         relaxed and virgin, after its filling.
       prony: (nterm, 2) or (nworld, nterm, 2) of fraction and time [s]; mullins: (3,) or (nworld, 3);
         hysteresis: (nbranch, 2) or (nworld, nbranch, 2), as in `skin.Material` and as many as the skin's;
-          None: the skin's.
+        None: the skin's.
       smoothing: half width [m] over which first contact and the transition from stick to slip are smooth:
         another law without these kinks in its gradient. It pushes from this gap on, at zero gap as Coulomb's
         law at a quarter of it, and slip begins earlier by as much. Contact with the core keeps its kinks. 0:
-          Coulomb's law.
+        Coulomb's law.
       together: "cpu" or a CUDA device, such as "cuda:0", on which all worlds are solved in parallel. None:
         one after another. Not available for liquid, rubber with memory, rest_nodes, smoothing.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume

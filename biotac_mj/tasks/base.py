@@ -1,5 +1,5 @@
-"""What all tasks share: arena, machine with BioTacs, actions in [-1, 1], observables by preset, rewards in
-[0, 1]."""
+"""Common parts of all tasks: arena, machine with BioTacs, actions in [-1, 1], observables by preset, rewards
+in [0, 1]."""
 
 import abc
 
@@ -15,7 +15,7 @@ from .robots import Gantry, Gripper
 
 __all__ = ["AWAY", "TouchTask", "arena"]
 
-AWAY = (0.0, 0.0, -1.0)  # [m] where a mocap object waits that is not in use
+AWAY = (0.0, 0.0, -1.0)  # [m] position of unused mocap objects
 CONTROL_TIMESTEP = 0.01  # [s] one frame of the sensor
 _OBSERVE = {"tactile": TACTILE, "estimated": ESTIMATED, "privileged": TACTILE + PRIVILEGED, "none": ()}
 
@@ -55,21 +55,21 @@ def arena() -> composer.Arena:
 
 
 class TouchTask(composer.Task, abc.ABC):
-    """A machine with BioTacs feels for something.
+    """A task of a machine with BioTacs.
 
     Args:
-      observe: "tactile" (what real sensors report), "estimated" (place and force that a formula finds in it),
-        "privileged" (forces, patches and the skin besides) or "none" (no touch at all).
+      observe: "tactile" (readings of a real sensor), "estimated" (contact position and force by a formula
+        from these), "privileged" (also forces, patches and the skin) or "none" (no touch).
       physics_timestep: [s].
       biotac: settings of every `BioTac`.
 
     Attributes:
-      estimated: names of what a controller may want to know of the hidden state, `hidden(physics)` gives it;
-        for calibration only.
+      estimated: names of the hidden state that a controller may estimate; `hidden(physics)` returns it, for
+        calibration only.
     """
 
     estimated: tuple
-    seconds = 4.0  # an episode
+    seconds = 4.0  # length of an episode
 
     def __init__(
         self,
@@ -134,7 +134,7 @@ class TouchTask(composer.Task, abc.ABC):
 
     @abc.abstractmethod
     def hidden(self, physics: mjcf.Physics) -> np.ndarray:
-        """(nbiotac, nestimated) true values of `estimated`, which no touch-only controller may read."""
+        """(nbiotac, nestimated) true values of `estimated`, which touch-only controllers must not use."""
 
     @abc.abstractmethod
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None: ...

@@ -1,5 +1,5 @@
-"""The BioTac as a composer Entity: attach it to any site of an arena or a robot; its observables own rate,
-delay and noise."""
+"""The BioTac as a composer Entity: attach it to any site of an arena or a robot. Its observables have their
+own rate, delay and noise."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -21,24 +21,25 @@ from ..short_repr import short_repr
 
 __all__ = ["ESTIMATED", "PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
 
-TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # what the real sensor reports
-ESTIMATED = ("contact_estimate",)  # what drivers make of that by a formula
-PRIVILEGED = ("contact_force", "contact_patch", "skin")  # what only a simulation knows
+TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # readings of the real sensor
+ESTIMATED = ("contact_estimate",)  # drivers' estimate from these by a formula
+PRIVILEGED = ("contact_force", "contact_patch", "skin")  # available in simulation only
 _ALL = TACTILE + ESTIMATED + PRIVILEGED
 _RATE = 100.0  # [Hz] of a frame: 19 electrodes, PDC, TAC, TDC once, PAC 22 times (BioTac manual)
-_SURE = 5.0  # standard deviations: by chance once in a day of 19 electrodes
+_SURE = 5.0  # standard deviations: exceeded by chance once in a day of 19 electrodes
 _PREFIX = "build_"  # of all names until the Entity has its own scope
-_PLACE = "site", "body", "pos", "quat", "prefix"  # arguments of `attach` that an Entity has no use for
+_PLACE = "site", "body", "pos", "quat", "prefix"  # arguments of `attach` that an Entity does not use
 
 
 class Reading(observable.Generic):
-    """An observable in seconds: its rate and delay become physics steps when the time step is known.
+    """An observable in seconds: its rate and delay are converted to physics steps when the time step is
+    known.
 
     Attributes:
-      rate: how often it is read [Hz]; None in every physics step.
-      lag: how old a value is when it arrives [s].
-      noise: f(values, random_state) -> values; None leaves them as they are.
-      find: f(values with noise) -> what is observed; None: these values.
+      rate: sampling rate [Hz]; None: every physics step.
+      lag: delay of a value [s].
+      noise: f(values, random_state) -> values; None: no noise.
+      find: f(values with noise) -> observation; None: these values.
     """
 
     def __init__(
@@ -75,9 +76,9 @@ class Reading(observable.Generic):
 class BioTac(composer.Entity):
     """A BioTac for composer: `robot.attach(BioTac(), site)`; its frame (tip -x, pad -y) is the site's.
 
-    The skin's constants are built when the model is compiled and shared by all BioTacs of the same settings;
-    an episode's reset writes the rest state, nothing is built again. The sensor's own noise is off: noise
-    belongs to the observables, drawn from the environment's random state."""
+    The skin's constants are built when the model is compiled and shared by all BioTacs with the same
+    settings. An episode's reset writes the state at rest without rebuilding. The sensor's own noise is off:
+    noise belongs to the observables, drawn from the environment's random state."""
 
     def _build(
         self,
@@ -90,18 +91,18 @@ class BioTac(composer.Entity):
         """
         Args:
           name: scope of its names.
-          slots: how many bodies of the whole model may touch it two-way.
+          slots: number of bodies of the whole model that may touch it with two-way coupling.
           noise: whether the observables have the real sensor's noise.
-          settings: `coupling.Settings`; None is a coarse skin of the condensed tier, which steps in real
-            time, and on_error="raise", which ends the episode with what went wrong inside a step ("warn" goes
-            on without touch).
-          keywords: the same by name, see `biotac_mj.attach`. Geoms' names in geoms, rounding, thermal and
+          settings: `coupling.Settings`; None: a coarse skin of the condensed tier, which steps in real time,
+            and on_error="raise", which ends the episode with the error of a step ("warn" continues without
+            touch).
+          keywords: the same by name, see `biotac_mj.attach`. Names of geoms in geoms, rounding, thermal and
             textures are those of the whole model. Of a list of materials or textures every reset draws one,
-            as it draws sensor="random" and what `randomise` names, from the environment's random state.
+            from the environment's random state, like sensor="random" and the effects of `randomise`.
 
         Raises:
-          ValueError, FileNotFoundError: as `biotac_mj.attach`, or a place (site, body, pos, quat, prefix) is
-            given.
+          ValueError, FileNotFoundError: as `biotac_mj.attach`, or a placement argument (site, body, pos,
+            quat, prefix).
         """
         from ..coupling import SettingKeywords, Settings, SkinSettings, attach
 
@@ -122,7 +123,7 @@ class BioTac(composer.Entity):
         sensor, own = chosen.sensor, chosen.sensor.options
         check_geoms("thermal", sensor.thermal, read_thermal)
         check_geoms("textures", sensor.textures, read_texture)
-        # which geoms are of what is said below: the arena is not here yet
+        # settings by geom are resolved later: the arena is not here yet
         alone = dataclasses.replace(
             chosen,
             contact=dataclasses.replace(chosen.contact, geoms=None, rounding=None),
@@ -150,7 +151,7 @@ class BioTac(composer.Entity):
         self._outer, self._weighted = _outer_nodes(self.handle.config.skin), None
 
     def _name_geoms(self, root, chosen):
-        """Settings about geoms that are not here yet, but in the arena."""
+        """Resolves settings of the arena's geoms."""
         rounding = {} if chosen.contact.rounding is None else chosen.contact.rounding
         named = {"geoms": chosen.contact.geoms, "rounding": rounding, "name": root.model}
         named |= {"thermal": chosen.sensor.thermal, "textures": chosen.sensor.textures}
@@ -179,7 +180,7 @@ class BioTac(composer.Entity):
 
     @property
     def outer(self) -> np.ndarray:
-        """(nouter,) indices of the skin's nodes that the world can touch."""
+        """(nouter,) indices of the skin's nodes on its outer surface."""
         return self._outer
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
@@ -187,7 +188,7 @@ class BioTac(composer.Entity):
             reading.resolve(physics.timestep())
 
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Draws what the settings leave open: sensor, effects, materials, textures."""
+        """Draws random settings: sensor, effects, materials, textures."""
         if self._draws:
             found = self._here().draw(physics.model.ptr, physics.data.ptr, int(random_state.randint(2**31)))
             self._sensor = found or self._sensor
@@ -201,23 +202,23 @@ class BioTac(composer.Entity):
 
     @property
     def sensor(self) -> Sensor:
-        """Its own numbers in this episode."""
+        """Its constants in this episode."""
         return self._sensor
 
     def read(self, physics: mjcf.Physics, channel: str | None = None) -> np.ndarray | dict[str, np.ndarray]:
         """Copy of a channel's present values, or of all channels: {channel: values}; see `Handle.read`."""
         if channel is None:
             return {name: self.read(physics, name) for name in SENSORS}
-        self.handle.sensor_name(channel)  # says which there are
+        self.handle.sensor_name(channel)  # raises for unknown channels
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
 
     def contact_estimate(self, counts: np.ndarray) -> np.ndarray:
-        """(6,) what electrodes that read counts (nelectrode,) tell by `sensor.WeightedElectrodes`: where the
-        skin is touched [m], and the force on the BioTac [N], in its frame; zeros where no electrode fell by
-        five times its noise.
+        """(6,) estimate by `sensor.WeightedElectrodes` from counts (nelectrode,) of the electrodes: contact
+        position [m], and force on the BioTac [N], in its frame; zeros if no electrode falls by five times its
+        noise.
 
         Raises:
-          ValueError: the design has other electrodes, and no scale of force is known.
+          ValueError: a design with other electrodes, without a known scale of force.
         """
         from ..geometry import load_skin
         from ..sensor.weighted import WeightedElectrodes
@@ -242,16 +243,15 @@ class BioTac(composer.Entity):
         return dataclasses.replace(self.handle, prefix="", body=self.core.full_identifier)
 
     def contact_patch(self, physics: mjcf.Physics) -> np.ndarray:
-        """(6,) where the skin is pushed, BioTac frame: the point of the deformed skin [m] that is nearest to
-        the line of the total contact force, and the outward direction there (against the force); zeros below
-        1 mN."""
+        """(6,) contact on the skin, BioTac frame: the point of the deformed skin [m] nearest to the line of
+        the total contact force, and the outward direction (against the force); zeros below 1 mN."""
         force = self.read(physics, "contact_force")
         size = np.linalg.norm(force[:3])
         if size < 1e-3:
             return np.zeros(6)
         along, lever = force[:3] / size, np.cross(force[:3], force[3:]) / size**2
         node = self.vert_xpos(physics)[self._outer]
-        # of the two sides, the one that is pushed
+        # of the two intersections, the one on the pushed side
         off = np.linalg.norm(np.cross(node - lever, along), axis=1) + 0.2 * node @ along
         return np.concatenate([node[off.argmin()], -along])
 
@@ -262,11 +262,11 @@ class BioTacObservables(composer.Observables):
     [m]."""
 
     def readings(self) -> list[Reading]:
-        """All of them, as `Reading`s."""
+        """All of them, as a list of `Reading`s."""
         return [self.get_observable(name) for name in _ALL]
 
     def enable(self, names: Iterable[str]) -> None:
-        """Enables a preset (TACTILE, ESTIMATED, PRIVILEGED) or any of the names, and nothing else.
+        """Enables a preset (TACTILE, ESTIMATED, PRIVILEGED) or some of the names, and disables all others.
 
         Raises:
           ValueError: an unknown name.
@@ -339,7 +339,7 @@ def _white(name):
 
 
 def _pac_noise(sensor, counts, random_state):
-    """Coloured within the frame, which begins as if it had gone on for ever."""
+    """Noise that is coloured within a frame; its first sample has the stationary distribution."""
     out = sensor.pac_noise * random_state.standard_normal(np.shape(counts))
     out[0] /= np.sqrt(1 - sensor.pac_colour**2)
     for i in range(1, len(out)):

@@ -1,5 +1,5 @@
-"""What a copy of an environment goes on from: an environment that is pickled or copied is made anew of its
-arguments, and then gets the state taken here."""
+"""State of an environment for pickles and copies: an environment is made again from its arguments, then gets
+this state."""
 
 import copy
 import functools
@@ -23,15 +23,15 @@ _OF_READING = ("buffer", "update_schedule", "update_interval", "buffer_size", "d
 
 
 class Copyable:
-    """Mixin that makes a `composer.Environment` one that can be pickled and copied, and goes on from there:
+    """Mixin for a `composer.Environment` that can be pickled and copied in its current state:
 
         class Peg(biotac_mj.tasks.Copyable, composer.Environment):
             def __init__(self, seed=0):
                 super().__init__(PegTask(), random_state=seed)
 
-    A copy is made anew of the arguments of the class, which therefore must make its own task, and then gets
-    the state (`take_state`). Arguments have to be copied and pickled themselves. What goes wrong in a BioTac
-    while the model is compiled is raised with its cause.
+    A copy is made from the arguments of the class, which must therefore make its own task, and then gets the
+    state (`take_state`). The arguments must be copyable and picklable. An error of a BioTac while the model
+    is compiled is raised with its cause.
     """
 
     def __new__(cls, *args: object, **settings: object):
@@ -44,7 +44,7 @@ class Copyable:
             super().__init__(*args, **settings)
 
     def reset(self) -> dm_env.TimeStep:
-        with plugin.explained():  # composer compiles anew in every episode, unless told otherwise
+        with plugin.explained():  # composer recompiles in every episode by default
             return super().reset()
 
     def __reduce__(self):
@@ -55,15 +55,15 @@ class Copyable:
         give_state(self, state)
 
     def __copy__(self):
-        return copy.deepcopy(self)  # two that shared a state would step each other
+        return copy.deepcopy(self)  # two with one state would step each other
 
 
 def take_state(env: composer.Environment) -> dict | None:
-    """All that steps and episodes have changed: the physics with its model (time, the skins' memory, masses
-    that an episode drew), the random generator, what tasks and entities note down (targets, beliefs, sensors
-    drawn), observations on their way, hooks. None of a closed environment.
+    """All changes by steps and episodes: the physics with its model (time, the skins' memory, masses drawn in
+    an episode), the random generator, attributes of tasks and entities (targets, beliefs, drawn sensors),
+    pending observations, hooks. None for a closed environment.
 
-    Nothing of it is shared with the environment, but for hooks, which a pickle holds by their names.
+    It shares nothing with the environment except hooks, which are pickled by name.
     """
     if env._physics is None:
         return None
@@ -81,13 +81,13 @@ def take_state(env: composer.Environment) -> dict | None:
 
 
 def give_state(env: composer.Environment, state: dict | None) -> None:
-    """Makes an environment of the same arguments go on from a state of `take_state`."""
+    """Sets an environment with the same arguments to a state of `take_state`."""
     if state is None:
         env.close()
         return
     physics, data = env._physics, state["data"]
     physics._reload_from_data(wrapper.MjData(copy.deepcopy(data)))
-    # what it computes while it loads goes: with it the next step would begin elsewhere
+    # results computed during loading are dropped, as the next step would start from them
     mujoco.mj_copyData(physics.data.ptr, physics.model.ptr, data)
     for owner, notes in zip(_owners(env.task), state["notes"], strict=True):
         vars(owner).update(copy.deepcopy(notes))
@@ -100,7 +100,7 @@ def give_state(env: composer.Environment, state: dict | None) -> None:
     for name, settings in state["observables"].items():
         for key, value in settings.items():
             setattr(observables[name], key, value)
-    # this episode observes what was enabled when it began
+    # this episode observes what was enabled at its start
     for name, one in observables.items():
         one.enabled = name in state["observed"][1]
     env._observation_updater = env._make_observation_updater()
@@ -108,18 +108,18 @@ def give_state(env: composer.Environment, state: dict | None) -> None:
     _observe(env._observation_updater, state["observed"])
     for name, settings in state["observables"].items():
         observables[name].enabled = settings["enabled"]
-    # last: readings draw noise, and bindings compute
+    # last, because readings draw noise and bindings compute
     mujoco.mj_copyData(physics.data.ptr, physics.model.ptr, data)
     if (
         physics.legacy_step
-    ):  # which ends with the first half of the next step: its skins are no data of MuJoCo
+    ):  # ends with the first half of the next step, because its skins are not in MuJoCo's data
         mujoco.mj_step1(physics.model.ptr, physics.data.ptr)
     physics._dirty = state["dirty"]
     env.random_state.set_state(state["random"])
 
 
 def _owners(task):
-    """Who may note something down in an episode."""
+    """Objects whose attributes may change in an episode."""
     return [task, *task.root_entity.iter_entities()]
 
 
@@ -128,7 +128,7 @@ def _notes(owner):
 
 
 def _is_plain(value):
-    """Whether a value is numbers and texts alone: elements of the scene are made anew, and not copied."""
+    """Whether a value consists of numbers and texts: elements of the scene are made again, not copied."""
     if isinstance(value, dict):
         return all(_is_plain(key) and _is_plain(one) for key, one in value.items())
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -143,8 +143,7 @@ def _settings(observable):
 
 
 def _observed(updater):
-    """Of each observable of the episode what it goes by: its buffer, with what has not arrived yet, and when
-    it is read."""
+    """For each observable of the episode its buffer with pending values, and its schedule."""
     kept = {
         name: {key: getattr(one, key) for key in _OF_READING if not callable(getattr(one, key))}
         for name, one in updater._enabled_structure.items()

@@ -28,13 +28,13 @@ _MADE_ANEW = ("suite", "_screen", "action_space", "observation_space", "_ezpickl
 
 
 class BioTacEnv(gymnasium.Env, EzPickle):
-    """A task of the suite: observations are a dict of float32 arrays, actions lie in [-1, 1], rewards in [0,
-    1]. Pickled or copied it goes on in its episode, with its own random generator.
+    """A task of the suite: observations are a dict of float32 arrays, actions in [-1, 1], rewards in [0, 1].
+    A pickle or copy continues its episode, with its own random generator.
 
     Args:
       domain, task: see `suite.tasks`.
       observe: "tactile", "estimated", "privileged" or "none".
-      render_mode: None or "rgb_array", the camera `side`, with the GL library that works here.
+      render_mode: None or "rgb_array", the camera `side`, with the available GL library.
       width, height: of a picture [pixel].
       settings: further arguments of the task (time_limit, physics_timestep, biotac ...).
 
@@ -89,7 +89,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
             self.close()
             return
         copying.give_state(self.suite, state["suite"])
-        if self._screen is not None:  # of the model that is no more
+        if self._screen is not None:  # it belongs to the old model
             self._screen.close()
             self._screen = self._make_screen()
 
@@ -135,7 +135,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
 
 
 def register() -> list[str]:
-    """Registers all tasks with Gymnasium; once is enough, more do no harm. Returns their ids."""
+    """Registers all tasks with Gymnasium; may be called repeatedly. Returns their ids."""
     for name, (domain, task) in IDS.items():
         if name not in gymnasium.registry:
             gymnasium.register(

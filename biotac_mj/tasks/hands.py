@@ -24,7 +24,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms", "known_hand"]
 
 _MASKS = "contype", "conaffinity"
-_CORE_MASS = 4e-3  # of the BioTac [kg], taken off the link that carries it
+_CORE_MASS = 4e-3  # of the BioTac [kg], subtracted from the link that carries it
 
 # The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the
 # Menagerie's meshes.
@@ -45,15 +45,15 @@ _ALLEGRO = {
     finger: Mount(f"{finger}_tip", (0, 0, (55e-3 if finger == "th" else 41e-3) - TIP), pad=(1.0, 0.0, 0.0))
     for finger in ("ff", "mf", "rf", "th")
 }
-# Menagerie's LEAP: tips end at y = -50 mm (fingers) and -62 mm (thumb), their flat pads look to -x at 11.2
-# mm, z = +-14.5 mm.
+# Menagerie's LEAP: tips end at y = -50 mm (fingers) and -62 mm (thumb), their flat pads face -x at 11.2 mm, z
+# = +-14.5 mm.
 _LEAP = {
     finger: Mount(
         f"{finger}_ds",
         (8.2e-3 - 11.2e-3, TIP - length, z),
         tip=(0.0, -1.0, 0.0),
         pad=(-1.0, 0.0, 0.0),
-        replaces=(f"{finger}_tip", f"{finger}_ds_visual"),  # the latter draws the tip too, and the link
+        replaces=(f"{finger}_tip", f"{finger}_ds_visual"),  # the latter draws both tip and link
         shown=tuple(f"{finger}_ds_collision_{i}" for i in (1, 2, 3)),
     )
     for finger, length, z in (
@@ -63,11 +63,11 @@ _LEAP = {
         ("th", 62e-3, -14.5e-3),
     )
 }
-# Menagerie's 2F-85: the pads end at z = 37.5 mm; the plate behind them, which stays, begins at y = 0, and a
-# BioTac reaches 5.3 mm behind its axis.
+# Menagerie's 2F-85: the pads end at z = 37.5 mm; the plate behind them, which remains, begins at y = 0, and a
+# BioTac extends 5.3 mm behind its axis.
 _GRIPPER = {f: Mount(f"{f}_pad", (0, -5.3e-3, 37.5e-3 - TIP)) for f in ("left", "right")}
-# Menagerie's Tetheria Aero: the tip's mesh ends at z = 26.8 mm (thumb 31.8 mm), its middle lies 2.2 mm
-# (3.4 mm) to the pad's side of the joint's plane. Tendons that the link carries stay.
+# Menagerie's Tetheria Aero: the tip's mesh ends at z = 26.8 mm (thumb 31.8 mm), its middle is 2.2 mm (3.4 mm)
+# to the pad's side of the joint's plane. Tendons of the link remain.
 _AERO = {
     finger: Mount(
         f"{name}_distal_link",
@@ -128,37 +128,38 @@ def attach_to_hand(
     settings: Settings | dict | str | pathlib.Path | None = None,
     **keywords: typing.Unpack[SettingKeywords],
 ) -> dict[str, "Handle"] | dict[str, str]:
-    """Puts BioTacs onto the fingertips of a hand.
+    """Attaches BioTacs to the fingertips of a hand.
 
-    What a BioTac stands for stays in the model, for tendons, sensors and whatever else refers to it, but
-    touches nothing, weighs nothing and is not drawn. Contact pairs that name it are taken out: the skin
-    touches their other geom instead.
+    Replaced geoms stay in the model, for tendons, sensors and other references, but have no contacts, no mass
+    and are not drawn. Contact pairs with them are removed: the skin touches their other geom instead.
 
     Args:
       spec: the MjSpec that holds the hand. Add the objects first, as for `attach`.
       hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, aero_hand, robotiq_2f85: Menagerie's
-        models, left or right), or {finger: Mount} of any other. "shadow_hand_authentic" is shadow_hand with
+        models, left or right), or {finger: Mount} for any other. "shadow_hand_authentic" is shadow_hand with
         that variant.
-      mount: a file that `biotac hand mount` wrote, in place of `hand`.
-      link_prefix: how names of the hand's links begin, where a scene has several: the prefix that was given
+      mount: a file from `biotac hand mount`, instead of `hand`.
+      link_prefix: common prefix of names of the hand's links, if a scene has several hands: the prefix given
         to `MjSpec.attach`.
-      fingers: which of them, e.g. ("ff", "th"); None takes all.
-      variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's
-        BioTac fingers, whose last joint does not move: the joint, what drove or measured it alone, and the
-        keyframes are taken out of the model.
+      fingers: subset, e.g. ("ff", "th"); None: all.
+      variant: of the Shadow Hand: "replace" puts the BioTac in place of the last link; "authentic" has
+        Shadow's BioTac fingers, whose last joint is fixed: the joint, its own actuators and sensors, and the
+        keyframes are removed.
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
-      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); skin, coupling and geoms
-        are then what counts here.
+      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); of the settings only skin,
+        coupling and geoms are then used.
       prefix: each finger's names begin with link_prefix + prefix + finger + "_".
-      slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
-      settings, keywords: as for `biotac_mj.attach`, for every finger (each gets its own noise seed).
+      slots: number of bodies that may touch each BioTac with two-way coupling; None: number of those outside
+        the hand.
+      settings, keywords: as for `biotac_mj.attach`, for every finger (each has its own noise seed).
 
+    Returns:
     Returns:
       {finger: Handle}, in the order of `fingers`; of a batch {finger: prefix}, for `biotac_mj.batch.attach`.
 
     Raises:
-      ValueError: unknown hand, variant or finger; a link, or a geom of it to replace, that the model does not
-        have.
+      ValueError: unknown hand, variant or finger; a link, or a geom of it to replace, that is not in the
+        model.
     """
     from ..coupling import attach
 
@@ -179,7 +180,7 @@ def attach_to_hand(
             raise ValueError(f"{name}={short_repr(keywords[name])} is given: a finger's place is its Mount's")
     own = ("hand", "mount", "link_prefix", "fingers", "variant", "self_touch", "batch", "prefix", "slots")
     chosen = Settings.of(settings, keywords, "attach_to_hand", also=own)
-    if batch:  # the rest is told `batch.attach`
+    if batch:  # other settings are arguments of `batch.attach`
         others = [one for one in SettingKeywords.__annotations__ if one not in ("skin", "coupling", "geoms")]
         Settings.of(None, keywords, "attach_to_hand with batch=True", others)
     if mount is not None:
@@ -202,7 +203,7 @@ def attach_to_hand(
     for body in own:  # exclusions need names
         body.name = body.name or next(free)
     names = {body.name for body in own}
-    masks = {}  # contype and conaffinity of what each BioTac stands for
+    masks = {}  # contype and conaffinity of the geoms that each BioTac replaces
     for finger, link in links.items():
         if variant == "authentic":
             _freeze(spec, link)
@@ -241,16 +242,16 @@ def attach_to_hand(
 
 
 def _give_masks(spec, masks):
-    """Has BioTacs meet what the geoms met that they stand for; masks: {core: (contype, conaffinity)}."""
+    """Gives BioTacs the collision masks of the replaced geoms; masks: {core: (contype, conaffinity)}."""
     for core, given in masks.items():
         for geom in spec.body(core).geoms:
             for name, mask in zip(_MASKS, given):
-                if getattr(geom, name):  # not where contact pairs alone say what it meets
+                if getattr(geom, name):  # not if only contact pairs define its contacts
                     setattr(geom, name, getattr(geom, name) | mask)
 
 
 def _add(spec, links, mounts, prefix, own, chosen, mask):
-    """`batch.add` at each link; rows are made for bodies that are not of `own`."""
+    """`batch.add` at each link; rows are made for bodies outside `own`."""
     from ..batch import add
 
     touching = chosen.contact.geoms
@@ -277,12 +278,12 @@ def _add(spec, links, mounts, prefix, own, chosen, mask):
 
 
 def _listed(fingers, mounts):
-    """The fingers that are wanted."""
+    """Names of the selected fingers."""
     if fingers is None or isinstance(fingers, str):
         return tuple(mounts) if fingers is None else (fingers,)
     try:
         return tuple(fingers)
-    except Exception:  # others' arrays raise what they like
+    except Exception:  # array types raise various errors
         raise ValueError(f"fingers is {short_repr(fingers)}: give a list of {', '.join(mounts)}") from None
 
 
@@ -312,7 +313,7 @@ def _mounts(hand, variant):
 
 
 def find_link(spec: mujoco.MjSpec, name: str, prefix: str = "") -> "mujoco._specs.MjsBody":
-    """The body of that name, or the only one whose name begins with `prefix` and ends with it.
+    """The body with that name, or the only one whose name begins with `prefix` and ends with it.
 
     Raises:
       ValueError: none, or several; the text lists them.
@@ -333,8 +334,8 @@ def _links(spec, name, prefix):
 
 
 def _remedy(spec, names, prefix):
-    """What to do where links that end with these names are not there once: of several hands one is named by
-    what is before the names, of another hand the name is said."""
+    """Remedy if the links are missing or not unique: for several hands their prefixes, for another known hand
+    its name."""
     before = [{b.name.removesuffix(name) for b in _links(spec, name, prefix)} for name in names]
     hands = sorted(set.intersection(*before) - {prefix})
     if len(hands) > 1:
@@ -347,14 +348,13 @@ def _remedy(spec, names, prefix):
 
 
 def known_hand(spec: mujoco.MjSpec) -> str | None:
-    """The name in HANDS of a hand all of whose fingers' links a model has, or None."""
+    """The name in HANDS of a hand whose fingers' links are all in the model, or None."""
     fits = (hand for hand, mounts in HANDS.items() if all(_links(spec, m.body, "") for m in mounts.values()))
     return next(fits, None)
 
 
 def _root(body):
-    """The hand's first body: the child of the world, or the first below a joint that a robot or a carriage
-    moves it with."""
+    """The hand's first body: the child of the world, or the first below a joint of a robot or a carriage."""
     while body.parent.name != "world":
         body = body.parent
     return body
@@ -365,8 +365,8 @@ def _subtree(body):
 
 
 def _replace(spec, link, mount, own):
-    """Puts what the BioTac stands for out of the way; the skin touches nothing of the bodies named `own`.
-    Gives the contype and conaffinity of what is replaced."""
+    """Disables the geoms that the BioTac replaces; the skin touches nothing of the bodies `own`. Returns
+    their contype and conaffinity."""
     shown, replaced = fixed_geoms(link, mount.shown), fixed_geoms(link, mount.replaces)
     masks = [functools.reduce(operator.or_, (getattr(g, mask) for g in replaced), 0) for mask in _MASKS]
     for geom in replaced:
@@ -383,13 +383,13 @@ def _replace(spec, link, mount, own):
 def fixed_geoms(
     link: "mujoco._specs.MjsBody", names: Iterable[str] | None = None
 ) -> list["mujoco._specs.MjsGeom"]:
-    """Geoms of a link and of the bodies that do not move against it.
+    """Geoms of a link and of the bodies fixed to it.
 
     Args:
-      names: of those that are wanted, or how they end; None is all.
+      names: of the wanted geoms, or the ends of their names; None: all.
 
     Raises:
-      ValueError: no geom has one of the names; the text lists those there are.
+      ValueError: no geom has one of the names; the text lists the existing ones.
     """
     fixed = (body for body in link.bodies if not body.joints and not body.mocap)
     geoms = [*link.geoms, *(g for body in fixed for g in fixed_geoms(body))]
@@ -409,7 +409,7 @@ def fixed_geoms(
 
 
 def _let_touch(spec, name, own):
-    """Lets skins touch a geom that only collided in pairs, by the bit that BioTacs alone have."""
+    """Lets skins touch a geom that collided only in pairs, through the collision bit of BioTacs."""
     geom = spec.geom(name)
     if geom is None or geom.contype or geom.conaffinity or geom.parent.name in own:
         return
@@ -417,7 +417,8 @@ def _let_touch(spec, name, own):
 
 
 def _freeze(spec, link):
-    """Takes out a link's joint: tendons on it become the joint before it, what else is about it goes."""
+    """Removes a link's joint: tendons on it are moved to the joint before it, other references are
+    deleted."""
     before = link.parent.joints[-1].name
     for joint in list(link.joints):
         for tendon in list(spec.tendons):
@@ -440,12 +441,12 @@ def _freeze(spec, link):
             _take_out(spec, tendon, "TENDON")
         _take_out(spec, joint, "JOINT")
     link.pos = [0.0, 0.0, 0.0]
-    for key in list(spec.keys):  # their lengths no longer fit
+    for key in list(spec.keys):  # their lengths are invalid
         spec.delete(key)
 
 
 def _take_out(spec, element, kind):
-    """Deletes a joint, tendon or actuator (`kind`, as in mjtObj) and what refers to it."""
+    """Deletes a joint, tendon or actuator (`kind`, as in mjtObj) and its references."""
     name, of_kind = element.name, getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
     transmission = {"JOINT": ("mjTRN_JOINT", "mjTRN_JOINTINPARENT"), "TENDON": ("mjTRN_TENDON",)}.get(
         kind, ()

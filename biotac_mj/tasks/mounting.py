@@ -1,5 +1,4 @@
-"""`biotac hand mount`: where a BioTac goes on a link of a hand that nobody has described yet, as a file and a
-picture."""
+"""`biotac hand mount`: finds the pose of a BioTac on a link of an unknown hand, as a file and a picture."""
 
 import argparse
 import pathlib
@@ -19,31 +18,31 @@ from .mounts import CLAMP, TIP, Mount, write_mounts
 
 __all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view", "stands_off"]
 
-_SIZES = 2e-3, 1.0  # [m] that a link with a fingertip may be long: others are of a model in other units
-_OBLIQUE = np.cos(np.radians(20))  # to all axes of its frame, and a link has an axis of its own
-_SLENDER = 1.4  # the moments' ratio above which it has one: fingertips of known hands have 1.7 to 3
-_FACING = 0.5  # cosine of what looks at another finger: of a row of fingers less, of opposite ones more
-_END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
-_OFF = 5e-3  # [m] off the hand: known mounts leave 2 mm at most, links that were replaced whole 11 and 25
-_FADED = 0.2  # opacity of what is no part of a link's finger
-_REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
-_VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
+_SIZES = 2e-3, 1.0  # [m] range of a fingertip link's length: others are in different units
+_OBLIQUE = np.cos(np.radians(20))  # to all axes of its frame, above which a link's own axis is used
+_SLENDER = 1.4  # least ratio of moments for an own axis: fingertips of known hands have 1.7 to 3
+_FACING = 0.5  # least cosine for opposite fingers: less for fingers in a row
+_END = 10e-3  # [m] length of the link's end, whose middle is on the BioTac's axis
+_OFF = 5e-3  # [m] gap to the hand: known mounts have at most 2 mm, links replaced as a whole 11 and 25
+_FADED = 0.2  # opacity of everything but the link's finger
+_REPLACED = 0.9, 0.15, 0.1  # colour of replaced geoms
+_VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from the side, onto the pad
 
 
 def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **given: object) -> Mount:
-    """A Mount by the link's own shape: the fingertip points along the axis of its frame on which its geoms
-    reach farthest, or along its own where it lies askew in its frame; the pad looks where its joint bends it
-    to, or to the other fingers where these are opposite or no hinge moves it; the BioTac ends where the link
-    ended. It stands for the geoms that reach beyond its own back end: what lies behind is the link that
-    carries it.
+    """Guesses a Mount from the link's shape. The fingertip points along the axis of the link's frame in which
+    its geoms extend farthest, or along the link's own axis if that is oblique. The pad faces the direction in
+    which the joint bends it, or the other fingers if these are opposite or there is no hinge. The BioTac ends
+    where the link ends, and replaces the geoms that extend beyond its own back end; geoms behind it are the
+    link that carries it.
 
     Args:
-      spec: of the hand. body: the link's name, or how it ends. others: links of the other fingers.
-      given: fields of Mount that are known.
+      spec: of the hand. body: the link's name, or the end of it. others: links of the other fingers.
+      given: known fields of Mount.
 
     Raises:
-      ValueError: no such link, or one without geoms, or of no fingertip's size; directions that are not at
-        right angles.
+      ValueError: no such link, or one without geoms or of an implausible size; directions that are not
+        orthogonal.
     """
     link = find_link(spec, body)
     model = spec.copy().compile()
@@ -80,7 +79,7 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
                 raise ValueError(
                     f"link {link.name!r} turns about its own length: say where its pad looks, --pad X Y Z"
                 )
-            if _faces_away(looks, towards):  # of a jaw the range of the joint tells how it opens
+            if _faces_away(looks, towards):  # for a jaw the joint's range shows how it opens
                 looks = -looks
         given["pad"] = _plain((looks / np.linalg.norm(looks)).round(9))
     if "pos" not in given:
@@ -93,13 +92,14 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
         goes = np.array(reach) > np.dot(given["pos"], tip) - CLAMP
         given["replaces"], given["shown"] = _fingertip(model, geoms, goes)
     mount = Mount(link.name, **given)
-    _ = mount.quat  # says what is wrong with the directions
+    _ = mount.quat  # raises for invalid directions
     return mount
 
 
 def _fingertip(model, geoms, goes):
-    """`Mount.replaces` and `.shown`: names of the geoms that go, and of hidden ones that stay where a drawn
-    one goes. (None, ()), which is all of the link, where none stays or one that goes has no name."""
+    """`Mount.replaces` and `.shown`: names of the replaced geoms, and of hidden ones that remain instead of a
+    replaced visual one. (None, ()), which is all of the link, if none remains or a replaced one has no
+    name."""
     names = np.array([model.geom(g).name for g in geoms])
     if goes.all() or not names[goes].all():
         return None, ()
@@ -109,12 +109,12 @@ def _fingertip(model, geoms, goes):
 
 
 def _longest_axis(points):
-    """(3,) in which a link's points (n, 3) [m] reach farthest from its frame: an axis of the frame, or the
-    link's own if it is slender and askew."""
+    """(3,) direction in which a link's points (n, 3) [m] extend farthest from its frame: an axis of the
+    frame, or the link's own if it is slender and oblique."""
     from ..triangles import trimesh
 
     axes = np.eye(3)
-    moments, own = np.linalg.eigh(trimesh.PointCloud(points).convex_hull.moment_inertia)  # least: its length
+    moments, own = np.linalg.eigh(trimesh.PointCloud(points).convex_hull.moment_inertia)  # smallest: length
     if moments[1] > _SLENDER * moments[0] and np.abs(own[:, 0]).max() < _OBLIQUE:
         axes = own[:, :1].T.round(9)
     ways = np.concatenate([axes, -axes])
@@ -122,11 +122,11 @@ def _longest_axis(points):
 
 
 def _plain(vector):
-    return tuple((vector + 0.0).tolist())  # -0.0 reads badly
+    return tuple((vector + 0.0).tolist())  # avoids -0.0
 
 
 def _fixed(model, link):
-    """(nbody,) whether a body is the link or does not move against it."""
+    """(nbody,) whether a body is the link or fixed to it."""
     found = np.zeros(model.nbody, bool)
     found[link] = True
     for i in range(link + 1, model.nbody):  # parents come first
@@ -160,7 +160,7 @@ def _hinge(model, body):
 
 
 def _axis(model, data, body):
-    """(3,) axis of the nearest hinge that moves a body, turned so that it bends the finger further."""
+    """(3,) axis of the nearest hinge that moves a body, with the sign that bends the finger further."""
     j = _hinge(model, body)
     if j is None:
         raise ValueError("no hinge moves this link: say where its pad looks, --pad X Y Z")
@@ -169,7 +169,7 @@ def _axis(model, data, body):
 
 
 def _towards(model, data, here, others):
-    """(3,) from a link to the middle of others, which may name itself [m]; 0 without others."""
+    """(3,) from a link to the mean position of others, which may include itself [m]; 0 without others."""
     places = [data.body(model.body(name).id).xipos for name in others if name != here.name]
     return np.mean(places, axis=0) - here.xipos if places else np.zeros(3)
 
@@ -179,7 +179,7 @@ def _faces_away(looks, towards):
 
 
 def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool:
-    """Whether a pad turns its back on links of opposite fingers."""
+    """Whether a pad faces away from links of opposite fingers."""
     model = spec.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -190,7 +190,7 @@ def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool
 
 
 def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:
-    """How far a mounted BioTac is from what is left of the hand [m]; 0.05 is that and more.
+    """Distance of a mounted BioTac from the remaining hand [m]; at most 0.05.
 
     Args:
       spec: of the hand; the BioTac is added to it.
@@ -201,7 +201,7 @@ def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:
     mujoco.mj_forward(model, data)
     core = model.body(handle.body).id
     own = np.flatnonzero(model.geom_bodyid == core)
-    seen = (model.geom_rgba[:, 3] > 0) | (model.geom_matid >= 0)  # what is replaced is neither
+    seen = (model.geom_rgba[:, 3] > 0) | (model.geom_matid >= 0)  # replaced geoms are neither
     hand = (model.body_rootid == model.body_rootid[core])[model.geom_bodyid] & seen
     hand[own] = False
     pairs = ((a, b) for a in own for b in np.flatnonzero(hand))
@@ -214,8 +214,8 @@ def side_view(
     """A camera on a BioTac.
 
     Args:
-      pos, mat: (3,) [m], (3, 3) of the BioTac frame. eye: direction in it from which is looked.
-      distance: [m] of the camera.
+      pos, mat: (3,) [m], (3, 3) of the BioTac frame. eye: viewing direction in it. distance: [m] of the
+        camera.
     """
     camera, look = mujoco.MjvCamera(), -mat @ np.asarray(eye) / np.linalg.norm(eye)
     camera.lookat[:], camera.distance = pos - 5e-3 * mat[:, 0], distance
@@ -227,9 +227,9 @@ def side_view(
 def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
 ) -> list[np.ndarray] | None:
-    """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then
-    with the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. Other
-    fingers are faded. None where no GL library works.
+    """Three pictures (height, width, 3) uint8: the original link with the replaced geoms in red; then with
+    the BioTac and its axes (x red, before the tip; y green, z blue), from the side and onto its pad. Other
+    fingers are translucent. None if no GL library works.
 
     Args:
       path: MJCF of the hand.
@@ -261,7 +261,7 @@ def draw_mount(
 
 
 def _fade_others(spec, link):
-    """What a link does not hang on is translucent: other fingers stand between it and the eye."""
+    """Makes all but a link's finger translucent, because other fingers may block the view."""
     own, body = fixed_geoms(link), link.parent
     while body is not None:
         own += body.geoms
@@ -274,7 +274,7 @@ def _fade_others(spec, link):
 
 
 def _add_axes(body):
-    ahead = [-TIP - 0.015, 0, 0, -TIP - 2e-3, 0, 0]  # along x the link would hide it
+    ahead = [-TIP - 0.015, 0, 0, -TIP - 2e-3, 0, 0]  # before the tip, as the link would hide it
     for k, (axis, colour) in enumerate(zip(np.eye(3), np.eye(3))):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -288,9 +288,9 @@ def _add_axes(body):
 
 
 def mount_verb(args: argparse.Namespace) -> None:
-    """`biotac hand mount`: guesses, writes, draws and says what was done."""
+    """`biotac hand mount`: guesses, writes, draws and reports the mount."""
     if args.picture:
-        picture_kind(args.picture)  # before the work
+        picture_kind(args.picture)  # check before the work
     with reading(args.hand, "MJCF of a hand", "give its .xml, beside its meshes"):
         mujoco.MjSpec.from_file(args.hand).compile()
     given = {name: getattr(args, name) for name in ("tip", "pad", "pos", "replaces")}
@@ -332,7 +332,7 @@ def mount_verb(args: argparse.Namespace) -> None:
 
 
 def _account(spec, mount):
-    """Lines that say where a BioTac goes, what it stands for and what of the link stays."""
+    """Lines on the pose of a BioTac, the replaced geoms and the remaining ones."""
     link = find_link(spec, mount.body)
     goes = fixed_geoms(link, mount.replaces)
     names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in goes]
@@ -344,7 +344,7 @@ def _account(spec, mount):
 
 
 def _write_picture(path, rows):
-    """rows: {body: what `draw_mount` answered}."""
+    """rows: {body: result of `draw_mount`}."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

@@ -1,4 +1,4 @@
-"""Where a BioTac goes on a link of a hand, and the file that keeps it."""
+"""Pose of a BioTac on a link of a hand, and its file."""
 
 import dataclasses
 import pathlib
@@ -14,21 +14,20 @@ from ..short_repr import short_repr
 __all__ = ["CLAMP", "TIP", "Mount", "read_mounts", "write_mounts"]
 
 TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
-CLAMP = 7.65e-3  # from there to its back end, which `assets/clamp.obj` has [m]
+CLAMP = 7.65e-3  # from the origin to the back end of `assets/clamp.obj` [m]
 _REMEDY = "give a file that `biotac hand mount` wrote"
 
 
 @dataclasses.dataclass(frozen=True)
 class Mount:
-    """Where a BioTac goes on a hand's link.
+    """Pose of a BioTac on a hand's link.
 
     Attributes:
-      body: name of the link; a hand that was attached with a prefix is found by the end of the name.
+      body: name of the link, or the end of it for a hand that was attached with a prefix.
       pos: of the BioTac frame's origin in the link's frame [m].
-      tip, pad: directions in that frame in which the fingertip points and in which the pad looks.
-      replaces: names of the geoms that the BioTac stands for; None is all of the link and of what is fixed to
-        it.
-      shown: names of hidden geoms that stay and are drawn, where what was drawn of the link is replaced.
+      tip, pad: directions of the fingertip and of the pad in that frame.
+      replaces: names of the replaced geoms; None: all of the link and of the bodies fixed to it.
+      shown: names of hidden geoms that remain and are drawn instead of replaced visual ones.
     """
 
     body: str
@@ -78,10 +77,10 @@ def write_mounts(path: pathlib.Path | str, mounts: dict[str, Mount]) -> None:
 
 
 def read_mounts(path: pathlib.Path | str) -> dict[str, Mount]:
-    """What `write_mounts` wrote.
+    """Reads a file of `write_mounts`.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, or another one; the text names what is wrong.
+      FileNotFoundError, ValueError: no such file, or an invalid one; the text has the cause.
     """
     document = read_yaml(path, "file of mounts", _REMEDY)
     names = [field.name for field in dataclasses.fields(Mount)]

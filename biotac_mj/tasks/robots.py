@@ -1,4 +1,4 @@
-"""The machines that carry BioTacs in the tasks: a gantry for one finger, a parallel gripper with two."""
+"""Machines that carry BioTacs in the tasks: a gantry for one finger, a parallel gripper with two."""
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -10,7 +10,7 @@ __all__ = ["Gantry", "Gripper"]
 _MASS = 0.15  # of a carriage [kg]
 _STIFFNESS = 3000.0  # of a servo [N/m]: 1 N moves it by 0.3 mm
 _YAW_INERTIA, _YAW_STIFFNESS = 1e-4, 20.0  # [kg m^2], [N m/rad]
-_LARGEST_FORCE = 12.0  # of a servo [N]: past it the finger gives way
+_LARGEST_FORCE = 12.0  # of a servo [N]: above it the finger is pushed back
 _PAD = 8.2e-3  # from the BioTac's axis to its pad [m]
 _ROD = dict(type="capsule", size=[0.005], rgba=[0.55, 0.58, 0.62, 1.0], contype=0, conaffinity=0)
 
@@ -21,9 +21,9 @@ def _quaternion(columns):
 
 
 class _Machine(composer.Entity):
-    """Sliding (and turning) carriages driven by servos that integrate a commanded velocity.
+    """Sliding (and rotating) carriages driven by servos that integrate a commanded velocity.
 
-    A command lies in [-1, 1] for each axis; `speed` is what 1 means.
+    A command is in [-1, 1] for each axis; `speed` is the velocity of 1.
     """
 
     def _start(self, name):
@@ -75,24 +75,24 @@ class _Machine(composer.Entity):
 
     @property
     def axes(self) -> list[str]:
-        """Names of what a command moves."""
+        """Names of the axes of a command."""
         return [a.name for a in self._actuators]
 
     @property
     def speed(self) -> np.ndarray:
-        """(naxis,) what a command of 1 means [m/s], [rad/s]."""
+        """(naxis,) velocity of a command of 1 [m/s], [rad/s]."""
         return np.array(self._speed[: len(self.axes)])
 
     def command(self, physics: mjcf.Physics, action: np.ndarray) -> None:
         """Sets the velocities of the axes: action (naxis,) in [-1, 1]."""
-        # not through a binding: it would make dm_control recompute the whole step, skin included, before the
-        # next reading
+        # not through a binding, which would make dm_control recompute the whole step, including the skin,
+        # before the next reading
         physics.data.ctrl[physics.bind(self._actuators).element_id] = np.clip(action, -1, 1) * np.array(
             self._speed
         )
 
     def place(self, physics: mjcf.Physics, position: np.ndarray) -> None:
-        """Puts the axes at position (naxis,) [m], [rad], at rest, and the servos with them."""
+        """Moves the axes to position (naxis,) [m], [rad], at rest, and the servos with them."""
         physics.bind(self._joints).qpos = position
         physics.bind(self._joints).qvel = 0.0
         physics.bind(self._actuators).act = position
@@ -103,7 +103,7 @@ class _Machine(composer.Entity):
 
 
 class Gantry(_Machine):
-    """Carries one BioTac, pad down: axes x, y, z and, if asked, yaw about the vertical through the BioTac's
+    """Carries one BioTac, pad down: axes x, y, z and optionally yaw about the vertical through the BioTac's
     origin.
 
     At rest the BioTac's axes are x along the world's x (tip at -x), y up, z along -y of the world.
@@ -126,8 +126,8 @@ class Gantry(_Machine):
 
 
 class Gripper(_Machine):
-    """Two facing BioTacs, tips down: lift raises both, grip moves each towards the other, until at 0 the pads
-    would just meet."""
+    """Two facing BioTacs, tips down: lift raises both, grip moves each towards the other; at 0 the pads are
+    just in contact."""
 
     def _build(self, name="gripper", lift=True):
         self._start(name)

@@ -1,9 +1,9 @@
-"""Controllers that solve the tasks from touch, the machine's own position and the told target; and one that
-acts at random.
+"""Controllers that solve the tasks from touch, the machine's own position and the observed target; and a
+random one.
 
-A controller never sees the simulation's hidden state. What it believes about force, place and load comes from
-`touch.Estimator`, a regression calibrated on other episodes (`calibrate`), or, in the calibration itself,
-from the truth handed to `act`."""
+A controller never uses the simulation's hidden state. Its estimates of force, position and load come from
+`touch.Estimator`, a regression calibrated on other episodes (`calibrate`), or, during the calibration, from
+the truth passed to `act`."""
 
 import pathlib
 import typing
@@ -20,16 +20,16 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["SCRIPTED", "Random", "make_controller"]
 
-_FRICTION = Config().friction  # of the skin; what the gripper knows about friction
+_FRICTION = Config().friction  # of the skin, known to the gripper
 
 
 class Scripted:
-    """Reads touch, estimates, acts. `act(observation, truth)` takes (nbiotac, nestimated) true values in
-    place of the estimates."""
+    """Estimates the hidden state from touch, and acts. `act(observation, truth)` takes (nbiotac, nestimated)
+    true values instead of the estimates."""
 
     task: str
-    calibration = None  # name of its estimator, where it is not that of the task
-    # the estimator, once it is needed; arrays of the calibration, None: the package's
+    calibration = None  # name of its estimator if not the task's
+    # the estimator, loaded on use; arrays of the calibration, None: the package's
     estimator = stored = None
 
     @property
@@ -62,7 +62,7 @@ class Scripted:
 
 
 class Press(Scripted):
-    """Goes down until it touches, then moves in proportion to the error of the force."""
+    """Moves down until contact, then in proportion to the error of the force."""
 
     task = "press"
 
@@ -72,7 +72,7 @@ class Press(Scripted):
 
 
 class FollowEdge(Scripted):
-    """Keeps the force, steers the pad onto the rim, turns with it, and goes tip first."""
+    """Keeps the force, steers the pad onto the rim, turns with it, and moves tip first."""
 
     task = "follow_edge"
 
@@ -92,7 +92,7 @@ class FollowEdge(Scripted):
 
 
 class RollBall(Scripted):
-    """Presses lightly and moves the finger twice as fast as the ball should go."""
+    """Presses lightly and moves the finger at twice the desired speed of the ball."""
 
     task = "roll_ball"
 
@@ -107,13 +107,13 @@ class RollBall(Scripted):
 
 
 class Explore(Scripted):
-    """Presses at five places to one depth below the first touch, then names the object whose presses felt
-    most alike."""
+    """Presses at five locations to one depth below first contact, then chooses the object with the most
+    similar presses."""
 
     task = "explore"
     places = 1e-3 * np.array([[0, 0], [3, 0], [-3, 0], [0, 3], [0, -3]])
     depth, clear = 0.9e-3, 0.7e-3
-    # frames at depth before the reading; frames after which a stiff thing is taken as it is
+    # frames at depth before the reading; frames after which a stiff object is read as is
     settle, patience = (4, 25)
 
     def reset(self) -> None:
@@ -128,7 +128,7 @@ class Explore(Scripted):
         return np.concatenate([np.clip(motion, -1, 1), self.belief])
 
     def _to(self, position, goal):
-        """Velocity towards a goal [m], and whether it is there."""
+        """Velocity towards a goal [m], and whether it is reached."""
         error = np.asarray(goal) - position
         return np.clip(25.0 * error / 0.03, -1, 1), np.abs(error).max() < 1.5e-4
 
@@ -168,11 +168,11 @@ class Explore(Scripted):
 
 
 class Hold(Scripted):
-    """Grips as hard as the load that it feels needs, with a margin; closes fast where the load nears the
-    friction limit: that is slip."""
+    """Grips as hard as the estimated load requires, with a margin; closes fast if the load approaches the
+    friction limit, which indicates slip."""
 
     task, calibration = "hold", "grip"
-    # grip before there is a load [N]; what it needs times a share, and more [N]; haste
+    # grip without load [N]; factor on the required grip, and margin [N]; gain
     least, share, spare, gain = (1.0, 1.5, 0.35, 1.5)
 
     def wait(self, observation: dict) -> np.ndarray:
@@ -192,7 +192,7 @@ class Hold(Scripted):
 
 
 class Lift(Hold):
-    """As `Hold`; raises when it has gripped, slowly while the load grows."""
+    """Like `Hold`; raises after gripping, slowly while the load grows."""
 
     task = "lift"
     least, share, spare, gain = 0.35, 1.3, 0.15, 0.7  # the load comes slowly here
@@ -216,7 +216,7 @@ class Lift(Hold):
 
 
 class Random:
-    """Uniform in the action's bounds."""
+    """Uniform over the action's bounds."""
 
     def __init__(self, spec: "specs.BoundedArray", seed: int = 0):
         self.spec, self.rng = spec, np.random.RandomState(seed)
@@ -225,7 +225,7 @@ class Random:
         """Nothing to forget."""
 
     def act(self, observation: dict) -> np.ndarray:
-        """An action drawn anew, whatever was observed."""
+        """A random action, independent of the observation."""
         return self.rng.uniform(self.spec.minimum, self.spec.maximum, size=self.spec.shape)
 
 
@@ -239,12 +239,12 @@ def make_controller(
 
     Args:
       task: its name.
-      env: where it will act; it is warned (`CalibrationWarning`) of BioTacs unlike those its estimator was
-        fitted on.
-      calibration: file of `python -m biotac_mj.tasks.calibrate --out`; None takes the package's.
+      env: environment; a `CalibrationWarning` is issued if its BioTacs differ from those of the estimator's
+        fit.
+      calibration: file of `python -m biotac_mj.tasks.calibrate --out`; None: the package's.
 
     Raises:
-      ValueError: there is none.
+      ValueError: the task has none.
     """
     if task not in SCRIPTED:
         raise ValueError(f"no scripted controller for task {task!r}: there are {', '.join(SCRIPTED)}")

@@ -27,7 +27,7 @@ def _environment_class():
     from . import copying
 
     class Environment(copying.Copyable, composer.Environment):
-        arguments: dict  # of `environment`, which makes it
+        arguments: dict  # of `environment`, for copies
 
         def step(self, action):
             shape = self.action_spec().shape
@@ -49,12 +49,13 @@ def _environment_class():
 
 
 def _settings(task):
-    """Names of what a task's class takes: its own, and those of the classes that it hands the rest on to."""
+    """Argument names of a task's class: its own, and those of the base classes that take its remaining
+    ones."""
     kinds, names = [k for k in task.__mro__ if "__init__" in vars(k)], []
     for kind in kinds:
         own = list(inspect.signature(kind.__init__).parameters.values())[1:]
         named = [p for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-        # what a base class must be given, its child gives
+        # arguments that the subclass supplies to its base class
         names += [p.name for p in named if kind is kinds[0] or p.default is not p.empty]
         if not any(p.kind is p.VAR_KEYWORD for p in own):
             break
@@ -68,7 +69,7 @@ def environment(
     time_limit: float | None = None,
     **settings: object,
 ) -> "composer.Environment":
-    """A composer.Environment of a TouchTask class. Pickled or copied, it goes on from the same state.
+    """A composer.Environment of a TouchTask class. A pickle or copy continues from the same state.
 
     Args:
       task: the class; settings: its arguments.
@@ -77,7 +78,7 @@ def environment(
       environment_kwargs: further arguments of `composer.Environment`.
 
     Raises:
-      ValueError: a setting that cannot be, or one that the task does not have.
+      ValueError: an invalid setting, or one that the task does not have.
     """
     refuse_unknown(settings, (*_settings(task), "random", "time_limit"), f"task_kwargs of {task.__name__}")
     if time_limit is not None:
@@ -90,22 +91,22 @@ def environment(
     # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
     # forces that act in it
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
-    # sums of time steps may fall short of it by rounding
+    # sums of time steps may be too small by rounding
     limit = (made.seconds if time_limit is None else time_limit) - 1e-6
     env = _environment_class()(made, time_limit=limit, random_state=random, **options | more)
     env.arguments = dict(
         task=task, environment_kwargs=environment_kwargs, random=random, time_limit=time_limit, **settings
     )
     state = env.random_state.get_state()
-    # the first one compiles and draws noise that later ones do not: done here, so that a seed means one
-    # episode
+    # the first episode compiles and draws noise that later ones do not: done here, so that a seed determines
+    # an episode
     env.reset()
     env.random_state.set_state(state)
     return env
 
 
 def _check_environment(given):
-    """Further arguments of `composer.Environment`, of names and types that it knows."""
+    """Further arguments of `composer.Environment`, with checked names and types."""
     from dm_control import composer
 
     given = _dict("environment_kwargs", given)

@@ -1,5 +1,4 @@
-"""From touch to what a controller wants to know: tared readings, and a regression of hidden quantities on
-them."""
+"""Estimates from touch for controllers: tared readings, and a regression of hidden quantities on them."""
 
 import dataclasses
 import functools
@@ -28,13 +27,13 @@ __all__ = [
     "load_estimator",
 ]
 
-_TARE = 5  # frames averaged before anything is touched
-_PDC_SCALE, _LOG_SCALE = 100.0, 0.1  # make features of order one
-_SMOOTHING = 0.5  # share of the newest frame
+_TARE = 5  # frames averaged before any contact
+_PDC_SCALE, _LOG_SCALE = 100.0, 0.1  # scale features to order one
+_SMOOTHING = 0.5  # weight of the newest frame
 
 
 class Touch:
-    """Readings of all BioTacs of a task, from its observations: tared over the first frames, smoothed.
+    """Readings of all BioTacs of a task from its observations: tared over the first frames, low-passed.
 
     Attributes:
       tared: whether the tare is complete.
@@ -77,8 +76,8 @@ class Touch:
 
 
 def _features(touch):
-    """(n, 251) of (n, 20): the touch, and constant, linear and quadratic terms of its shape, whose size is
-    that of no touch or any."""
+    """(n, 251) features of (n, 20): the touch, and constant, linear and quadratic terms of its normalised
+    shape."""
     shape = 10 * touch / (np.abs(touch).sum(axis=1, keepdims=True) + 1.0)
     i, j = np.triu_indices(touch.shape[1])
     return np.concatenate([np.ones((len(touch), 1)), shape, shape[:, i] * shape[:, j], touch], axis=1)
@@ -89,8 +88,7 @@ class Estimator:
     """Ridge regression of hidden quantities on one BioTac's touch and quadratic features of its shape.
 
     Attributes:
-      scale: (251,) of the features; weight: (251, nestimated); error: (nestimated,) RMS on episodes that were
-        held out.
+      scale: (251,) of the features; weight: (251, nestimated); error: (nestimated,) RMS on held-out episodes.
     """
 
     scale: np.ndarray
@@ -109,8 +107,8 @@ class Estimator:
         episode: np.ndarray,
         ridges: Sequence[float] = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0),
     ) -> "Estimator":
-        """From samples touch (n, 20), hidden (n, k) of episodes (n,); the ridge that predicts every fourth
-        episode best is taken.
+        """Fits to samples touch (n, 20), hidden (n, k) of episodes (n,), with the ridge of least error on
+        every fourth episode.
 
         Raises:
           ValueError: fewer than four episodes.
@@ -135,12 +133,12 @@ class Estimator:
 
 
 class CalibrationWarning(UserWarning):
-    """An estimator is used with a BioTac unlike that which it was fitted on."""
+    """An estimator is used with a BioTac that differs from the one of its fit."""
 
 
 def fitted_on(config: "Config") -> dict:
-    """What an estimator belongs to, of a BioTac's `coupling.Config`: digest of its skin, tier, material,
-    liquid, friction, readings."""
+    """Identification of a BioTac for an estimator, from its `coupling.Config`: digest of its skin, tier,
+    material, liquid, friction, readings."""
     from ..geometry import load_skin
 
     skin, digest = load_skin(config.skin), hashlib.sha256()
@@ -159,8 +157,8 @@ def fitted_on(config: "Config") -> dict:
 
 
 def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
-    """Warns (CalibrationWarning) where the estimator `name` of a calibration was fitted on another BioTac
-    than that of a `Config`."""
+    """Warns (CalibrationWarning) if the estimator `name` of a calibration was fitted for another BioTac than
+    that of a `Config`."""
     now, text = fitted_on(config), stored.get(f"{name}/fitted_on")
     then = {} if text is None else json.loads(str(text))
     differ = [key for key in now if then.get(key) != now[key]]
@@ -179,7 +177,7 @@ def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
 
 @functools.cache
 def load_calibration(path: str | None = None) -> dict:
-    """Arrays of a file made by `python -m biotac_mj.tasks.calibrate`; None takes the package's,
+    """Arrays of a file of `python -m biotac_mj.tasks.calibrate`; None: the package's,
     `biotac_mj/tasks/calibration.npz`."""
     if path is None:
         with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as own:
@@ -188,7 +186,7 @@ def load_calibration(path: str | None = None) -> dict:
 
 
 def load_estimator(task: str, stored: dict | None = None) -> Estimator:
-    """The calibrated estimator of a task (of "grip" for hold and lift), of a calibration or the package's.
+    """The calibrated estimator of a task ("grip" for hold and lift), from a calibration or the package's.
 
     Raises:
       ValueError: the task has none.

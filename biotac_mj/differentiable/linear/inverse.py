@@ -192,6 +192,7 @@ def solve_by_gmres(
       most: largest number of products.
       digits: reduction of a residual before it is recomputed; 0: never.
       restart: size of the basis.
+
     Raises:
       ValueError: no convergence within `most`: a matrix is nearly singular.
     """

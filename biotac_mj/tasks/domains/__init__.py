@@ -1,1 +1,1 @@
-"""The tasks themselves: one module each, on one finger (`finger`) or two fingertips (`gripper`)."""
+"""The tasks, one module each, on one finger (`finger`) or two fingertips (`gripper`)."""

@@ -1,5 +1,5 @@
-"""Follow an edge: the rim of a round plate of unknown radius and place, at a given speed, with the pad kept
-on it."""
+"""Follow an edge: the rim of a round plate of unknown radius and position, at a given speed, with the pad on
+it."""
 
 import numpy as np
 from dm_control import mjcf
@@ -11,7 +11,7 @@ from ..robots import Gantry
 __all__ = ["FollowEdge"]
 
 _PAD = 8.2e-3  # [m]
-_REFERENCE = -9e-3  # x of the pad's point that is to stay on the edge, BioTac frame [m]
+_REFERENCE = -9e-3  # x of the pad's point that should stay on the edge, BioTac frame [m]
 _RADII = (0.03, 0.045, 0.07)  # [m]
 _EDGE = 1e-3  # rounding of the rim [m]
 _SPEED = 8e-3  # along the rim [m/s]
@@ -23,8 +23,8 @@ def _name(radius):
 
 
 class FollowEdge(TouchTask):
-    """Reward: the product of three, each in [0, 1]: force between 0.15 and 3 N; the pad within 0.7 mm of the
-    rim (0 at 3 mm); speed along the rim, tip first, 8 mm/s or more (0 at rest)."""
+    """Reward: the product of three factors in [0, 1]: force between 0.15 and 3 N; the pad within 0.7 mm of
+    the rim (0 at 3 mm); speed along the rim, tip first, 8 mm/s or more (0 at rest)."""
 
     estimated = ("offset", "turn", "force")
     seconds = 5.0
@@ -59,13 +59,13 @@ class FollowEdge(TouchTask):
         for i, disc in enumerate(self._discs):
             height = -_PAD - random_state.uniform(1e-3, 3e-3)
             physics.bind(disc).mocap_pos = np.append(self._center, height) if i == chosen else AWAY
-        # turned about the pad's point, not about the BioTac's origin
+        # rotated about the pad's point, not about the BioTac's origin
         place = np.array([_REFERENCE - _REFERENCE * np.cos(turn), -_REFERENCE * np.sin(turn)])
         self.machine.place(physics, np.array([*place, 0.0, turn]))
 
     def _pose(self, physics):
-        """Signed distance of the pad's point from the rim (positive outside) [m], the finger's turn against
-        the rim [rad], the tangent."""
+        """Signed distance of the pad's point from the rim (positive outside) [m], the finger's angle to the
+        rim [rad], the tangent."""
         x, y, _, yaw = self.machine.position(physics)
         heading = np.array([np.cos(yaw), np.sin(yaw)])
         away = np.array([x, y]) + _REFERENCE * heading - self._center
@@ -79,7 +79,7 @@ class FollowEdge(TouchTask):
         )
 
     def hidden(self, physics: mjcf.Physics) -> np.ndarray:
-        offset, turn, _ = self._pose(physics)  # offset: how far the rim is to the finger's left
+        offset, turn, _ = self._pose(physics)  # offset: distance of the rim to the finger's left
         return np.array([[offset, turn, self.contact_force(physics)[1]]])
 
     def get_reward(self, physics: mjcf.Physics) -> float:

@@ -1,4 +1,4 @@
-"""Explore an object and say which of seventeen it is: the paper's eight indenters, six pegs, a table's
+"""Explore an object and classify it as one of seventeen: the paper's eight indenters, six pegs, a table's
 surface, edge and corner."""
 
 from collections.abc import Sequence
@@ -17,21 +17,21 @@ __all__ = ["Explore"]
 
 _PAD = 8.2e-3  # [m]
 CENTER = -9e-3  # x of the middle of the pad, BioTac frame [m]
-_OFF, _TURN = 1e-3, 0.2  # how badly the object is centred [m] and turned [rad]
-# an object's +y, which goes ahead, to the world's +z
+_OFF, _TURN = 1e-3, 0.2  # largest offset [m] and rotation [rad] of the object
+# rotates an object's forward direction +y to the world's +z
 _TURNED_UP = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
 
 
 class Explore(TouchTask):
-    """An action moves the finger (3) and holds a belief for each object (17); reward: the share of the right
-    one in the beliefs, which count from -1, that is 1/17 for one who does not know."""
+    """An action moves the finger (3) and sets a belief for each object (17). Reward: the fraction of the
+    right object in the beliefs, counted from -1: 1/17 without knowledge."""
 
     estimated = ("force",)
     seconds = 4.0
 
     def __init__(self, objects: Sequence[str] = OBJECTS, **settings: object):
-        """objects: names of those that are laid down; beliefs are always about all 17. Raises ValueError for
-        unknown ones."""
+        """objects: names of those that occur; beliefs always cover all 17. Raises ValueError for unknown
+        ones."""
         if not isinstance(objects, (list, tuple)) or not objects:
             raise ValueError(f"objects is {short_repr(objects)}: give a list of some of {', '.join(OBJECTS)}")
         for name in objects:
@@ -79,7 +79,7 @@ class Explore(TouchTask):
 
 
 def _add(root, shape):
-    """A mocap body with the shape, foremost point at its origin, upwards; both named after it."""
+    """A mocap body with the shape, foremost point at its origin, upwards; both have the shape's name."""
     body = root.worldbody.add("body", name=shape.name, mocap=True, pos=AWAY)
     pos, quat = np.empty(3), np.empty(4)
     mujoco.mju_rotVecQuat(pos, shape.pos, _TURNED_UP)

@@ -40,7 +40,7 @@ def roll_ball(**settings: object) -> "composer.Environment":
 
 @SUITE.add("benchmarking", "hard")
 def explore(**settings: object) -> "composer.Environment":
-    """Tell which of seventeen objects lies under the finger."""
+    """Classify the object under the finger as one of seventeen."""
     from .explore import Explore
 
     return environment(Explore, **settings)

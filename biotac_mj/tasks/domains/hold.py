@@ -1,4 +1,4 @@
-"""Hold a thing whose weight changes, and lift one of unknown mass, with two fingertips."""
+"""Hold an object with changing weight, and lift one of unknown mass, with two fingertips."""
 
 import numpy as np
 from dm_control import mjcf
@@ -10,7 +10,7 @@ from ..robots import Gripper
 
 __all__ = ["Hold", "Lift"]
 
-FRICTION = Config().friction  # of the skin, the larger of the pair's
+FRICTION = Config().friction  # of the skin, the larger of the pair
 _HALF = np.array([9e-3, 8e-3, 14e-3])  # of the object [m]
 _PADS = -0.010  # z of the pads' middle below the gripper's origin [m]
 _GRAVITY = 9.81
@@ -38,18 +38,18 @@ class _Grip(TouchTask):
         self._mass = mass
 
     def _put(self, physics, height, open_by):
-        """The object's middle at a height [m], the fingers `open_by` [m] away from it."""
+        """Sets the object's centre to a height [m], with the fingers `open_by` [m] away from it."""
         physics.bind(self._joint).qpos = [0, 0, height, 1, 0, 0, 0]
         physics.bind(self._joint).qvel = 0.0
         fingers = np.full(2, -_HALF[1] - open_by)
         self.machine.place(physics, fingers if len(self.machine.joints) == 2 else np.append(0.0, fingers))
 
     def height(self, physics: mjcf.Physics) -> float:
-        """Of the object's middle [m]."""
+        """Height of the object's centre [m]."""
         return float(physics.bind(self._joint).qpos[2])
 
     def hidden(self, physics: mjcf.Physics) -> np.ndarray:
-        # what the object's weight pulls is towards the tips, -x of the BioTacs
+        # the object's weight pulls towards the tips, -x of the BioTacs
         return np.array([self.contact_force(physics, i)[[1, 0]] for i in range(2)]) * [1, -1]
 
     def grip(self, physics: mjcf.Physics) -> float:
@@ -58,9 +58,9 @@ class _Grip(TouchTask):
 
 
 class Hold(_Grip):
-    """The object's support goes away at 0.5 s, and its weight changes three times. Reward: 1 while it has
-    sunk by less than 1 mm (0 at 10 mm), times a half to one for gentleness: one up to 1.6 times the grip that
-    friction needs plus 0.3 N, a half where it is 3 N more."""
+    """The object's support is removed at 0.5 s, and its weight changes three times. Reward: 1 if it has sunk
+    by less than 1 mm (0 at 10 mm), times a gentleness factor: 1 up to 1.6 times the grip that friction
+    requires plus 0.3 N, a half at 3 N more."""
 
     seconds = 4.0
 
@@ -81,7 +81,7 @@ class Hold(_Grip):
         self._begin = _PADS
 
     def pull(self, time: float) -> float:
-        """What is added to the object's weight [N]; each change takes 0.1 s."""
+        """Force added to the object's weight [N]; each change takes 0.1 s."""
         return float(
             np.interp(time, np.ravel([[t, t + 0.1] for t in self._times]), np.repeat(self._pulls, 2)[1:-1])
         )
@@ -102,9 +102,9 @@ class Hold(_Grip):
 
 
 class Lift(_Grip):
-    """Pinch a block of 20 to 150 g on a table and lift it by 30 mm. Reward: the height as a share of 30 mm,
-    times a half to one for gentleness: one up to twice the grip that friction needs plus 0.5 N, a half where
-    it is 3 N more."""
+    """Pinch a block of 20 to 150 g on a table and lift it by 30 mm. Reward: the height as a fraction of 30
+    mm, times a gentleness factor: 1 up to twice the grip that friction requires plus 0.5 N, a half at 3 N
+    more."""
 
     seconds = 4.0
     _goal = 0.03
@@ -120,7 +120,7 @@ class Lift(_Grip):
         body = physics.bind(self._body)
         mass = random_state.uniform(0.02, 0.15)
         body.mass, body.inertia = mass, mass / 3 * (np.sum(_HALF**2) - _HALF**2)
-        # as mj_setConst would
+        # like mj_setConst
         physics.model.body_subtreemass[[0, body.element_id]] += mass - body.subtreemass
         self._mass = mass
         self._put(physics, _PADS, random_state.uniform(2e-3, 5e-3))

@@ -1,4 +1,4 @@
-"""Press to a target force: a plate of unknown height and tilt; the wanted force is told, the felt one is
+"""Press to a target force on a plate of unknown height and tilt; the target is observed, the actual force is
 not."""
 
 import numpy as np
@@ -16,8 +16,8 @@ _TILT = 0.08  # [rad]
 
 
 class Press(TouchTask):
-    """Reward: 1 where the normal force is within 10 % of the target, down to 0 where it is off by the whole
-    target, which changes once."""
+    """Reward: 1 if the normal force is within 10 % of the target, 0 if its error is the whole target, which
+    changes once."""
 
     estimated = ("force",)
     seconds = 3.0
@@ -38,7 +38,7 @@ class Press(TouchTask):
         self._observe("target", lambda physics: np.array([self.target(physics)]))
 
     def target(self, physics: mjcf.Physics) -> float:
-        """The wanted force [N]."""
+        """The target force [N]."""
         return self._targets[int(physics.data.time > self.seconds / 2)]
 
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:

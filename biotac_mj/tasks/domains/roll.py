@@ -1,4 +1,4 @@
-"""Roll a sphere between fingertip and table to a place that is told; where the sphere is must be felt."""
+"""Roll a sphere between fingertip and table to a known target; its position must be estimated by touch."""
 
 import numpy as np
 from dm_control import mjcf
@@ -12,12 +12,12 @@ __all__ = ["RollBall"]
 
 _PAD = 8.2e-3  # [m]
 _CENTER = -9e-3  # x of the middle of the pad, BioTac frame [m]
-_START = np.array([2e-3, 1e-3])  # how far from the pad's middle the ball starts [m]
+_START = np.array([2e-3, 1e-3])  # initial distance of the ball from the pad's middle [m]
 _RADIUS, _MASS = 5e-3, 4e-3  # of the ball [m], [kg]: steel
 
 
 class RollBall(TouchTask):
-    """Reward: 1 where the ball is within 0.5 mm of the target, 0 at 4 mm and farther."""
+    """Reward: 1 if the ball is within 0.5 mm of the target, 0 from 4 mm on."""
 
     estimated = ("ball_x", "ball_y", "force")
     seconds = 4.0
@@ -26,7 +26,7 @@ class RollBall(TouchTask):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         world = self._arena.mjcf_model.worldbody
-        # 2: the finger's machine is not in the way, but for its BioTac
+        # 2: the ball collides with the BioTac only, not with the finger's machine
         met = 2 | OWN
         rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=met, conaffinity=met)
         floor = [0, 0, -_PAD - 2 * _RADIUS]
@@ -57,7 +57,7 @@ class RollBall(TouchTask):
 
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         start = np.array([_CENTER, 0.0]) + random_state.uniform(-1, 1, size=2) * _START
-        # along the finger: across it the pad is too round and too narrow to roll a ball far
+        # along the finger: across it the pad is too round and too narrow for rolling far
         self._target = start + np.array(
             [
                 random_state.choice([-1, 1]) * random_state.uniform(4e-3, 6e-3),
@@ -71,11 +71,11 @@ class RollBall(TouchTask):
         self.machine.place(physics, np.array([0.0, 0.0, 2e-3]))
 
     def ball(self, physics: mjcf.Physics) -> np.ndarray:
-        """(2,) place of the ball on the table [m]."""
+        """(2,) position of the ball on the table [m]."""
         return np.array(physics.bind(self._joint).qpos[:2])
 
     def hidden(self, physics: mjcf.Physics) -> np.ndarray:
-        # where the ball is under the finger
+        # position of the ball relative to the finger
         return np.append(
             self.ball(physics) - self.machine.position(physics)[:2], self.contact_force(physics)[1]
         )[None]
