@@ -57,7 +57,7 @@ def main(argv: list[str] | None = None) -> None:
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"real_match: {error}")
     found = match(response, rows)[0]
-    found["gains_one"] = match(response, rows, Setup(gains=0.0), alone=False)[0]
+    found["gains_one"] = match(response, rows, Setup(gains=0.0), estimate_force=False)[0]
     found["seconds"] = time.perf_counter() - begin
     write_json(given.json, found)
     print(report(found))

@@ -11,7 +11,7 @@ from logs import RATE, noisy, pressed
 from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.recordings.tared import on_a_rest
+from biotac_mj.recordings.tared import with_baseline
 
 
 def log(tmp_path, values):
@@ -66,11 +66,11 @@ def test_values_are_put_where_all_of_them_fit():
     rng = np.random.default_rng(0)
     counts = rng.integers(100, 4000, (500, 19)).astype(float)
     tared = counts - rng.uniform(1000, 3000, 19)
-    put = on_a_rest(tared)
+    put = with_baseline(tared)
     np.testing.assert_array_equal(np.diff(put, axis=0), np.diff(counts, axis=0))
     assert put.min() >= 1 and put.max() <= 4094 and (put == np.rint(put)).all()
     smooth = np.cumsum(rng.standard_normal((500, 19)), axis=0)
-    np.testing.assert_allclose(np.diff(on_a_rest(smooth), axis=0), np.diff(smooth, axis=0), atol=1e-9)
+    np.testing.assert_allclose(np.diff(with_baseline(smooth), axis=0), np.diff(smooth, axis=0), atol=1e-9)
 
 
 @pytest.mark.slow

@@ -16,12 +16,12 @@ from biotac_mj.quality.clock import clock_faults, guessed_rate, missing_rows
 from biotac_mj.quality.codes import put_back
 from biotac_mj.quality.confidence import NAMED, confidence
 from biotac_mj.quality.evidence import sign_flip
-from biotac_mj.quality.held import held_rows
 from biotac_mj.quality.lines import hum
 from biotac_mj.quality.log import Log
 from biotac_mj.quality.noise import running_median
 from biotac_mj.quality.repeats import repeated_rows
-from biotac_mj.quality.still import standing_still
+from biotac_mj.quality.sample_hold import sample_and_hold
+from biotac_mj.quality.stuck import stuck_or_clipped
 from biotac_mj.recordings import Recording, findings
 from biotac_mj.sensor.channels import electrode_noise
 
@@ -173,8 +173,8 @@ def test_a_filter_is_no_limit_and_a_limit_may_begin_late():
     filtered[:, 6] = signal.medfilt(counts[:, 6], 61)
     late[1500:, 6] = np.minimum(counts[1500:, 6], np.quantile(counts[1500:, 6], 0.6))
     assert late[:1500, 6].max() > late[1500:, 6].max() + 50
-    assert standing_still(Log(filtered)) == []
-    assert [(f.id, f.channels) for f in standing_still(Log(late))] == [("saturate", (6,))]
+    assert stuck_or_clipped(Log(filtered)) == []
+    assert [(f.id, f.channels) for f in stuck_or_clipped(Log(late))] == [("saturate", (6,))]
 
 
 def test_a_limit_that_gives_way_is_one():
@@ -212,7 +212,7 @@ def test_an_electrode_that_stands_still_for_a_part_is_stuck(size):
     e, _, rng = pressed(2, 30)
     counts = noisy(e, rng, size)
     seldom = 2000 + np.cumsum(rng.choice([-1, 0, 1], counts.shape, p=[0.01, 0.98, 0.01]), axis=0)
-    assert not faults(counts) and not standing_still(Log(seldom))
+    assert not faults(counts) and not stuck_or_clipped(Log(seldom))
     for rows in (50, 300, 1200):
         x = counts.copy()
         x[1000 : 1000 + rows, 6] = x[1000, 6]
@@ -449,7 +449,7 @@ def test_rows_that_no_bus_repeats_are_held():
     late = np.where(at < 0.4 * n, at, at - at % 3)
 
     def held(rows, clocked):
-        return bool(held_rows(Log(read[rows], LOGGER, clocked)))
+        return bool(sample_and_hold(Log(read[rows], LOGGER, clocked)))
 
     assert not held(at, True)
     assert held(last, True) and held(last, False)

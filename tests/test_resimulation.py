@@ -22,7 +22,7 @@ from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import frame
 from biotac_mj.recordings import Recording, write
 from biotac_mj.resimulation import fitted
-from biotac_mj.resimulation.fitted import plate_way
+from biotac_mj.resimulation.fitted import plate_path
 from biotac_mj.resimulation.resimulate import ResimulateOptions, resimulate
 from biotac_mj.resimulation.touch import biotac_poses, touches_of
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
@@ -202,7 +202,7 @@ def test_a_plate_rolls_without_sliding():
     n = 40
     state = np.column_stack([np.linspace(0.1, 0.4, n), np.linspace(-0.3, 0.2, n), np.zeros(n), np.zeros(n)])
     depth = np.full(n, 1e-3)
-    pos, mat, axes = plate_way(geometry, state, depth)
+    pos, mat, axes = plate_path(geometry, state, depth)
     outer = geometry.vert[np.unique(geometry.outer_face)]
     for k in range(1, n):
         inwards = axes[k, 2]
@@ -213,5 +213,5 @@ def test_a_plate_rolls_without_sliding():
         assert np.linalg.norm(moved - (moved @ inwards) * inwards) < 2e-4
     assert np.linalg.norm(pos[-1] - pos[0]) > 1e-3
     state[:, 2] = np.linspace(0, 0.5, n)  # dragged along by half its depth
-    other, _, _ = plate_way(geometry, state, depth)
+    other, _, _ = plate_path(geometry, state, depth)
     assert (other[-1] - pos[-1]) @ axes[-1, 0] == pytest.approx(5e-4, rel=0.2)

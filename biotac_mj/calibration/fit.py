@@ -268,7 +268,7 @@ def calibrate(
     found, correction = finish(problem.descend(start, max_iterations) if forces is None else start), 0.0
     draw = np.random.default_rng(0)
     for _ in range(starts - 1):
-        at = problem.draw_near(found.x, draw)
+        at = problem.draw_start(found.x, draw)
         if problem.promised(at) < (1 - _GAIN) * found.cost:
             found = min(found, finish(at), key=_cost)
     modulus = configuration.modulus
@@ -442,7 +442,7 @@ class _Problem:
             max_nfev=max_iterations,
         )
 
-    def draw_near(self, at, rng):
+    def draw_start(self, at, rng):
         """A point drawn from the error distribution of a fit."""
         _, force, jacobian, _ = self.evaluate(at)
         spread = np.linalg.cholesky(covariance(jacobian, force - self._indentation.force)[0])

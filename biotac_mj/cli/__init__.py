@@ -97,7 +97,7 @@ _REMEDIES = {
 }
 
 
-def _said(error) -> str:
+def _one_line(error) -> str:
     """An error in one line: cause and remedy."""
     if isinstance(error, OSError) and error.errno:
         where = f"{error.filename}: " if error.filename else ""
@@ -127,7 +127,7 @@ def _unexpected(error: Exception) -> int:
     place = traceback.extract_tb(error.__traceback__)[-1]
     print(
         f"biotac: error: unexpected {type(error).__name__} in {os.path.basename(place.filename)}, line "
-        f"{place.lineno}: {_said(error)[:200]}; BIOTAC_TRACEBACK=1 shows all of it, please report it",
+        f"{place.lineno}: {_one_line(error)[:200]}; BIOTAC_TRACEBACK=1 shows all of it, please report it",
         file=sys.stderr,
     )
     return 70
@@ -171,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, OSError, MemoryError) as error:
-        print(f"biotac: error: {_said(error)}", file=sys.stderr)
+        print(f"biotac: error: {_one_line(error)}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])

@@ -234,10 +234,10 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
 def _view(args):
     from ..view import view
 
-    view(render=args.render, seconds=args.seconds, hand=args.hand, mount=args.mount, **_seen(args))
+    view(render=args.render, seconds=args.seconds, hand=args.hand, mount=args.mount, **_displayed_skin(args))
 
 
-def _seen(args):
+def _displayed_skin(args):
     """The displayed skin."""
     check_device(args.device)
     names = ("skin", "tier", "material", "liquid", "seed", "device", "options")
@@ -300,7 +300,7 @@ def _play(args):
     from ..view import view
 
     more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)
-    view(web=True, **more, **_seen(args))
+    view(web=True, **more, **_displayed_skin(args))
 
 
 def add_hands(verbs: argparse._SubParsersAction) -> None:

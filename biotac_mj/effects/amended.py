@@ -28,7 +28,7 @@ Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as in `attach`
 _AIR = 101325.0  # [Pa]
 # parameters that the diagnosis fits to residuals and that no running sensor has: independent changes of the
 # film, the pressure or the skin, and a bus delay of PDC
-_DIAGNOSIS_ALONE = ("film", "liquid", "more", "sink", "of_pdc")
+_DIAGNOSIS_ONLY = ("film", "liquid", "more", "sink", "of_pdc")
 _ORDER = {effect.id: i for i, effect in enumerate(CATALOGUE)}
 
 
@@ -104,9 +104,11 @@ def amend(model: Model, effects: Effects) -> Model:
     if omitted:
         names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in omitted)
         warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=4)
-    alone = [f"{e.id}'s {name}" for e, theta in file.effects for name in _DIAGNOSIS_ALONE if theta.get(name)]
-    if alone:
-        warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(alone)}", stacklevel=4)
+    diagnosis_only = [
+        f"{e.id}'s {name}" for e, theta in file.effects for name in _DIAGNOSIS_ONLY if theta.get(name)
+    ]
+    if diagnosis_only:
+        warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(diagnosis_only)}", stacklevel=4)
     material = dataclasses.replace(material, **_joined(material, inside.material))
     if inside.contact or whole.air or whole.lost:
         liquid = _liquid(skin_reference(skin)[1])

@@ -26,7 +26,7 @@ class RoughFilm(FilmConduction):
     def __init__(self, film: FilmConduction, power: float):
         self.__dict__.update(film.__dict__)
         self._power = power
-        self._set_alone()
+        self._set_single()
 
 
 class SunkFilm(FilmConduction):
@@ -42,7 +42,7 @@ class SunkFilm(FilmConduction):
         to_core = film.core.closest(at)[1] - at
         gap = np.linalg.norm(to_core, axis=1, keepdims=True)
         self._sunk = to_core / np.maximum(gap, 1e-9) * np.minimum(depth, (1 - _THINNEST) * gap)
-        self._set_alone()
+        self._set_single()
 
     def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
         sunk = np.array(vert_xpos, float)

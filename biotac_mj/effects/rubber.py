@@ -67,7 +67,7 @@ class Relaxation(Effect):
     def rejection_reason(self, theta: dict) -> str | None:
         if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["g"] + 0.02:
             return "liquid"
-        return _doubt_of_film(theta, theta["g"])
+        return _film_rejection(theta, theta["g"])
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         return _relaxing(inside, theta["g"], theta["tau"])
@@ -96,7 +96,7 @@ class PowerCreep(Effect):
     def rejection_reason(self, theta: dict) -> str | None:
         if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["n"] + 0.005:
             return "liquid"
-        return _doubt_of_film(theta, 8 * theta["n"])  # of all its times together
+        return _film_rejection(theta, 8 * theta["n"])  # of all its times together
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         return all(_relaxing(inside, theta["n"] * _SLOPE, tau) for tau in _TAUS)
@@ -140,7 +140,7 @@ class Hysteresis(Effect):
     }
 
     def rejection_reason(self, theta: dict) -> str | None:
-        return _loop_of_liquid(theta)
+        return _liquid_rejection(theta)
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         return _looping(inside, theta["fraction"], theta["width"])
@@ -177,7 +177,7 @@ class LoadHysteresis(Effect):
     }
 
     def rejection_reason(self, theta: dict) -> str | None:
-        return _loop_of_liquid(theta)
+        return _liquid_rejection(theta)
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         return _looping(inside, theta["fraction"], _LOOP)
@@ -206,14 +206,14 @@ def _looping(inside, fraction, width):
     return True
 
 
-def _loop_of_liquid(theta):
+def _liquid_rejection(theta):
     """Rejection reason of a loop of the liquid's pressure without one of the force, or of its film."""
     if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["fraction"] + 0.02:
         return "liquid"
-    return _doubt_of_film(theta, theta["fraction"])
+    return _film_rejection(theta, theta["fraction"])
 
 
-def _doubt_of_film(theta, load):
+def _film_rejection(theta, load):
     """Rejection reason of a film that is delayed while the load is not (by its fraction `load`), or that
     changes by more than its delayed fraction: that is another effect."""
     late = theta.get("film", 0.0)

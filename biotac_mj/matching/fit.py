@@ -11,7 +11,7 @@ from .response import Loaded, Response
 __all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
 
 _COUNTS = 20.0  # [counts] error of an electrode that weighs as much as one sigma of a force or a prior
-_TOGETHER = 25  # rows per independent one, relative to the priors: model errors hardly change between rows
+_CORRELATED = 25  # rows per independent one, relative to the priors: model errors hardly change between rows
 _STEPS, _LEAST = 40, 16  # most and fewest joint steps
 _NESTED = 8  # fewest steps if the search starts from a nested model
 _AGAIN = (6, 14)  # steps before which all states are searched globally, as some are in a local minimum
@@ -313,18 +313,18 @@ class _Problem:
         """Levenberg-Marquardt for each row separately: states (n, 4), costs (n,)."""
         loaded, damp = self.loaded(const), np.full(len(state), 1e-2)
 
-        def look(state):
+        def evaluate(state):
             value, slope = loaded(state)
             r, counts = self.residuals(value, state, const)
             return r, self.state_slopes(slope, counts, const), (r * r).sum(1)
 
-        r, J, cost = look(state)
+        r, J, cost = evaluate(state)
         for _ in range(steps):
             H, g = np.einsum("nmi,nmj->nij", J, J), np.einsum("nmi,nm->ni", J, r)
             H = H + damp[:, None, None] * np.einsum("nii->ni", H)[:, :, None] * np.eye(4)
             new = state - np.linalg.solve(H, g[..., None])[..., 0]
             new = np.clip(new, self.response.low, self.response.high)
-            new_r, new_J, new_cost = look(new)
+            new_r, new_J, new_cost = evaluate(new)
             better = new_cost < cost
             damp = np.where(better, damp / 4, damp * 6)
             state, r = np.where(better[:, None], new, state), np.where(better[:, None], new_r, r)
@@ -357,19 +357,19 @@ def _slope(counts):
     return -counts * (1 - counts / FULL_SCALE)
 
 
-def _known_rest(design):
+def _known_baseline(design):
     """(nelectrode,) mean ln Z at rest of the known sensors."""
     return np.mean([log_impedance(counts) for counts in design.rests], axis=0)
 
 
 def _prior(setup, const, design):
     """Free constants (k,), and matrix and right-hand side of the priors: residuals P vector - at."""
-    weight, size = _COUNTS * np.sqrt(_TOGETHER), len(const._vector)
+    weight, size = _COUNTS * np.sqrt(_CORRELATED), len(const._vector)
     n, place = design.nelectrode, const._places
     free = [np.arange(n)]
     P, at = [np.zeros((n, size))], [np.zeros(n)]
     P[0][:, :n] = (np.eye(n) - 1 / n) * weight / setup.offsets
-    at[0] = P[0][:, :n] @ _known_rest(design)
+    at[0] = P[0][:, :n] @ _known_baseline(design)
     if setup.gains:
         free.append(np.arange(place.gain.start, place.gain.stop))
         P.append(np.zeros((n, size)))
@@ -398,7 +398,7 @@ def _begin(response, rows, setup):
     rows."""
     start = np.array([0.0, np.log(_TAU)])
     none = np.zeros(len(response.changes))
-    rest = _known_rest(response.states.design)
+    rest = _known_baseline(response.states.design)
     const = Constants(rest, np.ones(len(rest)), start, setup.modulus, amount=none)
     for _ in range(4):
         problem = _Problem(response, rows, const, setup)

@@ -84,12 +84,12 @@ SIGNS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def match(
-    response: Response, rows: Rows, setup: Setup | None = None, alone: bool = True
+    response: Response, rows: Rows, setup: Setup | None = None, estimate_force: bool = True
 ) -> tuple[dict, Constants]:
     """Fits constants to the first 70 % of rows and judges states of the last 30 %.
 
     Args:
-      alone: whether the force is also estimated from the electrodes only.
+      estimate_force: whether the force is also estimated from the electrodes only.
 
     Returns:
       content of `benchmarks/real_match.py`'s output, and the constants.
@@ -120,12 +120,12 @@ def match(
         "rest_counts": counts_from_log_impedance(const.offset).round(0).tolist(),
         "drift": {"size_ln_Z": const.drift[0], "tau_share_of_recording": float(np.exp(const.drift[1]))},
     }
-    if alone:
-        out["force_alone_N"] = _force_alone(response, first, fitted, last, const, setup)
+    if estimate_force:
+        out["force_alone_N"] = _force_from_electrodes(response, first, fitted, last, const, setup)
     return out, const
 
 
-def _force_alone(response, first, fitted, rows, const, setup):
+def _force_from_electrodes(response, first, fitted, rows, const, setup):
     """RMSE [N] along, across, pressing, of the force estimated from the electrodes only, and its spread.
 
     The best of several loads, refined by a parabola. The prior of a load is its frequency in the first rows,

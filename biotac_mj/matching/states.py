@@ -18,7 +18,7 @@ from ..skin.model import filled
 
 __all__ = ["PlateGrid", "PlateStates", "plate_states"]
 
-_STRIDE = 1.6e-4  # [m] step towards the core
+_STEP = 1.6e-4  # [m] step towards the core
 _DEEPEST = 4.5e-3  # [m] from first touch: more than skin and gap
 _LOST = 3  # steps without equilibrium that end a path
 
@@ -166,7 +166,7 @@ def _press(model, node, axes, drag_paths, load):
     track = [[(0.0, rest, np.zeros(3), 0.0, 0.0)] for _ in range(npath)]
     going, lost, depth = np.ones(npath, bool), np.zeros(npath, int), np.zeros(npath)
     while going.any():
-        depth[going] += _STRIDE
+        depth[going] += _STEP
         geoms.set_pose((start + depth[:, None] * push)[:, None], mat)
         step(model, data, geoms)
         wrench, pressure, x = data.wrench[:, 0, :3], data.pressure, data.vert_xpos[:, node]

@@ -124,7 +124,7 @@ class BioTacSensor:
         center = self._pos + (self._mat @ self._ipos[..., None])[..., 0]
         names = {model.body(name).id: name for name in self.cfg.poses()}
         found = {name: torch.zeros_like(applied[:, 0]) for name in names.values()}
-        for body, top in self._carried(names):
+        for body, top in self._attached(names):
             force = applied[:, body, :3]
             turning = torch.linalg.cross(center[:, body] - center[:, top], force)
             found[names[top]] += torch.cat([force, applied[:, body, 3:] + turning], dim=1)
@@ -172,8 +172,8 @@ class BioTacSensor:
         """Moves the bodies, and those fixed to them, to `poses`."""
         model, n = self.cfg.model, self.cfg.num_envs
         there = [model.body(i).name for i in range(model.nbody)]
-        told = self.cfg.poses()
-        for name, (pos, quat) in told.items():
+        poses = self.cfg.poses()
+        for name, (pos, quat) in poses.items():
             if name not in there:
                 raise ValueError(
                     f"poses name {name!r}: the model's bodies are {', '.join(filter(None, there))}"
@@ -183,14 +183,14 @@ class BioTacSensor:
                     f"poses of {name!r} have shapes {tuple(pos.shape)} and {tuple(quat.shape)}: ({n}, 3) and "
                     f"({n}, 4) are needed"
                 )
-        tops = {there.index(name): self._pose(*pose) for name, pose in told.items()}
-        for body, top in self._carried(tops):
+        tops = {there.index(name): self._pose(*pose) for name, pose in poses.items()}
+        for body, top in self._attached(tops):
             back = self._rest[1][top].T
             pos, mat = tops[top]
             self._pos[:, body] = pos + mat @ (back @ (self._rest[0][body] - self._rest[0][top]))
             self._mat[:, body] = mat @ (back @ self._rest[1][body])
 
-    def _carried(self, tops):
+    def _attached(self, tops):
         """(body, nearest of `tops` that it is or is fixed to) for all bodies fixed to one of these."""
         parent = self.cfg.model.body_parentid
         for body in range(1, self.cfg.model.nbody):

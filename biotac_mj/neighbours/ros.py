@@ -157,7 +157,7 @@ class Publisher:
 
     def _messages(self, time, reads):
         """{topic: message} of one row, from (readings of a Handle, pose) of each finger."""
-        alone, own, sensors, others = len(reads) == 1, TOPICS[self._form], [], {}
+        single, own, sensors, others = len(reads) == 1, TOPICS[self._form], [], {}
         for name, (read, pose) in zip(self._fingers, reads):
             for channel, width in _widths(self._fingers[name]).items():
                 if not (read[channel].size == width and np.isfinite(read[channel]).all()):
@@ -165,11 +165,11 @@ class Publisher:
                         f"{name}'s {channel} at {time:g} s is {read[channel]}: it cannot be sent"
                     )
             counts = {channel: value if value.size > 1 else value[0] for channel, value in read.items()}
-            sensors.append(row_of(counts, "" if alone else f"{name}_"))
+            sensors.append(row_of(counts, "" if single else f"{name}_"))
             rows = {"wrench": (force_on_object(read["contact_force"]), np.zeros(3))}
             rows |= {} if pose is None else {"object/pose": pose}
             for topic, values in rows.items():
-                place, frame = (topic, "biotac") if alone else (f"{name}/{topic}", name)
+                place, frame = (topic, "biotac") if single else (f"{name}/{topic}", name)
                 others[place] = self._make.of(topic, self._sent, time, values, frame)
         return {own: self._make.of(own, self._sent, time, sensors)} | others
 

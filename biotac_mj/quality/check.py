@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from .codes import coarse, put_back
 from .confidence import NAMED, clear, confidence
 from .fault import Fault
-from .held import held_rows
 from .lines import hum
 from .log import Log
 from .lost import dropped, jumping, unmeasured
+from .sample_hold import sample_and_hold
 from .spikes import off_rows, spikes
-from .still import dead, standing_still
+from .stuck import dead, stuck_or_clipped
 
 __all__ = ["Checked", "check", "lost_rows", "sample_faults"]
 
@@ -51,7 +51,7 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
         return Checked(log, dead(log), [])
     log, faults = put_back(log)
     weak = []
-    for find in (off_rows, unmeasured, coarse, dead, held_rows, hum, standing_still, spikes):
+    for find in (off_rows, unmeasured, coarse, dead, sample_and_hold, hum, stuck_or_clipped, spikes):
         for fault in find(_less(log, faults), faults):
             fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)

@@ -18,8 +18,8 @@ _GUESS = (0.02, 0.98)  # fraction of repeated rows within which a rate can be es
 _TREMBLE = 0.3
 # segments of a log; fewest rows to compare; difference of their sampling intervals (at most 0.0003 with a
 # correct clock)
-_PARTS, _ROWS, _PACE = 8, 400, 0.1
-_GOES_ON = 4.0  # times the usual change between rows, of the median channel
+_SEGMENTS, _ROWS, _PACE = 8, 400, 0.1
+_CONTINUES = 4.0  # times the usual change between rows, of the median channel
 
 
 def usual_step(time: np.ndarray) -> tuple[float, float]:
@@ -89,18 +89,18 @@ def clock_faults(
     """
     missing, found = missing_rows(time) if complete else None, []
     if missing is not None and counts is not None:
-        missing, found = _leaps(missing, time, counts)
-    return missing, found + _paces(time)
+        missing, found = _clock_jumps(missing, time, counts)
+    return missing, found + _pace_fault(time)
 
 
-def _leaps(missing, time, counts):
+def _clock_jumps(missing, time, counts):
     """Missing rows (n,) without gaps longer than the log across which the channels change no more than
     between neighbouring rows: there the clock jumps."""
     step = np.abs(np.diff(counts, axis=0))
     usual = np.maximum(np.median(step, axis=0), 1.0)
     found = []
     for row in np.flatnonzero(missing > len(counts)):
-        if np.median(step[row - 1] / usual) < _GOES_ON:
+        if np.median(step[row - 1] / usual) < _CONTINUES:
             missing[row] = 0
             text = (
                 f"{CLOCK_FAULT}leaps by {time[row] - time[row - 1]:.4g} s before row {row + 1}, "
@@ -110,13 +110,13 @@ def _leaps(missing, time, counts):
     return missing, found
 
 
-def _paces(time):
+def _pace_fault(time):
     """Fault of a clock whose sampling interval differs between segments of the log."""
     step = np.diff(time)
     if len(step) < _ROWS:
         return []
     pace = []
-    for part in np.array_split(step, _PARTS):  # gaps are a separate fault
+    for part in np.array_split(step, _SEGMENTS):  # gaps are a separate fault
         middle = np.median(part)
         pace.append(part[(part < 1.5 * middle) & (part > 0.5 * middle)].mean())
     if max(pace) < (1 + _PACE) * min(pace):

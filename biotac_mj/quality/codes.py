@@ -126,8 +126,8 @@ def _spacing(x):
     if often.sum() < 3:
         return np.nan
     gap = np.diff(value)
-    alone = np.minimum(np.append(gap, gap[-1]), np.insert(gap, 0, gap[0]))[often] > 1
-    return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
+    isolated = np.minimum(np.append(gap, gap[-1]), np.insert(gap, 0, gap[0]))[often] > 1
+    return float(np.median(gap[often[:-1]])) if isolated.mean() > 0.8 else 1.0
 
 
 def mostly_coarse(log: Log, faults: Sequence[Fault]) -> bool:
@@ -168,7 +168,7 @@ def put_back(log: Log) -> tuple[Log, list[Fault]]:
 def _overflowing(x):
     """Modulus (a power of two) at which channels x (n, c) wrap, and the channels that do: those that leave
     and return, and, if some surely wrap, also those that do not return."""
-    noise, x = noise_level(x), _less_ends(x)
+    noise, x = noise_level(x), _without_rails(x)
     for band in 2.0 ** np.array(_BITS):
         both, once, nats = [], [], 0.0
         for k in range(x.shape[1]):
@@ -182,7 +182,7 @@ def _overflowing(x):
                 and np.ptp(x[rows[0] + 1 :, k]) < band
             ):
                 once.append(k)
-            away = band >= _LARGE and len(mine) == 2 and _once(x[:, k], mine, band)
+            away = band >= _LARGE and len(mine) == 2 and _is_single_overflow(x[:, k], mine, band)
             if not away and len(mine) < max(_TIMES, _FRACTION * len(rows)):
                 continue
             after = x[mine[0] + 1 :, k]
@@ -193,8 +193,8 @@ def _overflowing(x):
             few = away or 2 * same <= len(ends)
             # minus one band, an overflow is an ordinary step; a spike of nearly that size is not
             usual = np.quantile(np.delete(np.abs(step), rows), _USUAL) + 1
-            goes_on = away or np.median(remainder[remainder < _NEAR * band]) <= usual
-            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few and goes_on:
+            continues = away or np.median(remainder[remainder < _NEAR * band]) <= usual
+            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few and continues:
                 both.append(k)
                 near = np.maximum(remainder[remainder < _NEAR * band], noise[k]) + 1
                 nats -= np.log(2 * near / band).sum() + (4 * np.log(_NEAR) if away else 0)
@@ -203,7 +203,7 @@ def _overflowing(x):
     return 0.0, np.zeros(0, int)
 
 
-def _less_ends(x):
+def _without_rails(x):
     """Counts x (n, c); a value that repeats at an end of the converter is replaced by the one before. Nothing
     is measured there, while a word that overflows keeps its noise."""
     same = np.diff(x, axis=0) == 0
@@ -213,7 +213,7 @@ def _less_ends(x):
     return np.take_along_axis(x, last, axis=0)
 
 
-def _once(x, rows, band):
+def _is_single_overflow(x, rows, band):
     """Whether x (n,), which leaves after the first and returns after the second of two rows, goes from one
     end of a band to the other. Spikes and broken wires do not start and end there."""
     ends = x[[rows[0], rows[0] + 1, rows[1], rows[1] + 1]] % band / band

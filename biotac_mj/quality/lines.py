@@ -62,7 +62,7 @@ def _line(log):
 
 def _line_by(log, read):
     """Strongest line in the rows with read (n,) bool, taken as evenly sampled."""
-    x = _between(log.counts[read], log.masked[read].all(1))
+    x = _interpolated(log.counts[read], log.masked[read].all(1))
     n, rate = len(x), log.rate * read.mean()
     size = int(min(n // 4, _SIZE[1]))
     if size < _SIZE[0]:
@@ -76,7 +76,7 @@ def _line_by(log, read):
     fine = fine[fine <= 0.5 * rate]  # higher frequencies are aliases
     lines = (np.abs(zoom_fft(y, fine[[0, -1]], len(fine), fs=rate, endpoint=True, axis=0)) ** 2).sum(1)
     frequency = float(fine[int(np.argmax(lines))])
-    gain, amplitude = _foretold(y, frequency, rate)
+    gain, amplitude = _phase_prediction(y, frequency, rate)
     there = gain >= np.quantile(gain, 1 - _THERE)  # it may start late or be intermittent
     p = sign_flip(gain)
     if p > 0.01 or gain[there].min() < 1:
@@ -94,7 +94,7 @@ def _line_by(log, read):
             "frequency": (frequency, frequency - width, frequency + width),
             "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
         },
-        correct=lambda counts: _taken_out(counts, read, channels, frequency, rate),
+        correct=lambda counts: _without_line(counts, read, channels, frequency, rate),
         detector="line",
         features={"score": min(float(np.log(score)), _PLAIN)},
         nats=float(gain.sum()),
@@ -122,10 +122,10 @@ def _peak(x, size, rate):
     ratio = power / np.maximum(smooth, 1e-9)
     # within the load's band a line must exceed the rhythm of a movement by far
     ratio /= np.where(f > 1.15 * band, 1.0, _RHYTHM)[:, None]
-    together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
+    common = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
     every = list(range(x.shape[1]))
     best = None
-    many = [(every, together * 3)] if len(every) > 1 else []
+    many = [(every, common * 3)] if len(every) > 1 else []
     for who, score in [*many, *(([k], ratio[:, k]) for k in every)]:
         i = int(np.argmax(np.where(inside, score, 0)))
         if best is None or score[i] > best[0]:
@@ -139,7 +139,7 @@ def _peak(x, size, rate):
     return score, frequency, channels, band
 
 
-def _foretold(y, frequency, rate):
+def _phase_prediction(y, frequency, rate):
     """Prediction of a line's phase in each block from its neighbours: gain (blocks,) [nats] for differences y
     (n, c) of channels, and amplitude (blocks, c)."""
     wave = np.exp(2j * np.pi * frequency * np.arange(len(y) + 1) / rate)
@@ -163,7 +163,7 @@ def _foretold(y, frequency, rate):
     return gain, np.array(amplitude)
 
 
-def _taken_out(counts, read, channels, frequency, rate):
+def _without_line(counts, read, channels, frequency, rate):
     """Counts (n, c) minus a line whose phase and size may change within seconds."""
     turn = np.exp(-2j * np.pi * frequency * np.arange(read.sum()) / rate)[:, None]
     y = counts[np.ix_(read, channels)]
@@ -180,7 +180,7 @@ def _smooth(x, rows):
     return uniform_filter1d(uniform_filter1d(x, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")
 
 
-def _between(x, gone):
+def _interpolated(x, gone):
     """x (n, c) with invalid rows gone (n,) interpolated linearly."""
     if not gone.any() or gone.all():
         return x

@@ -119,10 +119,10 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
     around = np.maximum(percentile_filter(score, 90, size=81), 1)
     places = [
         i
-        for i in _alone(score, around)
+        for i in _isolated(score, around)
         if all(abs(rows[i + _LINE] / log.rate - start) > _BEGUN for start in begun)
     ]
-    places = _in_order(_lively(log, x, rows, places), x, before, after)
+    places = _in_order(_not_after_repeats(log, x, rows, places), x, before, after)
     if not places:
         return []
     # equal changes on all channels come from the supply, not from a load
@@ -141,7 +141,7 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
         "times": float(np.clip(np.max(score[chosen] / around[chosen]), 12, 30)),
         "score": float(np.log(score[chosen].max())),
     }
-    return [_or_not(log, found, rows, chosen + _LINE, noise, x)]
+    return [_alternative(log, found, rows, chosen + _LINE, noise, x)]
 
 
 def _ends(x):
@@ -155,14 +155,14 @@ def _ends(x):
     return before[:-h], after[h:], np.sqrt(2 * (end**2).sum())
 
 
-def _alone(score, around):
+def _isolated(score, around):
     """Places whose score exceeds those around, by decreasing ratio."""
     times = np.where(score > _SCORE, score / around, 0.0)
     places, _ = find_peaks(times, height=_TIMES, distance=_APART)
     return places[np.argsort(-times[places], kind="stable")].tolist()
 
 
-def _lively(log, x, rows, places):
+def _not_after_repeats(log, x, rows, places):
     """Places that do not follow repeated or jittering rows, after which the load has moved on."""
     bend = np.abs(np.diff(x, n=3, axis=0))
     usual = np.maximum(np.median(bend, axis=0), 0.5)
@@ -206,11 +206,11 @@ def _moved(log):
     return bool(np.median(np.sqrt(np.sort(power)[-max(1, log.some(6)) :])) >= _MOVED)
 
 
-def _or_not(log, found, rows, at, noise, x):
+def _alternative(log, found, rows, at, noise, x):
     """The fault, or another one if evidence is against missing rows: signals of the other device must jump
     too, and the rows before must precede those after. x: rows (n, c) as read; rows: by decreasing score."""
     if log.other_device is not None:
-        leaps = np.median([_leap(log.other_device, int(row)) for row in rows[at[:_PLAINEST]]])
+        leaps = np.median([_relative_jump(log.other_device, int(row)) for row in rows[at[:_PLAINEST]]])
         id_, why = ("lost_rows", "") if leaps > _LEAPS else ("jump", "and the force does not")
     elif log.missing is not None:
         id_, why = "jump", "and the clock runs on"
@@ -227,7 +227,7 @@ def _or_not(log, found, rows, at, noise, x):
     return found
 
 
-def _leap(signal, row):
+def _relative_jump(signal, row):
     """Change of signal (n, k) at a row over its usual change, for the most active component."""
     before, after = _END + 1, _END - 1
     at = np.clip(np.r_[row, np.arange(10, len(signal) - 10, 7)], before, len(signal) - after)

@@ -20,6 +20,6 @@ def repeated_rows(counts: np.ndarray) -> np.ndarray:
     equal = np.diff(counts, axis=0) == 0
     same = np.concatenate([[False], equal.sum(1) >= least])
     single = equal.mean(0)
-    alone = np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1)
-    chance = np.prod(np.sort(alone)[::-1][:least])
+    by_channel = np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1)
+    chance = np.prod(np.sort(by_channel)[::-1][:least])
     return same if same.mean() > 20 * chance else np.zeros(n, bool)

@@ -23,9 +23,9 @@ _RARE = 1e-5  # fraction of such rows by chance
 # channels that one cable may affect, and least ratio of their spikes to others': if more channels have as
 # many, the cause is a common one
 _CABLE, _MORE = 3, 1.4
-_TOGETHER = 0.5  # fraction of samples of two channels in the same rows above which they have one cause
+_COINCIDENT = 0.5  # fraction of samples of two channels in the same rows above which they have one cause
 _OFTEN_EACH = 3  # most of these per channel
-_ADJACENT, _HELD = 0.1, 0.3  # fraction of outliers side by side, without and with repeated rows
+_ADJACENT, _REPEATED = 0.1, 0.3  # fraction of outliers side by side, without and with repeated rows
 _GONE = 100  # [counts] by which most channels leave for a row: no load does that
 _MOST = 12  # channels of 19 that leave and return at once: no touch lasts one or two rows
 _SPAN = 7  # rows of the running median
@@ -47,11 +47,11 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     own = (far.sum(0) >= _TIMES) & (number > _MORE * (1 + ordered[-1 - _CABLE]))
     own &= (far.sum(0) >= _TIMES).sum() <= _CABLE
     found = []
-    for alike in _together(bad):
+    for alike in _coincident(bad):
         k = int(alike[0])
-        if _in_a_row(log, bad[:, k]):
+        if _consecutive(log, bad[:, k]):
             if far[:, k].sum() >= _TIMES:
-                found.append(_loose(log, k, bad[:, k]))
+                found.append(_loose_contact(log, k, bad[:, k]))
             continue
         mask = np.zeros(x.shape, bool)
         mask[:, alike] = bad[:, alike]
@@ -68,7 +68,7 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         if own[k]:
             _by_far(one, far[:, k], log)
         found.append(one)
-    return found + _anywhere(log, far)
+    return found + _scattered(log, far)
 
 
 def _spikes(log, channels, mask, number, message, strength):
@@ -87,7 +87,7 @@ def _spikes(log, channels, mask, number, message, strength):
     )
 
 
-def _loose(log, k, bad):
+def _loose_contact(log, k, bad):
     """Fault of channel k, whose samples bad (n,) leave the signal for more than one row."""
     rows = np.flatnonzero(bad)
     message = (
@@ -96,13 +96,13 @@ def _loose(log, k, bad):
     return Fault("contact", (k,), rows[0] / log.rate, rows[-1] / log.rate, message)
 
 
-def _together(bad):
+def _coincident(bad):
     """Channels with a few outliers bad (n, c) bool, each with those that have them in the same rows. Healthy
     sensors have none, so these are no evidence against each other. Most samples first."""
     number = bad.sum(0)
     near = maximum_filter1d(bad.astype(np.int8), 3, axis=0)
     fraction = bad.T.astype(float) @ near / np.maximum(number, 1)[:, None]
-    alike = np.minimum(fraction, fraction.T) >= _TOGETHER
+    alike = np.minimum(fraction, fraction.T) >= _COINCIDENT
     unassigned, out = number >= _TIMES, []
     for k in np.argsort(-number, kind="stable"):
         if unassigned[k]:
@@ -112,14 +112,14 @@ def _together(bad):
     return out
 
 
-def _in_a_row(log, bad):
+def _consecutive(log, bad):
     """Whether outliers (n,) bool are often consecutive: a loose contact or an overflow lasts longer than a
     sample. Rows that the logger repeats count as one, unless too many repeat."""
     rows = np.flatnonzero(bad)
     fresh = np.unique(np.cumsum(~log.repeated)[rows])
     return any(
         np.count_nonzero(np.diff(at) == 1) > max(1, fraction * len(at))
-        for at, fraction in ((fresh, _ADJACENT), (rows, _HELD))
+        for at, fraction in ((fresh, _ADJACENT), (rows, _REPEATED))
     )
 
 
@@ -129,7 +129,7 @@ def _by_far(fault, far, log):
     fault.detector = "far"
 
 
-def _anywhere(log, far):
+def _scattered(log, far):
     """Finds rare outliers far (n, c) bool in any channel: bits or words lost in transmission."""
     number = far.sum(0)
     hit = np.flatnonzero(number)

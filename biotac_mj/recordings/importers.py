@@ -104,7 +104,7 @@ def load(
         )
     if not groups and not done:
         groups.append([])
-    for group in _together(_with_electrodes(groups)):
+    for group in _merge_row_by_row(_with_electrodes(groups)):
         done += join([*group, *shared], rate, object_name, scale)
     if companion_files:
         names = ", ".join(path.name for path in companion_files[:4]) + (
@@ -143,7 +143,7 @@ def _meet(part, other):
     return part.time[0] <= other.time[-1] and other.time[0] <= part.time[-1]
 
 
-def _together(groups):
+def _merge_row_by_row(groups):
     """Groups of parts; those without times and of equal length are merged: sensors logged row by row."""
     out = {}
     for k, group in enumerate(groups):

@@ -6,10 +6,10 @@ from ..quality.check import check
 from ..quality.clock import CLOCK_FAULT, clock_faults
 from ..quality.fault import Fault
 from ..quality.log import Log
-from ..quality.still import dead
+from ..quality.stuck import dead
 from ..sensor.channels import FULL_SCALE
 from .recording import CHANNELS, CLOCKED, REST_LIKE, Recording, check_recording
-from .tared import on_a_rest
+from .tared import with_baseline
 
 __all__ = ["check_clock", "doubts", "faults", "findings", "warnings"]
 
@@ -103,7 +103,7 @@ def _log(recording):
     missing, wrong = check_clock(recording, value)
     force = recording.force
     log = Log(
-        on_a_rest(value[whole]) if unit.startswith("tared") else value[whole],
+        with_baseline(value[whole]) if unit.startswith("tared") else value[whole],
         recording.rate,
         recording.rate_source == CLOCKED,
         missing=None if missing is None else missing[whole],

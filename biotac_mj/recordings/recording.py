@@ -22,7 +22,7 @@ from ..sensor.channels import (
     log_impedance,
 )
 from ..short_repr import short_repr
-from .tared import on_a_rest
+from .tared import with_baseline
 
 __all__ = [
     "CLOCKED",
@@ -217,7 +217,7 @@ class Recording:
                 f"{self.name}: the electrodes look like {unit} values; raw counts 0..4095 are needed: import "
                 "them again with --scale, counts for one of their units"
             )
-        return on_a_rest(self.electrodes), [
+        return with_baseline(self.electrodes), [
             f"electrodes are {unit}: put on the mean rest of the published sensors, an assumption"
         ]
 

@@ -5,13 +5,13 @@ import numpy as np
 from ..geometry.design import BIOTAC, design_of_channels
 from ..sensor.channels import FULL_SCALE
 
-__all__ = ["on_a_rest"]
+__all__ = ["with_baseline"]
 
 _EDGE = 1.0  # [counts] distance of the results from the ends of the converter
 _WHOLE = 0.02  # [counts] rounding of logs of whole counts minus a mean
 
 
-def on_a_rest(values: np.ndarray) -> np.ndarray:
+def with_baseline(values: np.ndarray) -> np.ndarray:
     """(n, nelectrode) counts from tared values (n, nelectrode): plus the mean rest counts of known sensors,
     shifted as little as keeps all of an electrode's values off the ends of the converter. If values differ by
     whole counts, as after subtraction of a mean, the results are whole."""

@@ -19,7 +19,7 @@ from ..sensor.film import FilmConduction
 from ..skin import PRESETS, Material, SkinOptions
 from .touch import MOST, Touch
 
-__all__ = ["PLATE", "fitted_touches", "plate_way"]
+__all__ = ["PLATE", "fitted_touches", "plate_path"]
 
 PLATE = "geom:plane"
 _LOADED = 0.5  # [N] least force for a fitted pose, as in `matching`
@@ -30,7 +30,7 @@ _EVERY = 10  # every tenth loaded row is used for the fit of the constants
 _FEWEST = 8  # rows of a touch
 
 
-def plate_way(
+def plate_path(
     geometry: SkinGeometry, state: np.ndarray, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A plate's poses (n, 3) [m] and (n, 3, 3) through states (n, 4) at depths (n,) from first touch [m], and
@@ -124,7 +124,7 @@ def _touch(recording, found, rows, state, force, const, states: PlateStates, geo
     n = geometry.design.nelectrode
     deep = Response(states, np.repeat(states.depth[..., None], n, -1))
     depth = np.maximum(deep.at_load(force[:, 2] / const.modulus)(state, False)[0][:, 0], 0.0)
-    pos, mat, axes = plate_way(geometry, state, depth)
+    pos, mat, axes = plate_path(geometry, state, depth)
     push = state[0, 2] * axes[0, 0] + state[0, 3] * axes[0, 1] + axes[0, 2]
     time = recording.time[rows]
     step = np.median(np.diff(time))

@@ -233,9 +233,9 @@ class _Drive:
 
     def _begin(self, members, pool, say):
         """Simulates touches; for each: (fields, index, pending readings)."""
-        together = [members] if self._model.device.is_cuda else [[i] for i in members]
+        groups = [members] if self._model.device.is_cuda else [[i] for i in members]
         out = []
-        for group in together:
+        for group in groups:
             touches = [self.touches[i] for i in group]
             longest = max(len(touch.time) for touch in touches)
             time = [_longer(touch.time, longest) for touch in touches]

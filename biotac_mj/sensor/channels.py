@@ -68,7 +68,7 @@ _TDC_SCALE, _ZERO_CELSIUS = 4025.0, 273.15  # [K]
 _TAC_SCALE = -41.07  # [C/s]
 # MEASURED: fraction of the formula's slope at mid-scale that recordings show: 1537 counts per C/s, from TAC
 # and TDC of 30 traces of two sensors (PHAC-2, holds of steel, acrylic and sponge), instead of 6603.
-_TAC_SHARE = 0.233
+_TAC_FRACTION = 0.233
 _HOTTEST = -0.1  # [C/s] of the manual's formula at which TAC's circuit saturates
 # MEASURED: noise of a resting PAC, n[i] = PAC_COLOUR n[i - 1] + PAC_NOISE white [counts]. Fitted to the
 # spectrum, 25 to 1000 Hz, of 7.6 s of a resting BioTac SP (native log); error in 25 Hz bands at most 1.3 dB,
@@ -144,7 +144,7 @@ def temperature_exponent(temperature: ArrayLike) -> np.ndarray:
 def heating_exponent(rate: ArrayLike) -> np.ndarray:
     """The manual's logarithm for TAC at dT/dt [C/s] above the value at mid-scale (see
     `heating_from_counts`)."""
-    total = np.float64(_TAC_SHARE) * rate + np.float64(_STEADY)
+    total = np.float64(_TAC_FRACTION) * rate + np.float64(_STEADY)
     # As the total approaches zero from below, the counts vanish; above zero the circuit is saturated.
     return np.float64(_TAC_SCALE) / np.where(total < np.float64(_HOTTEST), total, np.float64(_HOTTEST))
 
@@ -165,7 +165,7 @@ def heating_from_counts(counts: ArrayLike) -> np.ndarray:
     The manual's -41.07 / ln((155183 - 46555 r) / r), r = TAC / 4095, is never zero, so it cannot be an
     absolute rate. The difference from its value at mid-scale, where TAC rests, is zero in the steady state.
     Divided by the measured fraction of the slope it spans -1.1 to +3.4 C/s; cooling raises TAC."""
-    return (_TAC_SCALE / _thermistor_log(counts) - _STEADY) / _TAC_SHARE
+    return (_TAC_SCALE / _thermistor_log(counts) - _STEADY) / _TAC_FRACTION
 
 
 def electrode_noise(counts: ArrayLike) -> np.ndarray:

@@ -124,7 +124,7 @@ class BioTac(composer.Entity):
         check_geoms("thermal", sensor.thermal, read_thermal)
         check_geoms("textures", sensor.textures, read_texture)
         # settings by geom are resolved later: the arena is not here yet
-        alone = dataclasses.replace(
+        without_geoms = dataclasses.replace(
             chosen,
             contact=dataclasses.replace(chosen.contact, geoms=None, rounding=None),
             sensor=dataclasses.replace(
@@ -135,7 +135,7 @@ class BioTac(composer.Entity):
             ),
         )
         spec = mujoco.MjSpec()
-        self.handle = attach(spec, body="world", prefix=_PREFIX, slots=slots, settings=alone)
+        self.handle = attach(spec, body="world", prefix=_PREFIX, slots=slots, settings=without_geoms)
         with plugin.explained():
             spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())

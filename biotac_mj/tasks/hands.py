@@ -373,7 +373,7 @@ def _replace(spec, link, mount, own):
         geom.contype = geom.conaffinity = 0
         geom.mass, geom.material, geom.rgba[3] = 0.0, "", 0.0
         for pair in [p for p in spec.pairs if geom.name and geom.name in (p.geomname1, p.geomname2)]:
-            _let_touch(spec, pair.geomname2 if pair.geomname1 == geom.name else pair.geomname1, own)
+            _enable_contact(spec, pair.geomname2 if pair.geomname1 == geom.name else pair.geomname1, own)
             spec.delete(pair)
     for geom in shown:
         geom.group = 0
@@ -408,7 +408,7 @@ def fixed_geoms(
     return out
 
 
-def _let_touch(spec, name, own):
+def _enable_contact(spec, name, own):
     """Lets skins touch a geom that collided only in pairs, through the collision bit of BioTacs."""
     geom = spec.geom(name)
     if geom is None or geom.contype or geom.conaffinity or geom.parent.name in own:

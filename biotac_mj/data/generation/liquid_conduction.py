@@ -75,7 +75,7 @@ class LiquidConduction:
         self.core_point, self.normal = point, normal
         self._pair = self._pairs_within(np.arange(len(point)))
         gap = self.gap(geometry.vert, rest=True)
-        triangle, keep = _wet_part(triangle, gap > _WET, disc)
+        triangle, keep = _wet_component(triangle, gap > _WET, disc)
         number = np.full(len(point), -1)
         number[keep] = np.arange(len(keep))
         self.core_point, self.normal, self.triangle, disc = (
@@ -238,7 +238,7 @@ def _smooth_normals(point, triangle):
     return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
 
 
-def _wet_part(triangle, wet, disc):
+def _wet_component(triangle, wet, disc):
     """The connected wet triangles under the first electrode (m, 3) and their nodes (k,)."""
     from scipy.sparse.csgraph import connected_components
 

@@ -55,7 +55,7 @@ def make_shards(
     from .readings import THREADS
 
     cuda, several = options.devices[0] != "cpu", len(options.devices) > 1
-    alone = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
+    own_gpu = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
     cores = workers if ray is not None else -(-workers // len(options.devices))
     processes = one_per_gpu(options.devices) if several else None
     steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
@@ -65,7 +65,7 @@ def make_shards(
         cores = 0
     if processes or ray is not None:
         tasks.sort(key=lambda task: not task.value.measured)  # longest first
-    work = MakeShards(options, settings, "cuda:0" if alone else options.device, cores)
+    work = MakeShards(options, settings, "cuda:0" if own_gpu else options.device, cores)
     seconds = {}
     for spent in run_tasks(
         work,

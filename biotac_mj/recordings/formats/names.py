@@ -93,23 +93,23 @@ def place_of(name: str) -> Place | None:
         if not found:
             continue
         parts = found.groupdict()
-        who = (parts["who"] or "").strip("_")
+        prefix = (parts["who"] or "").strip("_")
         if field in _CHANNELS:
             number = parts.get("n")
             whole = parts.get("whole")
             if whole:
-                who = plain[: -len(whole)].strip("_")
-            return Place(who, field, int(number) if number else None)
+                prefix = plain[: -len(whole)].strip("_")
+            return Place(prefix, field, int(number) if number else None)
         axis, whole = parts["axis"], parts["whole"]
-        who = plain[: -len(whole)] if whole else who
-        body, who = _body(who.strip("_"))
+        prefix = plain[: -len(whole)] if whole else prefix
+        body, prefix = _split_body(prefix.strip("_"))
         if field in ("pos", "quat"):
             point = plain in ("px", "py", "pz")
             field = f"{'contact' if point else body or 'sensor'}_{field}"
             if field == "contact_quat":
                 return None
         column = None if whole else (_QUATERNION if field.endswith("quat") else _AXES)[axis]
-        return Place(who, field, column)
+        return Place(prefix, field, column)
     return None
 
 
@@ -129,14 +129,14 @@ def unit_named(unit: str) -> tuple[str, float]:
     return next((known for known in _UNITS.values() if known[0] == unit), ("", 1.0))
 
 
-def _body(who):
+def _split_body(prefix):
     """(body, remainder) of the prefix of a force or pose."""
-    who = re.sub(r"(^|_)(wrench|pose|data|transform)(?=_|$)", "", who).strip("_")
+    prefix = re.sub(r"(^|_)(wrench|pose|data|transform)(?=_|$)", "", prefix).strip("_")
     for body, pattern in _BODIES.items():
-        remainder = re.sub(rf"(^|_)({pattern})(?=_|$)", "", who)
-        if remainder != who:
+        remainder = re.sub(rf"(^|_)({pattern})(?=_|$)", "", prefix)
+        if remainder != prefix:
             return body, remainder.strip("_")
-    return "", who
+    return "", prefix
 
 
 def _plain(name):

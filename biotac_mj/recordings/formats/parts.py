@@ -208,11 +208,11 @@ def _clock_name(columns):
     clock."""
     clocks = (name for name in columns if is_time(name) and place_of(name) is None)
     named = next((name for name in clocks if np.size(columns[name])), None)
-    stamps = (name for name in columns if is_stamp(name) and _goes_on(columns[name]))
+    stamps = (name for name in columns if is_stamp(name) and _increases(columns[name]))
     return named or next(stamps, None)
 
 
-def _goes_on(value):
+def _increases(value):
     value = np.ravel(value)
     return (
         value.dtype.kind in "iuf" and len(value) > 1 and (np.diff(value) >= 0).all() and value[0] < value[-1]
@@ -333,15 +333,15 @@ def join(
     names = {part.sensor for part in sensors}
     common = os.path.commonprefix(sorted(names)).rpartition("_")[0] if len(names) > 1 else ""
     made, taken = [], {}
-    whose = {id(one): _owners(one, sensors) for one in others}
+    owners = {id(one): _owners(one, sensors) for one in others}
     common_to_all = [
         one
         for one in others
-        if not whose[id(one)] and one.sensor not in names and not (one.has_channels and one.sensor)
+        if not owners[id(one)] and one.sensor not in names and not (one.has_channels and one.sensor)
     ]
     doubtful = _doubtful(common_to_all) if len(sensors) > 1 else set()
     for part in sensors:
-        mine = [one for one in others if part in whose[id(one)]]
+        mine = [one for one in others if part in owners[id(one)]]
         mine += [_without(one, doubtful) for one in common_to_all]
         stem = part.source.split(".")[0]
         many = sum(p.source == part.source for p in sensors) > 1
@@ -444,8 +444,8 @@ def _rows_clock(sensors, part, rate):
         return np.arange(n) / rate, "given"
     if part.rate is not None:
         return np.arange(n) / part.rate, "the format's"
-    together = [one.fields["electrodes"] for one in sensors if len(one) == n and "electrodes" in one.fields]
-    guess, why = guessed_rate(*together)
+    electrodes = [one.fields["electrodes"] for one in sensors if len(one) == n and "electrodes" in one.fields]
+    guess, why = guessed_rate(*electrodes)
     return np.arange(n) / guess, why
 
 
@@ -498,8 +498,8 @@ def _clock(name, time):
             f"{CLOCK_FAULT}runs back {len(back)} times, by {usual - step[back].min():.3g} s at most, first "
             f"in row {rows[back[0] + 1]}: rows until it had caught up were left out"
         )
-    ahead = np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])) if len(time) else time
-    keep = time > ahead
+    latest = np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])) if len(time) else time
+    keep = time > latest
     if (~keep).any():
         fraction = (~keep).mean()
         if fraction > 0.5:

@@ -6,7 +6,7 @@ import re
 __all__ = ["companions", "is_companion", "object_of", "rate_of"]
 
 # File name -> names of files logged with it.
-_TOGETHER = (
+_COMPANIONS = (
     (re.compile(r"(.+)_bio(\.csv(?:\.gz)?)"), (r"\1_cp\2", r"\1_cw\2")),  # slides over materials
     (re.compile(r"sense_R_[LR]F(\.txt(?:\.gz)?)"), (r"position\1", r"orientation\1")),  # scraping
 )
@@ -23,7 +23,7 @@ def is_companion(path: pathlib.Path) -> bool:
 
 def companions(path: pathlib.Path) -> list[pathlib.Path]:
     """Other files that belong to this one."""
-    for pattern, others in _TOGETHER:
+    for pattern, others in _COMPANIONS:
         found = pattern.fullmatch(path.name)
         if found:
             candidates = [path.parent / found.expand(other) for other in others]

@@ -139,12 +139,12 @@ ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
         self._set_mesh()
         self._set_discs()
         self.cell_constant = self.rest = np.ones(design.nelectrode)
-        self._set_alone()
+        self._set_single()
         self.rest = self.impedance(geometry.vert)
         if sensor is not None:
             self.cell_constant = impedance_from_counts(sensor.rest) / self.rest
             self.rest = self.cell_constant * self.rest
-            self._set_alone()
+            self._set_single()
 
     def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
         """Impedance of E1, E2, ...
@@ -173,7 +173,7 @@ ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
         x, valid, impedance, local = self._views
         with self._lock:
             x[:, 0] = vert_xpos
-            for launch in self._solve_alone:
+            for launch in self._solve_single:
                 launch()
             if valid[0]:  # then all positions are finite
                 return impedance[0].copy()
@@ -212,8 +212,8 @@ ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
         self._check_finite(vert_xpos)
         with self._lock:
             self._views[0][:, 0] = vert_xpos
-            self._alone.lay(self._x, self._now)
-            return self._alone.middle.numpy()[:, 0].copy(), self._alone.thickness.numpy()[:, 0].copy()
+            self._single.lay(self._x, self._now)
+            return self._single.middle.numpy()[:, 0].copy(), self._single.thickness.numpy()[:, 0].copy()
 
     def _check_finite(self, vert_xpos):
         finite = np.isfinite(vert_xpos[self.node]).all(axis=1)
@@ -224,15 +224,15 @@ ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
                 "the skin's step did not converge; keep the last good state"
             )
 
-    def _set_alone(self):
+    def _set_single(self):
         """Makes the arrays of one world on the CPU, for one thread at a time."""
-        self._alone, self._lock = BatchFilm(self, 1), threading.Lock()
+        self._single, self._lock = BatchFilm(self, 1), threading.Lock()
         self._x, self._now = (
             wp.zeros((self.geometry.nvert, 1), dtype=vec3, device="cpu"),
             wp.ones(1, dtype=int, device="cpu"),
         )
-        self._solve_alone = self._alone.recorded(self._x, self._now)
-        arrays = self._x, self._alone.valid, self._alone.impedance, self._alone.local
+        self._solve_single = self._single.recorded(self._x, self._now)
+        arrays = self._x, self._single.valid, self._single.impedance, self._single.local
         self._views = [array.numpy() for array in arrays]
 
     def _set_mesh(self):

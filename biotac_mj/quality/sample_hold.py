@@ -12,7 +12,7 @@ from .fault import Fault
 from .log import Log
 from .noise import sound_noise
 
-__all__ = ["held_rows"]
+__all__ = ["sample_and_hold"]
 
 _HAND = 10.0  # [Hz] bandwidth of a load moved by hand, which a log must resolve
 _WINDOW = 24  # rows of a window in which the few new values stand out
@@ -29,7 +29,7 @@ _UNEVENLY = 0.02
 _HEIGHT = 1.3  # of the noise: change at a new reading; sqrt(2) if nothing moves
 
 
-def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
+def sample_and_hold(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Finds rows that repeat longer or less evenly than a slow bus explains, and steps with only white noise
     between them."""
     n = len(log)
@@ -138,16 +138,16 @@ def _dithered(log):
         return []
     usual = np.maximum(np.median(step, axis=0), 0.5)
     jump = step > 3 * usual
-    if _goes_on(jump[:, known], change[:, known]):
+    if _is_load(jump[:, known], change[:, known]):
         return []
     law = sound_noise(np.median(log.counts[rows], axis=0))
     height = [np.median(step[jump[:, e], e]) / law[e] for e in known if jump[:, e].any()]
     # the median over rows also jumps, by less than the noise
     if np.median(np.nanmedian(uneven[:, known], axis=0)) > _UNEVEN or np.median(height or [0.0]) < _HEIGHT:
         return []
-    mask, together = None, jump.mean(1) > 0.25
-    if jump[together].sum() > 0.8 * jump.sum():  # all channels at once: no jitter between
-        mask = _between(log.counts, 3 * usual)
+    mask, simultaneous = None, jump.mean(1) > 0.25
+    if jump[simultaneous].sum() > 0.8 * jump.sum():  # all channels at once: no jitter between
+        mask = _hardly_changed(log.counts, 3 * usual)
     seconds = float(1 / (log.rate * jump[:, known].mean()))
     message = f"all electrodes take a new value every {seconds:.3f} s, and tremble between"
     parts = [part[np.isfinite(part)] for part in np.array_split(uneven[:, known], BLOCKS)]
@@ -155,17 +155,17 @@ def _dithered(log):
     return [_fault(log, mask, seconds, message, np.nan_to_num(strength) * k, known=False)]
 
 
-def _goes_on(jump, change):
+def _is_load(jump, change):
     """Whether large changes (n, c) at jump (n, c) bool come from a load: they then continue in the same
     direction, at least every second one of them. New values after held ones have random signs."""
     first = jump[:-1]
     followed = np.count_nonzero(first & jump[1:] & (change[:-1] * change[1:] > 0))
     chance = max(jump.mean() / 2, 1 / jump.size)
-    alone = np.count_nonzero(first) - followed
-    return followed * np.log(0.5 / chance) + alone * np.log(0.5 / (1 - chance)) > 0
+    isolated = np.count_nonzero(first) - followed
+    return followed * np.log(0.5 / chance) + isolated * np.log(0.5 / (1 - chance)) > 0
 
 
-def _between(x, usual):
+def _hardly_changed(x, usual):
     """(n,) bool, rows of x (n, c) in which fewer than a quarter of the channels take a new value."""
     step = np.abs(np.diff(x, axis=0, prepend=x[:1]))
     return (step > usual).mean(1) <= 0.25

@@ -11,7 +11,7 @@ from .fault import Fault
 from .log import Log
 from .noise import sound_noise
 
-__all__ = ["dead", "standing_still"]
+__all__ = ["dead", "stuck_or_clipped"]
 
 _WINDOW = 12  # rows of a window that shows whether a channel has noise
 _QUIET = 0.3  # of its usual noise: 3 of 1000 windows of a real sensor have less by chance
@@ -46,7 +46,7 @@ def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     return found
 
 
-def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
+def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Finds channels that are constant for a time; a live one has noise in every row. A channel that returns
     again and again to a limit of its range is clipped, others are stuck."""
     known = {k for f in faults if f.step or f.silent for k in f.channels}
@@ -59,17 +59,17 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     fraction[[k for f in faults if f.silent for k in f.channels]] = 0.0
     ordered = np.concatenate([np.zeros(3), np.sort(fraction)])
     # several constant channels at a time have a common cause, unless each is at its limit
-    alone = fraction > np.maximum(_FRACTION, 6 * ordered[-3])
+    single = fraction > np.maximum(_FRACTION, 6 * ordered[-3])
     limited = fraction > np.maximum(_FRACTION, 6 * ordered[-1 - max(1, log.some(8))])
     # a row that repeats another has the same state
     before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
-    sure = _thrown_to_an_end(log) | _stays(log, log.read[rows])[before]
+    sure = _thrown_to_an_end(log) | _long_constant(log, log.read[rows])[before]
     found = []
-    for k in np.flatnonzero(alone | limited | sure.any(0)):
+    for k in np.flatnonzero(single | limited | sure.any(0)):
         if k in known:
             continue
         at = np.zeros(len(rows), bool)
-        at[1:-1] = quiet[:, k] & (alone | limited)[k]
+        at[1:-1] = quiet[:, k] & (single | limited)[k]
         at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of consecutive windows
         still = at[before] | sure[:, k]
         if not still.any():
@@ -78,12 +78,14 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         run = np.cumsum(np.diff(log.read[:, k], prepend=np.nan) != 0)
         still |= np.isin(run, run[still])
         found += [
-            f for f in _stood(log, int(k), still, sure[:, k]) if alone[k] or f.beyond or sure[:, k].any()
+            f
+            for f in _constant_faults(log, int(k), still, sure[:, k])
+            if single[k] or f.beyond or sure[:, k].any()
         ]
     return found
 
 
-def _stays(log, x):
+def _long_constant(log, x):
     """(n, c) bool: samples of x (n, c) that repeat longer than chance allows. If a step is zero with
     probability q, runs of m steps have probability q^m, and the longest in n rows is about log n / -log q. q
     comes from the channel's second longest run and those of all other channels but one."""
@@ -143,7 +145,7 @@ def _middle(values, on):
     return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
 
 
-def _stood(log, k, still, sure):
+def _constant_faults(log, k, still, sure):
     """Faults of channel k that is constant in samples still (n,) bool, and certainly in samples sure (n,)
     bool."""
     whole, found = log.read[:, k], []
@@ -156,8 +158,8 @@ def _stood(log, k, still, sure):
     if moving[first:].sum() > 0.2 * len(on):
         moving[:first] = False
     # range of the channel while it moves: hardly anything lies beyond a limit
-    ever = _reach(whole[~still & ~log.masked.all(1)])
-    ends = _reach(whole[moving])
+    ever = _moving_range(whole[~still & ~log.masked.all(1)])
+    ends = _moving_range(whole[moving])
     inner = np.abs(whole - ends.mean()) < _INNER * np.ptp(ends)
     between = np.abs(values - ends.mean()) < _INNER * np.ptp(ends)
     if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
@@ -174,7 +176,7 @@ def _stood(log, k, still, sure):
             continue  # no noise but movement: low-pass or smaller gain
         if not side and (found or length.max() < _BRIEF * log.rate and not sure.any()):
             continue
-        one = _one(log, k, side, values[mine], start[mine], length[mine])
+        one = _constant_fault(log, k, side, values[mine], start[mine], length[mine])
         if (one.mask[:, k] & sure).any():
             one.p = min(one.p, float(np.exp(-_CHANCE)))
         if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
@@ -188,7 +190,7 @@ def _stood(log, k, still, sure):
     return found
 
 
-def _reach(moving):
+def _moving_range(moving):
     """Range of a channel's samples (n,), without a few outliers."""
     return np.quantile(moving, [0.03, 0.97]) if len(moving) else np.array([np.inf, -np.inf])
 
@@ -200,7 +202,7 @@ def _at_ends(values, ends):
     return near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
 
 
-def _one(log, k, side, values, start, length):
+def _constant_fault(log, k, side, values, start, length):
     """Fault of channel k, constant at some values in runs: side 1 at its upper limit, -1 at its lower, 0
     anywhere."""
     mask = np.zeros(log.counts.shape, bool)
