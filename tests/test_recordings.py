@@ -16,8 +16,8 @@ from biotac_mj import cli
 from biotac_mj.recordings import FIELDS, Recording, findings, load, load_one, read, write
 from biotac_mj.recordings.formats.messages import Topic
 from biotac_mj.recordings.formats.names import is_time, place_of, unit_of
-from biotac_mj.recordings.formats.parts import guess_unit, join
-from biotac_mj.recordings.live import parts_of_lines
+from biotac_mj.recordings.formats.streams import guess_unit, join
+from biotac_mj.recordings.live import streams_of_lines
 from biotac_mj.recordings.picture import pac_spectrum
 from biotac_mj.sensor.channels import REST_COUNTS
 
@@ -379,7 +379,7 @@ def test_messages_of_any_package():
         ]
         assert topic.add(message(header=header, tactiles=fingers), 0.0)
     assert not topic.add(message(data="hello"), 0.0)
-    one, two = join(topic.parts())
+    one, two = join(topic.streams())
     assert (
         (two.electrodes - one.electrodes == 1).all() and one.time[0] == 7 and one.rate == pytest.approx(100)
     )
@@ -396,7 +396,7 @@ def test_two_poses_of_one_body_are_said():
             position = message(x=1.0 + axis, y=0.0, z=0.0)
             turn = message(x=0.0, y=0.0, z=0.0, w=1.0)
             topic.add(message(pose=message(position=position, orientation=turn)), 0.01 * k)
-    (one,) = join([part for topic in topics for part in topic.parts()])
+    (one,) = join([stream for topic in topics for stream in topic.streams()])
     assert (one.sensor_pos == [1, 0, 0]).all() and (one.sensor_quat == [1, 0, 0, 0]).all()
     assert "finger_pose: left out sensor_pos, sensor_quat, which stands elsewhere too" in one.notes
 
@@ -404,15 +404,15 @@ def test_two_poses_of_one_body_are_said():
 def test_lines_of_a_serial_port():
     times = 100 + 0.01 * np.arange(20)
     lines = [(",".join(f"{v:.0f}" for v in row) + "\r\n").encode() for row in ONE.electrodes[:20]]
-    (one,) = join(parts_of_lines("/dev/ttyUSB0", lines, times, None))
+    (one,) = join(streams_of_lines("/dev/ttyUSB0", lines, times, None))
     np.testing.assert_array_equal(one.electrodes, ONE.electrodes[:20])
     np.testing.assert_allclose(one.time, times)
     header = [b",".join(b"e%d" % k for k in range(19, 0, -1)) + b"\n"]
-    (one,) = join(parts_of_lines("p", header + lines, np.r_[0, times], None))
+    (one,) = join(streams_of_lines("p", header + lines, np.r_[0, times], None))
     np.testing.assert_array_equal(one.electrodes, ONE.electrodes[:20, ::-1])
     np.testing.assert_allclose(one.time, times)
     with pytest.raises(ValueError, match="sends 19 numbers a line, 2 were expected"):
-        parts_of_lines("p", lines, times, ["pdc", "tdc"])
+        streams_of_lines("p", lines, times, ["pdc", "tdc"])
 
 
 def test_recording_from_a_port(tmp_path, monkeypatch, capsys):

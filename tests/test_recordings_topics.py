@@ -8,7 +8,7 @@ from recorded import synthetic, write_bag
 
 from biotac_mj.recordings import load
 from biotac_mj.recordings.formats.messages import Topic
-from biotac_mj.recordings.formats.parts import join
+from biotac_mj.recordings.formats.streams import join
 
 ONE, TWO = synthetic(60), synthetic(60, seed=1)
 

@@ -17,9 +17,9 @@ from .formats.btd import is_btd, read_btd
 from .formats.columns import open_bytes
 from .formats.matlab import is_matlab, read_hdf5, read_matlab
 from .formats.nvidia import read_nvidia
-from .formats.parts import Part, join
 from .formats.pressed import KEYS, read_press
 from .formats.published import companions, is_companion, object_of, rate_of
+from .formats.streams import Stream, join
 from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read
@@ -29,8 +29,8 @@ __all__ = ["READERS", "Loaded", "choose", "load", "load_one"]
 _NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
-# kinds of files: test of the content (bytes), and reader (path, content, role) -> list[Part]. The first that
-# recognises a file reads it; `read_text` reads all others
+# kinds of files: test of the content (bytes), and reader (path, content, role) -> list[Stream]. The first
+# that recognises a file reads it; `read_text` reads all others
 READERS: list[tuple[Callable, Callable]] = [
     (is_matlab, read_matlab),
     (is_btd, read_btd),
@@ -92,8 +92,8 @@ def load(
             )
         if found and isinstance(found[0], Recording):
             done += found
-        elif any(part.has_channels for part in found) and path not in roles:
-            of_companions = [part for one in companions(path) for part in _read(one, None, rate, None)]
+        elif any(stream.has_channels for stream in found) and path not in roles:
+            of_companions = [stream for one in companions(path) for stream in _read(one, None, rate, None)]
             groups.append([*found, *of_companions])
         else:
             shared += found
@@ -116,13 +116,13 @@ def load(
 
 
 def _with_electrodes(groups):
-    """Groups of parts in which files of other channels are joined to the electrodes' file (to that of the
+    """Groups of streams in which files of other channels are joined to the electrodes' file (to that of the
     same number if there are several), if they were logged together."""
-    have = [group for group in groups if any("electrodes" in part.fields for part in group)]
+    have = [group for group in groups if any("electrodes" in stream.fields for stream in group)]
     out = list(have)
     for group in (group for group in groups if group not in have):
         fit = have if len(have) == 1 else [one for one in have if _number(one) == _number(group) != ""]
-        if len(fit) == 1 and all(_meet(fit[0][0], part) for part in group):
+        if len(fit) == 1 and all(_meet(fit[0][0], stream) for stream in group):
             fit[0].extend(group)
         else:
             out.append(group)
@@ -134,23 +134,23 @@ def _number(group):
     return re.search(r"\d*$", group[0].source.split(".")[0])[0]
 
 
-def _meet(part, other):
+def _meet(stream, other):
     """Whether one sensor can have logged both at a time, each with its own channels."""
-    if part.sensor != other.sensor or set(part.fields) & set(other.fields):
+    if stream.sensor != other.sensor or set(stream.fields) & set(other.fields):
         return False
-    if part.time is None or other.time is None:
-        return part.time is other.time and len(part) == len(other)
-    return part.time[0] <= other.time[-1] and other.time[0] <= part.time[-1]
+    if stream.time is None or other.time is None:
+        return stream.time is other.time and len(stream) == len(other)
+    return stream.time[0] <= other.time[-1] and other.time[0] <= stream.time[-1]
 
 
 def _merge_row_by_row(groups):
-    """Groups of parts; those without times and of equal length are merged: sensors logged row by row."""
+    """Groups of streams; those without times and of equal length are merged: sensors logged row by row."""
     out = {}
     for k, group in enumerate(groups):
-        rows = {len(part) for part in group}
-        loose = len(rows) == 1 and all(part.time is None and part.rate is None for part in group)
+        rows = {len(stream) for stream in group}
+        loose = len(rows) == 1 and all(stream.time is None and stream.rate is None for stream in group)
         kept = out.setdefault(("rows", *rows) if loose else ("clock", k), [])
-        kept += [part for part in group if part.source not in {one.source for one in kept}]
+        kept += [stream for stream in group if stream.source not in {one.source for one in kept}]
     return list(out.values())
 
 
@@ -203,7 +203,7 @@ def choose(
     return chosen[0], []
 
 
-def _read(path, role, rate, objects) -> list[Part] | list[Recording]:
+def _read(path, role, rate, objects) -> list[Stream] | list[Recording]:
     try:
         return _read_any(path, role, rate, objects)
     except OSError as error:
@@ -225,9 +225,9 @@ def _read_any(path, role, rate, objects):
         if _HDF5 in (head[:8], head[512:]):
             return _read_hdf5(path, rate, objects)
     content = open_bytes(path)
-    for recognise, read_parts in READERS:
+    for recognise, read_streams in READERS:
         if recognise(content):
-            return _named(path, read_parts(path, content, role))
+            return _named(path, read_streams(path, content, role))
     if content.startswith(b"PK\x03\x04"):
         raise ValueError(f"{path} is a .zip or .xlsx file: unpack it, or save its table as CSV")
     if path.suffix in (".h5", ".hdf5", ".mat", ".bag", ".mcap", ".db3"):
@@ -262,8 +262,8 @@ def _is_nvidia(path):
     return path.is_file() and h5py.is_hdf5(path) and bool(_holds(path)[0] & _NVIDIA)
 
 
-def _named(path, parts):
-    for part in parts:
-        part.object = part.object or object_of(path)
-        part.rate = part.rate or rate_of(path)
-    return parts
+def _named(path, streams):
+    for stream in streams:
+        stream.object = stream.object or object_of(path)
+        stream.rate = stream.rate or rate_of(path)
+    return streams

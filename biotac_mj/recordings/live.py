@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from ..sensor.channels import ELECTRODES
 from .formats.columns import parse_table
 from .formats.messages import Topic
-from .formats.parts import join, make_parts
+from .formats.streams import join, make_streams
 from .recording import Recording
 
-__all__ = ["parts_of_lines", "record_serial", "record_topics"]
+__all__ = ["streams_of_lines", "record_serial", "record_topics"]
 
 
 def record_topics(topics: list[str], seconds: float, object_name: str | None = None) -> list[Recording]:
@@ -34,7 +34,7 @@ def record_topics(topics: list[str], seconds: float, object_name: str | None = N
         raise ValueError(
             f"nothing of a BioTac came on {', '.join(silent)} in {seconds:g} s: is it published?"
         )
-    return join([part for topic in found.values() for part in topic.parts()], object_name=object_name)
+    return join([stream for topic in found.values() for stream in topic.streams()], object_name=object_name)
 
 
 def _is_here(module):
@@ -126,13 +126,13 @@ def record_serial(
         raise ValueError(
             f"no line came from {port} in {seconds:g} s: is --baud {baud} right, is the sensor on?"
         )
-    return join(parts_of_lines(port, lines, times, columns), object_name=object_name)
+    return join(streams_of_lines(port, lines, times, columns), object_name=object_name)
 
 
-def parts_of_lines(
+def streams_of_lines(
     port: str, lines: Iterable[bytes], times: Iterable[float], columns: list[str] | None
 ) -> list:
-    """Parts from lines that arrived at these times [s]; see `record_serial`.
+    """Streams from lines that arrived at these times [s]; see `record_serial`.
 
     Raises:
       ValueError: lines that are not rows of numbers, or differ in length.
@@ -149,4 +149,4 @@ def parts_of_lines(
     value = table.numbers(list(range(len(names))), names)
     skipped = len(list(lines)) - len(value)  # header
     found = {"time": list(times)[skipped:]} | dict(zip(names, value.T))
-    return make_parts(source.name, found)
+    return make_streams(source.name, found)

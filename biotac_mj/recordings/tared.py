@@ -17,9 +17,9 @@ def with_baseline(values: np.ndarray) -> np.ndarray:
     whole counts, as after subtraction of a mean, the results are whole."""
     rest = (design_of_channels(values.shape[1]) or BIOTAC).rest_counts.round()
     turn = np.exp(2j * np.pi * values)
-    part = np.angle(turn.mean(0)) / (2 * np.pi)  # fractional count common to all values of an electrode
-    whole = np.abs(values - part - np.rint(values - part)).max(0) < _WHOLE
-    out = np.where(whole, np.rint(values - part), values)
+    fraction = np.angle(turn.mean(0)) / (2 * np.pi)  # fractional count common to all values of an electrode
+    whole = np.abs(values - fraction - np.rint(values - fraction)).max(0) < _WHOLE
+    out = np.where(whole, np.rint(values - fraction), values)
     low, high = np.floor(_EDGE - out.min(0)), np.ceil(FULL_SCALE - _EDGE - out.max(0))
     # a range larger than the converter's means that the values were scaled: the ends are lost
     return np.clip(out + np.clip(rest, low, np.maximum(low, high)), _EDGE, FULL_SCALE - _EDGE)

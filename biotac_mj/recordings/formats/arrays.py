@@ -7,7 +7,7 @@ import numpy as np
 
 from ...reading import reading
 from .columns import Table
-from .parts import Part, make_parts
+from .streams import Stream, make_streams
 from .text import read_matrix
 
 __all__ = ["is_numpy", "read_numpy"]
@@ -21,8 +21,8 @@ def is_numpy(content: bytes) -> bool:
     return content.startswith(_NPY) or (content.startswith(_ZIP) and b".npy" in content[:256])
 
 
-def read_numpy(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """Parts of a NumPy file. role: as for `read_text`.
+def read_numpy(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Stream]:
+    """Streams of a NumPy file. role: as for `read_text`.
 
     Raises:
       ValueError: damaged, objects instead of numbers, or nothing recognised.
@@ -33,7 +33,7 @@ def read_numpy(path: pathlib.Path, content: bytes, role: str | None = None) -> l
     if isinstance(found, np.ndarray) and found.dtype.names:
         found = {name: found[name] for name in found.dtype.names}
     if isinstance(found, dict):
-        return make_parts(
+        return make_streams(
             path.name, {k: v for k, v in found.items() if v.dtype.kind in "fiub" and v.size > 1}
         )
     if found.ndim != 2 or found.dtype.kind not in "fiub" or not found.size:

@@ -8,7 +8,7 @@ from ...reading import reading
 from ..recording import Recording
 from .driver import FORMS, KINDS, Messages, rows_of
 from .messages import Topic
-from .parts import Part
+from .streams import Stream
 
 __all__ = ["DEFINITIONS", "FORMS", "is_bag", "read_bag", "write_bag"]
 
@@ -39,8 +39,8 @@ def is_bag(path: pathlib.Path) -> bool:
         return file.read(16).startswith(_MARKS)
 
 
-def read_bag(path: pathlib.Path) -> list[Part]:
-    """Parts of all topics with recognised content.
+def read_bag(path: pathlib.Path) -> list[Stream]:
+    """Streams of all topics with recognised content.
 
     Raises:
       ValueError: rosbags is not installed, the bag is damaged, or nothing is recognised; the text lists the
@@ -67,23 +67,23 @@ def read_bag(path: pathlib.Path) -> list[Part]:
                     topic
                 ):
                     useless.add(connection.topic)
-    parts, kept = [], set()
+    streams, kept = [], set()
     for name, topic in topics.items():
         if len(topic):
             try:
-                parts += topic.parts()
+                streams += topic.streams()
                 kept.add(name)
             except ValueError:
                 if topic.has_channels:
                     raise
-    if not parts:
+    if not streams:
         raise ValueError(f"{path} has no topic of a BioTac: it has {', '.join(seen) or 'none at all'}")
     unused = [name for name in seen if name.split(" ")[0] not in kept]
-    for part in parts:
-        part.notes = [f"{path.name}: topic {part.source}", *part.notes]
-        part.notes += [f"{path.name}: left out {', '.join(unused)}"] if unused else []
-        part.source = path.name
-    return parts
+    for stream in streams:
+        stream.notes = [f"{path.name}: topic {stream.source}", *stream.notes]
+        stream.notes += [f"{path.name}: left out {', '.join(unused)}"] if unused else []
+        stream.source = path.name
+    return streams
 
 
 def write_bag(

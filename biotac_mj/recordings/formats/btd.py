@@ -14,7 +14,7 @@ import numpy as np
 from ...geometry.design import designs
 from ...quality.clock import BUS_RATE
 from ...sensor.channels import NPAC
-from .parts import Part
+from .streams import Stream
 
 __all__ = ["is_btd", "read_btd"]
 
@@ -48,8 +48,8 @@ def _frame_of(design):
     return [*[_PAC] * len(others), *others]
 
 
-def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """One part for each sensor on the bus. Rows are frames, timed at their first sample. Channels are
+def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Stream]:
+    """One stream for each sensor on the bus. Rows are frames, timed at their first sample. Channels are
     numbered in the file, so `role` has no effect.
 
     Raises:
@@ -87,7 +87,7 @@ def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> lis
     if not np.ptp(time):
         time = (table[starts, 2] - table[starts[0], 2]) / BUS_RATE
         notes.append(f"{path.name}: no times: frames are {1e3 / BUS_RATE:g} ms long")
-    parts = []
+    streams = []
     for k in range(4, table.shape[1], 2):
         word = table[:, k][there]
         if not word.any():
@@ -99,10 +99,10 @@ def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> lis
             **{name: word[channel == c] for name, c in (("pdc", _PDC), ("tac", _TAC), ("tdc", _TDC))},
         }
         more = [f"parity failed in {failed.sum()} of {failed.size} samples"] if failed.any() else []
-        parts.append(Part(path.name, f"bt{(k - 2) // 2}", fields, time, notes=[*notes, *more]))
-    if not parts:
+        streams.append(Stream(path.name, f"bt{(k - 2) // 2}", fields, time, notes=[*notes, *more]))
+    if not streams:
         raise ValueError(f"{path} has no sensor on its bus: all words are zero")
-    return parts
+    return streams
 
 
 def _frames(path, table):

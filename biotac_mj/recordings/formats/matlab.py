@@ -9,7 +9,7 @@ import numpy as np
 from ...geometry.design import designs
 from ...reading import reading
 from .names import is_time, place_of, unit_named
-from .parts import Part, make_parts
+from .streams import Stream, make_streams
 
 __all__ = ["is_matlab", "read_hdf5", "read_matlab"]
 
@@ -25,8 +25,8 @@ def is_matlab(content: bytes) -> bool:
     return content.startswith(b"MATLAB 5.0 MAT-file")
 
 
-def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """Parts of a file up to v7. Each struct of an array is a separate log, as are the cells of arrays of
+def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Stream]:
+    """Streams of a file up to v7. Each struct of an array is a separate log, as are the cells of arrays of
     equal length. Variables have names, so `role` has no effect.
 
     Raises:
@@ -39,19 +39,19 @@ def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> 
     found = {name: value for name, value in found.items() if not name.startswith("__")}
     while len(found) == 1 and isinstance(inner := next(iter(found.values())), dict):
         found = inner  # a single struct that holds all
-    parts, trials = [], _trials(found)
+    streams, trials = [], _trials(found)
     for k, trial in enumerate(trials, 1):
         columns, words = {}, {}
         _walk(trial, "", columns, words, 0)
-        for part in _parts(path, columns, words):
-            part.source = f"{path.stem}_{k}" if len(trials) > 1 else part.source
-            parts.append(part)
-    return parts
+        for stream in _streams(path, columns, words):
+            stream.source = f"{path.stem}_{k}" if len(trials) > 1 else stream.source
+            streams.append(stream)
+    return streams
 
 
-def read_hdf5(path: pathlib.Path) -> list[Part]:
-    """Parts of a MATLAB file of v7.3, or of any HDF5 file whose data sets have such names. If all data are in
-    groups and these have electrodes, each group is a separate log.
+def read_hdf5(path: pathlib.Path) -> list[Stream]:
+    """Streams of a MATLAB file of v7.3, or of any HDF5 file whose data sets have such names. If all data are
+    in groups and these have electrodes, each group is a separate log.
 
     Raises:
       ValueError: damaged, or nothing recognised.
@@ -77,29 +77,29 @@ def read_hdf5(path: pathlib.Path) -> list[Part]:
         groups.setdefault(group if own else "", {})[own or group] = value
     logs = {name: one for name, one in groups.items() if any(map(_is_electrodes, one))}
     if "" in groups or not logs:
-        out = _parts(path, {name.replace("/", "_"): value for name, value in columns.items()}, {})
-        for part in out:
-            part.notes = [*said, *part.notes]
+        out = _streams(path, {name.replace("/", "_"): value for name, value in columns.items()}, {})
+        for stream in out:
+            stream.notes = [*said, *stream.notes]
         return out
     out = []
     for name, one in groups.items():
         try:
-            parts = _parts(path, {inner.replace("/", "_"): value for inner, value in one.items()}, {})
-            if name not in logs and any(part.time is None for part in parts):
+            streams = _streams(path, {inner.replace("/", "_"): value for inner, value in one.items()}, {})
+            if name not in logs and any(stream.time is None for stream in streams):
                 raise ValueError  # its time is unknown
         except ValueError:
             if name in logs:
                 raise
             said.append(f"{path.name}: left out group {name}")
             continue
-        for part in parts:
-            part.source = f"{path.stem}_{name}" if len(logs) > 1 or name not in logs else part.source
+        for stream in streams:
+            stream.source = f"{path.stem}_{name}" if len(logs) > 1 or name not in logs else stream.source
             if len(logs) > 1:  # a data set named after one of them belongs to it
-                part.called = name if name in logs else ""
-                part.sensor = part.sensor if name in logs else f"{name}_{part.sensor}".strip("_")
-            out.append(part)
-    for part in out:
-        part.notes = [*said, *part.notes]
+                stream.called = name if name in logs else ""
+                stream.sensor = stream.sensor if name in logs else f"{name}_{stream.sensor}".strip("_")
+            out.append(stream)
+    for stream in out:
+        stream.notes = [*said, *stream.notes]
     return out
 
 
@@ -160,12 +160,12 @@ def _walk(value, name, columns, words, depth):
         columns[name] = value
 
 
-def _parts(path, columns, words):
+def _streams(path, columns, words):
     columns, notes = _with_electrodes(path.name, columns)
-    parts = make_parts(path.name, columns, notes)
-    for part in parts:
-        part.object = words.get("object", "")
-    return parts
+    streams = make_streams(path.name, columns, notes)
+    for stream in streams:
+        stream.object = words.get("object", "")
+    return streams
 
 
 def _with_electrodes(source, columns):

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..recording import CHANNELS
 from .names import place_of
-from .parts import Part, make_parts
+from .streams import Stream, make_streams
 
 __all__ = ["Topic"]
 
@@ -46,7 +46,7 @@ class Topic:
         self.time.append(_stamp(message) or received)
         return True
 
-    def parts(self) -> list[Part]:
+    def streams(self) -> list[Stream]:
         """Collected data, in order of time.
 
         Raises:
@@ -57,13 +57,13 @@ class Topic:
             columns = {name: np.array(value)[order] for name, value in self._columns.items()}
         except ValueError:
             raise ValueError(f"topic {self.name} has messages of different length: record it again") from None
-        parts = make_parts(self.name, {"time": np.array(self.time)[order], **columns})
+        streams = make_streams(self.name, {"time": np.array(self.time)[order], **columns})
         for name, places in self._places.items():
             for (serial, _), k in places.items():
-                for part in parts:
-                    if part.sensor == _joined(name, k).lower():
-                        part.called = serial
-        return parts
+                for stream in streams:
+                    if stream.sensor == _joined(name, k).lower():
+                        stream.called = serial
+        return streams
 
     @property
     def has_channels(self) -> bool:

@@ -9,7 +9,7 @@ from ...geometry.design import designs
 from ...sensor.channels import ELECTRODES, NPAC
 from .columns import Table, parse_table
 from .names import is_part_of_stamp, is_stamp, is_time, place_of
-from .parts import Part, make_parts
+from .streams import Stream, make_streams
 
 __all__ = ["RUPPEL", "read_matrix", "read_text"]
 
@@ -33,8 +33,8 @@ _TURNED = ("electrodes", "force", "wrench")  # may have time along the columns
 _LONG = 40
 
 
-def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
-    """Parts of a text file.
+def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Stream]:
+    """Streams of a text file.
 
     Args:
       path: for names and errors. content: of the file, not packed.
@@ -73,10 +73,10 @@ def _named(table, role):
         *table.notes,
         *([] if clock or any(map(is_stamp, table.names)) else _like_clocks(table, columns)),
     ]
-    parts = make_parts(table.path.name, columns, notes)
-    if role and not any(role in part.fields for part in parts):
+    streams = make_streams(table.path.name, columns, notes)
+    if role and not any(role in stream.fields for stream in streams):
         raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")
-    return parts
+    return streams
 
 
 def _clock(table):
@@ -113,8 +113,8 @@ def _stamps(table, column, name):
         return ()
 
 
-def read_matrix(table: Table, role: str | None = None) -> list[Part]:
-    """Parts of a matrix without names; role: as for `read_text`.
+def read_matrix(table: Table, role: str | None = None) -> list[Stream]:
+    """Streams of a matrix without names; role: as for `read_text`.
 
     Raises:
       ValueError: an ambiguous width, or cells that are not numbers.
@@ -135,7 +135,7 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
                 f"({_range(names)}), but those of line {table.lines[0]} do not increase: turn the table, and "
                 "name its columns in a header"
             )
-        return make_parts(path.name, dict(zip(["time", *names] if clock else names, value.T)), notes)
+        return make_streams(path.name, dict(zip(["time", *names] if clock else names, value.T)), notes)
     clock = width == len(names) + 1 and not more  # in the first column
     columns = ["time", *names] if clock else [*names, *(f"column {k + 1}" for k in range(len(names), width))]
     called = columns[:width] if len(columns) > width else columns
@@ -156,7 +156,7 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
         notes.append(f"{path.name}: left out columns {len(names) + 1} to {width}")
     if role == "orientation":
         notes.append(f"{path.name}: taken for quaternions x y z w, ROS' order")
-    return make_parts(path.name, dict(zip(columns if clock else names, value.T)), notes)
+    return make_streams(path.name, dict(zip(columns if clock else names, value.T)), notes)
 
 
 def _fits(count, names):

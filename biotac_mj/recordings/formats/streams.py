@@ -12,7 +12,7 @@ from ...sensor.channels import NPAC
 from ..recording import CHANNELS, FIELDS, Recording
 from .names import is_stamp, is_time, place_of, unit_of
 
-__all__ = ["Part", "join", "make_parts"]
+__all__ = ["Stream", "join", "make_streams"]
 
 _OF_ONE_SENSOR = {"force", "torque", "sensor_pos", "sensor_quat"}
 _HOLE = 0.25  # [s] longest gap of a force or pose log that is interpolated
@@ -26,14 +26,14 @@ _EPOCH = 1e11  # larger clocks count fractions of seconds since 1970 (1e11 s are
 # [Hz] row rates of BioTac logs; outside, the clock is not in seconds
 _SLOWEST, _FASTEST = 0.5, 1e4
 _USUAL = (20.0, 5e3)  # typical ones
-_PARTS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
+_SECONDS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
 # fractions of backward steps: one in five is not a restarted clock, and nearly all mean that the log is
 # reversed
 _SHUFFLED, _REVERSED = 0.2, 0.98
 
 
 @dataclasses.dataclass(eq=False)
-class Part:
+class Stream:
     """Columns of one file or topic with common rows.
 
     Attributes:
@@ -61,7 +61,7 @@ class Part:
         return len(next(iter(self.fields.values())))
 
 
-def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | None = None) -> list[Part]:
+def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] | None = None) -> list[Stream]:
     """Groups named columns by sensor. Unknown names are ignored with a note.
 
     Args:
@@ -99,7 +99,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
             "docs/howto/file_formats.md has all names"
         )
     notes += [f"{source}: {', '.join(names)} are read as {unit}" for unit, names in units.items()]
-    parts, own = [], {} if clock else _own_clocks(columns, found)
+    streams, own = [], {} if clock else _own_clocks(columns, found)
     if own:
         named = {name for name, _ in own.values()}
         unused = [name for name in unused if name not in named]
@@ -114,62 +114,64 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
                 whole[field] = value
         notes += _normalise(source, whole)
         if whole:
-            parts.append(Part(source, sensor, whole, own[sensor][1] if sensor in own else time, notes=notes))
-    lengths = {len(value) for part in parts for value in part.fields.values()}
+            streams.append(
+                Stream(source, sensor, whole, own[sensor][1] if sensor in own else time, notes=notes)
+            )
+    lengths = {len(value) for stream in streams for value in stream.fields.values()}
     lengths |= set() if time is None else {len(time)}
-    each = [{len(p.time), *map(len, p.fields.values())} for p in parts if p.time is not None]
-    if len(lengths) > 1 and not (len(each) == len(parts) and all(len(rows) == 1 for rows in each)):
+    each = [{len(p.time), *map(len, p.fields.values())} for p in streams if p.time is not None]
+    if len(lengths) > 1 and not (len(each) == len(streams) and all(len(rows) == 1 for rows in each)):
         raise ValueError(
             f"{source} has columns of {', '.join(map(str, sorted(lengths)))} rows: one log has one length"
         )
-    if not parts or 0 in lengths:
+    if not streams or 0 in lengths:
         raise ValueError(
             f"{source} has no rows, or no channel, force or pose that is whole ({', '.join(columns)})"
         )
-    return [one for part in _connected(parts) for one in _without_gaps(part)]
+    return [one for stream in _connected(streams) for one in _without_gaps(stream)]
 
 
-def _without_gaps(part):
-    """A part without the rows that lack an electrode, as in logs of several clocks merged by time. A force or
-    pose that is in few of the other rows becomes a separate part, so that it is interpolated to them."""
-    electrodes = part.fields.get("electrodes")
-    if electrodes is None or part.time is None:
-        return [part]
+def _without_gaps(stream):
+    """A stream without the rows that lack an electrode, as in logs of several clocks merged by time. A
+    force or pose in few of the other rows becomes a separate stream, so that it is interpolated to them."""
+    electrodes = stream.fields.get("electrodes")
+    if electrodes is None or stream.time is None:
+        return [stream]
     there = np.isfinite(electrodes).all(1)
     if there.all():
-        return [part]
+        return [stream]
     some = np.isfinite(electrodes).any(1) & ~there
     if some.sum() > there.sum():
         least = int(np.isfinite(electrodes).sum(0).argmin())
         raise ValueError(
-            f"{part.source}: {some.sum()} of {len(there)} rows lack an electrode, mostly e{least + 1}: a gap "
-            f"cannot be guessed; all {electrodes.shape[1]} are needed in a row"
+            f"{stream.source}: {some.sum()} of {len(there)} rows lack an electrode, mostly e{least + 1}: a "
+            f"gap cannot be guessed; all {electrodes.shape[1]} are needed in a row"
         )
-    part.notes.append(f"{part.source}: left out {(~there).sum()} rows that lack an electrode")
+    stream.notes.append(f"{stream.source}: left out {(~there).sum()} rows that lack an electrode")
     others = []
-    for name in [name for name in part.fields if name not in CHANNELS]:
-        value = part.fields[name]
+    for name in [name for name in stream.fields if name not in CHANNELS]:
+        value = stream.fields[name]
         have = np.isfinite(value).reshape(len(value), -1).all(1)
         if have[there].mean() < 0.5 and have.sum() > 1:
-            own = {name: part.fields.pop(name)[have]}
-            others.append(Part(part.source, part.sensor, own, part.time[have], notes=part.notes))
-    part.fields = {name: value[there] for name, value in part.fields.items()}
-    part.time = part.time[there]
-    return [part, *others]
+            own = {name: stream.fields.pop(name)[have]}
+            others.append(Stream(stream.source, stream.sensor, own, stream.time[have], notes=stream.notes))
+    stream.fields = {name: value[there] for name, value in stream.fields.items()}
+    stream.time = stream.time[there]
+    return [stream, *others]
 
 
-def _connected(parts):
-    """Parts without absent sensors: messages of a hand have an entry for each finger, with zeros if there is
+def _connected(streams):
+    """Streams without absent sensors: messages of a hand have an entry for each finger, with zeros if there is
     no sensor."""
-    dumb = [p for p in parts if "electrodes" in p.fields and not p.fields["electrodes"].any()]
-    rest = [part for part in parts if not any(part is one for one in dumb)]
-    if not dumb or not any("electrodes" in part.fields for part in rest):
-        return parts
-    named = ", ".join(part.sensor or "no name" for part in dumb)
-    for part in rest:
-        part.notes = [
-            *part.notes,
-            f"{part.source}: left out {named}: all electrodes are zero, no sensor there",
+    dumb = [p for p in streams if "electrodes" in p.fields and not p.fields["electrodes"].any()]
+    rest = [stream for stream in streams if not any(stream is one for one in dumb)]
+    if not dumb or not any("electrodes" in stream.fields for stream in rest):
+        return streams
+    named = ", ".join(stream.sensor or "no name" for stream in dumb)
+    for stream in rest:
+        stream.notes = [
+            *stream.notes,
+            f"{stream.source}: left out {named}: all electrodes are zero, no sensor there",
         ]
     return rest
 
@@ -183,9 +185,9 @@ def _with_whole_stamps(columns):
         for rest in ("nsecs", "nsec", "nanosec", "nanosecs") if found else ():
             other = next((n for n in columns if n.lower() == (found[1] + rest).lower()), None)
             if other and np.size(value) == np.size(columns[other]) > 0:
-                seconds, parts = (np.asarray(out.pop(n), float).ravel() for n in (name, other))
+                seconds, streams = (np.asarray(out.pop(n), float).ravel() for n in (name, other))
                 stem = found[1].rstrip("._ /")
-                out[stem if is_time(stem) or is_stamp(stem) else "time"] = seconds + 1e-9 * parts
+                out[stem if is_time(stem) or is_stamp(stem) else "time"] = seconds + 1e-9 * streams
                 return out
     return out
 
@@ -298,7 +300,7 @@ def _normalise(source, fields):
 def _seconds(time, name):
     """A clock in seconds: its unit is in its name, or it is an epoch in fractions of seconds."""
     factor = next(
-        (f for unit, f in _PARTS.items() if re.sub("ecs?$", "", name.lower().rstrip("]) ")).endswith(unit)),
+        (f for unit, f in _SECONDS.items() if re.sub("ecs?$", "", name.lower().rstrip("]) ")).endswith(unit)),
         1,
     )
     if factor == 1 and len(time) and np.nanmedian(time) > _EPOCH:
@@ -307,12 +309,12 @@ def _seconds(time, name):
 
 
 def join(
-    parts: list[Part],
+    streams: list[Stream],
     rate: float | None = None,
     object_name: str | None = None,
     scale: float | None = None,
 ) -> list[Recording]:
-    """Makes recordings of the parts with channels and interpolates forces and poses of the others to their
+    """Makes recordings of the streams with channels and interpolates forces and poses of the others to their
     rows.
 
     Args:
@@ -323,14 +325,16 @@ def join(
     Raises:
       ValueError: no sensor, incompatible clocks or lengths, or invalid values.
     """
-    sensors = [part for part in parts if "electrodes" in part.fields] or [p for p in parts if p.has_channels]
-    others = [part for part in parts if part not in sensors]
+    sensors = [stream for stream in streams if "electrodes" in stream.fields] or [
+        p for p in streams if p.has_channels
+    ]
+    others = [stream for stream in streams if stream not in sensors]
     if not sensors:
         raise ValueError(
-            f"{', '.join(dict.fromkeys(p.source for p in parts))}: no electrodes: give the sensor's own "
+            f"{', '.join(dict.fromkeys(p.source for p in streams))}: no electrodes: give the sensor's own "
             "file too"
         )
-    names = {part.sensor for part in sensors}
+    names = {stream.sensor for stream in sensors}
     common = os.path.commonprefix(sorted(names)).rpartition("_")[0] if len(names) > 1 else ""
     made, taken = [], {}
     owners = {id(one): _owners(one, sensors) for one in others}
@@ -340,15 +344,15 @@ def join(
         if not owners[id(one)] and one.sensor not in names and not (one.has_channels and one.sensor)
     ]
     doubtful = _doubtful(common_to_all) if len(sensors) > 1 else set()
-    for part in sensors:
-        mine = [one for one in others if part in owners[id(one)]]
+    for stream in sensors:
+        mine = [one for one in others if stream in owners[id(one)]]
         mine += [_without(one, doubtful) for one in common_to_all]
-        stem = part.source.split(".")[0]
-        many = sum(p.source == part.source for p in sensors) > 1
-        name = f"{stem}_{part.sensor.removeprefix(common).strip('_')}" if many and part.sensor else stem
+        stem = stream.source.split(".")[0]
+        many = sum(p.source == stream.source for p in sensors) > 1
+        name = f"{stem}_{stream.sensor.removeprefix(common).strip('_')}" if many and stream.sensor else stem
         taken[name] = taken.get(name, 0) + 1
         name = f"{name}_{taken[name]}" if taken[name] > 1 else name
-        made.append(_recording(name, part, mine, _rows_clock(sensors, part, rate), object_name, scale))
+        made.append(_recording(name, stream, mine, _rows_clock(sensors, stream, rate), object_name, scale))
     return made
 
 
@@ -361,7 +365,7 @@ def _owners(one, sensors):
 
 
 def _doubtful(others):
-    """Fields that several parts have for one sensor, with names that match no sensor."""
+    """Fields that several streams have for one sensor, with names that match no sensor."""
     names = {}
     for one in others:
         for field in _OF_ONE_SENSOR & set(one.fields):
@@ -369,31 +373,31 @@ def _doubtful(others):
     return {field for field, of in names.items() if len(of) > 1}
 
 
-def _without(part, fields):
-    """A part without these fields, and a note."""
-    there = [field for field in part.fields if field in fields]
+def _without(stream, fields):
+    """A stream without these fields, and a note."""
+    there = [field for field in stream.fields if field in fields]
     if not there:
-        return part
-    unused = {key: value for key, value in part.fields.items() if key not in there}
-    said = f"{part.source}: left out {', '.join(there)} of {part.sensor or 'no name'}: no name says whose"
-    return dataclasses.replace(part, fields=unused, notes=[*part.notes, said])
+        return stream
+    unused = {key: value for key, value in stream.fields.items() if key not in there}
+    said = f"{stream.source}: left out {', '.join(there)} of {stream.sensor or 'no name'}: no name says whose"
+    return dataclasses.replace(stream, fields=unused, notes=[*stream.notes, said])
 
 
-def _recording(name, part, others, rows_clock, object_name, scale):
-    notes, sources = list(part.notes), [part.source]
-    clock = part.time
+def _recording(name, stream, others, rows_clock, object_name, scale):
+    notes, sources = list(stream.notes), [stream.source]
+    clock = stream.time
     if clock is None:  # a file logged row by row with it may have one
-        clock = next((o.time for o in others if o.time is not None and len(o) == len(part)), None)
+        clock = next((o.time for o in others if o.time is not None and len(o) == len(stream)), None)
     if clock is None:
         (time, said), keep = rows_clock, slice(None)
     else:
-        (time, keep, more), said = _clock(part.source, clock), "the file's times"
+        (time, keep, more), said = _clock(stream.source, clock), "the file's times"
         notes += more
         if rows_clock[1] == "given":
-            notes.append(f"{part.source}: --rate is not needed, the file has times")
-    fields = {key: value[keep] for key, value in part.fields.items()}
+            notes.append(f"{stream.source}: --rate is not needed, the file has times")
+    fields = {key: value[keep] for key, value in stream.fields.items()}
     for other in others:
-        placed, more = _placed(part, other, time, keep) if other.fields else ({}, [])
+        placed, more = _placed(stream, other, time, keep) if other.fields else ({}, [])
         notes += [n for n in (*other.notes, *more) if n not in notes]
         twice = [key for key in placed if key in fields]
         if twice:
@@ -409,7 +413,7 @@ def _recording(name, part, others, rows_clock, object_name, scale):
     units = {
         key: unit for key in there if key == "electrodes" or np.abs(np.nanmedian(fields[key])) < _RAW_OTHERS
     }
-    what = part.object or next((o.object for o in others if o.object), "")
+    what = stream.object or next((o.object for o in others if o.object), "")
     return Recording(
         time,
         **fields,
@@ -437,13 +441,13 @@ def guess_unit(electrodes: np.ndarray) -> str:
     return "tared counts" if value.min() < 0 else "tared counts without sign"
 
 
-def _rows_clock(sensors, part, rate):
+def _rows_clock(sensors, stream, rate):
     """((n,) [s], source of the rate) for rows without times, common to all sensors logged together."""
-    n = len(part)
+    n = len(stream)
     if rate is not None:
         return np.arange(n) / rate, "given"
-    if part.rate is not None:
-        return np.arange(n) / part.rate, "the format's"
+    if stream.rate is not None:
+        return np.arange(n) / stream.rate, "the format's"
     electrodes = [one.fields["electrodes"] for one in sensors if len(one) == n and "electrodes" in one.fields]
     guess, why = guessed_rate(*electrodes)
     return np.arange(n) / guess, why
@@ -465,7 +469,7 @@ def _unnamed_unit(usual):
     one unit makes it plausible; (None, 1) otherwise."""
     fits = [
         (unit, f)
-        for unit, f in _PARTS.items()
+        for unit, f in _SECONDS.items()
         if 1 / usual < _SLOWEST and _USUAL[0] <= 1 / (usual * f) <= _USUAL[1]
     ]
     return fits[0] if len(fits) == 1 else (None, 1.0)
@@ -517,21 +521,21 @@ def _clock(name, time):
     return time[keep], rows[keep], notes
 
 
-def _placed(part, other, time, keep):
-    """Fields of another part, interpolated to these times, and notes."""
-    if other.time is None or part.time is None:
-        if len(other) != len(part):
+def _placed(stream, other, time, keep):
+    """Fields of another stream, interpolated to these times, and notes."""
+    if other.time is None or stream.time is None:
+        if len(other) != len(stream):
             raise ValueError(
-                f"{part.source} has {len(part)} rows and {other.source} has {len(other)}: they must be "
+                f"{stream.source} has {len(stream)} rows and {other.source} has {len(other)}: they must be "
                 "logged row by row together; cut both to the time they share (a clock gap cannot be guessed)"
             )
         return {k: v[keep] for k, v in other.fields.items()}, []
-    if part.time is other.time:
+    if stream.time is other.time:
         return {k: v[keep] for k, v in other.fields.items()}, []
     clock, rows, notes = _clock(other.source, other.time)
     if clock[0] > time[-1] or clock[-1] < time[0]:
         raise ValueError(
-            f"{part.source} and {other.source} have no time in common: are their clocks the same?"
+            f"{stream.source} and {other.source} have no time in common: are their clocks the same?"
         )
     placed = {
         k: _interpolated(k, time, clock, v[rows]).reshape(-1, *v.shape[1:]) for k, v in other.fields.items()
