@@ -161,8 +161,8 @@ def _without_gaps(stream):
 
 
 def _connected(streams):
-    """Streams without absent sensors: messages of a hand have an entry for each finger, with zeros if there is
-    no sensor."""
+    """Streams without absent sensors: messages of a hand have an entry for each finger, of zeros without a
+    sensor."""
     dumb = [p for p in streams if "electrodes" in p.fields and not p.fields["electrodes"].any()]
     rest = [stream for stream in streams if not any(stream is one for one in dumb)]
     if not dumb or not any("electrodes" in stream.fields for stream in rest):
