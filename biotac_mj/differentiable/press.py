@@ -59,9 +59,6 @@ def press(
     friction: torch.Tensor | None = None,
     rest_nodes: torch.Tensor | None = None,
     dt: float | np.ndarray | None = None,
-    prony: torch.Tensor | None = None,
-    mullins: torch.Tensor | None = None,
-    hysteresis: torch.Tensor | None = None,
     smoothing: float = 0.0,
     together: str | None = None,
     **parameters: torch.Tensor,
@@ -87,9 +84,6 @@ def press(
         addition to the volume of this shape.
       dt: time of a step, or (nstep,) of the steps [s]; required for a Prony series. A skin with memory starts
         relaxed and virgin, after its filling.
-      prony: (nterm, 2) or (nworld, nterm, 2) of fraction and time [s]; mullins: (3,) or (nworld, 3);
-        hysteresis: (nbranch, 2) or (nworld, nbranch, 2), as in `skin.Material` and as many as the skin's;
-        None: the skin's.
       smoothing: half width [m] over which first contact and the transition from stick to slip are smooth:
         another law without these kinks in its gradient. It pushes from this gap on, at zero gap as Coulomb's
         law at a quarter of it, and slip begins earlier by as much. Contact with the core keeps its kinks. 0:
@@ -98,7 +92,9 @@ def press(
         one after another. Not available for liquid, rubber with memory, rest_nodes, smoothing.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
         (liquid in addition to the unstressed skin's) [m^3], bulk_modulus (of the liquid) [Pa],
-        contact_stiffness [Pa/m], default 180 E per millimetre unless the skin's options set it.
+        contact_stiffness [Pa/m], default 180 E per millimetre unless the skin's options set it. And of the
+        memory, as in `skin.Material` and as many as the skin's, each also with a leading nworld: prony
+        (nterm, 2) of fraction and time [s], mullins (3,), hysteresis (nbranch, 2).
 
     Raises:
       ValueError: incompatible shapes, values that are not finite, an invalid smoothing, an unknown or unused
@@ -135,10 +131,11 @@ def press(
     if not ((friction >= 0) & torch.isfinite(friction)).all():
         raise ValueError(f"friction is {friction.tolist()}: give 0 or more")
     _refuse_smoothing(skin, smoothing)
+    memory = {name: parameters.pop(name, None) for name in ("prony", "mullins", "hysteresis")}
     given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
     rest = _rest_of(skin, rest_nodes, nworld)
     times = _times_of(skin, dt, pos.shape[1])
-    constants = _constants_of(skin, {"prony": prony, "mullins": mullins, "hysteresis": hysteresis}, nworld)
+    constants = _constants_of(skin, memory, nworld)
     made = [numbers_of(skin, {name: v[w] for name, v in given.items()}, rest[w]) for w in range(nworld)]
     made = torch.stack([torch.stack([own[name] for name in NUMBERS]) for own in made])
     changes, mat, parts = [], _matrix(quat), []

@@ -252,21 +252,15 @@ def train_split(
     predictions["physics"] = physics
     predictions["physics_gain"] = film_with_gains(arrays, fit, both)
 
+    def head(label, name, seed):
+        work = lambda: train_head(  # noqa: E731
+            features, train, validation, config, seed=seed, pod=pod, checkpoints=checkpoints, **FORWARD[name]
+        )
+        return timed(label, work)
+
     models = {}
     for name in names:
-        models[name] = timed(
-            name,
-            lambda name=name: train_head(
-                features,
-                train,
-                validation,
-                config,
-                seed=seed,
-                pod=pod,
-                checkpoints=checkpoints,
-                **FORWARD[name],
-            ),
-        )
+        models[name] = head(name, name, seed)
         predictions[name] = models[name](both)
     if names:
         # ensemble of the best model on validation. Windows are excluded: interactions of a second do not
@@ -277,22 +271,7 @@ def train_split(
             for name in steady
         }
         best = min(errors, key=errors.get)
-        more = [
-            timed(
-                f"{best} again {k}",
-                lambda k=k: train_head(
-                    features,
-                    train,
-                    validation,
-                    config,
-                    seed=1000 * (k + 1) + seed,
-                    pod=pod,
-                    checkpoints=checkpoints,
-                    **FORWARD[best],
-                ),
-            )
-            for k in range(config.members - 1)
-        ]
+        more = [head(f"{best} again {k}", best, 1000 * (k + 1) + seed) for k in range(config.members - 1)]
         members = [models[best], *more]
         predictions["ensemble"] = torch.stack([m(both) for m in members]).mean(0)
 
@@ -321,7 +300,7 @@ def train_split(
     every = arrays.rows(test)
     codes = {"pod": lambda u: basis.decode(basis(u))}
     back = {name: lambda r, head=head: head(arrays.log_change(r)) for name, head in inverses.items()}
-    shares = dict.fromkeys(back, PATCH)
+    patches, served = dict.fromkeys(back, PATCH), {}
     if settings["paper"]:
         points, there = features.at_points
         lp, report["curves"] = timed(
@@ -346,33 +325,32 @@ def train_split(
             served["latent_projection"].target(arrays, r)
         )
         fit_patch = fit[torch.linspace(0, len(fit) - 1, min(2000, len(fit)), device=device).long()]
-        shares["latent_inverse"] = patch_of_push(
+        patches["latent_inverse"] = patch_of_push(
             _in_batches(lambda r: back["latent_inverse"](r)[1], fit_patch).cpu().numpy(),
             arrays.force[fit_patch].float().cpu().numpy(),
         )
     report["mesh"] = {name: _mesh_errors(arrays, code, every) for name, code in codes.items()}
     report["inverse"] = {
-        name: _inverse_summary(inverse_errors(arrays, model, rows, shares[name]))
+        name: _inverse_summary(inverse_errors(arrays, model, rows, patches[name]))
         for name, model in back.items()
     }
     report["seconds"] = seconds
     if names:
         report["ensemble_of"] = best
     if seed == 0:
-        kept = {"split": split, "seed": seed, "set": arrays.sensor, "nvert": arrays.geometry.nvert}
+        about = {"split": split, "seed": seed, "set": arrays.sensor, "nvert": arrays.geometry.nvert}
         forward = {name: ([model], name) for name, model in models.items()}
         if names:
             forward["forward"] = members, best
         for file, (ones, name) in forward.items():
             path = out / f"{file}-{split}.safetensors"
-            save_forward(path, ones, basis, config, FORWARD[name], arrays.geometry, kept | {"model": name})
+            save_forward(path, ones, basis, config, FORWARD[name], arrays.geometry, about | {"model": name})
         for file, name in [*((name, name) for name in inverses), ("inverse", best_inverse)]:
             path = out / f"{file}-{split}.safetensors"
-            save_inverse(path, inverses[name], arrays.geometry, kept | {"model": name})
-        if settings["paper"]:
-            about = kept | {"patch": shares["latent_inverse"]}
-            for name, one in served.items():
-                save_points_model(out / f"{name}-{split}.safetensors", one.net, points, config, about)
+            save_inverse(path, inverses[name], arrays.geometry, about | {"model": name})
+        for name, one in served.items():
+            path = out / f"{name}-{split}.safetensors"
+            save_points_model(path, one.net, points, config, about | {"patch": patches["latent_inverse"]})
     _write(out, f"{split}-{seed}", arrays, check, rows, both, truth, predictions, report)
 
 

@@ -398,16 +398,14 @@ class BatchFilm:
                 wp.array(layout.start, dtype=int),
                 wp.array(layout.slot, dtype=int),
             ]
-            self._discs = [
-                wp.array(film._pos, dtype=vec3),
-                wp.array(film._tangent, dtype=vec3, ndim=2),
-                wp.array(np.searchsorted(electrode[order], np.arange(len(film._pos) + 1)), dtype=int),
-                wp.array(face[order], dtype=int),
-                wp.array(film._disc, dtype=wp.vec2d),
-                self._face,
-                film._footprint,
-                layout.rhs,
-            ]
+            self._discs = kernels.Discs()
+            self._discs.pos = wp.array(film._pos, dtype=vec3)
+            self._discs.tangent = wp.array(film._tangent, dtype=vec3, ndim=2)
+            starts = np.searchsorted(electrode[order], np.arange(len(film._pos) + 1))
+            self._discs.pair_start = wp.array(starts, dtype=int)
+            self._discs.pair_face = wp.array(face[order], dtype=int)
+            self._discs.sample = wp.array(film._disc, dtype=wp.vec2d)
+            self._discs.footprint = film._footprint
             self._local_network = [
                 wp.array(table, dtype=real),
                 table_step,
@@ -490,7 +488,7 @@ class BatchFilm:
         self._launch(kernels.clear_system, self._quads.shape, [due], [self._quads])
         entries = len(layout.entry), self.nworld
         self._launch(kernels.assemble, entries, [due, *self._gather, self._edge], [system])
-        discs = [due, *self._discs, *surface]
+        discs = [due, self._discs, self._face, layout.rhs, *surface]
         self._launch(kernels.cover_discs, self.local.shape, discs, [system, self.local])
         layout.solve(self._launch, due, system, self._resistance)
         network = [due, self._resistance, self.local, *self._local_network]

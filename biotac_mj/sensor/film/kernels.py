@@ -141,17 +141,24 @@ def _where_on_disc(q: vec3, pos: vec3, tangent1: vec3, tangent2: vec3):
     return wp.vec2d(wp.dot(q - pos, tangent1), wp.dot(q - pos, tangent2))
 
 
+@wp.struct
+class Discs:
+    """Electrodes as discs: where current enters the sheet."""
+
+    pos: wp.array(dtype=vec3)  # (ndisc,) centres [m]
+    tangent: wp.array2d(dtype=vec3)  # (ndisc, 2) axes
+    pair_start: wp.array(dtype=int)  # (ndisc + 1,) range of each disc in pair_face
+    pair_face: wp.array(dtype=int)  # candidate faces
+    sample: wp.array(dtype=wp.vec2d)  # (NSAMPLE,) points on a disc [m]
+    footprint: real  # radius [m]
+
+
 @wp.kernel
 def cover_discs(
     # In:
     due: wp.array(dtype=int),
-    pos: wp.array(dtype=vec3),
-    tangent: wp.array2d(dtype=vec3),
-    pair_start: wp.array(dtype=int),
-    pair_face: wp.array(dtype=int),
-    disc: wp.array(dtype=wp.vec2d),
+    discs: Discs,
     face: wp.array(dtype=wp.vec3i),
-    footprint: real,
     rhs: int,
     middle: wp.array2d(dtype=vec3),
     thickness: wp.array2d(dtype=real),
@@ -168,19 +175,19 @@ def cover_discs(
     covered = int(0)
     local = real(0.0)
     for sweep in range(2):  # count the faces over each sample, then divide its weight
-        for k in range(pair_start[e], pair_start[e + 1]):
-            t = face[pair_face[k]]
-            a = _where_on_disc(middle[t[0], w], pos[e], tangent[e, 0], tangent[e, 1])
-            b = _where_on_disc(middle[t[1], w], pos[e], tangent[e, 0], tangent[e, 1])
-            c = _where_on_disc(middle[t[2], w], pos[e], tangent[e, 0], tangent[e, 1])
+        for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
+            t = face[discs.pair_face[k]]
+            a = _where_on_disc(middle[t[0], w], discs.pos[e], discs.tangent[e, 0], discs.tangent[e, 1])
+            b = _where_on_disc(middle[t[1], w], discs.pos[e], discs.tangent[e, 0], discs.tangent[e, 1])
+            c = _where_on_disc(middle[t[2], w], discs.pos[e], discs.tangent[e, 0], discs.tangent[e, 1])
             low = wp.min(a, wp.min(b, c))
             high = wp.max(a, wp.max(b, c))
-            if wp.max(low[0], low[1]) <= footprint and wp.min(high[0], high[1]) >= -footprint:
+            if wp.max(low[0], low[1]) <= discs.footprint and wp.min(high[0], high[1]) >= -discs.footprint:
                 e1 = b - a
                 e2 = c - a
                 area = e1[0] * e2[1] - e1[1] * e2[0]
                 for i in range(NSAMPLE):
-                    d = disc[i] - a
+                    d = discs.sample[i] - a
                     u = (d[0] * e2[1] - d[1] * e2[0]) / area
                     v = (e1[0] * d[1] - e1[1] * d[0]) / area
                     if wp.min(wp.min(u, v), real(1.0) - u - v) >= real(-_ON_EDGE):
