@@ -35,14 +35,14 @@ def hand(topic, sensors, there=lambda i, names: names):
             for name in there(i, list(sensors))
         ]
         out.add(message(header=stamp(time), bt_data=data), 0.0)
-    return out.parts()
+    return out.streams()
 
 
 def wrench(topic, force):
     out = Topic(topic)
     for time, value in zip(ONE.time, force):
         out.add(message(header=stamp(time), force=message(**dict(zip("xyz", value)))), 0.0)
-    return out.parts()
+    return out.streams()
 
 
 def test_a_sensor_keeps_its_number_whatever_the_order():
@@ -85,7 +85,7 @@ def test_joints_and_many_poses_are_no_pose_of_the_sensor():
     poses.add(message(poses=[pose, pose]), 1.0)
     one.add(message(pose=pose), 1.0)
     assert len(joints) == 0 and len(poses) == 0
-    assert set(one.parts()[0].fields) == {"sensor_pos", "sensor_quat"}
+    assert set(one.streams()[0].fields) == {"sensor_pos", "sensor_quat"}
 
 
 def test_a_topic_without_anything_whole_does_not_spoil_the_bag(tmp_path):
