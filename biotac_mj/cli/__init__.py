@@ -62,7 +62,7 @@ def parser() -> Parser:
     top = Parser(
         prog="biotac",
         description="A SynTouch BioTac fingertip in MuJoCo. Quantities have units, as in 1.5mm or -12deg; a "
-        "plain number is of SI.",
+        "plain number is in SI units.",
     )
     top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")

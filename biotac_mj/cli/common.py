@@ -40,7 +40,7 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
         "--tier",
         default="full",
         choices=TIERS,
-        help="full finite elements, or the condensed skin for real time on one core",
+        help="full finite elements, or the condensed skin, real time on one core",
     )
     verb.add_argument(
         "--material", default="default", help=f"{', '.join(MATERIALS)}, a .json file of a material, or JSON"
@@ -49,7 +49,7 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
         "--liquid",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="liquid under the skin (default: the material's choice)",
+        help="liquid under the skin (default: by the material)",
     )
     verb.add_argument("--seed", type=SEED, default=0, help=seed)
     verb.add_argument(
@@ -70,19 +70,19 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         "--signal",
         default="physics",
         metavar="NAME",
-        help="where the electrodes come from: physics (the film), latent_projection or learned (networks, "
+        help="source of the electrodes: physics (the film), latent_projection or learned (networks, "
         "extra learning), or a file *.safetensors of `biotac learn train`",
     )
     verb.add_argument(
         "--randomise",
         nargs="+",
         metavar="EFFECT",
-        help="effects that are drawn: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
+        help="random effects: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
     )
     verb.add_argument(
         "--effects",
         metavar="FILE.yaml",
-        help="a sensor that `biotac diagnose` amended: its base model and effects (sensor_amended.yaml)",
+        help="sensor file of `biotac diagnose`, with base model and effects (sensor_amended.yaml)",
     )
     for names, example in ((["--thermal"], "steel"), (["--texture", "--textures"], "cork")):
         verb.add_argument(
@@ -91,7 +91,7 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
             nargs="+",
             type=choice,
             metavar="MATERIAL",
-            help=f"of what {touched}, as in {example}, or JSON; of several one is drawn (default: left out)",
+            help=f"of {touched}, such as {example}, or JSON; of several one is drawn (default: none)",
         )
 
 

@@ -18,7 +18,7 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "diagnose",
         _diagnose,
-        "Name what the simulation misses in measured data; writes report.html and verdict.json.",
+        "Find effects in measured data that the simulation lacks; writes report.html and verdict.json.",
     )
     verb.add_argument(
         "data",
@@ -28,36 +28,38 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         "(docs/lab/discrepancy.md)",
     )
     verb.add_argument(
-        "--object", metavar="NAME", help="what touched in DATA, where it does not say, as sphere_7mm"
+        "--object",
+        metavar="NAME",
+        help="object in DATA, if the file does not name it, such as sphere_7mm",
     )
     verb.add_argument(
         "--repeatability",
         type=quantity("length", 5e-3, 1e-7),
         metavar="LENGTH",
-        help="by which poses differ from trial to trial (default: 0.05mm)",
+        help="scatter of poses between trials (default: 0.05mm)",
     )
     verb.add_argument(
         "--earlier",
         nargs="+",
         metavar="REPORT",
-        help="folders of earlier rounds' reports, whose trajectories are compared together with DATA",
+        help="folders of earlier reports, whose trajectories are added to DATA",
     )
-    verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --effects says)")
+    verb.add_argument("--skin", help="mesh that simulates DATA (default: that of --effects, or coarse)")
     verb.add_argument(
         "--effects",
         metavar="FILE.yaml",
-        help="the simulator that is compared with DATA: a sensor_amended.yaml (default: our own sensor)",
+        help="simulator to compare with DATA: a sensor_amended.yaml (default: our own sensor)",
     )
     verb.add_argument(
         "--electrodes",
         metavar="FILE",
         help="plain recording instead: text, a column of raw counts for each electrode, one row per sample; "
-        "or whatever `biotac recording import` reads",
+        "or any file of `biotac recording import`",
     )
     add_which(verb)
-    verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
+    verb.add_argument("--force", metavar="FILE", help="with --electrodes: Fx Fy Fz [N] row by row")
     verb.add_argument(
-        "--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row"
+        "--tdc", metavar="FILE", help="with --electrodes: raw counts of the thermistor row by row"
     )
     verb.add_argument(
         "--protocol",
@@ -75,18 +77,18 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--simulate",
         action="store_true",
-        help="flat presses with --force: fit each row's pose in simulated states (made the first time, in "
-        "minutes) and say in which stage of the model the rest disagrees",
+        help="flat presses with --force: fit each row's pose in simulated states (computed once, in "
+        "minutes) and report the stage of the model that disagrees",
     )
     verb.add_argument(
         "--also",
         nargs=2,
         action="append",
         metavar=("E", "F"),
-        help="electrodes and force of another sensor: with --simulate what both share is the base model's",
+        help="electrodes and force of another sensor, with --simulate: common errors are the base model's",
     )
     kept = (
-        "of the data, kept aside for the proof (default: "
+        "fraction of the data held out for the test (default: "
         "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     )
     verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="SHARE", help=kept)
@@ -94,7 +96,7 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         "--tier",
         default="full",
         choices=TIERS,
-        help="skin that simulates DATA; condensed is faster, and its own error may look like an effect",
+        help="skin that simulates DATA; condensed is faster, but its own error may look like an effect",
     )
     verb.add_argument(
         "--material", help="of the skin that simulates DATA: a preset, a .json file of a material, or JSON"
@@ -119,7 +121,7 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "next",
         _next,
-        "Plan the contacts that would tell apart what a diagnosis could not; writes poses over time.",
+        "Plan contacts that separate the explanations left by a diagnosis; writes poses over time.",
     )
     verb.add_argument(
         "report", metavar="REPORT", help="folder that `biotac diagnose` of data with poses wrote"
@@ -154,9 +156,9 @@ def add_checkup(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "checkup",
         _checkup,
-        "Say the steps of a checkup of a sensor, three minutes for anybody, and write them as a protocol.",
+        "Print the steps of a checkup of a sensor, three minutes by hand, and write them as a protocol.",
     )
-    verb.add_argument("--against", metavar="NAME", help="what the sensor will be held against")
+    verb.add_argument("--against", metavar="NAME", help="object that the sensor will be pressed on")
     verb.add_argument(
         "--out", type=output_file(), default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
     )

@@ -30,7 +30,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help="instead of DATA: our own skin of --truth pressed and slid, with --noise",
     )
     verb.add_argument(
-        "--truth", help="material of the synthetic skin; a preset, its liquid with it (default: rubber)"
+        "--truth", help="material of the synthetic skin; a preset, including its liquid (default: rubber)"
     )
     verb.add_argument(
         "--truth-skin",
@@ -50,7 +50,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--seed", type=SEED, default=0, help="of that noise")
     verb.add_argument(
-        "--indenter", default=None, metavar="NAME", help=f"what pressed, needed with CSV: {INDENTER_HELP}"
+        "--indenter", default=None, metavar="NAME", help=f"indenter, required for CSV: {INDENTER_HELP}"
     )
     verb.add_argument(
         "--direction",
@@ -68,7 +68,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--correct",
         action="store_true",
-        help="correct the fit by the mesh refined: the material, not the mesh's stiffness",
+        help="correct the fit by a refined mesh, to remove the discretisation error",
     )
     verb.add_argument(
         "--material",
@@ -88,13 +88,13 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         nargs="+",
         default=["E", "nu", "mu"],
         metavar="NAME[:LOW:HIGH]",
-        help="parameters, with bounds if you like",
+        help="parameters, optionally with bounds",
     )
     verb.add_argument(
         "--starts",
         type=whole(1, 100),
         default=1,
-        help="from so many points, if they promise a better fit: where forces jump, one may end beside it",
+        help="number of starting points, used if they may improve the fit: forces may jump in the parameters",
     )
     verb.add_argument(
         "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
@@ -144,7 +144,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         "--data",
         nargs="+",
         metavar="INDENTER=FILE",
-        help="measured indentations, not our stand-in; the first calibrates",
+        help="measured indentations instead of our reference; the first one is for calibration",
     )
     verb.add_argument(
         "--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which"
@@ -154,13 +154,13 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--seed", type=SEED, default=0, help="of the indentations")
     verb.add_argument(
-        "--reference-material", help="of the stand-in: a preset, its liquid with it (default: rubber)"
+        "--reference-material", help="of the reference: a preset, including its liquid (default: rubber)"
     )
-    verb.add_argument("--reference-skin", help="mesh of the stand-in (default: coarse)")
+    verb.add_argument("--reference-skin", help="mesh of the reference (default: coarse)")
     verb.add_argument(
         "--reference-element",
         choices=("linear", "quadratic"),
-        help="elements of the stand-in (default: quadratic)",
+        help="elements of the reference (default: quadratic)",
     )
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
     verb.add_argument(
@@ -207,25 +207,28 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     )
     add_load_arguments(verb)
     verb.add_argument(
-        "--rest", type=whole(1, 10**6), default=1, help="first rows whose mean is the sensor untouched"
+        "--rest",
+        type=whole(1, 10**6),
+        default=1,
+        help="first rows, whose mean is the sensor at rest",
     )
     verb.add_argument(
-        "--sensor", metavar="NAME", help="whose rest it is where the file has no row untouched, as in 1"
+        "--sensor", metavar="NAME", help="sensor of the rest counts if no row is without contact, such as 1"
     )
     verb.add_argument(
-        "--row", type=int, nargs="+", help="which rows (default: the one that differs most from rest)"
+        "--row", type=int, nargs="+", help="rows to estimate (default: the one that differs most from rest)"
     )
     verb.add_argument(
         "--known",
         metavar="FILE",
         help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, --rest rows "
-        "first: its touches teach what is this sensor's own",
+        "first: its touches calibrate this sensor",
     )
-    verb.add_argument("--touches", type=whole(1, 1000), default=10, help="how many of them")
+    verb.add_argument("--touches", type=whole(1, 1000), default=10, help="number of these touches")
     verb.add_argument(
         "--indenter",
         metavar="NAME",
-        help=f"what touches (default: that of a simulated press, else sphere_7mm): {INDENTER_HELP}",
+        help=f"indenter (default: that of a simulated press, else sphere_7mm): {INDENTER_HELP}",
     )
     verb.add_argument(
         "--skin",
@@ -234,7 +237,7 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--material",
-        help=f"{', '.join(MATERIALS)}, or a material's or calibration's .json; force goes with its modulus",
+        help=f"{', '.join(MATERIALS)}, or a material's or calibration's .json; force scales with its modulus",
     )
     add_options(verb)
     verb.add_argument(

@@ -85,7 +85,7 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         dest="two_way",
         action="store_true",
         default=False,
-        help="a servo with mass pushes the indenter and gives way",
+        help="a compliant servo with mass pushes the indenter",
     )
     verb.add_argument(
         "--friction",
@@ -178,7 +178,7 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "samples",
         _samples,
-        "Write synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
+        "Write synthetic sample files for diagnose and train: electrodes.txt, forces.txt, log.csv, set.",
     )
     files = output_folder("electrodes.txt", "forces.txt", "log.csv")
     verb.add_argument("out", type=files, metavar="DIR", help="folder to make")
@@ -186,7 +186,7 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         "--seed",
         type=SEED,
         default=0,
-        help="of touches and noise; 0 is shipped, others are simulated, in minutes",
+        help="of touches and noise; 0 is in the package, others take minutes of simulation",
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -227,7 +227,7 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--mount",
         metavar="FILE",
-        help="with --hand: what `biotac hand mount` wrote of one without a known name",
+        help="with --hand: file of `biotac hand mount` for an unknown hand",
     )
 
 
@@ -257,7 +257,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "recording",
         nargs="*",
         metavar="FILE",
-        help=f"skin.h5 of presses, several beside each other; or a task: {', '.join(TASKS)}",
+        help=f"skin.h5 of presses, one or several; or a task: {', '.join(TASKS)}",
     )
     add_skin(verb)
     verb.set_defaults(skin="coarse", tier="condensed")  # a press takes a second or two
@@ -265,7 +265,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "--hand", metavar="FILE", help="MJCF of a hand: with BioTacs on its fingertips and a ball"
     )
     verb.add_argument(
-        "--mount", metavar="FILE", help="with --hand: what `biotac hand mount` wrote of one without a name"
+        "--mount", metavar="FILE", help="with --hand: file of `biotac hand mount` for an unknown hand"
     )
     verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
     verb.add_argument(
@@ -305,7 +305,7 @@ def _play(args):
 
 def add_hands(verbs: argparse._SubParsersAction) -> None:
     """Adds it to the command line."""
-    add_verb(verbs, "list", _hands, "The hands that attach_to_hand knows by name, and their fingers.")
+    add_verb(verbs, "list", _hands, "List the known hands of attach_to_hand, and their fingers.")
 
 
 def _hands(args):
@@ -322,23 +322,23 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "mount",
         _mount,
-        "Find where a BioTac goes on a hand's link, for attach_to_hand(mount=FILE), and draw it.",
+        "Find the pose of a BioTac on a hand's link, for attach_to_hand(mount=FILE), and draw it.",
     )
     verb.add_argument("hand", metavar="HAND.xml", help="MJCF of the hand")
     verb.add_argument(
         "--body", nargs="+", required=True, metavar="NAME", help="the links with the fingertips"
     )
     for name, text in (
-        ("tip", "where the fingertip points in the link's frame (default: the link's longest way)"),
-        ("pad", "where the pad looks there (default: to the links opposite, or where its joint bends it to)"),
-        ("pos", "of the BioTac's frame there [m] (default: it ends where the link ends)"),
+        ("tip", "direction of the fingertip in the link's frame (default: the link's longest axis)"),
+        ("pad", "direction of the pad (default: to opposite links, or in which its joint bends it)"),
+        ("pos", "of the BioTac's frame [m] (default: it ends where the link ends)"),
     ):
         verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)
     verb.add_argument(
         "--replaces",
         nargs="*",
         metavar="GEOM",
-        help="geoms that the BioTac stands for (default: all of the link)",
+        help="geoms that the BioTac replaces (default: all of the link)",
     )
     verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
     verb.add_argument("--picture", type=output_file(), metavar="PNG", help="the link before and after")
@@ -352,9 +352,7 @@ def _mount(args):
 
 def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
     """Adds it to the command line."""
-    verb = add_verb(
-        verbs, "mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin."
-    )
+    verb = add_verb(verbs, "mesh", _import_mesh, "Import a skin, check it, and store it for --skin.")
     verb.add_argument(
         "path", metavar="PATH", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file"
     )
@@ -394,8 +392,8 @@ def _import_mesh(args):
 
 def add_design(verbs: argparse._SubParsersAction) -> None:
     """Adds its jobs to the command line."""
-    verb = add_verb(verbs, "new", _new_design, "Make a pad of your own: a folder for attach(design=FOLDER).")
-    verb.add_argument("folder", metavar="FOLDER", help="where it goes; its name is the design's")
+    verb = add_verb(verbs, "new", _new_design, "Make a custom pad: a folder for attach(design=FOLDER).")
+    verb.add_argument("folder", metavar="FOLDER", help="of the design; its name is the design's")
     length, axes = quantity("length", 0.1, 1e-4), ("ALONG", "ACROSS", "DEPTH")
     for name, text in (
         ("dome", "shell: half an ellipsoid of these semi axes over a core, with liquid"),
@@ -410,7 +408,7 @@ def add_design(verbs: argparse._SubParsersAction) -> None:
     for name in ("electrodes", "excitation"):
         text = "columns x y z [mm]: x to the fingertip, z out of the nail; none: no electrodes"
         verb.add_argument(f"--{name}", metavar="FILE", help=text)
-    verb = add_verb(verbs, "show", _show_design, "Say what a fingertip is.")
+    verb = add_verb(verbs, "show", _show_design, "Describe a fingertip.")
     verb.add_argument("design", metavar="DESIGN", help="biotac, biotac_sp, or a folder made by `new`")
 
 

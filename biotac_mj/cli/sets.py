@@ -15,7 +15,7 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "generate",
         _generate,
-        "Make a synthetic data set of random interactions; goes on where it was interrupted.",
+        "Make a synthetic data set of random interactions; continues an interrupted run.",
     )
     verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="interactions")
     verb.add_argument("--steps", type=whole(8, 2000), default=20, help="time steps of each")
@@ -23,13 +23,13 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--labelled",
         type=whole(0, 10_000_000),
-        help="of them, how many get the synthetic measured sensor's counts too (default: 359)",
+        help="number with counts of the synthetic measured sensor too (default: 359)",
     )
     verb.add_argument(
         "--recordings",
         type=whole(0, 10_000_000),
         default=0,
-        help="further interactions of which only the synthetic sensor's counts are kept",
+        help="further interactions with only the synthetic sensor's counts",
     )
     verb.add_argument(
         "--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches"
@@ -51,13 +51,13 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         "--batch",
         type=whole(1, 100_000),
         default=160,
-        help="worlds at most that are solved together; a shard holds one batch",
+        help="most worlds in a batch; a shard holds one batch",
     )
     verb.add_argument(
         "--measured-batch",
         type=whole(1, 100_000),
         default=90,
-        help="the same where the synthetic measured sensor takes part",
+        help="the same for batches with the synthetic measured sensor",
     )
     verb.add_argument("--measured-seed", type=SEED, default=0, help="number of the synthetic measured sensor")
     verb.add_argument(
@@ -72,7 +72,7 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--vary",
         metavar="JSON",
-        help="drawn anew for each interaction, JSON or a file of it: "
+        help="random values per interaction, JSON or a file of it: "
         '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
     )
     add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
@@ -104,7 +104,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "import",
         _import_data,
-        "Read recordings of real sensors, whatever `biotac recording import` reads, into a set.",
+        "Read recordings of real sensors, any file of `biotac recording import`, into a set.",
     )
     verb.add_argument("files", nargs="+", metavar="FILE", help="each becomes a shard")
     verb.add_argument("--force", metavar="FILE", help="forces row by row, text of 3 columns [N]")
@@ -112,7 +112,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         "--block",
         type=real(1e-3, 1e9),
         metavar="S",
-        help="cut into interactions of this length (they end at gaps of half a second in any case)",
+        help="split into interactions of this length (and at gaps of half a second)",
     )
     verb.add_argument(
         "--objects", nargs="+", metavar="NAME", help="NVIDIA's files: names of indenter types 0, 1, ..."
@@ -131,7 +131,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--measured",
         action="store_true",
-        help="measured counts, of interactions that have them, not simulated ones",
+        help="measured counts of interactions that have them, instead of simulated ones",
     )
     verb.add_argument(
         "--rate",

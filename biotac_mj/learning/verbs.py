@@ -30,7 +30,7 @@ def _add_train(verbs, verb):
         "reads "
         "force and place from electrodes; of a folder of trained networks the best one that predicts "
         "electrodes, "
-        "for attach(signal=FILE). Into a folder: all networks on a labelled set, which goes on where it was "
+        "for attach(signal=FILE). Into a folder: all networks on a labelled set, continued if it was "
         "interrupted.",
     )
     v.add_argument("source", metavar="SOURCE", help="a recording, a set, or a folder of trained networks")
@@ -44,7 +44,10 @@ def _add_train(verbs, verb):
         help="FILE.safetensors, or a folder of predictions, errors and weights",
     )
     v.add_argument(
-        "--fraction", type=real(0.2, 0.95), default=0.7, help="of a recording's rows, in time, that train"
+        "--fraction",
+        type=real(0.2, 0.95),
+        default=0.7,
+        help="fraction of a recording, in time, for training",
     )
     v.add_argument("--seed", type=SEED, default=0, help="of one model's random numbers")
     v.add_argument(
@@ -57,7 +60,7 @@ def _add_train(verbs, verb):
         "--splits",
         nargs="+",
         metavar="NAME",
-        help="trajectory (72/18/10 %% of interactions), or the object that training never sees, several "
+        help="trajectory (72/18/10 %% of interactions), or the object held out for the test, several "
         "with + (default: trajectory ring_7mm, on a CPU trajectory)",
     )
     v.add_argument(
@@ -182,7 +185,7 @@ def _add_judge(verbs, verb):
         verbs,
         "judge",
         _judge,
-        "Judge models, beside the mean or no change: trained networks on what they did not see; or, on a "
+        "Evaluate models, with the mean or no change as baselines: networks on held-out data; or, on a "
         "recording of a real sensor, codes of its electrodes and regressions of its force.",
     )
     v.add_argument(
@@ -197,10 +200,10 @@ def _add_judge(verbs, verb):
     v.add_argument(
         "--known",
         metavar="FILE",
-        help="another sensor's recording with force; judges what it teaches with few touches of this one",
+        help="another sensor's recording with force; evaluates its transfer with few touches of this one",
     )
     v.add_argument(
-        "--touches", type=whole(5, 10_000), help="labelled ones that go with --known (default: 20)"
+        "--touches", type=whole(5, 10_000), help="number of labelled ones for --known (default: 20)"
     )
     v.add_argument(
         "--new-sensor",
@@ -215,7 +218,7 @@ def _add_judge(verbs, verb):
         "--sensor",
         type=output_file(),
         metavar="FILE.yaml",
-        help="of --new-sensor: writes the sensor that its touches teach, for attach(effects=FILE)",
+        help="of --new-sensor: writes the adapted sensor, for attach(effects=FILE)",
     )
     v.add_argument(
         "--ship",
@@ -224,14 +227,14 @@ def _add_judge(verbs, verb):
         help="copy the trained weights there, each with a card",
     )
     v.add_argument(
-        "--fraction", type=real(), default=0.7, help="of the recording's rows, in time, that train"
+        "--fraction", type=real(), default=0.7, help="fraction of the recording, in time, for training"
     )
     v.add_argument("--seed", type=SEED, default=0, help="of the recording's networks")
     v.add_argument(
         "--json",
         type=output_file(),
         metavar="FILE",
-        help="where the numbers go, a plot beside them (default: out/judge/..., or in the folder)",
+        help="file of the results, with a plot (default: out/judge/..., or in the folder)",
     )
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -316,9 +319,9 @@ def _add_predict(verbs, verb):
         verbs,
         "predict",
         _predict,
-        "What a model says of a recording: force, contact place and electrodes with intervals and novelty; "
+        "Predict from a recording: force, contact position and electrodes with intervals and novelty; "
         "or, "
-        "of inverse weights, how the skin is deformed and where it is touched.",
+        "with inverse weights, deformation and contact of the skin.",
     )
     v.add_argument(
         "model",
@@ -335,7 +338,7 @@ def _add_predict(verbs, verb):
         "--tare",
         type=whole(1, 10_000_000),
         metavar="ROWS",
-        help="first rows, whose mean is the sensor at rest, for a model that reads changes",
+        help="number of first rows whose mean is the sensor at rest, for models of changes",
     )
     v.add_argument(
         "--row",

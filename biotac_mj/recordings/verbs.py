@@ -24,9 +24,9 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         "import",
         _import,
         "Read recordings of real BioTacs (text, CSV, MATLAB, .btd, ROS bags, HDF5) into one file; "
-        "says what it found: clock gaps, dropped and held rows, units, rate.",
+        "reports clock gaps, dropped and repeated rows, units, rate.",
     )
-    v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of forces and poses beside it")
+    v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of its forces and poses")
     add_load_arguments(v)
     v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
     v = verb(
@@ -35,7 +35,9 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         _export,
         "Write a recording, or the skin.h5 of a simulated press, as the bag of a driver of the real sensor.",
     )
-    v.add_argument("file", metavar="FILE", help="skin.h5 of a press, or what `biotac recording import` reads")
+    v.add_argument(
+        "file", metavar="FILE", help="skin.h5 of a press, or any file of `biotac recording import`"
+    )
     add_which(v)
     add_load_arguments(v)
     bag = v.add_mutually_exclusive_group(required=True)
@@ -43,7 +45,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     bag.add_argument("--ros2", type=_new_folder, metavar="OUT", help="a bag of ROS 2: a folder to make")
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
-    v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac recording import` wrote or reads")
+    v.add_argument("files", nargs="+", metavar="FILE", help="output or input of `biotac recording import`")
     add_which(v)
     add_load_arguments(v)
     v.add_argument("--out", type=output_file(), default="out/show.png", metavar="PNG", help="the picture")
@@ -62,15 +64,13 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         metavar="NAME",
         help="of --serial's lines, as time e1 ... e19 pdc (default: a header line, or e1..e19)",
     )
-    v.add_argument(
-        "--seconds", type=real(0.01, 1e6), help="how long (default: 10, or what the protocol takes)"
-    )
+    v.add_argument("--seconds", type=real(0.01, 1e6), help="duration (default: 10, or that of the protocol)")
     v.add_argument(
         "--protocol",
         type=output_file(),
         metavar="FILE.yaml",
-        help="prompt the steps of a checkup, those of this file where it is there (`biotac checkup`), and "
-        "write into it when they were done",
+        help="announce the steps of a checkup, from this file if it exists (`biotac checkup`), and "
+        "write their times into it",
     )
     v.add_argument("--object", metavar="NAME", help="what touches")
     v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
@@ -82,12 +82,12 @@ def add_which(verb: argparse.ArgumentParser) -> None:
         "--recording",
         dest="which",
         metavar="NAME",
-        help="which, where the file has several (default: the first)",
+        help="name, if the file has several (default: the first)",
     )
 
 
 def add_load_arguments(
-    verb: argparse.ArgumentParser, touched: str = "what touched (default: what the files say)"
+    verb: argparse.ArgumentParser, touched: str = "object that touched (default: from the files)"
 ) -> None:
     """Adds arguments for what files do not contain. touched: help of --object."""
     verb.add_argument(
@@ -96,7 +96,7 @@ def add_load_arguments(
     verb.add_argument(
         "--scale",
         type=real(1e-9, 1e9),
-        help="counts for one unit of the channels: 4095 where they are normalised",
+        help="counts per unit of the channels: 4095 if they are normalised",
     )
     verb.add_argument("--object", metavar="NAME", help=touched)
 

@@ -17,13 +17,13 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
         verbs,
         "resimulate",
         _resimulate,
-        "Drive the simulated skin along a recording: a set of deformations and measured electrodes; goes on "
-        "where it was interrupted.",
+        "Drive the simulated skin along a recording: a set of deformations and measured electrodes; "
+        "continues an interrupted run.",
     )
     v.add_argument("recording", metavar="FILE", help="of any kind that `biotac recording import` reads")
-    v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
+    v.add_argument("--force", metavar="FILE", help="its forces: text, 3 columns [N] row by row")
     add_which(v)
-    add_load_arguments(v, "what touched: a name of `biotac data generate --objects`, geom:... or mesh:FILE")
+    add_load_arguments(v, "object: a name of `biotac data generate --objects`, geom:... or mesh:FILE")
     v.add_argument(
         "--poses",
         choices=("recorded", "fitted"),
@@ -32,11 +32,11 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     )
     for name, text in (
         ("mount", "pose of the BioTac frame in the frame of the sensor's recorded pose (default: the same)"),
-        ("object-pose", "of an object that stood still and has no recorded pose"),
+        ("object-pose", "of a stationary object without recorded pose"),
     ):
         v.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs="+", metavar="X", help=f"{text}: {_TEXT}")
     v.add_argument(
-        "--at-most", type=real(0.1, 1e4), default=20.0, metavar="HZ", help="rows a second that are simulated"
+        "--at-most", type=real(0.1, 1e4), default=20.0, metavar="HZ", help="most simulated rows per second"
     )
     v.add_argument(
         "--block", type=real(0.1, 1e6), default=5.0, metavar="S", help="length of a touch with fitted poses"
@@ -50,7 +50,7 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
         help="liquid under the skin (default: the material's)",
     )
     v.add_argument("--options", metavar="JSON", help="further settings of the skin (docs/features.md)")
-    v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, together on a GPU")
+    v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, parallel on a GPU")
     v.add_argument("--workers", type=whole(0, 1024), help="processes for the readings (default: one a core)")
     v.add_argument("--seed", type=SEED, default=0, help="of the split, and of the simulated noise")
     v.add_argument("--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
