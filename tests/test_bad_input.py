@@ -859,10 +859,10 @@ def numbers():
     yield Row("press --two-way --one-way", "not allowed with")
     for option in ("truth rubber", "truth-skin coarse", "noise 0.1", "truth-liquid", "truth-options {}"):
         name = option.split()[0]
-        yield Row(f"{CALIBRATE} --{option}", f"--{name} is of our own synthetic skin: give --synthetic")
+        yield Row(f"{CALIBRATE} --{option}", f"--{name} belongs to our own synthetic skin: give --synthetic")
     for option in ("material rubber", "skin coarse", "element linear"):
         words = f"lab compare --data sphere_7mm=way.csv --reference-{option}"
-        yield Row(words, f"--reference-{option.split()[0]} is of our own synthetic skin: leave it out")
+        yield Row(words, f"--reference-{option.split()[0]} belongs to our own synthetic skin: leave it out")
     yield Row("view --render out.png --hand force.txt", "force.txt is no hand (")
     for name, ending in (("o.xyz", ".xyz"), ("o", "nothing")):
         yield Row(f"view --skin coarse --render {name}", f"{name} ends in {ending}: give one of .png")

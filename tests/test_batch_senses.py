@@ -186,7 +186,7 @@ def test_what_cannot_be_is_refused():
         ({"thermal": {"cup": "steel"}}, "no geom 'cup' to touch"),
         ({"thermal": ["steel", "foam"]}, "thermal is 'steel': give a dict, of geoms' names"),
         ({"thermal": {"pin": ["steel", "mithril"]}}, "no material is known by 'mithril'"),
-        ({"readings": {"cold": True}}, "cold is of a sensor with heat"),
+        ({"readings": {"cold": True}}, "cold needs a sensor with heat"),
         ({"readings": False, "thermal": {}}, "readings is False: leave signal, sensor"),
         ({"randomise": ["gremlins"]}, "cannot randomise 'gremlins'"),
         ({"sensor": "phac_f0", "readings": {"sensor": "1"}}, "readings has '1': give one of them"),

@@ -116,7 +116,7 @@ def test_a_film_that_cannot_be_is_refused_at_once(film, said):
 
 def test_paths_without_a_film_refuse_it():
     pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
-    with pytest.raises(ValueError, match="a network stands in the film's place"):
+    with pytest.raises(ValueError, match="a network replaces the film"):
         biotac_mj.attach(mujoco.MjSpec(), body="world", signal="learned", options={"film": {}})
     with pytest.raises(ValueError, match="options has 'film'"):
         read_settings(None, {"film": {}})

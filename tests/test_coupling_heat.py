@@ -84,5 +84,5 @@ def test_thermal_is_checked():
         pressed({"plate": "unobtainium"})
     with pytest.raises(ValueError, match="no geom 'cup' to touch"):
         pressed({"cup": "glass"})
-    with pytest.raises(ValueError, match="cold is of a sensor with heat"):
+    with pytest.raises(ValueError, match="cold needs a sensor with heat"):
         pressed(None, 0.01, {"cold": True})

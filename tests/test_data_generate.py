@@ -483,8 +483,8 @@ def test_what_cannot_vary_is_refused():
     with pytest.raises(ValueError, match="leave vary out, or choose tier='full'"):
         GenerateOptions(vary={"friction": [0, 1]}, tier="condensed")
     for vary, match in (
-        ({"prony": [0.1, 0.5]}, "prony varies and the material has none: give its terms in material"),
-        ({"hysteresis": [0.3, 0.9]}, "hysteresis varies and the material has none"),
+        ({"prony": [0.1, 0.5]}, "prony varies but the material has none: give its terms in material"),
+        ({"hysteresis": [0.3, 0.9]}, "hysteresis varies but the material has none"),
         ({"youngs_modulus": [-1.0, 5e5]}, "Young's modulus -1 Pa must be from 100"),
         ({"poissons_ratio": [0.3, 0.6]}, "Poisson's ratio 0.6 is outside"),
     ):

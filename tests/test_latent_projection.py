@@ -176,7 +176,7 @@ def test_predict_takes_the_inverse_projection(tmp_path, capsys):
 def test_a_networks_film_takes_no_settings_of_the_film():
     from biotac_mj.data.generation.generate import GenerateOptions
 
-    with pytest.raises(ValueError, match="a network stands in the film's place"):
+    with pytest.raises(ValueError, match="a network replaces the film"):
         GenerateOptions(signal=NAME, options={"film": {"residual_film": 1e-4}})
     with pytest.raises(ValueError, match="unknown signal 'telepathy'"):
         GenerateOptions(signal="telepathy")

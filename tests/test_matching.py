@@ -153,7 +153,7 @@ def test_what_cannot_be_matched_is_told(truth):
         PlateGrid(pitch=(0.2, 0.1))
     with pytest.raises(ValueError, match="rolls from 0 on"):
         PlateGrid(roll=(0.1, 0.2))
-    with pytest.raises(ValueError, match="knows no time"):
+    with pytest.raises(ValueError, match="no rate effects"):
         plate_states(load_skin("coarse"), dataclasses.replace(Material(), prony=((0.1, 1.0),)), quiet=True)
 
 

@@ -604,7 +604,7 @@ def test_what_is_wrong_is_said_of_recordings_in_other_units():
     volts[:, 9] = 1.0
     said = findings(Recording(time, volts, units={"electrodes": "volts"}))
     assert [line for line in said if line.startswith("warning")] == [
-        "warning: e10 never changes: is it dead? What reads it errs there"
+        "warning: e10 never changes: is it dead? Models that use it are wrong there"
     ]
 
 

@@ -398,7 +398,7 @@ def test_two_poses_of_one_body_are_said():
             topic.add(message(pose=message(position=position, orientation=turn)), 0.01 * k)
     (one,) = join([stream for topic in topics for stream in topic.streams()])
     assert (one.sensor_pos == [1, 0, 0]).all() and (one.sensor_quat == [1, 0, 0, 0]).all()
-    assert "finger_pose: left out sensor_pos, sensor_quat, which stands elsewhere too" in one.notes
+    assert "finger_pose: left out sensor_pos, sensor_quat, which is in another file too" in one.notes
 
 
 def test_lines_of_a_serial_port():
@@ -646,7 +646,7 @@ def test_saturated_and_dead_electrodes_are_named():
     value[221:231, 9] *= np.linspace(0, 0.9, 10).round(1)
     said = findings(dataclasses.replace(ONE, electrodes=value))
     assert any(line.startswith("warning: e5 never changes: is it dead?") for line in said)
-    assert any(line.startswith("warning: e8 stands still at 0 counts in 5.0%") for line in said)
+    assert any(line.startswith("warning: e8 is constant at 0 counts in 5.0%") for line in said)
     assert any(line.startswith("saturated (0 or 4095 counts): e10 5.") for line in said)
 
 

@@ -383,7 +383,7 @@ class _Problem:
             if np.sqrt((column**2).sum(1).mean()) < 1e-6 * self._scale:
                 raise ValueError(
                     f"the force of this indentation does not depend on {p.name}: "
-                    "leave it out, or load the skin so that it shows"
+                    "leave it out, or load the skin so that it matters"
                 )
 
     def descend(self, start, max_iterations):

@@ -26,12 +26,12 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
     """
     n, m, p = jacobian.shape
     if n * m <= p or n <= p:
-        raise ValueError(f"{n} samples cannot tell {p} parameters apart: record more of the indentation")
+        raise ValueError(f"{n} samples do not identify {p} parameters: record more of the indentation")
     normal = np.einsum("tip,tiq->pq", jacobian, jacobian)
     scale = np.sqrt(np.diag(normal))
     if (scale == 0).any() or np.linalg.cond(normal / np.outer(scale, scale)) > 1e12:
         raise ValueError(
-            "the forces do not tell the parameters apart: "
+            "the forces do not identify the parameters: "
             "fit fewer, or use an indentation with more shear and sliding"
         )
     inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)

@@ -50,7 +50,7 @@ def _complete(args, defaults, used, remedy):
         if getattr(args, name) is None:
             setattr(args, name, value)
         elif not used:
-            raise ValueError(f"--{name.replace('_', '-')} is of our own synthetic skin: {remedy}")
+            raise ValueError(f"--{name.replace('_', '-')} belongs to our own synthetic skin: {remedy}")
 
 
 def _body(name, skin, liquid, options):

@@ -56,7 +56,7 @@ class Logged(Effect):
         Args:
           counts: (n, c). time: (n, 1) [s]. rest: (1, c) counts at rest.
         """
-        raise NotImplementedError(f"{self.id} does not say what it makes of counts")
+        raise NotImplementedError(f"{self.id} does not implement `changed`")
 
 
 class Trend(typing.Protocol):

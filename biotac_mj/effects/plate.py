@@ -98,7 +98,7 @@ class PlateEffect(Effect):
         return {self.parameter: Param(self.unit, low, high, "a straight line: CHOSEN", abs(by), self.base)}
 
     def apply(self, run: Run, theta: dict) -> None:
-        raise NotImplementedError(f"{self.id} is what a skin is made with: solve a skin that has it")
+        raise NotImplementedError(f"{self.id} is a property of the skin: solve a skin that has it")
 
     @property
     def solved_anew(self) -> bool:

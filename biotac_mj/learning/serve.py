@@ -135,7 +135,7 @@ class LearnedReadings:
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
         if "film" in config.options:
-            raise ValueError("a network stands in the film's place: leave options['film'] out")
+            raise ValueError("a network replaces the film: leave options['film'] out")
         settings = check_settings(
             config.options.get("readings", {}), more={"weights": str | None}, design=geometry.design
         )

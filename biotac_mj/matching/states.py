@@ -129,7 +129,7 @@ def plate_states(
     """
     grid, options = grid or PlateGrid(), filled(options or SkinOptions(), material)
     if material.remembers:
-        raise ValueError("a table of states knows no time: leave prony, mullins and hysteresis out")
+        raise ValueError("a table of states has no rate effects: leave prony, mullins and hysteresis out")
     if not options.rest_pressure and options.contact_stiffness is None:  # else shapes do not scale with E
         material = dataclasses.replace(material, youngs_modulus=Material().youngs_modulus)
     node = np.unique(geometry.inner_face)

@@ -158,8 +158,8 @@ def put_back(log: Log) -> tuple[Log, list[Fault]]:
             out[:, k] += shift
     channels = tuple(int(k) for k in faulty)
     message = (
-        f"counts of {log.name(channels)} overflow at {band:.0f}: upper bits are lost; what is said is of "
-        "counts put back"
+        f"counts of {log.name(channels)} overflow at {band:.0f}: upper bits are lost; other findings are "
+        "for restored counts"
     )
     fault = Fault("overflow", channels, 0.0, (len(x) - 1) / log.rate, message, {"band": (band, band, band)})
     return dataclasses.replace(log, counts=np.clip(out, 0, 4095), read=None), [fault]

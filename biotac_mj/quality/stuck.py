@@ -40,7 +40,7 @@ def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         mask = np.zeros(log.counts.shape, bool)
         mask[:, k] = True
         value, end = float(low[k]), (len(log) - 1) / log.rate
-        message = f"{log.name([k])} never changes: is it dead? What reads it errs there"
+        message = f"{log.name([k])} never changes: is it dead? Models that use it are wrong there"
         level = {"value": (value, value, value)}
         found.append(Fault("stuck", (int(k),), 0.0, end, message, level, mask, silent=True, detector="dead"))
     return found
@@ -217,7 +217,7 @@ def _constant_fault(log, k, side, values, start, length):
         (k,),
         rows[0] / log.rate,
         rows[-1] / log.rate,
-        f"{log.name([k])} stands still at {value:.0f} counts in {flags.mean():.1%} of the samples{place}",
+        f"{log.name([k])} is constant at {value:.0f} counts in {flags.mean():.1%} of the samples{place}",
         {"level" if side else "value": (value, value - spread, value + spread)},
         mask,
         beyond=side,

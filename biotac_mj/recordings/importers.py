@@ -77,7 +77,7 @@ def load(
     if len(set(paths)) < len(paths):
         raise ValueError("a file is given twice: give each once")
     if not paths:
-        raise ValueError("no file was given: give the sensor's own, others beside it")
+        raise ValueError("no file was given: give the sensor's own, and others with it")
     roles = {pathlib.Path(p): role for p, role in ((force, "force"), (tdc, "tdc")) if p is not None}
     done, groups, shared = [], [], []
     companion_files = [path for path in paths if len(paths) > 1 and is_companion(path)]

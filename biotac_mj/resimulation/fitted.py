@@ -113,7 +113,7 @@ def fitted_touches(
     notes = [
         *found.notes,
         f"the plate's poses were fitted from force and electrodes (median misfit {np.median(misfit):.0f} "
-        "counts), row 0 of each touch is the fitted rest: nobody measured either",
+        "counts), row 0 of each touch is the fitted rest: neither was measured",
         f"Young's modulus that fits the forces: {const.modulus / 1e6:.2f} MPa",
     ]
     return out, dataclasses.replace(material, youngs_modulus=const.modulus), notes

@@ -183,7 +183,7 @@ def _object(recording, given):
     name = given or recording.object
     if not name or (given is None and name not in OBJECTS and not name.startswith(("geom:", "mesh:"))):
         raise ValueError(
-            f"{recording.name} was touched with {name or 'something that nobody named'}: give --object, one "
+            f"{recording.name} was touched with {name or 'an unknown object'}: give --object, one "
             f"of {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
         )
     return name

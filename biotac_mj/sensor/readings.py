@@ -88,7 +88,7 @@ class PhysicsReadings:
         if bodies is not None:
             self._heat = Heat(bodies)
         elif cold:
-            raise ValueError("cold is of a sensor with heat: give bodies, in attach thermal")
+            raise ValueError("cold needs a sensor with heat: give bodies (in attach: thermal)")
         self._warm = slice(self.acquisition.nstate, self.acquisition.nstate)
         if self._heat is not None:
             self._warm = slice(self._warm.start, self._warm.start + self._heat.nstate)

@@ -120,7 +120,7 @@ class GenerateOptions:
             object.__setattr__(self, "measured_skin", finest)
         take_sensor({"sensor": self.sensor, "randomise": self.randomise}, design=design)
         if read_signal(self.signal)[0] != "physics" and "film" in (self.options or {}):
-            raise ValueError("a network stands in the film's place: leave film out of options")
+            raise ValueError("a network replaces the film: leave film out of options")
         for value, read in ((self.thermal, read_thermal), (self.texture, read_texture)):
             if value is not None:
                 check_choices(value, read)

@@ -39,7 +39,7 @@ def refuse_impossible(vary: dict, material: Material) -> None:
     for name in _FACTORS:
         if name in vary and not getattr(material, name):
             raise ValueError(
-                f"{name} varies and the material has none: give its terms in material, "
+                f"{name} varies but the material has none: give its terms in material, "
                 "vary multiplies their g"
             )
     for end in (0, 1):

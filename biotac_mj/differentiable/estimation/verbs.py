@@ -111,7 +111,7 @@ def _inverted(args, pressed, design):
     liquid = {"liquid": own["liquid"]} if "liquid" in own else {}
     settings = read_settings(args.material or own.get("material"), options, **liquid)
     if settings.modulus is not None:
-        raise ValueError("an estimate knows no modulus by element: leave it out of --options")
+        raise ValueError("an estimate does not support moduli by element: leave them out of --options")
     skin, indenter = own.get("skin", shipped_skin(design, "coarse")), own.get("indenter", "sphere_7mm")
     return args.skin or skin, args.indenter or indenter, settings, film
 

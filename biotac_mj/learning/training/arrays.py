@@ -70,7 +70,7 @@ class Arrays:
         rows = mask.nonzero()[:, 0]
         if not len(rows):
             raise ValueError(
-                f"a part of the split has no {'labelled ' if labelled else ''}time steps: more interactions "
+                f"one split has no {'labelled ' if labelled else ''}time steps: more interactions "
                 "with measured counts are "
                 "needed (biotac data generate --labelled), or another object"
             )

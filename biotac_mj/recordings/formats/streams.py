@@ -401,7 +401,7 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
         notes += [n for n in (*other.notes, *more) if n not in notes]
         twice = [key for key in placed if key in fields]
         if twice:
-            notes.append(f"{other.source}: left out {', '.join(twice)}, which stands elsewhere too")
+            notes.append(f"{other.source}: left out {', '.join(twice)}, which is in another file too")
         fields |= {key: value for key, value in placed.items() if key not in twice}
         sources += [other.source]
     there = [key for key in CHANNELS if key in fields]
