@@ -402,7 +402,7 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
     signal, weights = read_signal(signal, settings.pop("weights", None))
     if signal != "physics":
         if "film" in config.options:
-            raise ValueError("a network stands in the film's place: leave options['film'] out")
+            raise ValueError("a network replaces the film: leave options['film'] out")
         from ..learning.serve import LearnedBatchFilm
 
         film = LearnedBatchFilm(geometry, nworld, device, weights)

@@ -167,7 +167,7 @@ class Senses:
             self._rests.append((wp.array(begins, dtype=wp.float64, device=device), self.heat.state))
             temperature = begins[:, THERMISTOR]
         elif cold:
-            raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
+            raise ValueError("cold needs a sensor with heat: give thermal, {} if all is of plastic")
         self.acquisition = BatchAcquisition(
             film.rest,
             nworld,

@@ -149,7 +149,7 @@ class Config:
             refuse_two_way(self.coupling, self.options)
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
-                raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
+                raise ValueError("cold needs a sensor with heat: give thermal, {} if all is of plastic")
 
     @property
     def rounds(self) -> int:
