@@ -23,7 +23,7 @@ from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.matching.match import log_changes, rows_of
 from biotac_mj.matching.states import PlateGrid, plate_states
 from biotac_mj.recordings import load_one
-from biotac_mj.resimulation.fitted import PLATE, plate_way
+from biotac_mj.resimulation.fitted import PLATE, plate_path
 from biotac_mj.sensor.channels import NELECTRODE, log_impedance
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.sensor.presets import SENSORS
@@ -66,7 +66,7 @@ def plates(geometry, rng):
     pitch, roll = np.radians([rng.uniform(0, 30), rng.uniform(-26, 26)])
     state = np.tile([pitch, roll, *rng.uniform(-1.4, 1.4, 2) / np.sqrt(2)], (_STEPS, 1))
     depth = np.concatenate([[-5e-6], np.linspace(0.1, 1, _STEPS - 1) * rng.uniform(0.8e-3, 2.2e-3)])
-    pos, mat, _ = plate_way(geometry, state, depth)
+    pos, mat, _ = plate_path(geometry, state, depth)
     return Motion("press", {}, pos, mat)
 
 
