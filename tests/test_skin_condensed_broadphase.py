@@ -10,7 +10,7 @@ import warp as wp
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, SkinModel, SkinOptions
 from biotac_mj.skin.condensed import LinearSkin
-from biotac_mj.skin.condensed.broadphase import _meets_core
+from biotac_mj.skin.condensed.broadphase import _may_meet_core, _meets_core
 from biotac_mj.skin.condensed.structs import Constants
 from biotac_mj.skin.contact.meshes import mesh_distance
 from biotac_mj.skin.types import real, vec3
@@ -25,7 +25,10 @@ def look(
     true_out: wp.array2d(dtype=int),
 ):
     f, w = wp.tid()
-    found_out[f, w] = _meets_core(f, w, share, x, c)
+    if _may_meet_core(f, w, share, x, c):
+        for i in range(c.sample.shape[0]):
+            if _meets_core(f, i, w, share, x, c):
+                found_out[f, w] = 1
     face = c.inner_face[f]
     moved = real(0.0)
     for k in range(3):

@@ -9,11 +9,11 @@ from ..contact.broadphase import (
     geoms_within,
     has,
     motion_bound,
-    sample_clearance,
+    sample_within,
 )
 from ..contact.meshes import TRILINEAR, mesh_distance
 from ..contact.penetration import core_clearance
-from ..contact.posed import SKIN, Geoms
+from ..contact.posed import SKIN, Geoms, face_radius
 from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
 from .lanes import block_max, block_rank, sync
@@ -144,51 +144,30 @@ def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=v
 
 
 @wp.func
-def _meets(
-    f: int,
-    w: int,
-    reach: real,
-    room: real,
-    near: wp.int64,
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-):
-    """Whether a sample of a face comes nearer to a geom of a set than a reach; it has to move by the room for
-    it."""
-    if room > real(0.0) and room * room > _ROOT3 * _ROOT3 * _moved(f, w, c.face, x, c):
-        return 0
-    t = c.face[f]
-    clearance = sample_clearance(x[t[0], w], x[t[1], w], x[t[2], w], c.sample, w, geoms, near, reach, reach)
-    return wp.where(clearance < reach, 1, 0)
+def _may_meet_core(f: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether an inner face may be nearer to the core than a fraction of its displacement: none has come
+    nearer by more than it has moved."""
+    moved = wp.sqrt(_moved(f, w, c.inner_face, x, c))
+    return c.inner_far[f] < moved + fraction * moved + _NEARLY
 
 
 @wp.func
-def _meets_core(f: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether a sample of an inner face is nearer to the core than a fraction of the face's displacement.
-    None has come nearer by more than it has moved, or by much more than its gap's slope foretells: so few
-    distances are looked at."""
+def _meets_core(f: int, i: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether sample i of an inner face is nearer to the core than a fraction of the face's displacement. No
+    sample has come nearer by more than it has moved, or by much more than the slope of its gap predicts: so
+    few distances are evaluated."""
     face = c.inner_face[f]
-    moved = wp.sqrt(_moved(f, w, c.inner_face, x, c))
-    reach = fraction * moved
-    if c.inner_far[f] >= moved + reach + _NEARLY:
-        return 0
-    k = c.core.grid[0]
+    reach = fraction * wp.sqrt(_moved(f, w, c.inner_face, x, c))
     x0 = x[face[0], w]
     x1 = x[face[1], w]
     x2 = x[face[2], w]
-    u0 = x0 - c.rest[face[0], 0]
-    u1 = x1 - c.rest[face[1], 0]
-    u2 = x2 - c.rest[face[2], 0]
-    for i in range(c.sample.shape[0]):
-        b = c.sample[i]
-        u = b[0] * u0 + b[1] * u1 + b[2] * u2
-        nearer = wp.min(c.inner_bend[f] * wp.length(u) - wp.dot(c.inner_slope[f, i], u), wp.length(u))
-        if c.inner_gap[f, i] - nearer < reach + _NEARLY:
-            p = b[0] * x0 + b[1] * x1 + b[2] * x2
-            if mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i] < reach:
-                return 1
-    return 0
+    b = c.sample[i]
+    u = b[0] * (x0 - c.rest[face[0], 0]) + b[1] * (x1 - c.rest[face[1], 0]) + b[2] * (x2 - c.rest[face[2], 0])
+    nearer = wp.min(c.inner_bend[f] * wp.length(u) - wp.dot(c.inner_slope[f, i], u), wp.length(u))
+    if c.inner_gap[f, i] - nearer >= reach + _NEARLY:
+        return False
+    p = b[0] * x0 + b[1] * x1 + b[2] * x2
+    return mesh_distance(c.core.grids, c.core.grid[0], p)[3] - c.inner_rest[f, i] < reach
 
 
 @wp.func
@@ -243,16 +222,74 @@ def find_faces(
         most = real(wp.inf)
         free = most
         near = ALL
-    new = int(0)  # those next to each other are near together: so they are looked at by different threads
-    for f in range(t, c.face.shape[0], threads):
-        if s.near[w, f] == 0 and s.far[w, view, f] < most:
-            if _meets(f, w, reach, s.far[w, view, f] - free, near, geoms, x, c) == 1:
+    # what is left is listed after each test, so that each thread has a part of it, and in the end a sample
+    count = int(0)
+    for begin in range(0, c.face.shape[0], threads):
+        f = begin + t
+        left = int(0)
+        if f < c.face.shape[0]:
+            if s.near[w, f] == 0 and s.far[w, view, f] < most:
+                room = s.far[w, view, f] - free  # by which it has to move
+                left = 1
+                if room > real(0.0) and room * room > _ROOT3 * _ROOT3 * _moved(f, w, c.face, x, c):
+                    left = 0
+        rank = block_rank(left)
+        if left == 1:
+            s.look[w, count + rank[0]] = f
+        count += rank[1]
+    sync()
+    close = int(0)
+    for begin in range(0, count, threads):
+        f = int(0)
+        left = int(0)
+        within = wp.int64(0)
+        if begin + t < count:
+            f = s.look[w, begin + t]
+            face = c.face[f]
+            center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+            left, within = geoms_within(center, radius + reach, w, geoms, near)
+        rank = block_rank(wp.min(left, 1))  # its barriers are between reading and writing
+        if left > 0:
+            s.look[w, close + rank[0]] = f
+            s.close_to[w, f] = within
+        close += rank[1]
+    sync()
+    nsample = c.sample.shape[0]
+    for m in range(t, close * nsample, threads):
+        f = s.look[w, m / nsample]
+        if s.near[w, f] == 0:
+            face = c.face[f]
+            b = c.sample[m % nsample]
+            x0 = x[face[0], w]
+            x1 = x[face[1], w]
+            x2 = x[face[2], w]
+            p = b[0] * x0 + b[1] * x1 + b[2] * x2
+            if sample_within(p, reach, face_radius(x1 - x0, x2 - x0), w, geoms, s.close_to[w, f]):
                 s.near[w, f] = 1
-                new += 1
-    for f in range(t, c.inner_face.shape[0], threads):
-        if s.near_core[w, f] == 0 and _meets_core(f, w, fraction, x, c) == 1:
+    sync()
+    new = int(0)
+    for k in range(t, close, threads):
+        new += s.near[w, s.look[w, k]]
+    sync()
+    inside = int(0)
+    for begin in range(0, c.inner_face.shape[0], threads):
+        f = begin + t
+        left = int(0)
+        if f < c.inner_face.shape[0]:
+            if s.near_core[w, f] == 0 and _may_meet_core(f, w, fraction, x, c):
+                left = 1
+        rank = block_rank(left)
+        if left == 1:
+            s.look[w, inside + rank[0]] = f
+        inside += rank[1]
+    sync()
+    for m in range(t, inside * nsample, threads):
+        f = s.look[w, m / nsample]
+        if s.near_core[w, f] == 0 and _meets_core(f, m % nsample, w, fraction, x, c):
             s.near_core[w, f] = 1
-            new += 1
+    sync()
+    for k in range(t, inside, threads):
+        new += s.near_core[w, s.look[w, k]]
     sync()
     nface = _list_marked(w, t, threads, 0, s.near, s.face)
     ncore = _list_marked(w, t, threads, 0, s.near_core, s.core_face)

@@ -24,7 +24,6 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 MOST_EQUATIONS = 1024  # that `eliminate` has room for
-_NEAR = 9600  # numbers of a matrix that has room in the memory that a block shares
 
 
 @wp.func_native("""
@@ -112,97 +111,129 @@ def block_rank(own: int) -> wp.vec2i:
     ...
 
 
-# Gauss's elimination with row pivots. On CUDA rows stay where they are, and a column takes one barrier: the
-# threads that make the next column find its pivot. A thread has a column and every warps-th row, four at
-# once, since a load takes long. A matrix that is not large is brought into shared memory.
+# Gauss's elimination with row pivots, of which eight are found at a time: what is right of their columns is
+# changed by all eight at once. On CUDA rows stay where they are. Eight columns are copied to shared memory,
+# where a thread has whole rows and a pivot takes one barrier; right of them it has a column and every
+# warps-th row, four at once, since a load takes long.
 @wp.func_native(f"""
     const int width = n + m;
     float* a = A.data + (long long)world * A.shape[1];
 #if defined(__CUDA_ARCH__)
     const int t = threadIdx.x, threads = blockDim.x, lane = t % 32, warp = t / 32, warps = threads / 32;
-    __shared__ float most[2][32];
-    __shared__ int row_of_most[2][32];
+    __shared__ float panel[{MOST_EQUATIONS}][9];
+    __shared__ unsigned long long most[2][32];
+    __shared__ float square[8][8];
     __shared__ unsigned short order[{MOST_EQUATIONS}];
     __shared__ unsigned char used[{MOST_EQUATIONS}];
-    __shared__ float here[{_NEAR}];
-    float* there = a;
-    if (n > {MOST_EQUATIONS}) return 0;
-    __syncthreads();
-    if (n * width <= {_NEAR}) {{
-        for (int i = t; i < n * width; i += threads) here[i] = a[i];
-        a = here;
-        __syncthreads();
-    }}
+    if (n > {MOST_EQUATIONS} || m > 8) return 0;
     for (int i = t; i < n; i += threads) used[i] = 0;
-    if (lane == 0) {{
-        float largest = 0.0f;
-        int at = n;
-        for (int i = warp; i < n; i += warps) {{
-            const float v = fabsf(a[(long long)i * width]);
-            if (v > largest) largest = v, at = i;
-        }}
-        most[0][warp] = largest;
-        row_of_most[0][warp] = at;
-    }}
-    for (int j = 0; j < n; ++j) {{
+    for (int first = 0; first < n; first += 8) {{
+        const int next = first + 8 < n ? first + 8 : n;
         __syncthreads();
-        float largest = 0.0f;
+        for (int o = t; o < 8 * n; o += threads)
+            panel[o / 8][o % 8] = first + o % 8 < next ? a[(long long)(o / 8) * width + first + o % 8] : 0.0f;
+        __syncthreads();
         int p = n;
-        for (int i = 0; i < warps; ++i) {{
-            const float v = most[j & 1][i];
-            const int k = row_of_most[j & 1][i];
-            if (v > largest || (v == largest && k < p)) largest = v, p = k;
+        float inverse = 0.0f;
+        for (int j = -1; j < next - first; ++j) {{
+            // by the last pivot the thread's rows are changed, and of them the next one is found
+            unsigned long long largest = 0;
+            for (int i = t; i < n; i += threads) {{
+                if (used[i] || i == p) continue;
+                if (j >= 0) {{
+                    const float f = panel[i][j] * inverse;
+                    panel[i][j] = f;
+                    for (int k = j + 1; k < 8; ++k) panel[i][k] -= f * panel[p][k];
+                }}
+                const float v = fabsf(panel[i][j + 1 < 8 ? j + 1 : 7]);
+                const unsigned long long key = (unsigned long long)__float_as_uint(v) << 32 | (n - i);
+                if (v > 0.0f && key > largest) largest = key;
+            }}
+            if (j >= 0 && p % threads == t) used[p] = 1;
+            if (j + 1 == next - first) break;
+            for (int far = 16; far > 0; far /= 2) {{
+                const unsigned long long other = __shfl_xor_sync(0xffffffffu, largest, far);
+                largest = other > largest ? other : largest;
+            }}
+            if (lane == 0) most[j & 1][warp] = largest;
+            __syncthreads();
+            largest = 0;
+            for (int i = 0; i < warps; ++i) largest = most[j & 1][i] > largest ? most[j & 1][i] : largest;
+            if (largest == 0) return 0;
+            p = n - (int)(largest & 0xffffffffu);
+            inverse = 1.0f / panel[p][j + 1];
+            if (t == 0) order[first + j + 1] = p;
         }}
-        if (p == n) return 0;
-        if (t == 0) order[j] = p, used[p] = 1;
-        const float* row = a + (long long)p * width;
-        const float inverse = 1.0f / row[j];
-        largest = 0.0f;
-        int at = n;
-        for (int k = j + 1 + lane; k < width; k += 32) {{
-            const float pivot = inverse * row[k];
-            const bool next = k == j + 1;
+        __syncthreads();
+        // what is right of the pivots in their rows
+        const unsigned short* row = order + first;
+        for (int k = next + t; k < width; k += threads) {{
+            float u[8];
+            for (int l = 0; l < next - first; ++l) u[l] = a[(long long)row[l] * width + k];
+            for (int l = 1; l < next - first; ++l) {{
+                for (int q = 0; q < l; ++q) u[l] -= panel[row[l]][q] * u[q];
+                a[(long long)row[l] * width + k] = u[l];
+            }}
+        }}
+        for (int o = t; o < 64; o += threads)
+            if (o / 8 < next - first && o % 8 < next - first)
+                a[(long long)row[o / 8] * width + first + o % 8] = panel[row[o / 8]][o % 8];
+        __syncthreads();
+        // and in all other rows
+        for (int k = next + lane; k < width; k += 32) {{
+            float u[8];
+            #pragma unroll
+            for (int l = 0; l < 8; ++l) u[l] = l < next - first ? a[(long long)row[l] * width + k] : 0.0f;
             for (int i = warp; i < n; i += 4 * warps) {{
-                float v[4], f[4];
+                float v[4];
                 bool on[4];
                 #pragma unroll
                 for (int b = 0; b < 4; ++b) {{
                     const int r = i + b * warps;
-                    on[b] = r < n && r != p && !used[r];
-                    f[b] = on[b] ? a[(long long)r * width + j] : 0.0f;
+                    on[b] = r < n && !used[r];
                     v[b] = on[b] ? a[(long long)r * width + k] : 0.0f;
                 }}
                 #pragma unroll
                 for (int b = 0; b < 4; ++b) {{
-                    v[b] -= f[b] * pivot;
-                    if (on[b]) a[(long long)(i + b * warps) * width + k] = v[b];
-                    if (on[b] && next && fabsf(v[b]) > largest) largest = fabsf(v[b]), at = i + b * warps;
+                    const int r = on[b] ? i + b * warps : i;
+                    #pragma unroll
+                    for (int l = 0; l < 8; ++l) v[b] -= panel[r][l] * u[l];
+                    if (on[b]) a[(long long)r * width + k] = v[b];
                 }}
             }}
         }}
-        if (lane == 0) {{
-            most[(j + 1) & 1][warp] = largest;
-            row_of_most[(j + 1) & 1][warp] = at;
+    }}
+    __syncthreads();
+    for (int o = t; o < n * m; o += threads)
+        panel[o / m][o % m] = a[(long long)order[o / m] * width + n + o % m];
+    for (int first = (n - 1) / 8 * 8; first >= 0; first -= 8) {{
+        const int count = first + 8 < n ? 8 : n - first;
+        for (int o = t; o < 64; o += threads)
+            if (o / 8 < count && o % 8 < count)
+                square[o / 8][o % 8] = a[(long long)order[first + o / 8] * width + first + o % 8];
+        __syncthreads();
+        for (int k = t; k < m; k += threads)
+            for (int i = count - 1; i >= 0; --i) {{
+                float v = panel[first + i][k];
+                for (int j = i + 1; j < count; ++j) v -= square[i][j] * panel[first + j][k];
+                panel[first + i][k] = v / square[i][i];
+            }}
+        __syncthreads();
+        for (int i = t; i < first; i += threads) {{
+            const float* mine = a + (long long)order[i] * width + first;
+            float f[8];
+            #pragma unroll
+            for (int l = 0; l < 8; ++l) f[l] = l < count ? mine[l] : 0.0f;
+            for (int k = 0; k < m; ++k) {{
+                float v = panel[i][k];
+                for (int l = 0; l < count; ++l) v -= f[l] * panel[first + l][k];
+                panel[i][k] = v;
+            }}
         }}
     }}
     __syncthreads();
-    for (int j = n - 1; j >= 0; --j) {{
-        float* row = a + (long long)order[j] * width;
-        for (int k = n + t; k < width; k += threads) row[k] /= row[j];
-        __syncthreads();
-        for (int i = t; i < j; i += threads) {{
-            float* mine = a + (long long)order[i] * width;
-            for (int k = n; k < width; ++k) mine[k] -= mine[j] * row[k];
-        }}
-        __syncthreads();
-    }}
-    // into the rows' own order, by a column of the matrix that nobody needs any more
-    for (int k = n; k < width; ++k) {{
-        for (int j = t; j < n; j += threads) a[(long long)j * width] = a[(long long)order[j] * width + k];
-        __syncthreads();
-        for (int j = t; j < n; j += threads) there[(long long)j * width + k] = a[(long long)j * width];
-        __syncthreads();
-    }}
+    for (int o = t; o < n * m; o += threads) a[(long long)(o / m) * width + n + o % m] = panel[o / m][o % m];
+    __syncthreads();
 #else
     // eight pivots are found at a time, and what is right of and below them is changed by all eight at once
     for (int first = 0; first < n; first += 8) {{
@@ -282,8 +313,8 @@ def block_rank(own: int) -> wp.vec2i:
     return 1;
 """)
 def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
-    """Solves n equations for m right-hand sides, which follow the matrix in each of the n rows of A[world]
-    and become the solutions; 0 where the matrix is singular or no number."""
+    """Solves n equations for m right-hand sides, at most eight, which follow the matrix in each of the n rows
+    of A[world] and become the solutions; 0 where the matrix is singular or no number."""
     ...
 
 

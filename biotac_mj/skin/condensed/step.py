@@ -190,6 +190,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     for name, count in (
         ("near", nface),
         ("near_core", ncore),
+        ("look", max(nface, ncore)),
         ("face", faces),
         ("core_face", core_faces),
         ("place", nouter),

@@ -88,6 +88,7 @@ class Scratch:
 
     near: wp.array2d(dtype=int)  # which faces are candidates, by their place among them plus one; 0: none
     near_core: wp.array2d(dtype=int)  # which inner ones
+    look: wp.array2d(dtype=int)  # faces of which that is not known yet
     face: wp.array2d(dtype=int)  # their numbers
     core_face: wp.array2d(dtype=int)
     close_to: wp.array2d(dtype=wp.int64)  # which geoms may touch a face that is a candidate

@@ -155,21 +155,24 @@ def gather_blocks(
         for a in range(3):
             s.swollen[w, 3 * k + a] = held[a]
     nsample = c.sample.shape[0]
-    for k in range(t, wp.min(inner, s.touched.shape[1] - room), threads):
+    most = s.core_block.shape[2]
+    for m in range(t, wp.min(inner, s.touched.shape[1] - room) * most, threads):
+        k = m / most
         p = s.core_node[w, s.touched[w, outer + k] - nnode]
-        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+        e = c.inner_ring_start[p] + m % most
+        if e < c.inner_ring_start[p + 1]:
             stiff = real(0.0)
-            for m in range(c.inner_term_start[e], c.inner_term_start[e + 1]):
-                f = c.inner_term[m] / 9
-                a = (c.inner_term[m] / 3) % 3
-                b = c.inner_term[m] % 3
+            for i in range(c.inner_term_start[e], c.inner_term_start[e + 1]):
+                f = c.inner_term[i] / 9
+                a = (c.inner_term[i] / 3) % 3
+                b = c.inner_term[i] % 3
                 place = s.near_core[w, f] - 1
                 if place >= 0:
                     weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
                     for n in range(nsample):
                         if s.now[w, place, n] < real(0.0):
                             stiff += weight * c.sample[n][a] * c.sample[n][b]
-            s.core_block[w, k, e - c.inner_ring_start[p]] = float(stiff)
+            s.core_block[w, k, m % most] = float(stiff)
     sync()
     return outer, inner
 

@@ -25,6 +25,7 @@ __all__ = [
     "list_unknown",
     "motion_bound",
     "sample_clearance",
+    "sample_within",
     "track_geoms",
 ]
 
@@ -111,6 +112,18 @@ def geom_clearance(
             if clearance < enough:
                 return clearance
     return clearance
+
+
+@wp.func
+def sample_within(p: vec3, reach: real, radius: real, w: int, geoms: Geoms, geom_set: wp.int64):
+    """Whether a sample of a face may be nearer to a geom of a set than the reach [m]. radius: of the face's
+    ball."""
+    for g in range(geoms.count):
+        if has(geom_set, g):
+            y = place_on(geoms, g, w, p)
+            if touch_bound(geoms, g, y, bound_to(geoms, g, p, y), radius) < reach:
+                return True
+    return False
 
 
 @wp.func
