@@ -40,7 +40,7 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
         "--tier",
         default="full",
         choices=TIERS,
-        help="full finite elements, or the condensed skin, real time on one core",
+        help="full finite elements, or the condensed skin, fast and less exact, for hands and control",
     )
     verb.add_argument(
         "--material", default="default", help=f"{', '.join(MATERIALS)}, a .json file of a material, or JSON"

@@ -41,7 +41,7 @@ class SkinSettings:
         them, or a Material. "calibrated" was fitted to real sensors. None is "default". In a batch also a
         sequence of one for each world, all of one law and element, with as many terms of memory.
       liquid: whether there is liquid under the skin. None: the material's choice.
-      tier: "full" finite elements, or "condensed" for real time on one CPU core.
+      tier: "full" finite elements, or "condensed", fast and less exact, for hands and control.
       options: SkinOptions or a dict of its fields; as a keyword `options["skin"]`.
       modulus: a factor on Young's modulus for each element (nelem,), a .npy file of them, or a function of
         positions (n, 3) [m], asked at the elements' centroids; as a keyword `options["modulus"]`.

@@ -1,1 +1,1 @@
-"""Skins behind the protocol `SkinStepper`: finite elements, and the tier for real time."""
+"""Skins behind the protocol `SkinStepper`: finite elements, and the fast tier."""

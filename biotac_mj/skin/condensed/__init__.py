@@ -1,4 +1,4 @@
-"""The real-time tier: a skin that is linear but for its contact, solved over the nodes that touch.
+"""The fast tier: a skin that is linear but for its contact, solved over the nodes that touch.
 
 Displacements are u = C (s f + c p g): C the inverse of the stiffness at rest, f the contact forces of outer
 nodes (Coulomb friction) and of inner nodes against the core (normal only), p the liquid's pressure above that
