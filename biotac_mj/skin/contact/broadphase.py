@@ -1,8 +1,8 @@
 """Broad phase: which faces of a surface may touch which geoms.
 
-Distances are bounded from below (`posed.bound_to`), so a face that is left out cannot touch. A face as a
-whole is bounded by the ball around its centre, at the price of one distance for each geom. The full tier
-keeps what it finds as a clearance, until the face and the geoms may have moved that far.
+Distances are bounded from below (`posed.bound_to`), so a face that is excluded cannot touch. A ball around a
+face bounds its distance by one evaluation for each geom. The full tier stores the distance as a clearance
+until the face and the geoms may have moved that far.
 """
 
 import warp as wp
@@ -20,7 +20,7 @@ __all__ = [
     "geom_clearance",
     "geoms_within",
     "has",
-    "keep_clearance",
+    "store_clearance",
     "list_near",
     "list_unknown",
     "motion_bound",
@@ -31,10 +31,10 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-FREE = wp.constant(real(1.0))  # [m] clearance of what nothing is near to
+FREE = wp.constant(real(1.0))  # [m] clearance of a face far from all geoms
 
 
-# sets of geoms: a bit for each of the first 63; later ones belong to every set
+# a set of geoms has a bit for each of the first 63; later geoms belong to every set
 ALL = wp.constant(wp.int64(-1))
 
 
@@ -48,7 +48,7 @@ def has(geom_set: wp.int64, g: int):
 
 @wp.func
 def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms, geom_set: wp.int64):
-    """How many geoms of a set may be nearer to a point than the reach [m], and their set."""
+    """Number and set of the geoms of a set that may be closer to a point than `reach` [m]."""
     count = int(0)
     found = wp.int64(0)
     for g in range(geoms.count):
@@ -62,7 +62,7 @@ def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms, geom_set: wp.i
 
 @wp.func
 def face_ball(x0: vec3, x1: vec3, x2: vec3):
-    """Centre and radius [m] of a ball around a face."""
+    """Centre and radius of a ball around a face [m]."""
     center = (x0 + x1 + x2) / real(3.0)
     radius = wp.sqrt(
         wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
@@ -72,7 +72,7 @@ def face_ball(x0: vec3, x1: vec3, x2: vec3):
 
 @wp.func
 def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms, geom_set: wp.int64):
-    """Lower bound of a face's distance from all geoms of a set [m], by its ball."""
+    """Lower bound of a face's distance from all geoms of a set [m], from its ball."""
     center, radius = face_ball(x0, x1, x2)
     clearance = FREE
     for g in range(geoms.count):
@@ -98,9 +98,8 @@ def geom_clearance(
     most: real,
     enough: real,
 ):
-    """Lower bound of the distance [m] of a face's samples from geom g at pos, mat, where that is less than
-    `most`; else that. The search ends at a sample that is nearer than `enough`. center, radius: the face's
-    ball."""
+    """Lower bound of the distance of a face's samples from geom g at pos, mat, at most `most` [m]. Returns
+    early at a sample that is closer than `enough`. center, radius: ball around the face."""
     clearance = most
     y = wp.transpose(mat) * (center - pos)
     if touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) < radius + most:
@@ -152,8 +151,8 @@ def sample_clearance(
 
 @wp.func
 def motion_bound(pos0: vec3, mat0: mat33, pos: vec3, mat: mat33, center: vec3, radius: real):
-    """How far a point that is fixed in a ball moves at most [m] in the frame of a geom that goes from pose 0
-    to the other. By that frame's coordinates, as distances are: rotations may be rounded."""
+    """Most that a point fixed in a ball moves in the frame of a geom that moves from pose 0 to another [m].
+    Computed from coordinates in that frame, as distances are, since rotations may be rounded."""
     turn = mat - mat0
     moved = wp.length(wp.transpose(mat) * (center - pos) - wp.transpose(mat0) * (center - pos0))
     return moved + wp.sqrt(wp.ddot(turn, turn)) * radius
@@ -161,7 +160,7 @@ def motion_bound(pos0: vec3, mat0: mat33, pos: vec3, mat: mat33, center: vec3, r
 
 @wp.func
 def contact_range(laws: Laws, w: int):
-    """How far from a geom skin feels it [m]."""
+    """Largest gap with a contact force [m]."""
     reach = real(0.0)
     if laws.reach.shape[0] > 0:
         reach = laws.reach[w]
@@ -172,29 +171,28 @@ def contact_range(laws: Laws, w: int):
 
 @wp.struct
 class ClearanceCache:
-    """Clearances of the faces of a surface. A distance changes by no more than the face and the geoms have
-    moved, so a face that was clear by more is skipped. A face that leaves the ball around the skin is always
+    """Clearances of the faces of a surface. A distance changes by at most the motion of the face plus that of
+    the geoms, so a face is skipped while its clearance is larger. A face outside the ball is always
     evaluated."""
 
-    center: vec3  # of the ball [m]
+    center: vec3  # of the ball around the skin [m]
     radius: real
-    mark: wp.array(dtype=int)  # of the geoms that were tracked last [world]
-    pos: wp.array2d(dtype=vec3)  # where they were [geom, world]
+    mark: wp.array(dtype=int)  # number of the geoms that were tracked last [world]
+    pos: wp.array2d(dtype=vec3)  # their poses [geom, world]
     mat: wp.array2d(dtype=mat33)
-    travel: wp.array(dtype=real)  # path length of the geoms, at most, since it was last zero [world] [m]
-    # corners of the face when its clearance was found, to 1e-9 m [3 face + corner, world]
-    seen: wp.array2d(dtype=wp.vec3)
-    since: wp.array2d(dtype=real)  # travel then [face, world]
+    travel: wp.array(dtype=real)  # bound of the geoms' path length since it was last zero [world] [m]
+    seen: wp.array2d(dtype=wp.vec3)  # corners when the clearance was found [3 face + corner, world] [m]
+    since: wp.array2d(dtype=real)  # travel when the clearance was found [face, world] [m]
     clearance: wp.array2d(dtype=real)  # [face, world] [m]
-    unknown: wp.array(dtype=int)  # face x world whose clearance is used up
-    near: wp.array(dtype=int)  # face x world that may touch
-    count: wp.array(dtype=int)  # how many of either
+    unknown: wp.array(dtype=int)  # face * nworld + world of the faces without clearance
+    near: wp.array(dtype=int)  # face * nworld + world of the faces that may touch
+    count: wp.array(dtype=int)  # lengths of these two lists
 
 
-_FAR = wp.constant(real(2.0))  # [m] more than any clearance
-_ROUNDED = wp.constant(real(1.0e-7))  # [m] more than places and distances of meshes are rounded by
-_STRETCHED = wp.constant(real(1.0 + 1.0e-6))  # more than poses in single precision stretch
-_LONG = wp.constant(real(1.0e3))  # [m] of travel beside which small motions would be lost
+_FAR = wp.constant(real(2.0))  # [m] above every clearance
+_ROUNDED = wp.constant(real(1.0e-7))  # [m] above the rounding of positions and of distances of meshes
+_STRETCHED = wp.constant(real(1.0 + 1.0e-6))  # above the stretch by rotations in single precision
+_LONG = wp.constant(real(1.0e3))  # [m] of travel, to which small motions cannot be added exactly
 
 
 @wp.kernel
@@ -206,7 +204,7 @@ def track_geoms(
     # In and out:
     cache: ClearanceCache,
 ):
-    """Adds what geoms have moved since the last evaluation, and empties the lists."""
+    """Adds the geoms' motion since the last evaluation to `travel` of world w, and empties the lists."""
     w = wp.tid()
     if w == 0:
         cache.count[0] = 0
@@ -223,17 +221,17 @@ def track_geoms(
         far = wp.max(far, moved)
         cache.pos[g, w] = p
         cache.mat[g, w] = R
-    if cache.mark[w] != mark:  # others were tracked
+    if cache.mark[w] != mark:  # other geoms were tracked
         cache.mark[w] = mark
         far = _FAR
     cache.travel[w] = cache.travel[w] + far
     if not (cache.travel[w] < _LONG):
-        cache.travel[w] = real(0.0)  # less than any face has seen: all are evaluated
+        cache.travel[w] = real(0.0)  # less than `since` of every face: all are evaluated
 
 
 @wp.func
 def _is_clear(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, reach: real, cache: ClearanceCache):
-    """Whether a face has not come near since its clearance was found."""
+    """Whether the clearance of a face is larger than all motion since it was found."""
     out = wp.length_sq(x0 - cache.center)
     out = wp.max(out, wp.max(wp.length_sq(x1 - cache.center), wp.length_sq(x2 - cache.center)))
     if not (out < cache.radius * cache.radius) or cache.since[f, w] > cache.travel[w]:
@@ -246,9 +244,9 @@ def _is_clear(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, reach: real, cache: 
 
 
 @wp.func
-def keep_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, clearance: real, cache: ClearanceCache):
-    """Keeps the clearance of a face [m]. A face whose place is not finite has none: it is evaluated again,
-    wherever it goes."""
+def store_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, clearance: real, cache: ClearanceCache):
+    """Stores the clearance of a face [m]. A face whose position is not finite has none, and is always
+    evaluated."""
     known = clearance
     if not wp.isfinite(wp.length_sq(x0) + wp.length_sq(x1) + wp.length_sq(x2)):
         known = real(-1.0)
@@ -270,8 +268,8 @@ def list_unknown(
     # Out:
     near_out: wp.array2d(dtype=int),
 ):
-    """Lists the faces whose clearance is used up. They are few, and `list_near` takes so many registers on
-    CUDA that the others would wait for it. Their order is arbitrary and changes no result."""
+    """Lists face f if its clearance is used up. A kernel of its own, since `list_near` takes many registers
+    on CUDA and only few faces need it. The order of the list changes no result."""
     f, w = wp.tid()
     if on[w] == 0:
         return
@@ -294,8 +292,7 @@ def list_near(
     # Out:
     near_out: wp.array2d(dtype=int),
 ):
-    """Of the faces that `list_unknown` found, lists those that may touch, and keeps the clearance of the
-    others."""
+    """Lists the faces without clearance that may touch, and stores the clearance of the others."""
     for k in range(wp.tid(), cache.count[0], threads):
         f = cache.unknown[k] // x.shape[1]
         w = cache.unknown[k] % x.shape[1]
@@ -314,4 +311,4 @@ def list_near(
                 for i in range(f * nsample, (f + 1) * nsample):
                     contact.trial_geom[i, w] = -1
                     contact.bond[i, w] = -1
-            keep_clearance(f, w, x0, x1, x2, clearance, cache)
+            store_clearance(f, w, x0, x1, x2, clearance, cache)

@@ -1,8 +1,7 @@
-"""The faces of a surface that geoms may touch: sums over samples, wrenches, anchors.
+"""Faces of a contact surface: sums over samples, wrenches, anchors.
 
-Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too
-(as surface-to-surface contact does in ANSYS and CalculiX); `touch` says what a sample feels. Far faces are
-left out by one distance of their centre."""
+Each face has `nsample` points with equal parts of its rest area, so that contact acts between the nodes, too
+(surface-to-surface contact as in ANSYS and CalculiX). `touch` computes the force at a sample."""
 
 import numpy as np
 import warp as wp
@@ -34,21 +33,21 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Laws:
-    """What a `ContactLaw` is in every world (nworld,); of a surface without one all arrays are empty, but
-    perhaps for its smoothing."""
+    """Parameters of a `ContactLaw` in every world (nworld,). Without a law all arrays except the smoothing
+    are empty."""
 
     exponent: wp.array(dtype=real)  # n
     pressure: wp.array(dtype=real)  # p0 [Pa]
-    work: wp.array(dtype=real)  # W of coming together [J/m^2]
-    parting: wp.array(dtype=real)  # of parting
+    work: wp.array(dtype=real)  # work of adhesion W [J/m^2]
+    separation: wp.array(dtype=real)  # work of separation [J/m^2]
     reach: wp.array(dtype=real)  # range of adhesion [m]
-    smoothing: wp.array(dtype=real)  # half width of first touch [m]; empty where nobody asks for it
+    smoothing: wp.array(dtype=real)  # half width of the smoothed kink at first contact [m]; perhaps empty
     node_area: wp.array(dtype=real)  # of the surface [nvert] [m^2]
     node_normal_force: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
 
 
 def empty_laws(device: wp.DeviceLike) -> Laws:
-    """Of a surface without a ContactLaw."""
+    """Laws of a surface without a ContactLaw."""
     laws = Laws()
     for name, variable in Laws.vars.items():
         none = wp.zeros((0,) * variable.type.ndim, dtype=variable.type.dtype, device=device)
@@ -58,8 +57,7 @@ def empty_laws(device: wp.DeviceLike) -> Laws:
 
 @wp.struct
 class Contact:
-    """Contact of one surface in all worlds: what a face and its samples are evaluated with, and what that
-    writes."""
+    """Contact of one surface in all worlds: parameters, anchors, and results of the evaluation."""
 
     face: wp.array(dtype=wp.vec3i)
     area: wp.array(dtype=real)  # of the faces at rest [m^2]
@@ -67,8 +65,8 @@ class Contact:
     stick_ratio: real
     stiffness: wp.array(dtype=real)  # [world] [Pa/m]
     laws: Laws
-    x_last: wp.array2d(dtype=vec3)  # nodes where the load increment began [m]
-    bound: wp.array2d(dtype=real)  # of friction [sample, world] [N], see `touch`; perhaps empty
+    x_last: wp.array2d(dtype=vec3)  # nodes at the start of the load increment [node, world] [m]
+    bound: wp.array2d(dtype=real)  # stored bound of friction [sample, world] [N]; perhaps empty
     # of a `data.ContactState`
     anchor_geom: wp.array2d(dtype=int)
     anchor: wp.array2d(dtype=vec3)
@@ -97,8 +95,7 @@ def face_samples(order: int) -> np.ndarray:
 
 @wp.struct
 class FaceSum:
-    """Force on the corners of a face, and the six blocks of its tangent between them, of the samples so
-    far."""
+    """Forces on the corners of a face [N] and the six blocks of its tangent [N/m], summed over samples."""
 
     f0: vec3
     f1: vec3
@@ -113,7 +110,7 @@ class FaceSum:
 
 @wp.func
 def with_sample(total: FaceSum, b: vec3, force: vec3, K: mat33):
-    """The sum with a sample at barycentric b."""
+    """Adds a sample at barycentric coordinates b."""
     total.f0 += b[0] * force
     total.f1 += b[1] * force
     total.f2 += b[2] * force
@@ -149,13 +146,13 @@ def write_face(
 
 @wp.func
 def block_index(a: int, b: int):
-    """Which of the six stored blocks of a face couples corners a <= b: 00 01 02 11 12 22."""
+    """Index of the stored block of a face between corners a <= b: 00 01 02 11 12 22."""
     return a * (5 - a) // 2 + b
 
 
 @wp.kernel
 def switch_off_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
-    """Switches off the worlds in which a face touches."""
+    """Clears the flag of a world in which face f touches."""
     f, w = wp.tid()
     if on[w] == 1 and touching[f, w] == 1:
         on[w] = 0
@@ -163,7 +160,7 @@ def switch_off_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int))
 
 @wp.kernel
 def clear_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
-    """Where nothing will touch there is no friction."""
+    """Clears the friction bound of sample i, for faces that the broad phase will skip."""
     i, w = wp.tid()
     if on[w] == 1:
         bound[i, w] = real(0.0)
@@ -180,7 +177,7 @@ def normal_forces(
     # Out:
     corner_out: wp.array2d(dtype=real),
 ):
-    """Size of the normal push on the corners of every face [N]."""
+    """Normal force on the corners of face f [N]."""
     f, w = wp.tid()
     if on[w] == 0:
         return
@@ -194,22 +191,22 @@ def normal_forces(
         for s in range(nsample):
             b = contact.sample[s]
             p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
-            deepest = Meeting()  # it meets one geom, as in `touch`
+            deepest = Meeting()  # a sample touches one geom, as in `touch`
             for g in range(geoms.count):
                 dn = distance_to(geoms, g, w, p)
                 met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v, 1)
                 if met.gap < deepest.gap:
                     deepest = met
-            total -= k * deepest.part * deepest.gap * deepest.at
+            total -= k * deepest.weight * deepest.gap * deepest.at
     for c in range(3):
         corner_out[3 * f + c, w] = total[c]
 
 
 class NormalForces:
-    """Size of the normal force on faces of a single world, recorded once.
+    """Normal forces on faces of a single world, by a recorded launch.
 
     Args:
-      contact, geoms, x: of the surface, what touches it and where its nodes (nvert, 1) are [m].
+      contact, geoms: of the surface, and the geoms that touch it. x: nodes (nvert, 1) [m].
     """
 
     def __init__(self, contact: Contact, geoms: Geoms, x: wp.array):
@@ -221,7 +218,7 @@ class NormalForces:
         self._run = Program(device, lambda program: program.launch(normal_forces, dim, given, [corner])).run
 
     def __call__(self, faces: np.ndarray) -> np.ndarray:
-        """(nface,) [N], 0 on what is not among `faces`, numbers of those that may be touched."""
+        """Normal forces (nface,) [N], 0 on faces that are not in `faces`, indices of those that may be touched."""
         near = np.zeros(self._near.shape, np.int32)
         near[faces] = 1
         self._near.assign(near)
@@ -239,6 +236,7 @@ def sum_normal_forces(
     # Out:
     laws: Laws,
 ):
+    """Sums the normal force at node i [N]."""
     i, w = wp.tid()
     if on[w] == 0:
         return
@@ -256,36 +254,36 @@ def partial_wrench(
     x: wp.array2d(dtype=vec3),
     contact: Contact,
     # Out:
-    part_out: wp.array3d(dtype=vec3),
+    partial_out: wp.array3d(dtype=vec3),
     touched_by: wp.array2d(dtype=int),
 ):
-    """Force and torque of a chunk of faces ON each group of geoms [2 group + (0, 1), chunk, world]; marks
-    geoms that touch."""
+    """Force and torque of a chunk of faces ON each group of geoms [2 group + (0, 1), chunk, world] [N, N m];
+    marks geoms that touch."""
     c, w = wp.tid()
-    for k in range(part_out.shape[0]):
-        part_out[k, c, w] = vec3()
+    for k in range(partial_out.shape[0]):
+        partial_out[k, c, w] = vec3()
     nsample = contact.sample.shape[0]
-    last = int(-1)  # whose force and torque have not been written yet
+    last = int(-1)  # group whose force and torque have not been written yet
     push = vec3()
     turn = vec3()
     for f in range(c * chunk, wp.min((c + 1) * chunk, contact.face.shape[0])):
         if contact.touching[f, w] == 1:
             t = contact.face[f]
-            # what pushes elsewhere than at a sample, at an edge of a geom, has another torque
+            # torque of the forces that act beside their samples, at edges of geoms
             other = vec3()
             for a in range(3):
                 other += wp.cross(x[t[a], w], contact.corner[3 * f + a, w])
             for s in range(nsample):
                 i = f * nsample + s
                 g = contact.trial_geom[i, w]
-                if g >= 0 and g < geoms.count:  # a world that is off may have touched other geoms
+                if g >= 0 and g < geoms.count:  # a skipped world may have touched other geoms
                     b = contact.sample[s]
                     p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
                     k = 2 * geoms.group[g]
                     if k != last:
                         if last >= 0:
-                            part_out[last, c, w] = part_out[last, c, w] + push
-                            part_out[last + 1, c, w] = part_out[last + 1, c, w] + turn
+                            partial_out[last, c, w] = partial_out[last, c, w] + push
+                            partial_out[last + 1, c, w] = partial_out[last + 1, c, w] + turn
                         last = k
                         push = vec3()
                         turn = vec3()
@@ -296,18 +294,18 @@ def partial_wrench(
                     touched_by[g, w] = 1
             turn -= other
     if last >= 0:
-        part_out[last, c, w] = part_out[last, c, w] + push
-        part_out[last + 1, c, w] = part_out[last + 1, c, w] + turn
+        partial_out[last, c, w] = partial_out[last, c, w] + push
+        partial_out[last + 1, c, w] = partial_out[last + 1, c, w] + turn
 
 
-# in a module of its own: the others are launched by other blocks, and would be compiled for both
+# in a module of its own: the others are launched with another block size, and would be compiled for both
 @wp.kernel(module=f"{__name__}.sum_wrench", enable_backward=False)
-def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
-    """Wrench on each group of geoms [group, world, 6], by the threads of a block."""
+def sum_wrench(partial: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
+    """Wrench on each group of geoms [group, world, 6] [N, N m], summed by the threads of a block."""
     k, w, t = wp.tid()
     total = vec3()
-    for c in range(t, part.shape[1], wp.block_dim()):
-        total += part[k, c, w]
+    for c in range(t, partial.shape[1], wp.block_dim()):
+        total += partial[k, c, w]
     total = sum_of_block(total)
     if t == 0:
         for a in range(3):
@@ -316,8 +314,7 @@ def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real))
 
 @wp.func
 def commit_face(f: int, w: int, contact: Contact):
-    """Anchors of a face that touches, or touched when the last step ended, become those that the next step
-    starts from."""
+    """Stores the anchors of face f for the next step, if it touches or had anchors."""
     touching = contact.touching[f, w]
     if touching == 0 and contact.kept[f, w] == 0:
         return
@@ -334,7 +331,7 @@ def commit_face(f: int, w: int, contact: Contact):
 
 @wp.kernel
 def commit_contacts(on: wp.array(dtype=int), contact: Contact):
-    """`commit_face` of all faces in the worlds that are on."""
+    """`commit_face` in the worlds that are on."""
     f, w = wp.tid()
     if on[w] == 1:
         commit_face(f, w, contact)

@@ -1,18 +1,16 @@
-"""Contact beyond Coulomb and push: friction whose coefficient falls with pressure, and adhesion with
-hysteresis.
+"""Contact laws beyond Coulomb's: pressure-dependent friction, and adhesion with hysteresis.
 
-Both act at the samples inside the faces, as contact itself does (`contact`), each on its share of the face's
-area:
+Both act at the samples of a face, each on its part of the face's area:
 
-- mu = friction (p / friction_pressure)^-friction_exponent, p the push on a node over its area, linear between
-  nodes (flat faces touch round bodies in spots, whose pressure is the mesh's). With exponent 1 the shear
-  stress is one number whatever the pressure (smooth rubber: Sahli et al., PNAS 2018); Hertz's contact turns
-  p^-n into N^(-n/3).
-- traction t(g) at the gap g: the contact's own spring k carries on into tension up to the peak 2 W / range,
-  then the traction falls in a straight line to zero at `adhesion_range`. The area under it is W, the work of
-  adhesion, whatever k. A sample that has touched is parted by `adhesion_hysteresis` times W until it is out
-  of range: both laws have one branch where it touches, so that within a step traction has a potential and
-  energy is lost only by parting.
+- mu = friction (p / friction_pressure)^-friction_exponent. p is the normal force on a node over the node's
+  area, interpolated linearly: flat faces touch round bodies in spots, whose pressure depends on the mesh.
+  With exponent 1 the shear stress does not depend on the pressure (smooth rubber: Sahli et al., PNAS 2018).
+  In Hertz contact p^-n becomes N^(-n/3).
+- traction t(g) at the gap g: the contact spring k continues into tension up to the peak 2 W / range, then the
+  traction falls linearly to zero at `adhesion_range`. The area below is W, the work of adhesion, for any k. A
+  sample that has touched needs `adhesion_hysteresis` times W to separate, until it is out of range. Loading
+  and unloading have the same branch in contact, so that traction has a potential within a step, and energy is
+  lost only by separation.
 """
 
 import dataclasses
@@ -33,28 +31,29 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["ContactLaw", "GridTooCoarse", "WorldLaws", "contact_law"]
 
-# range^2 = this W h / E*: softening then takes half of the stiffness E* / h of a patch as wide as a face
+# range^2 = _RESOLVED W h / E*: the softening slope is then half of the stiffness E* / h of a patch of one
+# face
 _RESOLVED = 4.0
 
 
 class GridTooCoarse(ValueError):
-    """Adhesion reaches farther than the distance to a mesh geom is exact."""
+    """Adhesion acts beyond the range in which the distance from a mesh geom is exact."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ContactLaw:
-    """Friction and adhesion of a skin with what touches it; the defaults are Coulomb's law and none.
+    """Friction and adhesion between a skin and the geoms; by default Coulomb friction without adhesion.
 
     Attributes:
       friction_exponent: n in mu = friction (p / friction_pressure)^-n; the geoms' `friction` is the
         coefficient at that pressure.
-      friction_pressure: [Pa]; the default is what a sphere of 7 mm presses with at 1 N (Hertz: 0.24 MPa on
-        the average). Below a hundredth of it mu stays.
-      adhesion: work of adhesion W [J/m^2] of surfaces that come together. Rubber: 0.02-0.1.
-      adhesion_hysteresis: factor on W once surfaces have touched.
-      adhesion_range: gap at which adhesion ends [m]; None takes the shortest that the mesh resolves, sqrt(4 W
-        h / E*) with the work that parts the surfaces and h the length of the outer faces' edges. A shorter
-        one snaps face by face.
+      friction_pressure: [Pa]; the default is about the pressure of a sphere of 7 mm at 1 N (Hertz: 0.24 MPa
+        on average). mu is constant below a hundredth of it.
+      adhesion: work of adhesion W of approaching surfaces [J/m^2]. Rubber: 0.02-0.1.
+      adhesion_hysteresis: factor on W after contact.
+      adhesion_range: gap at which adhesion ends [m]; None takes the shortest range that the mesh resolves,
+        sqrt(4 W h / E*) with the work of separation W and the mean edge h of the outer faces. With a shorter
+        range the skin snaps off face by face.
 
     Raises:
       ValueError: a value is out of its range.
@@ -79,8 +78,8 @@ class ContactLaw:
             raise ValueError(f"adhesion is {self.adhesion}: pass a work >= 0 in J/m^2")
         if not (math.isfinite(self.adhesion_hysteresis) and self.adhesion_hysteresis >= 1):
             raise ValueError(
-                f"adhesion_hysteresis is {self.adhesion_hysteresis}: parting takes at least the work of "
-                "joining, pass >= 1"
+                f"adhesion_hysteresis is {self.adhesion_hysteresis}: separation takes at least the work of "
+                "adhesion, pass >= 1"
             )
         if self.adhesion_range is not None and not (
             math.isfinite(self.adhesion_range) and self.adhesion_range > 0
@@ -89,7 +88,7 @@ class ContactLaw:
 
 
 def contact_law(choice: ContactLaw | dict | None) -> ContactLaw | None:
-    """A ContactLaw, a dict of its fields or None, as a ContactLaw or None.
+    """Converts a ContactLaw, a dict of its fields, or None to a ContactLaw or None.
 
     Raises:
       ValueError: anything else, or an unknown field.
@@ -103,16 +102,16 @@ def contact_law(choice: ContactLaw | dict | None) -> ContactLaw | None:
 
 
 class WorldLaws:
-    """A surface's ContactLaw in every world; worlds may have laws of their own, see `set`.
+    """The ContactLaw of a surface in every world; worlds may have laws of their own, see `set`.
 
     Args:
-      model: SkinModel, perhaps with a contact law; materials: of each world; stiffness: (nworld,) of contact
+      model: SkinModel, perhaps with a contact law. materials: of each world. stiffness: (nworld,) of contact
         [Pa/m].
 
     Attributes:
-      struct: `faces.Laws`, empty where the model has no contact law.
-      pulls: (nworld,) Warp array, 1 where there is adhesion. by_load: where friction depends on load.
-      range: (nworld,) at which adhesion ends [m].
+      struct: `faces.Laws`, empty if the model has no contact law.
+      adhesive: (nworld,) Warp array, 1 with adhesion. load_dependent: 1 if friction depends on pressure.
+      range: (nworld,) gap at which adhesion ends [m].
     """
 
     def __init__(self, model: typing.Any, materials: list, stiffness: np.ndarray):
@@ -121,12 +120,12 @@ class WorldLaws:
         n, nvert = (nworld, model.nvert) if self.law else (0, 0)
         self.struct = Laws()
         with wp.ScopedDevice(self.device):
-            for name in ("exponent", "pressure", "work", "parting", "reach"):
+            for name in ("exponent", "pressure", "work", "separation", "reach"):
                 setattr(self.struct, name, wp.zeros(n, dtype=real))
             self.struct.smoothing = wp.zeros(0, dtype=real)
             self.struct.node_area = wp.zeros(nvert, dtype=real)
             self.struct.node_normal_force = wp.zeros((nvert, nworld), dtype=real)
-            self.pulls, self.load_dependent = (wp.zeros(nworld, dtype=int) for _ in range(2))
+            self.adhesive, self.load_dependent = (wp.zeros(nworld, dtype=int) for _ in range(2))
         if self.law is None:
             return
         self.stiffness = stiffness
@@ -150,11 +149,11 @@ class WorldLaws:
         friction_pressure: ArrayLike | None = None,
         adhesion_hysteresis: ArrayLike | None = None,
     ) -> None:
-        """Gives each world its law, from the next step on.
+        """Sets each world's law, from the next step on.
 
         Args:
           friction_exponent, adhesion, friction_pressure, adhesion_hysteresis: (nworld,) or a number; see
-            `ContactLaw`. None leaves them.
+            `ContactLaw`. None: unchanged.
 
         Raises:
           ValueError: a value out of its range, adhesion whose range is too short for the contact's stiffness,
@@ -178,18 +177,18 @@ class WorldLaws:
             if value.shape not in ((), (self.nworld,)):
                 raise ValueError(f"{name} has shape {value.shape}: pass one number or ({self.nworld},)")
             for one in np.unique(value):
-                dataclasses.replace(self.law, **{name: float(one)})  # refuses what no law can have
+                dataclasses.replace(self.law, **{name: float(one)})  # checks the value
             values[name] = np.broadcast_to(value, self.nworld).copy()
-        parting = values["adhesion"] * values["adhesion_hysteresis"]
+        separation = values["adhesion"] * values["adhesion_hysteresis"]
         reach = self.law.adhesion_range
         if reach is None:
-            reach = np.sqrt(_RESOLVED * parting * self.edge / self.modulus)
-        reach = np.where(parting > 0, reach, 0.0)
-        shortest = 2 * np.sqrt(parting / self.stiffness)
+            reach = np.sqrt(_RESOLVED * separation * self.edge / self.modulus)
+        reach = np.where(separation > 0, reach, 0.0)
+        shortest = 2 * np.sqrt(separation / self.stiffness)
         if (reach < shortest).any():
             w = int(np.argmax(shortest - reach))
             raise ValueError(
-                f"adhesion_range {reach[w]:g} m is too short for a work of {parting[w]:g} J/m^2: the "
+                f"adhesion_range {reach[w]:g} m is too short for a work of {separation[w]:g} J/m^2: the "
                 f"contact's own springs of {self.stiffness[w]:g} Pa/m stretch by half of it; "
                 f"take a range above {shortest[w]:.1e} m"
             )
@@ -198,15 +197,15 @@ class WorldLaws:
             (s.exponent, values["friction_exponent"]),
             (s.pressure, values["friction_pressure"]),
             (s.work, values["adhesion"]),
-            (s.parting, parting),
+            (s.separation, separation),
             (s.reach, reach),
-            (self.pulls, (parting > 0).astype(np.int32)),
+            (self.adhesive, (separation > 0).astype(np.int32)),
             (self.load_dependent, (values["friction_exponent"] > 0).astype(np.int32)),
         ):
             array.assign(value)
 
     def refuse_coarse_grids(self, geoms: "GeomSet") -> None:
-        """Refuses meshes whose distance is not exact as far as adhesion reaches (GridTooCoarse)."""
+        """Raises GridTooCoarse if the distance from a mesh is not exact within the range of adhesion."""
         if self.law is None:
             return
         spacing = geoms.struct.grids.spacing.numpy()

@@ -1,5 +1,5 @@
-"""Signed distance to closed triangle meshes, in Warp: far from the surface by a grid, close to it by the
-nearest triangle or, of what the triangles approximate a smooth surface, by a spline through the grid."""
+"""Signed distance from closed triangle meshes, in Warp: far from the surface by a grid; close to it by the
+nearest triangle or, if the mesh approximates a smooth surface, by a spline through the grid."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -38,12 +38,12 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-_MOST = 48  # triangles of a cell's list; where there are more the tree is faster
+_MAX_TRIANGLES = 48  # in the list of a cell; the bounding volume hierarchy is faster for more
 
 
 @wp.struct
 class Grids:
-    """Distance grids of all meshes, one after another, and the meshes themselves (millimetres)."""
+    """Distance grids of all meshes, concatenated, and the meshes in millimetres."""
 
     mesh: wp.array(dtype=wp.uint64)
     value: wp.array(dtype=wp.float32)
@@ -54,9 +54,9 @@ class Grids:
     first_face: wp.array(dtype=int)
     corner: wp.array2d(dtype=wp.vec3)  # of each face [mm]
     normal: wp.array2d(dtype=wp.vec3)  # of each face, `closest.pseudonormals`
-    of_cell: wp.array(dtype=int)  # its list, or -1; cells are numbered as the values at their first corners
+    of_cell: wp.array(dtype=int)  # index of a cell's list, or -1; a cell has the index of its first corner
     lists: TriangleLists
-    coefficient: wp.array(dtype=wp.float32)  # of splines, see `DistanceGrid`; empty where meshes stay sharp
+    coefficient: wp.array(dtype=wp.float32)  # of splines, see `DistanceGrid`; empty if meshes have edges
     error: wp.array(dtype=real)  # of each spline [m]
 
 
@@ -67,13 +67,14 @@ class DistanceGrid:
     Attributes:
       value: (nx, ny, nz) float32, negative inside [m].
       origin: (3,) position of value[0, 0, 0] [m].
-      spacing: of the grid, the same along the three axes [m].
-      vert, face: (n, 3) [m], (m, 3) the mesh: within a few cells of its surface the distance is computed from
+      spacing: of the grid, equal along the three axes [m].
+      vert, face: (n, 3) [m], (m, 3) the mesh; within a few cells of its surface the distance is computed from
         the triangles.
-      of_cell, lists: which triangles can be the nearest, of the cells there (nx, ny, nz); -1: no list.
+      of_cell: (nx, ny, nz) index of the cell's list of triangles that can be the nearest; -1: no list.
+      lists: these lists.
       coefficient: (nx, ny, nz) float32, of the quadratic B-spline through the values [m], which is the
-        distance near the surface instead; None: the mesh is met as it is.
-      error: of the spline, which is no farther than this from the mesh's distance there [m].
+        distance near the surface; None: the triangles are.
+      error: largest difference between spline and mesh near the surface [m].
     """
 
     value: np.ndarray
@@ -112,16 +113,17 @@ def bake_distance_grid(
     spacing: float | None = None,
     smooth: bool = False,
 ) -> DistanceGrid:
-    """Distance grid of a closed triangle mesh. It takes seconds, once: grids are kept on disk.
+    """Distance grid of a closed triangle mesh. It takes seconds, once: grids are cached on disk.
 
     Args:
       vert: (n, 3) [m].
       face: (m, 3), outward orientation.
       cells: grid cells along the longest side of the mesh, and at most twice as many with the margins.
-      margin: how far the grid reaches beyond the mesh [m].
+      margin: width of the grid beyond the mesh [m].
       spacing: of the grid [m], instead of `cells`.
-      smooth: whether the mesh stands for a surface without edges: its distance is a spline then, whose normal
-        has no jumps. A contact's energy has no kinks then, of which each parts two balances.
+      smooth: whether the mesh approximates a surface without edges. Its distance is then a spline with a
+        continuous normal, so that the energy of contact has no kinks, each of which may separate two
+        equilibria.
 
     Raises:
       ValueError: the mesh bounds no solid (it is open, say) or is empty.
@@ -157,11 +159,11 @@ def bake_distance_grid(
 
 
 def _spline_of(grid):
-    """The spline through a grid's values, and its error: against the mesh, at eight points of each cell
+    """The spline through a grid's values, and its largest error against the mesh at eight points of each cell
     within `NEAR_SURFACE`."""
     coefficient = spline_filter(grid.value, order=2, mode="mirror").astype(np.float32)
     packed = [pack_grids([g], "cpu") for g in (grid, dataclasses.replace(grid, coefficient=coefficient))]
-    # a cell's first corner may be as much farther away as its diagonal is long
+    # the first corner of a cell may be further away by the length of the diagonal
     cell = np.argwhere(abs(grid.value[:-1, :-1, :-1]) <= (float(NEAR_SURFACE) + 3**0.5) * grid.spacing)
     middle = (np.indices((2, 2, 2)).reshape(3, -1).T + 0.5) / 2
     point = grid.origin + grid.spacing * (cell[:, None] + middle).reshape(-1, 3)
@@ -171,10 +173,10 @@ def _spline_of(grid):
     return {"coefficient": coefficient, "error": error.numpy().max(initial=0.0)}
 
 
-# in a module of its own: it needs both kinds of distance
+# in a module of its own, since it needs both kinds of distance
 @wp.kernel(module=f"{__name__}.compare", enable_backward=False)
 def _compare(sharp: Grids, smooth: Grids, point: wp.array(dtype=vec3), error_out: wp.array(dtype=real)):
-    """How far the two kinds of distance are apart where that is known."""
+    """Difference of both kinds of distance at point i, near the surface [m]."""
     i = wp.tid()
     far = wp.abs(grid_value(sharp, 0, point[i]))
     if far <= NEAR_SURFACE * sharp.spacing[0]:
@@ -184,16 +186,18 @@ def _compare(sharp: Grids, smooth: Grids, point: wp.array(dtype=vec3), error_out
 
 
 def _list_cells(mesh, value, origin, spacing):
-    """Lists of the cells (nx, ny, nz) through which the surface may go, or to which it is close. They hold
-    for all points of a cell: a triangle that is farther from its centre than the nearest one, by more than
-    the cell's diagonal, is the nearest to none of them."""
+    """Lists of triangles for the cells (nx, ny, nz) near the surface, valid for all points of a cell: a
+    triangle that is further from the cell's centre than the nearest one, by more than the diagonal, is the
+    nearest to no point of the cell."""
     low, high = value[:-1, :-1, :-1].copy(), value[:-1, :-1, :-1].copy()
     for corner in np.ndindex(2, 2, 2):
         there = value[tuple(slice(c, n - 1 + c) for c, n in zip(corner, value.shape))]
         np.minimum(low, there, out=low)
         np.maximum(high, there, out=high)
     cell = np.argwhere((low <= spacing) & (high >= -spacing))
-    lists = list_nearest(mesh, 1e3 * (origin + spacing * (cell + 0.5)), 3**0.5 * 1e3 * spacing, _MOST)
+    lists = list_nearest(
+        mesh, 1e3 * (origin + spacing * (cell + 0.5)), 3**0.5 * 1e3 * spacing, _MAX_TRIANGLES
+    )
     listed = lists.count > 0
     of_cell = np.full(value.shape, -1, np.int32)
     of_cell[tuple(cell[listed].T)] = np.arange(listed.sum())
@@ -202,21 +206,23 @@ def _list_cells(mesh, value, origin, spacing):
 
 
 def _mesh(vert, face, device) -> wp.Mesh:
-    """In millimetres: single-precision queries drop triangles that are tiny in metres."""
+    """Warp mesh in millimetres: queries in single precision lose triangles that are tiny in metres."""
     vert, face = (
         wp.array(vert * 1e3, dtype=wp.vec3, device=device),
         wp.array(face.ravel(), dtype=int, device=device),
     )
-    # a query of few points waits for one node of the tree after the other: 23 us on an H100 where Warp's
-    # choice for CUDA takes 35
+    # a query of few points reads the nodes of the tree one after the other: 23 us on an H100, 35 us with
+    # Warp's default for CUDA
     return wp.Mesh(vert, face, bvh_constructor="sah", bvh_leaf_size=1)
 
 
 def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Grids, list]:
-    """The grids as one Warp struct, and the meshes, which must live as long as the struct does."""
+    """The grids as one Warp struct, and the meshes, which must live as long as the struct."""
     grids = list(grids)
     if len({g.coefficient is None for g in grids}) > 1:
-        raise ValueError("grids of one set are all smooth or none is: bake them alike")
+        raise ValueError(
+            "some grids of the set are smooth and others are not: bake all with the same `smooth`"
+        )
     meshes = [_mesh(g.vert, g.face, device) for g in grids]
     packed = Grids()
     with wp.ScopedDevice(device):
@@ -246,13 +252,13 @@ def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Gr
 
 @wp.func
 def grid_value(grids: Grids, k: int, p: vec3):
-    """Trilinear; outside the grid, whose box holds the mesh, a lower bound of the distance (by the box's
-    nearest point)."""
+    """Distance by trilinear interpolation [m]; outside the grid's box, which contains the mesh, a lower bound
+    from the nearest point of the box."""
     n = grids.shape[k]
     top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
-    asked = (p - grids.origin[k]) / grids.spacing[k]
-    s = wp.min(wp.max(asked, vec3()), top)
-    beyond = wp.length(asked - s) * grids.spacing[k]
+    scaled = (p - grids.origin[k]) / grids.spacing[k]
+    s = wp.min(wp.max(scaled, vec3()), top)
+    beyond = wp.length(scaled - s) * grids.spacing[k]
     i = wp.clamp(int(s[0]), 0, n[0] - 2)
     j = wp.clamp(int(s[1]), 0, n[1] - 2)
     l = wp.clamp(int(s[2]), 0, n[2] - 2)
@@ -268,27 +274,27 @@ def grid_value(grids: Grids, k: int, p: vec3):
     v10 = real(grids.value[base + slab]) * (one - c) + real(grids.value[base + slab + 1]) * c
     v11 = real(grids.value[base + slab + row]) * (one - c) + real(grids.value[base + slab + row + 1]) * c
     value = (v00 * (one - b) + v01 * b) * (one - a) + (v10 * (one - b) + v11 * b) * a
-    if beyond > real(0.0):  # the angle at the box's nearest point is at least a right one
+    if beyond > real(0.0):  # the angle at the nearest point of the box is at least 90 degrees
         value = wp.sqrt(value * value + beyond * beyond)
     return value
 
 
-NEAR_SURFACE = wp.constant(real(2.0))  # cells within which a spline's error is known
+NEAR_SURFACE = wp.constant(real(2.0))  # distance in cells within which the error of a spline is known
 
-# of what is linear between the corners of a cell, of a function of slope 1, in cells
+# error bound of trilinear interpolation of a function with slope 1, in cells
 TRILINEAR = wp.constant(real(0.5 * 3.0**0.5))
 
 
 @wp.func
 def _spline_row(grids: Grids, at: int, value: vec3, slope: vec3):
-    """Sums of three coefficients, from `at` on, by the weights of the value and of its slope."""
+    """Value and slope from three coefficients, starting with index `at`."""
     c = vec3(real(grids.coefficient[at]), real(grids.coefficient[at + 1]), real(grids.coefficient[at + 2]))
     return wp.vec2d(wp.dot(c, value), wp.dot(c, slope))
 
 
 @wp.func
 def _spline_weights(t: real):
-    """Of the quadratic B-splines around a place, t of a cell from the nearest of their centres."""
+    """Weights of the three quadratic B-splines around a point, t cells from the nearest centre."""
     low = real(0.5) - t
     high = real(0.5) + t
     return vec3(real(0.5) * low * low, real(0.75) - t * t, real(0.5) * high * high)
@@ -301,9 +307,9 @@ def _spline_slopes(t: real):
 
 @wp.func
 def _spline_centre(grids: Grids, k: int, p: vec3):
-    """The nearest centre of a spline with neighbours on all sides, and the place from there, in cells."""
+    """Nearest spline centre with neighbours on all sides, and the point relative to it, in cells."""
     n = grids.shape[k]
-    # beyond the grid a lower bound, as `grid_value` is
+    # outside the grid a lower bound, as in `grid_value`
     top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
     s = wp.min(wp.max((p - grids.origin[k]) / grids.spacing[k], vec3()), top)
     i = wp.vec3i()
@@ -336,16 +342,15 @@ def _from_spline(grids: Grids, k: int, p: vec3):
     return wp.vec4d(gradient[0], gradient[1], gradient[2], value)
 
 
-@wp.func(inline=False)  # long, and seldom asked for
+@wp.func(inline=False)  # long, and rarely called
 def mesh_curvature(grids: Grids, k: int, p: vec3):
-    """Second derivatives of a spline's distance [1/m]: how its gradient turns. Zero of a mesh that is sharp,
-    whose faces are flat."""
+    """Second derivatives of a spline's distance [1/m]; zero for a mesh with edges, whose faces are flat."""
     K = mat33()
     if grids.coefficient.shape[0] > 0:
         n = grids.shape[k]
         h = grids.spacing[k]
         i, t = _spline_centre(grids, k, p)
-        values = mat33()  # rows: along an axis, of the coefficients around the place
+        values = mat33()  # weights of the coefficients around the point; a row for each axis
         slopes = mat33()
         for a in range(3):
             values[a] = _spline_weights(t[a])
@@ -372,8 +377,8 @@ def mesh_curvature(grids: Grids, k: int, p: vec3):
 
 @wp.func
 def mesh_distance(grids: Grids, k: int, p: vec3):
-    """From the grid far from the surface, close to it from the nearest triangle, so that edges of the mesh
-    stay sharp, or from the spline of a smooth one."""
+    """Normal and distance: from the grid far from the surface; close to it from the nearest triangle, so that
+    edges stay sharp, or from the spline of a smooth mesh."""
     d = grid_value(grids, k, p)
     if d > TRILINEAR * grids.spacing[k]:  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
@@ -382,8 +387,8 @@ def mesh_distance(grids: Grids, k: int, p: vec3):
 
 @wp.func
 def mesh_field(grids: Grids, k: int, p: vec3, d: real):
-    """Gradient, of length 1, and value of the distance where the grid says d: from the nearest triangle close
-    to the surface; of a smooth one everywhere from its spline, whose gradient may be a little off 1."""
+    """Normal and distance where the grid's value is d: from the nearest triangle close to the surface; of a
+    smooth mesh from its spline, whose gradient may differ slightly from length 1."""
     h = grids.spacing[k]
     if wp.abs(d) <= h or grids.coefficient.shape[0] > 0:
         return to_triangles(grids, k, p, wp.abs(d) + h)
@@ -401,7 +406,7 @@ def mesh_field(grids: Grids, k: int, p: vec3, d: real):
 
 @wp.func
 def _listed(grids: Grids, k: int, p: vec3):
-    """The face that is the nearest to p, or -1 where its cell has no list."""
+    """Index of the face closest to p, or -1 if the cell of p has no list."""
     shape = grids.shape[k]
     h = grids.spacing[k]
     s = (p - grids.origin[k]) / h
@@ -419,10 +424,10 @@ def _listed(grids: Grids, k: int, p: vec3):
     return nearest_listed(grids.lists, cell, grids.corner, grids.first_face[k], real(1.0e3) * p, moved)
 
 
-@wp.func(inline=False)  # long, with Warp's queries: bounds that ask it stand in a dozen places of a kernel
+@wp.func(inline=False)  # long, with Warp's queries, and called from a dozen places of a kernel
 def to_triangles(grids: Grids, k: int, p: vec3, within: real):
-    """From the nearest triangle, which is within so far [m]; four cells if there is none. Of a smooth surface
-    from its spline."""
+    """Normal and distance from the nearest triangle within `within` [m], or four cells if there is none; of a
+    smooth mesh from its spline."""
     if grids.coefficient.shape[0] > 0:
         return _from_spline(grids, k, p)
     h = grids.spacing[k]
@@ -443,7 +448,7 @@ def to_triangles(grids: Grids, k: int, p: vec3, within: real):
         d = wp.dot(q - a, n)
     else:
         side = wp.dot(away, double(grids.normal[face, place]))
-        if side == real(0.0):  # normals do not tell: rays do
+        if side == real(0.0):  # normals do not decide: cast rays
             reach = wp.float32(real(1.0e3) * within)
             side = real(wp.mesh_query_point(grids.mesh[k], single(q), reach).sign)
         side = wp.sign(side)

@@ -1,8 +1,8 @@
-"""Where the solid parts of a BioTac and meshes with hollows overlap, in Warp: contacts by the signed
-distances that the skin meets, in place of those of convex hulls.
+"""Contacts between the solid parts of a BioTac and meshes that are not convex, in Warp, by the signed
+distances that the skin uses instead of convex hulls.
 
-Points are spread over the surfaces of both. One that lies inside the other solid is a contact there; of those
-nearest to each of a few seeds on a part the deepest one counts."""
+Points are spread over the surfaces of both. A point inside the other solid is a contact. Points are grouped
+by the nearest of a few seeds on the part, and the deepest of each group counts."""
 
 from collections.abc import Sequence
 
@@ -19,9 +19,12 @@ __all__ = ["MOST", "Overlaps"]
 
 wp.set_module_options({"enable_backward": False})
 
-MOST = 6  # contacts of a part with a shape: seeds
-_SPACING, _POINTS = 7e-4, 4000  # [m] of points on a solid, and how many at most: wider on a large one
-_ANYWHERE = 1e9  # [m]
+MOST = 6  # contacts of a part with a shape, and seeds of a part
+_SPACING, _POINTS = (
+    7e-4,
+    4000,
+)  # spacing of points on a solid [m], and most points: fewer per area on large ones
+_ANYWHERE = 1e9  # [m] initial value of a least distance
 _SHIFT = wp.constant(wp.int64(1 << 31))
 _NANO = wp.constant(real(1e9))
 
@@ -38,8 +41,7 @@ class Points:
 
 @wp.func
 def _inside(solids: Geoms, points: Points, n: int, other: int, w: int):
-    """Gradient and value of the distance of a point from another solid, and the point; in the BioTac
-    frame."""
+    """Normal and distance of point n from another solid, and the point, in the BioTac frame."""
     o = points.owner[n]
     x = solids.pos[o, w] + solids.mat[o, w] * points.pos[n]
     y = place_on(solids, other, w, x)
@@ -61,8 +63,8 @@ def find_deepest(
     deepest: wp.array3d(dtype=wp.int64),
     least: wp.array2d(dtype=real),
 ):
-    """Depth in nanometres and number of the deepest point at each seed [pair, seed, world], and a lower
-    bound of the points' distances [pair, world]; pairs are numbered part by part."""
+    """Depth in nanometres and index of the deepest point at each seed [pair, seed, world], and a lower bound
+    of the points' distances [pair, world]. Pairs are numbered part by part."""
     n, w = wp.tid()
     o = points.owner[n]
     nshapes = solids.count - points.nparts
@@ -98,8 +100,8 @@ def describe_deepest(
     normal_out: wp.array3d(dtype=vec3),
     depth_out: wp.array3d(dtype=real),
 ):
-    """Of each pair, seed and world: midpoint and normal from part to shape in the BioTac frame, and the
-    depth [m]; 0: no contact."""
+    """Midpoint, normal from part to shape, and depth [m] of the contact of a pair at a seed, in the BioTac
+    frame; depth 0: no contact."""
     pair, s, w = wp.tid()
     depth_out[pair, s, w] = real(0.0)
     found = deepest[pair, s, w]
@@ -118,14 +120,14 @@ def describe_deepest(
 
 
 class Overlaps:
-    """Of solid parts, which rest in the BioTac frame, and shapes with hollows.
+    """Overlaps of solid parts, fixed in the BioTac frame, with shapes that are not convex.
 
     Args:
-      parts, shapes: the grid of each. solids: GeomSet of all these meshes, parts first.
+      parts, shapes: their grids. solids: GeomSet of all these meshes, parts first.
 
     Attributes:
-      pos, mat: [solid, world] poses in the BioTac frame, for the caller to write.
-      wanted: [pair, world] int, which pairs are looked at, for the caller to write; numbered part by part.
+      pos, mat: [solid, world] poses in the BioTac frame, written by the caller.
+      wanted: [pair, world] int, pairs that are evaluated, written by the caller; numbered part by part.
       least: [pair, world] lower bounds of the distances of their points [m].
       contact_pos, contact_normal, depth: [pair, seed, world] see `describe_deepest`.
     """
@@ -162,7 +164,7 @@ class Overlaps:
 
 
 def _seeds(points):
-    """(MOST, 3) of the points that are far from each other."""
+    """MOST of the points (n, 3), far from each other."""
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     away = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < MOST:

@@ -1,4 +1,5 @@
-"""Penetration: geoms inside the rigid core, inner faces inside it, and geoms whose path is not known."""
+"""Penetration checks: geoms in the rigid core, inner faces in the core, and start poses of geoms whose path
+is not known."""
 
 import warp as wp
 
@@ -18,7 +19,7 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-_ROUNDS = 4  # distances of meshes from afar are lower bounds along their grid's box
+_ROUNDS = 4  # steps out of the skin: the distance from a mesh outside its grid is only a lower bound
 
 
 # in a module of its own: it is needed first, while the others compile
@@ -32,7 +33,7 @@ def rest_gap(
     # Out:
     gap_out: wp.array(dtype=real),
 ):
-    """Distance of every sample to the first geom."""
+    """Distance of sample s of face f from the first geom [m]."""
     f, s = wp.tid()
     t = face[f]
     b = sample[s]
@@ -48,13 +49,13 @@ def mark_crushed(
     node: wp.array(dtype=int),
     core: Geoms,
     x: wp.array2d(dtype=vec3),
-    asked: wp.array(dtype=int),
+    on: wp.array(dtype=int),
     # Out:
     failed_out: wp.array(dtype=int),
 ):
-    """Marks worlds with a node of the inner surface deeper in the core than the limit: on its way through."""
+    """Marks a world with a node of the inner surface deeper in the core than `limit` [m]."""
     n, w = wp.tid()
-    if asked[w] == 0:
+    if on[w] == 0:
         return
     y = wp.transpose(core.mat[0, w]) * (x[node[n], w] - core.pos[0, w])
     if rough_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y) < -limit:
@@ -67,9 +68,8 @@ def mark_crushed(
 def core_clearance(
     i: int, geoms: Geoms, g: int, pos: vec3, mat: mat33, core: Geoms, core_vert: wp.array(dtype=vec3)
 ):
-    """Lower bound of the distance [m] between geom g at pos, mat and point i of the core, negative where they
-    overlap. The points are the core's vertices; the last is the geom's own centre, which finds a geom that
-    lies between them."""
+    """Lower bound of the distance between geom g at pos, mat and point i of the core [m], negative where they
+    overlap. The points are the core's vertices and, last, the geom's centre, for geoms between vertices."""
     n = core_vert.shape[0]
     p = pos
     if i < n:
@@ -77,7 +77,7 @@ def core_clearance(
     bound = bound_to(geoms, g, p, wp.transpose(mat) * (p - pos))
     if i == n:
         if bound < real(0.0):
-            k = core.grid[0]  # it is a mesh
+            k = core.grid[0]  # the core is a mesh
             bound = grid_value(core.grids, k, pos) - TRILINEAR * core.grids.spacing[k]
         else:  # a ring, which may lie around the core
             bound = real(1.0)
@@ -98,8 +98,8 @@ def mark_deep_geoms(
     failed_out: wp.array(dtype=int),
     deep_out: wp.array(dtype=int),
 ):
-    """Worlds in which a geom reaches deeper into the rigid core than the limit fail: no skin fits between
-    them."""
+    """Marks a world as failed and deep if geom g is deeper in the rigid core than `limit` [m], since no skin
+    fits between them."""
     g, c, w = wp.tid()
     if active[w] == 0:
         return
@@ -112,15 +112,15 @@ def mark_deep_geoms(
 
 @wp.func
 def _outside(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: mat33):
-    """Where a geom at pos, mat comes from if it comes from outside: clear of a ball."""
+    """Position of a geom at pos, mat after it is moved out of a ball along its distance's gradient [m]."""
     p = pos
-    rounds = int(_ROUNDS)  # a variable: unrolled, the module takes a minute to compile for CUDA
+    rounds = int(_ROUNDS)  # a variable, since the module takes a minute to compile for CUDA if unrolled
     for _round in range(rounds):
         dn = distance_from(geoms, g, center, wp.transpose(mat) * (center - p), mat)
-        left = wp.max(radius - dn[3], real(0.0))
-        if geoms.kind[g] == SKIN:  # where two meet goes half as far
-            left *= real(2.0)
-        p -= left * (mat * vec3(dn[0], dn[1], dn[2]))
+        overlap = wp.max(radius - dn[3], real(0.0))
+        if geoms.kind[g] == SKIN:  # the surface between two skins moves half as far
+            overlap *= real(2.0)
+        p -= overlap * (mat * vec3(dn[0], dn[1], dn[2]))
     return p
 
 
@@ -130,24 +130,24 @@ def start_path_outside(
     center: vec3,
     radius: real,
     geoms: Geoms,
-    asked: wp.array(dtype=int),
+    on: wp.array(dtype=int),
     # In and out:
     path: LoadPath,
 ):
-    """Where nothing is known of how geoms came to where they are, they come from outside: their way starts
-    where the ball around the skin is clear of them."""
+    """Starts the path of geoms without a previous pose, or of geoms that all stand still, where a ball around
+    the skin is clear of them."""
     w = wp.tid()
-    if asked[w] == 0:
+    if on[w] == 0:
         return
-    still = int(1)
+    unmoved = int(1)
     for g in range(geoms.count):
         p = path.pos_start[g, w]
         R = path.mat_start[g, w] - path.mat_end[g, w]
         if wp.length_sq(p - path.pos_end[g, w]) + wp.ddot(R, R) > real(0.0):
-            still = 0
+            unmoved = 0
     for g in range(geoms.count):
         p = path.pos_start[g, w]
-        if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
+        if unmoved == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
             R = path.mat_end[g, w]
             p = _outside(geoms, g, center, radius, path.pos_end[g, w], R)
             path.pos_start[g, w] = p
@@ -163,7 +163,7 @@ def come_from_outside(
     # Out:
     pos_out: wp.array2d(dtype=vec3),
 ):
-    """Where geoms of which nothing is known come from."""
+    """Start position of a geom without a previous pose: clear of a ball around the skin [m]."""
     g, w = wp.tid()
     last = geoms.pos_last[g, w]
     if not wp.isfinite(last[0] + last[1] + last[2]):

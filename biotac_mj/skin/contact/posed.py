@@ -1,8 +1,8 @@
-"""Geoms posed in the BioTac frame, and how far points of the skin are from them, in Warp.
+"""Geoms posed in the BioTac frame, and distances of points from them, in Warp.
 
-The skin of another BioTac gives way as this one does. Two that press against each other meet where the
-distances d1, d2 from either's shape at rest are the same: on the surface of zeros of (d2 - d1) / 2, which is
-what each skin is solved against, and which lies halfway if they are alike (`docs/design.md`, "Skin on skin").
+The skin of another BioTac deforms as this one does. Two skins in contact are each solved against the surface
+where the signed distances d1, d2 from both undeformed shapes are equal, the zeros of (d2 - d1) / 2; equal
+skins meet there by symmetry (`docs/design.md`, "Skin on skin").
 """
 
 import math
@@ -30,7 +30,7 @@ __all__ = [
     "distance_from",
     "distance_to",
     "face_radius",
-    "held_at",
+    "carried_anchor",
     "least_to",
     "meet",
     "place_on",
@@ -39,11 +39,11 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-WINDOW = 1.25  # of the distance of a face's corners from its samples, see `meet`
-# cosines of angles between two normals: of a side of a solid, from where to where they are of its edge
+WINDOW = 1.25  # radius around edges, over the distance of a face's corners from its samples, see `meet`
+# cosines of the angle between two normals: below the first it is a side of a solid, above the second an edge
 _SMOOTH, _SHARP = (wp.constant(real(math.cos(math.radians(angle)))) for angle in (10, 25))
-_FIRM = wp.constant(real(4.0))  # springs at an edge, which few samples bear, to those of a side
-_BEYOND = wp.constant(real(0.3))  # of a face, so far outside of which an edge is no longer over it
+_FIRM = wp.constant(real(4.0))  # stiffness at an edge, where few samples take part, over that of a side
+_BEYOND = wp.constant(real(0.3))  # barycentric distance outside a face at which an edge leaves it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
 
 
@@ -56,7 +56,7 @@ class Geoms:
     kind: wp.array(dtype=int)
     size: wp.array(dtype=vec3)
     rounding: wp.array(dtype=real)
-    window: wp.array(dtype=real)  # around edges, to the radius of a face, see `meet`; 0 of what has none
+    window: wp.array(dtype=real)  # radius around edges over that of a face, see `meet`; 0: no sharp edges
     grid: wp.array(dtype=int)
     group: wp.array(dtype=int)
     friction: wp.array2d(dtype=real)
@@ -65,13 +65,13 @@ class Geoms:
     pos_last: wp.array2d(dtype=vec3)
     mat_last: wp.array2d(dtype=mat33)
     grids: Grids
-    own: int  # grid of the skin that they touch, as it rests, where another one's is among them
+    own: int  # grid of the undeformed skin that they touch, if the skin of another BioTac is among them
 
 
 @wp.struct
 class LoadPath:
-    """Of the geoms within a step [geom, world]: from where they were in the last one, or where nothing
-    touched, to where they are asked to be."""
+    """Path of the geoms within a step [geom, world]: from their poses in the last step, or clear of the skin,
+    to their new poses."""
 
     pos_start: wp.array2d(dtype=vec3)
     mat_start: wp.array2d(dtype=mat33)
@@ -81,13 +81,13 @@ class LoadPath:
 
 @wp.func
 def place_on(geoms: Geoms, g: int, w: int, p: vec3):
-    """Point p of the BioTac frame in that of geom g."""
+    """Point p of the BioTac frame in the frame of geom g."""
     return wp.transpose(geoms.mat[g, w]) * (p - geoms.pos[g, w])
 
 
 @wp.func
 def least_to(geoms: Geoms, g: int, d: real):
-    """The least that a `distance_to` d may be [m]."""
+    """Lower bound of the true distance if `distance_to` is d [m]."""
     if geoms.kind[g] == SKIN:
         return d - TRILINEAR * wp.max(geoms.grids.spacing[geoms.grid[g]], geoms.grids.spacing[geoms.own])
     return lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], d)
@@ -109,7 +109,7 @@ def _between_skins(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
 
 @wp.func
 def distance_from(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
-    """`distance_to` of a geom turned by R, in whose frame p is y."""
+    """`distance_to` for a geom with rotation R, in whose frame p is y."""
     if geoms.kind[g] == SKIN:
         return _between_skins(geoms, g, p, y, R)
     return distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
@@ -124,14 +124,13 @@ def distance_to(geoms: Geoms, g: int, w: int, p: vec3):
 
 @wp.func
 def _bound_between(geoms: Geoms, g: int, p: vec3, y: vec3):
-    apart = grid_value(geoms.grids, geoms.grid[g], y) - grid_value(geoms.grids, geoms.own, p)
-    return least_to(geoms, g, real(0.5) * apart)
+    difference = grid_value(geoms.grids, geoms.grid[g], y) - grid_value(geoms.grids, geoms.own, p)
+    return least_to(geoms, g, real(0.5) * difference)
 
 
 @wp.func
 def bound_to(geoms: Geoms, g: int, p: vec3, y: vec3):
-    """Lower bound of the distance [m] of point p, which geom g has at y in its frame: cheap where that is
-    far."""
+    """Lower bound of the distance of point p, y in the frame of geom g [m]; cheap far from the geom."""
     if geoms.kind[g] == SKIN:
         return _bound_between(geoms, g, p, y)
     return distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
@@ -147,8 +146,8 @@ def face_radius(u: vec3, v: vec3):
 
 @wp.func
 def touch_bound(geoms: Geoms, g: int, y: vec3, d: real, radius: real):
-    """Lower bound of how far a point at y in the frame of geom g, which is at least d from it, is from
-    touching it [m]. radius: of its face, or of a ball around faces."""
+    """Lower bound of the distance to contact [m] of a point y in the frame of geom g, at a distance of at
+    least d. radius: of its face, or of a ball around faces."""
     window = geoms.window[g] * radius
     if window == real(0.0):
         return d
@@ -158,7 +157,7 @@ def touch_bound(geoms: Geoms, g: int, y: vec3, d: real, radius: real):
 
 @wp.func
 def _closest(geoms: Geoms, g: int, y: vec3, meshes: int):
-    """Outward unit normal and distance, however far from a mesh."""
+    """Outward unit normal and distance, exact at any distance from a mesh."""
     if meshes == 1 and geoms.kind[g] == MESH:
         within = wp.abs(grid_value(geoms.grids, geoms.grid[g], y)) + geoms.grids.spacing[geoms.grid[g]]
         return to_triangles(geoms.grids, geoms.grid[g], y, within)
@@ -167,8 +166,8 @@ def _closest(geoms: Geoms, g: int, y: vec3, meshes: int):
 
 @wp.func
 def _moved(b: vec3, u: vec3, v: vec3, by: vec3):
-    """Barycentric coordinates, in a triangle with edges u, v from its first corner, of what is at b and goes
-    by so much in its plane."""
+    """Barycentric coordinates of the point b of a triangle with edges u, v after a motion `by` in its
+    plane."""
     uu = wp.dot(u, u)
     uv = wp.dot(u, v)
     vv = wp.dot(v, v)
@@ -179,33 +178,34 @@ def _moved(b: vec3, u: vec3, v: vec3, by: vec3):
 
 @wp.struct
 class Meeting:
-    """How a sample of a face meets a geom: outward unit normal in the geom's frame, gap [m], barycentric
-    coordinates of where it pushes, and the sample's part in it."""
+    """Contact of a sample with a geom: outward unit normal in the geom's frame, gap [m], barycentric
+    coordinates at which the force acts, and weight of the sample."""
 
     normal: vec3
     gap: real
     at: vec3
-    part: real
+    weight: real
 
 
 @wp.func
 def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3, meshes: int):
-    """Meeting of a sample of a face with geom g, whose edges are met by the face as a whole.
+    """Contact of a sample of a face with geom g.
 
-    At an edge a solid has a cone of normals. Skin meets it with its own normal where the cone has that, else
-    with the nearest one there. How far the edge is from the plane of the face does not depend on where along
-    the face it is, so that it drags on no skin. Samples within the window bear it, where it is.
+    At an edge a solid has a cone of normals. The skin meets the edge with its own normal if the cone contains
+    it, else with the nearest normal of the cone. The gap is the distance of the edge from the plane of the
+    face, which does not depend on where along the face the edge lies, so that there is no tangential force.
+    The force acts at the edge, by the samples within the window.
 
     Args:
       y, dn: the sample in the geom's frame and its `distance`. b: its barycentric coordinates. u, v: edges of
-        the face from its first corner, in the BioTac frame. meshes: 0 where no geom is a mesh, which leaves
-        code away.
+        the face from its first corner, in the BioTac frame. meshes: 0 if no geom is a mesh, which removes
+        code.
     """
     met = Meeting()
     met.normal = vec3(dn[0], dn[1], dn[2])
     met.gap = dn[3]
     met.at = b
-    met.part = real(1.0)
+    met.weight = real(1.0)
     window = geoms.window[g]
     if window == real(0.0):
         return met
@@ -213,7 +213,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     if dn[3] > window:
         return met
     if meshes == 1 and geoms.kind[g] == MESH:
-        if dn[3] > TRILINEAR * geoms.grids.spacing[geoms.grid[g]]:  # by its grid alone
+        if dn[3] > TRILINEAR * geoms.grids.spacing[geoms.grid[g]]:  # dn is from the grid alone
             own = _closest(geoms, g, y, meshes)
             met.normal = vec3(own[0], own[1], own[2])
     deep = wp.max(-dn[3], real(0.0))
@@ -222,8 +222,8 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     along = wp.transpose(geoms.mat[g, w]) * u
     across = wp.transpose(geoms.mat[g, w]) * v
     inward = wp.normalize(wp.cross(across, along))
-    # from inside the skin the solid's closest point is its edge; what is closest to a point over that has the
-    # normal that is wanted
+    # seen from inside the skin, the solid's closest point is its edge; the closest point of a second point
+    # above it gives the normal
     probe = y + (window + real(2.0) * deep) * inward
     found = _closest(geoms, g, probe, meshes)
     probe = probe - found[3] * vec3(found[0], found[1], found[2]) + window * inward
@@ -233,28 +233,28 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     gap = wp.dot(normal, off)
     if gap > dn[3]:  # in a hollow
         return met
-    # a side of the solid is met at every sample, an edge where it is, by samples of the face that is over it
+    # every sample touches a side of the solid; only samples of the face above an edge touch that, at the edge
     edge = wp.clamp((_SMOOTH - wp.dot(normal, met.normal)) / (_SMOOTH - _SHARP), real(0.0), real(1.0))
     near = wp.length_sq(off - gap * normal) / (window * window)
     at = _moved(b, along, across, -off)
     beyond = wp.max(-wp.min(at), real(0.0)) / _BEYOND
     if edge == real(0.0) or near >= real(1.0) or beyond >= real(1.0):
-        met.part = real(1.0) - edge
+        met.weight = real(1.0) - edge
         return met
-    borne = (real(1.0) - near) * (real(1.0) - beyond)
-    borne = edge * _FIRM * borne * borne
-    met.part = real(1.0) - edge + borne
-    borne = borne / met.part
-    met.at = b + borne * (at - b)
-    met.normal = wp.normalize(met.normal + borne * (normal - met.normal))
-    met.gap = dn[3] + borne * (gap - dn[3])
+    blend = (real(1.0) - near) * (real(1.0) - beyond)
+    blend = edge * _FIRM * blend * blend
+    met.weight = real(1.0) - edge + blend
+    blend = blend / met.weight
+    met.at = b + blend * (at - b)
+    met.normal = wp.normalize(met.normal + blend * (normal - met.normal))
+    met.gap = dn[3] + blend * (gap - dn[3])
     return met
 
 
 @wp.func
-def held_at(geoms: Geoms, g: int, w: int, stick: vec3):
-    """Where an anchor of the last step is on geom g now: of another skin halfway, since that gives way
-    too."""
+def carried_anchor(geoms: Geoms, g: int, w: int, stick: vec3):
+    """Anchor of the last step in the present frame of geom g. On another skin it moves half as far, as the
+    surface between both does."""
     if geoms.kind[g] == SKIN:
         there = place_on(geoms, g, w, geoms.mat_last[g, w] * stick + geoms.pos_last[g, w])
         return real(0.5) * (stick + there)

@@ -1,8 +1,8 @@
-"""Proximity query: which faces of a skin at rest are near to the geoms of one world, and whether a geom is
-inside the core.
+"""Proximity queries: which faces of the undeformed skin are near the geoms of one world, and whether a geom
+is inside the core.
 
-Faces near to the geoms are kept for a few poses, with their clearances, and hold until the geoms have moved
-far: BioTacs of one model share a skin. Which of them is used changes nothing but the time."""
+Near faces are stored with their clearances for a few poses, and are valid until the geoms have moved far. The
+cache changes only the time, not the results."""
 
 import dataclasses
 import typing
@@ -28,12 +28,12 @@ __all__ = ["ProximityQuery", "poses"]
 
 wp.set_module_options({"enable_backward": False})
 
-_REGION = 2e-3  # geoms may move this far before the region around them is chosen again [m]
-_KEPT = 16
-_NARROW = 1e-4  # [m] within which the place is found where a geom begins to touch
-_CORE = 1e-6  # and where it comes out of the core
-_EVEN = 1e-9  # of a path: finer it is not divided
-_FAR = 1.0  # [m] geoms are moved out of the skin by no more
+_REGION = 2e-3  # motion of the geoms for which a region is valid [m]
+_MAX_REGIONS = 16  # stored regions; several BioTacs of one model share a skin
+_NARROW = 1e-4  # [m] accuracy of the position at first contact
+_CORE = 1e-6  # [m] accuracy of the position at which a geom leaves the core
+_LEAST_INTERVAL = 1e-9  # of a path in a bisection
+_FAR = 1.0  # [m] most motion of a geom out of the skin
 _NONE = np.zeros(0, int)
 
 
@@ -52,8 +52,8 @@ def _measure_faces(
     # Out:
     clearance_out: wp.array(dtype=real),
 ):
-    """Clearance of the first count[0] numbered faces, where it is less than reach[0] [m]; below reach[1] any
-    bound will do. All faces lie in the ball (centre, radius): most geoms are far from it."""
+    """Clearances of the faces number[:count[0]], at most reach[0] [m]; below reach[1] any lower bound. The
+    ball around all faces excludes most geoms."""
     _count, near = geoms_within(center, radius + reach[0], 0, geoms, ALL)
     for i in range(count[0]):
         t = face[number[i]]
@@ -71,7 +71,7 @@ def _measure_core(
     # Out:
     clearance_out: wp.array(dtype=real),
 ):
-    """`core_clearance` of each geom from all points of the core."""
+    """Least `core_clearance` of geom g over all points of the core [m]."""
     g = wp.tid()
     least = real(1.0)
     for i in range(core_vert.shape[0] + 1):
@@ -81,16 +81,16 @@ def _measure_core(
 
 
 def poses(geoms: GeomSet) -> tuple[np.ndarray, ...]:
-    """Views of the positions (ngeom, 3) [m] and rotations (ngeom, 3, 3) of geoms of one world on the CPU, now
-    and at the last step: made once, as Warp takes longer for them than for writing there."""
+    """Views of the positions (ngeom, 3) [m] and rotations (ngeom, 3, 3) of geoms of one world on the CPU, of
+    this step and the last. Make them once: Warp needs more time for a view than for writing to it."""
     struct = geoms.struct
     return tuple(a.numpy()[:, 0] for a in (struct.pos, struct.mat, struct.pos_last, struct.mat_last))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Region:
-    """Faces (n,) of the resting skin nearer than `width` [m] to the geoms, their clearances (n,), which grow,
-    and the geoms' clearance from the core [m]. A width below zero: only the latter is known."""
+    """Faces (n,) of the undeformed skin closer than `width` [m] to the geoms, their clearances (n,) in
+    ascending order, and the geoms' clearance from the core [m]. width < 0: only the latter is known."""
 
     faces: np.ndarray
     clearances: np.ndarray
@@ -99,36 +99,36 @@ class _Region:
 
     @property
     def least(self) -> float:
-        """No geom is nearer to the skin."""
+        """Least clearance of the skin from all geoms [m]."""
         return self.clearances[0] if len(self.faces) else self.width
 
 
 class _Regions:
-    """What was found at the last few poses of `ngeom` geoms, and how far points in a ball at the BioTac have
-    moved since in their frames."""
+    """Regions at the last few poses of `ngeom` geoms, and the motion since in the geoms' frames of points in
+    a ball around the skin."""
 
     def __init__(self, ngeom: int, center: np.ndarray, radius: float):
-        self._found, self._next, self._asked, self._moved = [], 0, None, []
+        self._found, self._next, self._queried, self._moved = [], 0, None, []
         self._center, self._radius = center, radius
-        self._local, self._mat = np.zeros((_KEPT, ngeom, 3)), np.zeros((_KEPT, ngeom, 9))
+        self._local, self._mat = np.zeros((_MAX_REGIONS, ngeom, 3)), np.zeros((_MAX_REGIONS, ngeom, 9))
 
     def add(self, pos: np.ndarray, mat: np.ndarray, found: _Region) -> None:
-        """Keeps what was found at poses (ngeom, 3), (ngeom, 3, 3) instead of the oldest."""
+        """Stores a region at poses (ngeom, 3), (ngeom, 3, 3) in place of the oldest."""
         place = self._next
         self._local[place], self._mat[place] = self._in_frames(pos, mat), mat.reshape(-1, 9)
         self._found[place : place + 1] = [found]
-        self._next, self._asked = (place + 1) % _KEPT, None
+        self._next, self._queried = (place + 1) % _MAX_REGIONS, None
 
     def since(self, pos: np.ndarray, mat: np.ndarray) -> Iterator[tuple[_Region, float]]:
-        """What was found, and the bound of the motion since [m]: `broadphase.motion_bound`."""
-        asked = pos.tobytes(), mat.tobytes()
-        if asked != self._asked:  # a step asks some times for each pose
+        """Yields each region and a bound of the motion since [m], see `broadphase.motion_bound`."""
+        queried = pos.tobytes(), mat.tobytes()
+        if queried != self._queried:  # a step queries each pose several times
             n = len(self._found)
             moved = self._in_frames(pos, mat) - self._local[:n]
             turned = mat.reshape(-1, 9) - self._mat[:n]
             bound = np.sqrt(np.einsum("kij,kij->ki", moved, moved))
             bound += self._radius * np.sqrt(np.einsum("kij,kij->ki", turned, turned))
-            self._asked, self._moved = asked, bound.max(1).tolist()
+            self._queried, self._moved = queried, bound.max(1).tolist()
         return zip(self._found, self._moved)
 
     def _in_frames(self, pos, mat):
@@ -136,7 +136,7 @@ class _Regions:
 
 
 class ProximityQuery:
-    """Queries about a skin at rest and the geoms of one world, on the CPU.
+    """Queries about the undeformed skin and the geoms of one world, on the CPU.
 
     Args:
       model: SkinModel. geoms: GeomSet of one world, posed before each query.
@@ -172,7 +172,7 @@ class ProximityQuery:
         self._jump = float(TRILINEAR) * float(spacing.max())
 
     def faces(self, reach: float, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-        """Faces at rest with a sample nearer than the reach [m] to a geom."""
+        """Indices (n,) of the undeformed faces with a sample closer than `reach` [m] to a geom."""
         if not self._geoms.count:
             return _NONE
         region, moved = self._region(reach, pos, mat)
@@ -181,7 +181,7 @@ class ProximityQuery:
         return np.sort(faces[self._clearances(faces, reach, reach) < reach]) if count else _NONE
 
     def clear(self, pos: np.ndarray, mat: np.ndarray, margin: float) -> bool:
-        """Whether the skin at rest is further than a margin [m] from geoms at these poses, and none of these
+        """Whether geoms at these poses are further than `margin` [m] from the undeformed skin, and none is
         too `deep` in the core."""
         if not self._geoms.count:
             return True
@@ -192,54 +192,54 @@ class ProximityQuery:
         return not len(self.faces(margin, pos, mat)) and not self.deep(pos, mat)
 
     def overlaps(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether geoms at these poses, which are not `clear`, have a sample of the resting skin inside, or
-        are `deep`. That looks at the solids themselves: bounds of distances count how far the law of edges
-        reaches, too."""
+        """Whether geoms at these poses, which are not `clear`, contain a sample of the undeformed skin or are
+        `deep`. Evaluated without the windows around edges, which the bounds of distances include."""
         self.pose(pos, mat)
         self._region(0.0, pos, mat)
         window = self._geoms.struct.window.numpy()
-        kept, window[:] = window.copy(), 0.0
+        saved, window[:] = window.copy(), 0.0
         inside = len(self.faces(0.0, pos, mat)) > 0
-        window[:] = kept
+        window[:] = saved
         return inside or self.deep(pos, mat)
 
     def last_clear(
         self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray, margin: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (ngeom, 3) [m], (ngeom, 3, 3), about the last on the path from the first ones, which are
-        `clear`, to the others."""
+        """Last poses (ngeom, 3) [m], (ngeom, 3, 3), to within 0.1 mm, that are `clear` on the path from pos0,
+        mat0, which are clear, to pos, mat."""
         path, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
         far = np.abs(path).max(initial=0.0)
-        while (high - low) * far > _NARROW and high - low > _EVEN:
+        while (high - low) * far > _NARROW and high - low > _LEAST_INTERVAL:
             middle = 0.5 * (low + high)
             clear = self.clear(*displace(pos0, mat0, middle * path), margin)
             low, high = (middle, high) if clear else (low, middle)
         return displace(pos0, mat0, low * path)
 
     def outside(self, pos: np.ndarray, mat: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Positions (ngeom, 3) [m] where geoms that are in the resting skin have just left it, each along the
-        mean normal of what it touches."""
+        """Positions (ngeom, 3) [m] of the geoms after each is moved out of the undeformed skin, along the
+        mean normal of the faces that it touches."""
         return self._out(pos, mat, lambda at: self.clear(at, mat, margin), _NARROW, margin)
 
     def shallow(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-        """Positions (ngeom, 3) [m] where geoms that are too `deep` inside the core have just come out so far
-        that a skin fits between, each along the mean normal of what it touches of the resting skin."""
+        """Positions (ngeom, 3) [m] of the geoms after each that is too `deep` in the core is moved out until
+        a skin fits between, along the mean normal of the undeformed faces that it touches."""
         return self._out(pos, mat, lambda at: not self.deep(at, mat), _CORE)
 
     def _out(self, pos, mat, free, narrow, margin=0.0):
-        """Positions from where each geom, alone at (ngeom, 3), is free, found to within `narrow` [m]."""
+        """Positions (ngeom, 3) to which each geom is moved until it is free, the others far away; accurate to
+        `narrow` [m]."""
         out = pos.copy()
         for g in range(len(pos)):
-            alone = np.full_like(pos, 2 * _FAR)
+            single = np.full_like(pos, 2 * _FAR)
 
-            def is_free(distance, g=g, alone=alone, normal=0.0):
-                alone[g] = pos[g] + distance * normal
-                self.pose(alone, mat)
-                return free(alone)
+            def is_free(distance, g=g, single=single, normal=0.0):
+                single[g] = pos[g] + distance * normal
+                self.pose(single, mat)
+                return free(single)
 
             if is_free(0.0):
                 continue
-            normal = self._outward(pos[g], self.faces(margin, alone, mat))
+            normal = self._outward(pos[g], self.faces(margin, single, mat))
             high = narrow
             while high < _FAR and not is_free(high, normal=normal):
                 high *= 2
@@ -251,8 +251,8 @@ class ProximityQuery:
         return out
 
     def _outward(self, point, faces):
-        """Mean outward normal (3,) of outer faces (n,) at rest; without any, of the one next to
-        a point (3,)."""
+        """Mean outward normal (3,) of outer faces (n,) of the undeformed skin; if n is 0, that of the face
+        closest to a point (3,)."""
         corner = self._rest[self._face]
         if not len(faces):
             away = corner.mean(1) - point
@@ -262,29 +262,29 @@ class ProximityQuery:
         return total / max(np.linalg.norm(total), 1e-30)
 
     def deep(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether a geom, posed so, is deeper inside the core than `max_core_depth`."""
+        """Whether a geom at these poses is deeper inside the core than `max_core_depth`."""
         if not (self._model.has_core and self._geoms.count):
             return False
         limit = self._model.options.max_core_depth
-        # a bound may change a little faster than the geom moves, as grids are trilinear, and jump
+        # a bound may change slightly faster than the geom moves, since grids are trilinear, and jump
         least = self._jump - limit
         if any(region.core - 2 * moved > least for region, moved in self._regions.since(pos, mat)):
             return False
         self._measure_core()
         least = float(self._core.min())
-        if least > -limit:  # it is known for the next steps
+        if least > -limit:  # stored for the next steps
             self._regions.add(pos, mat, _Region(_NONE, _NONE, -1.0, least))
         return -least > limit
 
     def pose(self, pos: np.ndarray, mat: np.ndarray) -> None:
-        """Puts the geoms to (ngeom, 3), (ngeom, 3, 3) for what is queried next."""
+        """Sets the geoms' poses (ngeom, 3), (ngeom, 3, 3) for the next query."""
         self._now[0][...], self._now[1][...] = pos, mat
 
     def _region(self, reach, pos, mat):
-        """A region that holds all faces nearer than the reach [m] to geoms at these poses, and how far these
-        may have moved since [m]."""
+        """A region with all faces closer than `reach` [m] to geoms at these poses, and a bound of the motion
+        since it was found [m]."""
         for region, moved in self._regions.since(pos, mat):
-            if reach + 2 * moved <= region.width:  # further off, too many faces are evaluated
+            if reach + 2 * moved <= region.width:  # with more motion, too many faces would be evaluated
                 return region, moved
         width = reach + _REGION
         found = self._clearances(np.arange(len(self._face)), width, -1.0).copy()
@@ -299,7 +299,7 @@ class ProximityQuery:
         return region, 0.0
 
     def _clearances(self, faces, reach, enough):
-        """(n,) of faces (n,) where they are less than the reach [m]; else that. Below `enough`, any bound."""
+        """Clearances (n,) of faces (n,), at most `reach` [m]; below `enough` any lower bound."""
         n = len(faces)
         self._count[0], self._reach[:], self._number[:n] = n, (reach, enough), faces
         self._measure_faces()

@@ -1,5 +1,5 @@
-"""Signed distance to MuJoCo's geoms, in Warp: sphere, capsule, cylinder, ellipsoid, box, plane, and meshes as
-`meshes` has them. What lies in the frame of another one is asked by `posed`.
+"""Signed distance from MuJoCo's geoms, in Warp: sphere, capsule, cylinder, ellipsoid, box, plane, and mesh
+(see `meshes`). Points are in the geom's frame; `posed` transforms them.
 
 A `rounding` radius r shrinks a box or a cylinder by r and grows it again by r: its edges become fillets of
 radius r, its faces stay."""
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 GEOM_TYPES = {
     "plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7, "skin": 8,
 }  # fmt: skip
-# [m] cells that a bound may err by; distances that matter to who asks for one
+# [m] largest cells whose error a bound may have; distances above which a bound need not be accurate
 _COARSE, _NEAR = (wp.constant(real(2.5e-4)), wp.constant(real(5e-3)))
 
 
@@ -111,7 +111,7 @@ def _ellipsoid(radii: vec3, p: vec3):
 
 @wp.func
 def primitive_distance(kind: int, size: vec3, rounding: real, p: vec3):
-    """`distance` of what is no mesh."""
+    """`distance` from a geom that is no mesh."""
     if kind == 0:
         return wp.vec4d(real(0.0), real(0.0), real(1.0), p[2])
     if kind == 2 or kind == 3:
@@ -132,8 +132,8 @@ def primitive_distance(kind: int, size: vec3, rounding: real, p: vec3):
 
 @wp.func
 def distance_to_edge(kind: int, size: vec3, rounding: real, p: vec3, d: real):
-    """Lower bound of the distance of a point from the nearest edge or corner [m], which is d from the
-    surface; of a mesh that is all that is known."""
+    """Lower bound of the distance from the nearest edge or corner [m] of a point at distance d from the
+    surface; |d| for a mesh."""
     q = wp.cw_mul(_signs(p), p) - (size - vec3(rounding, rounding, rounding))
     if kind == 5:
         rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
@@ -153,8 +153,8 @@ def distance_to_edge(kind: int, size: vec3, rounding: real, p: vec3, d: real):
 
 @wp.func
 def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
-    """Outward unit normal (x, y, z), of a smooth mesh its spline's gradient, and signed distance (w) [m] of
-    point p in the geom's frame."""
+    """Outward unit normal (x, y, z) and signed distance (w) [m] of point p in the geom's frame. The normal of
+    a smooth mesh is the gradient of its spline."""
     if kind == 7:
         return mesh_distance(grids, grid, p)
     return primitive_distance(kind, size, rounding, p)
@@ -162,18 +162,17 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
 
 @wp.func
 def lower_bound(kind: int, grids: Grids, grid: int, d: real):
-    """The least that a `distance` d may be [m]: far from a mesh it is the grid's, which errs at sharp
-    tips."""
+    """Lower bound of the true distance if `distance` is d [m]: a grid has errors at sharp tips."""
     if kind == 7 and d > TRILINEAR * grids.spacing[grid]:
         return d - TRILINEAR * grids.spacing[grid]
-    if kind == 7:  # what a spline says of two places may differ by more than they are apart
+    if kind == 7:  # the values of a spline at two points may differ by more than the points' distance
         return d - real(2.0) * grids.error[grid]
     return d
 
 
 @wp.func
 def rough_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
-    """Lower bound of the distance [m] that asks no mesh: of one, by its grid alone."""
+    """Lower bound of the distance [m] that is evaluated on the grid of a mesh alone."""
     if kind == 7:
         return grid_value(grids, grid, p) - TRILINEAR * grids.spacing[grid]
     return primitive_distance(kind, size, rounding, p)[3]
@@ -181,8 +180,7 @@ def rough_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, 
 
 @wp.func
 def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
-    """Lower bound of the distance [m], cheap where that is far: what is surely not nearer needs no exact
-    distance."""
+    """Lower bound of the distance [m], exact only near the surface, and cheap elsewhere."""
     bound = rough_bound(kind, size, rounding, grids, grid, p)
     if kind == 7 and bound > -(real(1.0) + TRILINEAR) * grids.spacing[grid]:
         h = grids.spacing[grid]
@@ -190,6 +188,6 @@ def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: in
             if bound < (NEAR_SURFACE - TRILINEAR) * h:
                 bound = wp.max(bound, to_triangles(grids, grid, p, h)[3] - real(2.0) * grids.error[grid])
         elif h > _COARSE and bound < _NEAR:
-            # a large mesh has large cells, and what is centimetres away is not near
+            # a large mesh has large cells: its grid alone would keep too many faces
             bound = wp.max(bound, to_triangles(grids, grid, p, real(4.0) * h)[3])
     return bound

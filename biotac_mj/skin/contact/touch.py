@@ -1,11 +1,10 @@
-"""What a sample of a face feels: overclosure, adhesion, friction with stick and slip; and the faces that it
-is summed over.
+"""Contact force at the samples of a face: penalty contact, adhesion, friction with stick and slip; and its
+sums over faces.
 
-Normal traction is k * overclosure; friction is an elastic stick of k * stick_ratio about an anchor that stays
-put on the geom, returned radially to mu times the normal force where it slips. Surfaces with a
-`law.ContactLaw` have kernels of their own, in which friction depends on pressure and surfaces stick together;
-Coulomb's law is the case without, and may have its kinks smoothed, for gradients. The CPU evaluates face by
-face; on CUDA each sample has a thread, and the faces of a block are added up together.
+The normal traction is k * overclosure. Friction is a spring k * stick_ratio to an anchor that is fixed on the
+geom, with radial return to mu times the normal force. Surfaces with a `law.ContactLaw` have kernels of their
+own, with pressure-dependent friction and adhesion. Kernels of Coulomb's law may have smoothed kinks, for
+gradients. The CPU evaluates face by face; on CUDA each sample has a thread, and a block sums its faces.
 """
 
 import functools
@@ -14,10 +13,10 @@ import types
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .broadphase import ALL, ClearanceCache, has, keep_clearance
+from .broadphase import ALL, ClearanceCache, has, store_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
 from .meshes import mesh_curvature
-from .posed import Geoms, distance_to, face_radius, held_at, least_to, meet, place_on, touch_bound
+from .posed import Geoms, carried_anchor, distance_to, face_radius, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
 __all__ = [
@@ -37,18 +36,23 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-SOLIDS, MESHES, SKINS = "solids", "meshes", "skins"  # what kernels know
-BLOCK = 256  # threads of a block of `by_sample`; a face has so many samples at most
-# How friction is bounded: by its own push, with a symmetric tangent, or with the coupling of slip to push;
-# by its push, which is stored; by the stored push of an earlier equilibrium
+SOLIDS, MESHES, SKINS = (
+    "solids",
+    "meshes",
+    "skins",
+)  # kinds of geoms that kernels support, each with the ones before
+BLOCK = 256  # threads of a block of `by_sample`, and the most samples of a face
+# Friction modes: the bound is mu times the current normal force, with a symmetric tangent (CURRENT) or with
+# the exact one (CONSISTENT); it is stored as well (RECORDED); it is the stored one of an earlier equilibrium
+# (LAGGED)
 CURRENT, CONSISTENT, RECORDED, LAGGED = (wp.constant(i) for i in range(4))
-_LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
+_LEAST_PRESSURE = 1e-2  # over friction_pressure: below it the coefficient is constant
 
 
 @wp.func
 def stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real):
-    """Coulomb's friction of at most `most` [N] at `local`, held by a spring kt about the anchor `stick`:
-    force, its tangent, anchor."""
+    """Coulomb friction at `local` by a spring kt [N/m] to the anchor `stick`, of at most `most` [N]: force,
+    its tangent, new anchor."""
     slip = local - stick
     slip = slip - wp.dot(slip, normal) * normal
     length = wp.length(slip)
@@ -66,8 +70,8 @@ def stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real):
 
 @wp.func
 def normal_traction(k: real, peak: real, reach: real, gap: real):
-    """Push (negative: pull) per area and its slope where it is not softening, for contact springs k; all
-    three in one unit of area."""
+    """Normal traction (negative: adhesion) and its slope, which is 0 on the softening branch, for contact
+    springs k; per area, or all for the same area."""
     if k * gap <= peak:
         return wp.vec2d(-k * gap, k)
     return wp.vec2d(-peak * (reach - gap) / (reach - peak / k), real(0.0))
@@ -75,8 +79,8 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
 
 @wp.func
 def smooth_traction(k: real, width: real, gap: real):
-    """Push and its slope of contact springs k that come in along a parabola, from a gap of `width` to minus
-    that, where they are the springs; a kink of the slope at zero without a width."""
+    """Normal traction and its slope of contact springs k: a parabola between the gaps `width` and -`width`,
+    linear beyond. Without a width the slope has a kink at zero."""
     if gap <= -width:
         return wp.vec2d(-k * gap, k)
     within = width - gap
@@ -85,8 +89,8 @@ def smooth_traction(k: real, width: real, gap: real):
 
 @wp.func
 def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real, width: real):
-    """`stick_or_slip` along a parabola where the anchor begins to creep: within h = w d / (w + d) of the
-    stretch d at which Coulomb's friction slips, so that light contact has its kink smoothed as well."""
+    """`stick_or_slip` with a parabola around the start of slip: within h = w d / (w + d) of the stretch d at
+    which Coulomb friction slips, so that the kink of light contact is smooth as well."""
     slip = local - stick
     slip = slip - wp.dot(slip, normal) * normal
     length = wp.length(slip)
@@ -106,51 +110,51 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
             slope = real(1.0) - real(0.5) * over / half
         force = -kt * stretch * along
         K = kt * (stretch / length * (tangent - wp.outer(along, along)) + slope * wp.outer(along, along))
-        # of what lies along the normal Coulomb's anchor keeps nothing where it slips
-        share = real(1.0) - slope
-        share = share * share * (real(3.0) - real(2.0) * share)
-        anchor = stick + (length - stretch) * along + share * (local - stick - length * along)
+        # where Coulomb friction slips, its anchor has the point's normal component
+        kept = real(1.0) - slope
+        kept = kept * kept * (real(3.0) - real(2.0) * kept)
+        anchor = stick + (length - stretch) * along + kept * (local - stick - length * along)
     return force, K, anchor
 
 
-# A face's sums, with its samples in their order: 9 numbers of its corners, and where it touches 6 blocks of
-# 9. All threads of a block take part; f is negative where one has nothing. Returns the least of the face's
-# clearances, which are -1 where a sample touches.
+# Sums of a face over its samples, in their order: 9 numbers of its corners and, where it touches, 6 blocks of
+# 9 numbers. All threads of a block take part; f is negative in a thread without a sample. Returns the least
+# clearance of the face, -1 where a sample touches.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ double held[{BLOCK}][16];
-    __shared__ int of[{BLOCK}][3];
-    const int thread = threadIdx.x, abreast = {BLOCK} / nsample;
+    __shared__ double value[{BLOCK}][16];
+    __shared__ int item[{BLOCK}][3];
+    const int thread = threadIdx.x, faces = {BLOCK} / nsample;
     for (int i = 0; i < 3; ++i) {{
-        held[thread][i] = force[i];
-        for (int j = 0; j < 3; ++j) held[thread][3 + 3 * i + j] = K.data[i][j];
+        value[thread][i] = force[i];
+        for (int j = 0; j < 3; ++j) value[thread][3 + 3 * i + j] = K.data[i][j];
     }}
-    for (int i = 0; i < 3; ++i) held[thread][12 + i] = at[i];
-    held[thread][15] = free_;
-    of[thread][0] = f;
-    of[thread][1] = w;
+    for (int i = 0; i < 3; ++i) value[thread][12 + i] = at[i];
+    value[thread][15] = free_;
+    item[thread][0] = f;
+    item[thread][1] = w;
     __syncthreads();
     double least = free_;
     const int own = thread - thread % nsample;
-    for (int s = 0; s < nsample && own < abreast * nsample; ++s) least = fmin(least, held[own + s][15]);
-    of[thread][2] = least <= -1.0;
+    for (int s = 0; s < nsample && own < faces * nsample; ++s) least = fmin(least, value[own + s][15]);
+    item[thread][2] = least <= -1.0;
     __syncthreads();
-    for (int o = thread; o < 63 * abreast; o += {BLOCK}) {{
-        const int begin = o / 63 * nsample, what = o % 63;
-        if (of[begin][0] < 0) break;
+    for (int o = thread; o < 63 * faces; o += {BLOCK}) {{
+        const int begin = o / 63 * nsample, column = o % 63;
+        if (item[begin][0] < 0) break;
         double total = 0.0;
-        if (what < 9) {{
+        if (column < 9) {{
             for (int s = 0; s < nsample; ++s)
-                total += held[begin + s][12 + what / 3] * held[begin + s][what % 3];
-            const int row = 3 * of[begin][0] + what / 3;
-            (*wp::address(corner, row, of[begin][1]))[what % 3] = total;
-        }} else if (of[begin][2]) {{
-            const int block = what / 9 - 1, a = block < 3 ? 0 : block < 5 ? 1 : 2;
-            const int b = block < 3 ? block : block < 5 ? block - 2 : 2, entry = what % 9;
+                total += value[begin + s][12 + column / 3] * value[begin + s][column % 3];
+            const int row = 3 * item[begin][0] + column / 3;
+            (*wp::address(corner, row, item[begin][1]))[column % 3] = total;
+        }} else if (item[begin][2]) {{
+            const int block = column / 9 - 1, a = block < 3 ? 0 : block < 5 ? 1 : 2;
+            const int b = block < 3 ? block : block < 5 ? block - 2 : 2, entry = column % 9;
             for (int s = 0; s < nsample; ++s)
-                total += held[begin + s][12 + a] * held[begin + s][12 + b] * held[begin + s][3 + entry];
-            const int row = 6 * of[begin][0] + block;
-            ((double*)wp::address(blocks, row, of[begin][1]))[entry] = total;
+                total += value[begin + s][12 + a] * value[begin + s][12 + b] * value[begin + s][3 + entry];
+            const int row = 6 * item[begin][0] + block;
+            ((double*)wp::address(blocks, row, item[begin][1]))[entry] = total;
         }}
     }}
     __syncthreads();
@@ -173,12 +177,8 @@ def add_samples(
 
 
 @functools.cache
-def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, with smoothing, or with neither;
-    `touch_sample` is a function of theirs, `touch_faces` one for the threads of a block. shapes: SOLIDS,
-    MESHES besides, or SKINS besides these: where there are fewer they take fewer registers."""
-    law = "lawful" if lawful else "smooth" if smooth else "coulomb"
-    module = f"{__name__}.{law}_{shapes}"
+def _sample_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
+    """`touch_sample` for `contact_kernels`."""
 
     # inline: on the CPU a call copies all that Geoms and Contact hold, which takes as long as a sample does
     @wp.func(inline=True)
@@ -190,21 +190,22 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         x0: vec3,
         x1: vec3,
         x2: vec3,
-        share: real,
+        area: real,
         geoms: Geoms,
         c: Contact,
         friction_mode: int,
         near: wp.int64,
     ):
-        """Contact of sample i at b of a face, which stands for a share of area [m^2], with a set of geoms:
-        geom (-1: none), the geom that it has touched, least distance [m], force [N], its tangent [N/m],
-        anchor, and where in the face it pushes. slips: one of CURRENT, CONSISTENT, RECORDED, LAGGED."""
-        k = c.stiffness[w] * share
+        """Contact of sample i with a set of geoms. b: barycentric coordinates; area: of the sample [m^2].
+
+        Returns geom (-1: none), geom of the adhesive bond, least distance [m], force [N], tangent [N/m],
+        anchor in the geom's frame, and barycentric coordinates at which the force acts."""
+        k = c.stiffness[w] * area
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
         clearance = real(1.0)
         gap = real(0.0)
-        if wp.static(lawful):
+        if wp.static(has_law):
             gap = c.laws.reach[w]
         width = real(0.0)
         if wp.static(smooth):
@@ -213,7 +214,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         normal = vec3()
         local = vec3()
         at = b
-        part = real(1.0)
+        weight = real(1.0)
         radius = face_radius(x1 - x0, x2 - x0)
         for g in range(geoms.count):
             if not has(near, g):
@@ -235,24 +236,24 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 touched = g
                 normal = met.normal
                 at = met.at
-                part = met.part
+                weight = met.weight
                 local = y
         force = vec3()
         K = mat33()
         stick = local
         bond = touched
         if touched >= 0:
-            k = k * part
-            share = share * part
+            k = k * weight
+            area = area * weight
             mu = geoms.friction[touched, w]
-            follows = real(1.0)  # slip's force, to the push: as a power of it
+            slope_factor = real(1.0)  # of the slip force over the normal force: exponent of its power law
             fn = -k * gap
-            if wp.static(lawful):
-                joined = real(2.0) * c.laws.work[w] * share  # peak force times range
+            if wp.static(has_law):
+                joined = real(2.0) * c.laws.work[w] * area  # peak force times range
                 work = joined
                 bond = int(-1)
                 if c.anchor_geom[i, w] == touched:
-                    work = real(2.0) * c.laws.parting[w] * share
+                    work = real(2.0) * c.laws.separation[w] * area
                     bond = touched
                 peak = real(0.0)
                 if c.laws.reach[w] > real(0.0):
@@ -267,9 +268,9 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     pressure = real(0.0)
                     for n in range(3):
                         pressure += b[n] * c.laws.node_normal_force[t[n], w] / c.laws.node_area[t[n]]
-                    if pressure > real(_LEAST) * c.laws.pressure[w]:
-                        follows = real(1.0) - c.laws.exponent[w]
-                    pressure = wp.max(pressure, real(_LEAST) * c.laws.pressure[w])
+                    if pressure > real(_LEAST_PRESSURE) * c.laws.pressure[w]:
+                        slope_factor = real(1.0) - c.laws.exponent[w]
+                    pressure = wp.max(pressure, real(_LEAST_PRESSURE) * c.laws.pressure[w])
                     mu = mu * wp.pow(pressure / c.laws.pressure[w], -c.laws.exponent[w])
             else:
                 K = k * wp.outer(normal, normal)
@@ -279,7 +280,9 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     fn = push[0]
                     K = push[1] * wp.outer(normal, normal)
             if wp.static(shapes != SOLIDS):
-                if geoms.kind[touched] == 7:  # as the skin moves along it a smooth surface turns its push
+                if (
+                    geoms.kind[touched] == 7
+                ):  # the normal of a smooth surface turns as the skin moves along it
                     K = K - fn * mesh_curvature(geoms.grids, geoms.grid[touched], local)
             force = fn * normal
             if friction_mode == RECORDED and mu > real(0.0):
@@ -288,12 +291,11 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 if c.anchor_geom[i, w] == touched:
                     stick = c.anchor[i, w]
                 else:
-                    # touched within this step: slip counts from where the sample was on the geom when the
-                    # step began
+                    # new contact: slip counts from the sample's position on the geom at the start of the step
                     last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
                     stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
                 if wp.static(shapes == SKINS):
-                    stick = held_at(geoms, touched, w, stick)
+                    stick = carried_anchor(geoms, touched, w, stick)
                 most = mu * fn
                 if friction_mode == LAGGED:
                     most = c.bound[i, w]
@@ -302,16 +304,31 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     force = force + ft
                     K = K + Kt
                 else:
-                    held = stick
-                    ft, Kt, stick = stick_or_slip(local, held, normal, most, k * c.stick_ratio)
+                    start = stick
+                    ft, Kt, stick = stick_or_slip(local, start, normal, most, k * c.stick_ratio)
                     force = force + ft
-                    if friction_mode == CONSISTENT and wp.length_sq(stick - held) > real(0.0):  # it slips
-                        Kt = Kt + follows * mu / most * wp.outer(ft, K * normal)
+                    if friction_mode == CONSISTENT and wp.length_sq(stick - start) > real(0.0):  # it slips
+                        Kt = Kt + slope_factor * mu / most * wp.outer(ft, K * normal)
                     K = K + Kt
             R = geoms.mat[touched, w]
             force = R * force
             K = R * K * wp.transpose(R)
         return touched, bond, clearance, force, K, stick, at
+
+    return touch_sample
+
+
+@functools.cache
+def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
+    """Kernels `by_face` and `by_sample`, and `touch_faces`, a function for the threads of a block.
+
+    Args:
+      has_law: whether surfaces have a ContactLaw. smooth: whether Coulomb's law has smoothed kinks.
+      shapes: SOLIDS, MESHES or SKINS; fewer kinds take fewer registers.
+    """
+    law = "lawful" if has_law else "smooth" if smooth else "coulomb"
+    module = f"{__name__}.{law}_{shapes}"
+    touch_sample = _sample_function(has_law, smooth, shapes)
 
     @wp.func
     def touch_face(
@@ -323,7 +340,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         friction_mode: int,
         near: wp.int64,
     ):
-        """Evaluates a face; returns a lower bound of its clearance [m], -1 where it touches."""
+        """Evaluates face f; returns a lower bound of its clearance [m], -1 where it touches."""
         nsample = c.sample.shape[0]
         t = c.face[f]
         x0 = x[t[0], w]
@@ -332,12 +349,12 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         clearance = real(1.0)
         touching = int(0)
         total = FaceSum()
-        share = c.area[f] / real(nsample)
+        area = c.area[f] / real(nsample)
         for s in range(nsample):
             i = f * nsample + s
             b = c.sample[s]
             touched, bond, gap, force, K, stick, at = touch_sample(
-                i, w, b, t, x0, x1, x2, share, geoms, c, friction_mode, near
+                i, w, b, t, x0, x1, x2, area, geoms, c, friction_mode, near
             )
             clearance = wp.min(clearance, gap)
             c.trial_geom[i, w] = touched
@@ -348,7 +365,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 c.sample_force[i, w] = force
                 total = with_sample(total, at, force, K)
         write_face(f, w, touching, total, c)
-        if touching == 1:  # whatever reach it will have next
+        if touching == 1:  # evaluated again, for any range of adhesion
             clearance = real(-1.0)
         return clearance
 
@@ -365,20 +382,20 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         c: Contact,
         friction_mode: int,
     ):
-        """Evaluates the first `count` faces listed[w], each with its geoms near[w, face], by the threads of a
-        block: by one for each sample, where they are `BLOCK`; else by one alone."""
+        """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block of
+        `BLOCK` threads with one sample each, or by a single thread."""
         nsample = c.sample.shape[0]
-        abreast = int(1)
+        parallel_faces = int(1)
         first = int(0)
         last = nsample
         if threads > 1:
-            abreast = threads // nsample
+            parallel_faces = threads // nsample
             first = t % nsample
             last = first + 1
-        for begin in range(0, count, abreast):
+        for begin in range(0, count, parallel_faces):
             at = begin + t // nsample
             f = int(-1)
-            if at < count and t < abreast * nsample:
+            if at < count and t < parallel_faces * nsample:
                 f = listed[w, at]
             touching = int(0)
             force = vec3()
@@ -388,9 +405,9 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             for s in range(first, wp.where(f >= 0, last, first)):
                 i = f * nsample + s
                 v = c.face[f]
-                share = c.area[f] / real(nsample)
+                area = c.area[f] / real(nsample)
                 touched, bond, _gap, force, K, stick, push = touch_sample(
-                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], share, geoms, c, friction_mode,
+                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], area, geoms, c, friction_mode,
                     near[w, f],
                 )  # fmt: skip
                 c.trial_geom[i, w] = touched
@@ -427,7 +444,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             w = cache.near[at] % x.shape[1]
             t = contact.face[f]
             clearance = touch_face(f, w, geoms, x, contact, friction_mode[w], ALL)
-            keep_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
+            store_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
     @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=(BLOCK, 2))
     def by_sample(
@@ -440,13 +457,13 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         cache: ClearanceCache,
         contact: Contact,
     ):
-        """The same by a thread for each sample: for CUDA."""
+        """Contact of the listed faces with a thread for each sample, for CUDA."""
         block, thread = wp.tid()
         nsample = contact.sample.shape[0]
         count = cache.count[1]
-        abreast = BLOCK // nsample
+        parallel_faces = BLOCK // nsample
         s = thread % nsample
-        for first in range(block * abreast, count, blocks * abreast):
+        for first in range(block * parallel_faces, count, blocks * parallel_faces):
             at = first + thread // nsample
             f = int(-1)
             w = int(0)
@@ -455,26 +472,26 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             K = mat33()
             push = vec3()
             t = wp.vec3i()
-            if at < count and thread < abreast * nsample:
+            if at < count and thread < parallel_faces * nsample:
                 f = cache.near[at] // x.shape[1]
                 w = cache.near[at] % x.shape[1]
                 i = f * nsample + s
                 t = contact.face[f]
-                share = contact.area[f] / real(nsample)
+                area = contact.area[f] / real(nsample)
                 touched, bond, clearance, force, K, stick, push = touch_sample(
-                    i, w, contact.sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], share, geoms, contact,
+                    i, w, contact.sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], area, geoms, contact,
                     friction_mode[w], ALL,
                 )  # fmt: skip
                 contact.trial_geom[i, w] = touched
                 contact.bond[i, w] = bond
                 if touched >= 0:
-                    clearance = real(-1.0)  # whatever reach it will have next
+                    clearance = real(-1.0)  # evaluated again, for any range of adhesion
                     contact.trial_anchor[i, w] = stick
                     contact.sample_force[i, w] = force
             clearance = add_samples(f, w, clearance, force, K, push, nsample, contact.corner, contact.block)
             if f >= 0 and s == 0:
                 contact.touching[f, w] = wp.where(clearance > real(-1.0), 0, 1)
-                keep_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
+                store_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
     return types.SimpleNamespace(
         touch_sample=touch_sample,
