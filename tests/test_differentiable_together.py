@@ -28,7 +28,7 @@ NUMBERS = {
 
 
 def worlds(nworld, count=13):
-    """Presses that stick, slip and squeeze the skin on the core, each world its own."""
+    """Presses that stick, slip and barrier the skin on the core, each world its own."""
     pos, quat = path(count)
     given = {"pos": pos + torch.tensor(OFF[:nworld])[:, None, None], "quat": quat.expand(nworld, -1, -1, -1)}
     given |= {name: torch.tensor(value[:nworld], dtype=torch.float64) for name, value in NUMBERS.items()}

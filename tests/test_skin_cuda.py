@@ -8,7 +8,7 @@ import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, launch_step, prepare_step, step
-from biotac_mj.skin.precondition.native import invert
+from biotac_mj.skin.precondition.batched_inverse import invert
 from biotac_mj.skin.program import Fork, Launcher
 
 CUDA = wp.is_cuda_available()

@@ -17,7 +17,7 @@ from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance_bound
 from biotac_mj.skin.forces import Forces
 from biotac_mj.skin.precondition import inverse, sparse
-from biotac_mj.skin.precondition.carried import Carrier
+from biotac_mj.skin.precondition.pushed_forward import PushForward
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.step import prepare_step
@@ -161,7 +161,7 @@ def test_the_inverse_is_carried_by_what_keeps_volume(law):
     stretch = np.array([[1.3, 0.1, 0.0], [0.1, 0.9, 0.05], [0.0, 0.05, 1.1]])
     F = turn @ stretch
     x = np.stack([skin.rest.vert @ F.T, skin.rest.vert @ np.diag([1.0, 1.0, -1.0])], axis=1)
-    carrier = Carrier(skin.elements, wp.array(x, dtype=wp.vec3d, ndim=2, device="cpu"))
+    carrier = PushForward(skin.elements, wp.array(x, dtype=wp.vec3d, ndim=2, device="cpu"))
     carrier.measure(np.array([0, 1]))
     wanted = F / np.cbrt(np.linalg.det(F)) if law == "neo_hookean" else turn
     np.testing.assert_allclose(carrier.matrix[:, 0], np.broadcast_to(wanted, (skin.nvert, 3, 3)), atol=1e-9)
@@ -183,10 +183,10 @@ def test_carried_the_dense_inverse_takes_fewer_products(monkeypatch):
             products += data.worlds.work.numpy()[-1]
         return products, data.wrench[-1, 0, :3].copy(), data.tangent(geoms)[-1, 0]
 
-    carried, force, tangent = press()
-    monkeypatch.setattr(inverse, "carries", lambda *of: False)
+    pushed, force, tangent = press()
+    monkeypatch.setattr(inverse, "pushes_forward", lambda *of: False)
     rest, force_at_rest, tangent_at_rest = press()
-    assert carried < 0.6 * rest
+    assert pushed < 0.6 * rest
     np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())
     np.testing.assert_allclose(tangent, tangent_at_rest, atol=2e-2 * np.abs(tangent[:3, :3]).max())
 
@@ -207,7 +207,7 @@ def test_carried_the_inverse_takes_fewer_products(model, monkeypatch):
     (alone, force), (both, force_of_two) = press(1), press(2)
     assert both == alone
     np.testing.assert_allclose(force_of_two, force, rtol=1e-9)
-    monkeypatch.setattr(sparse, "carries", lambda *of: False)
+    monkeypatch.setattr(sparse, "pushes_forward", lambda *of: False)
     rest, force_at_rest = press(2)
     assert alone < 0.7 * rest
     np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())

@@ -9,7 +9,7 @@ import scipy.sparse.linalg  # noqa: F401
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import Material, SkinModel
-from biotac_mj.skin.precondition.dissection import dissect
+from biotac_mj.skin.precondition.nested_dissection import dissect
 from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor, elimination_of
 
 
@@ -126,6 +126,6 @@ def test_chains_and_loose_parts(n):
 def test_not_positive_definite():
     matrix = sp.csc_matrix(np.diag([1.0, 1, 1, 1, -1, 1]))
     with pytest.raises(
-        ValueError, match="not positive definite: elements are inverted, or parts of the skin are not held"
+        ValueError, match="not positive definite: check for inverted elements"
     ):
         SupernodalFactor(matrix, Elimination(matrix, np.eye(3)[:2]), np.arange(2))

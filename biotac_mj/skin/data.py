@@ -15,6 +15,7 @@ from .contact.law import WorldLaws
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.bodies import BodyContact
+from .newton.nodes import SurfaceForces
 from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
@@ -56,6 +57,10 @@ class ContactState:
         self.sample_force = zeros(self.anchor.shape, vec3, tier)  # of samples that touch [N]
         self.corner = zeros((3 * nface, nworld), vec3, tier)
         self.block = zeros((6 * nface, nworld), mat33, tier)
+        self.forces = forces = SurfaceForces()
+        forces.face, forces.start, forces.slot = surface.face, surface.start, surface.slot
+        forces.touching, forces.corner, forces.block = self.touching, self.corner, self.block
+        forces.node_force = self.node_force
         cache = self.clearances
         cache.mark, cache.travel = wp.full(nworld, -1, dtype=int), wp.zeros(nworld, dtype=real)
         cache.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)

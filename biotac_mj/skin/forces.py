@@ -285,20 +285,6 @@ class Forces:
         else:
             liquid.face, liquid.start, liquid.slot, liquid.node = k.no_face, k.no_list, k.no_list, k.no_list
             liquid.wet, liquid.corner, liquid.gradient = k.no_vector, k.no_vector, k.no_vector
-        core = m.core_surface if d.core else None
-        return self._surface_forces(m.outer, d.outer), self._surface_forces(core, d.core), liquid
-
-    def _surface_forces(self, surface, state):
-        k, out = self.k, nodes.SurfaceForces()
-        if state is None:
-            out.face, out.start, out.slot, out.touching = k.no_face, k.no_list, k.no_list, k.no_flag
-            out.corner, out.block, out.node_force = k.no_vector, k.no_block, k.no_vector
-            return out
-        out.face, out.start, out.slot, out.touching = (
-            surface.face,
-            surface.start,
-            surface.slot,
-            state.touching,
-        )
-        out.corner, out.block, out.node_force = state.corner, state.block, state.node_force
-        return out
+        with wp.ScopedDevice(m.device):
+            core = d.core.forces if d.core else nodes.empty_surface(d.nworld)
+        return d.outer.forces, core, liquid

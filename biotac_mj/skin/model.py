@@ -20,7 +20,7 @@ from .contact.law import ContactLaw, contact_law
 from .contact.meshes import bake_distance_grid
 from .contact.penetration import rest_gap
 from .geoms import GeomSet
-from .precondition.dissected import DissectedInverse
+from .precondition.block_inverse import DissectedInverse
 from .precondition.sparse import SparseFactor
 from .rubber.law import LAWS
 from .rubber.material import ELEMENTS, Material, material

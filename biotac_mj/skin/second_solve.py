@@ -145,7 +145,9 @@ def _arrays(data, geoms, single) -> Iterator[tuple[wp.array, int, wp.array]]:
     while pairs:
         batch, one = pairs.pop()
         if isinstance(batch, ContactState):
-            pairs += [(getattr(batch, n), getattr(one, n)) for n in vars(batch) if n != "clearances"]
+            pairs += [
+                (getattr(batch, n), getattr(one, n)) for n in vars(batch) if n not in ("clearances", "forces")
+            ]
         elif hasattr(batch, "cls"):  # a struct of arrays
             pairs += [(getattr(batch, n), getattr(one, n)) for n in batch.cls.__annotations__]
         elif isinstance(batch, wp.array) and batch.size:

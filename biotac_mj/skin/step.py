@@ -37,7 +37,7 @@ from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, load_path, nodes, worlds
 from .precondition import Residual
-from .precondition.native import kernels_up_to
+from .precondition.batched_inverse import kernels_up_to
 from .program import Launcher, Program, compile_ahead, compile_kernels
 from .rubber.element_forces import module_for_cuda
 from .types import SINGLE, mat33, vec3

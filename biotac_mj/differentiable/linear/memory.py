@@ -19,7 +19,7 @@ from ..skin import SkinWorlds
 __all__ = ["LinearMemory", "Memory"]
 
 _KINK = 1e-9  # relative distance from slip of friction elements, or from the largest energy, taken as a kink
-_SHORT = 1e-4  # step over relaxation time below which `share_of_term` uses its series
+_SHORT = 1e-4  # step over relaxation time below which `prony_weight` uses its series
 
 
 @dataclasses.dataclass(frozen=True)

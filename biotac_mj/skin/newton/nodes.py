@@ -16,6 +16,7 @@ __all__ = [
     "NodeSlots",
     "SurfaceForces",
     "assemble_force",
+    "empty_surface",
     "begin_nodes",
     "end_core",
     "end_nodes",
@@ -51,6 +52,16 @@ class SurfaceForces:
     corner: wp.array2d(dtype=vec3)  # forces [3 face + corner, world] [N]
     block: wp.array2d(dtype=mat33)  # tangent [6 face + block, world] [N/m]
     node_force: wp.array2d(dtype=vec3)  # [node, world] [N]
+
+
+def empty_surface(nworld: int) -> SurfaceForces:
+    """No contact surface, on Warp's default device."""
+    out = SurfaceForces()
+    out.face = wp.zeros(0, dtype=wp.vec3i)
+    out.start, out.slot = (wp.zeros(0, dtype=int) for _ in range(2))
+    out.touching, out.block = wp.zeros((0, nworld), dtype=int), wp.zeros((0, nworld), dtype=mat33)
+    out.corner, out.node_force = (wp.zeros((0, nworld), dtype=vec3) for _ in range(2))
+    return out
 
 
 @wp.struct

@@ -17,10 +17,10 @@ __all__ = ["Preconditioner", "Residual"]
 
 
 class Residual(NamedTuple):
-    """What a preconditioner is applied to.
+    """The residual to which a preconditioner is applied.
 
     Attributes:
-      worth: (4, nchunk, nworld) squares of r and of the gradient as its first and third.
+      norms: (4, nchunk, nworld); the first is the square of r, the third that of the gradient.
       r: [nvert, nworld] residual, zero at fixed nodes.
       gradient: of the liquid's volume [nvert, nworld], or of length zero.
     """
@@ -31,8 +31,8 @@ class Residual(NamedTuple):
 
 
 class Preconditioner(Protocol):
-    """The approximate inverse of the tangent, for all worlds of one SkinData: of the rest stiffness,
-    corrected for contact and liquid. Methods put what they do into a program.
+    """The approximate inverse of the tangent, for all worlds of one SkinData: the inverse of the undeformed
+    stiffness, corrected for contact and liquid. Methods put launches into a program.
 
     Attributes:
       precision: of directions.
@@ -41,7 +41,7 @@ class Preconditioner(Protocol):
     precision: Precision
 
     def begin_step(self, program: Launcher, x: wp.array) -> None:
-        """A step begins, of nodes that are in x [nvert, nworld] all the time."""
+        """Starts a step whose nodes are in x [nvert, nworld]."""
 
     def update(
         self,
@@ -52,14 +52,14 @@ class Preconditioner(Protocol):
         partial_out: wp.array,
         in_parallel: Callable[..., None],
     ) -> None:
-        """Takes the tangents of contact and liquid, just evaluated, in the active worlds, and marks in
-        `st.touched` where something touches; z is the approximate inverse of the new tangent times r.
+        """Takes the tangents of contact and liquid from the last evaluation in the active worlds, sets
+        `st.touched`, and computes z = approximate inverse of the new tangent times r.
 
         Args:
-          st: Worlds, of which the active ones are looked at.
-          residual: r and the liquid's gradient, see `Residual`.
-          z_out: [nvert, nworld]. part_out: (2, nchunk, nworld) r . z and gradient . z.
-          beside: launches functions that do not need each other's results.
+          st: Worlds.
+          residual: r and the gradient of the liquid's volume, see `Residual`.
+          z_out: [nvert, nworld]. partial_out: (2, nchunk, nworld) r . z and gradient . z.
+          in_parallel: launches functions that do not need each other's results.
         """
 
     def apply(
@@ -72,13 +72,13 @@ class Preconditioner(Protocol):
         z_out: wp.array,
         partial_out: wp.array,
     ) -> None:
-        """The same for another r in the running worlds; `partial` holds the square of r by chunks."""
+        """Computes z for another r in the running worlds. partial: square of r by chunks."""
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
-        """After a linear solve at x [nvert, nworld]: may take the factor of this shape."""
+        """After a linear solve at x [nvert, nworld]: takes the factor of this shape if solves were long."""
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Takes the factor of the shape x, if it can."""
+        """Takes the factor of the shape x, if the preconditioner supports it."""
 
     def measure_tangents(
         self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array

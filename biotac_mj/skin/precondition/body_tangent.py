@@ -1,13 +1,12 @@
-"""Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the BioTac frame's
-origin.
+"""Stiffness of the skin against rigid motions of a touching body, 6 x 6 about the BioTac frame's origin.
 
-The body drags the contact springs D of the nodes that it touches, and the skin behind them gives way by its
-corrected compliance C = (A0 + U D U^T)^-1: R' (D - D C D) R with the body's rigid motions R, translations
-first. The rest stiffness stands for the tangent here, as in the preconditioners.
+The stiffness is R' (D - D C D) R, with the contact springs D of the nodes that the body touches, the
+corrected compliance C = (A0 + U D U^T)^-1 of the skin behind them, and the body's rigid motions R,
+translations first. The undeformed stiffness A0 replaces the tangent, as in the preconditioners.
 
-`body_tangent` is that in double precision for one body. The kernels have G = (I + D W)^-1 D over all touching
-nodes from the linear solves of many worlds, and that is D - D C D; nodes that two bodies touch count for one
-of them.
+`body_tangent` computes it in double precision for one body. The kernels use G = (I + D W)^-1 D = D - D C D
+over all touching nodes, from the linear solves of many worlds. A node that two bodies touch counts for one of
+them.
 """
 
 from collections.abc import Callable
@@ -18,13 +17,13 @@ import warp as wp
 from ...geometry.rigid import rigid_motions
 from ..types import mat33, real, vec3
 
-__all__ = ["assemble", "body_tangent", "drag_rows", "group_rows", "sum_rows"]
+__all__ = ["assemble", "body_tangent", "row_tangents", "group_rows", "sum_rows"]
 
 wp.set_module_options({"enable_backward": False})
 
 _BLOCK = np.array(
     [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-)  # of a face, between its corners: see `faces.block_index`
+)  # index of the block between corners: `faces.block_index`
 
 
 def body_tangent(
@@ -35,14 +34,8 @@ def body_tangent(
     x: np.ndarray,
     nvert: int,
 ) -> np.ndarray:
-    """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin
-    (translation, rotation vector).
-
-    The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0
-    + U D U^T)^-1 over
-    T: G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness
-      stands for the tangent
-    here, as in the preconditioner.
+    """Stiffness (6, 6) of the skin against rigid motions of a touching body about the origin (translation,
+    rotation vector), see the module's docstring.
 
     Args:
       nodes: (m,) touching free nodes.
@@ -92,7 +85,7 @@ def group_rows(
     # Out:
     group_out: wp.array2d(dtype=int),
 ):
-    """Which body touches each node of the small systems from outside [row, world]; -1: none."""
+    """Group of the body that touches node s of a Woodbury system from outside [row, world]; -1: none."""
     s, w = wp.tid()
     found = int(-1)
     if s < size[w]:
@@ -108,7 +101,7 @@ def group_rows(
 
 
 @wp.kernel
-def drag_rows(
+def row_tangents(
     # In:
     liquid: int,
     size: wp.array(dtype=int),
@@ -117,16 +110,16 @@ def drag_rows(
     x: wp.array2d(dtype=vec3),
     group: wp.array2d(dtype=int),
     # Out:
-    part_out: wp.array2d(dtype=wp.spatial_matrixd),
+    partial_out: wp.array2d(dtype=wp.spatial_matrixd),
 ):
-    """Each row's part R_s' sum_t G_st R_t of its body's tangent [row, world]."""
+    """Part R_s' sum_t G_st R_t of row s in the tangent of its body [row, world]."""
     s, w = wp.tid()
     if s >= size[w]:
         return
     mine = group[s, w]
     if mine < 0:
         return
-    move = mat33()  # forces on node s of the body's unit translations, and rotations
+    move = mat33()  # forces on node s by unit translations of the body, and by rotations
     turn = mat33()
     for t in range(size[w]):
         if group[t, w] == mine:
@@ -140,14 +133,14 @@ def drag_rows(
     arm = wp.skew(x[node[s, w], w])
     bend = arm * move
     wind = arm * turn
-    part = wp.spatial_matrixd()
+    partial = wp.spatial_matrixd()
     for a in range(3):
         for b in range(3):
-            part[a, b] = move[a, b]
-            part[a, 3 + b] = turn[a, b]
-            part[3 + a, b] = bend[a, b]
-            part[3 + a, 3 + b] = wind[a, b]
-    part_out[s, w] = part
+            partial[a, b] = move[a, b]
+            partial[a, 3 + b] = turn[a, b]
+            partial[3 + a, b] = bend[a, b]
+            partial[3 + a, 3 + b] = wind[a, b]
+    partial_out[s, w] = partial
 
 
 @wp.kernel
@@ -155,7 +148,7 @@ def sum_rows(
     # In:
     size: wp.array(dtype=int),
     group: wp.array2d(dtype=int),
-    part: wp.array2d(dtype=wp.spatial_matrixd),
+    partial: wp.array2d(dtype=wp.spatial_matrixd),
     # Out:
     tangent_out: wp.array2d(dtype=wp.spatial_matrixd),
 ):
@@ -163,5 +156,5 @@ def sum_rows(
     total = wp.spatial_matrixd()
     for s in range(size[w]):
         if group[s, w] == g:
-            total += part[s, w]
+            total += partial[s, w]
     tangent_out[g, w] = real(0.5) * (total + wp.transpose(total))

@@ -1,9 +1,9 @@
-"""The preconditioner of `sparse.py` for all worlds at once, without a look back at the host: for CUDA.
+"""The preconditioner of `sparse.py` for all worlds at once and without reads by the host, for CUDA.
 
-Woodbury's identity with the inverse of the rest stiffness: first what the residual does at the touching
-nodes, then the forces of contact and liquid that answer there, q = (I + D W)^-1 D u; these join the residual.
-G = (I + D W)^-1 D is made explicitly, so that applying it is one short product. The inverse itself is that of
-`dissected`, of nearly incompressible rubber carried into the present shape, see `carried`."""
+Woodbury's identity with the inverse of the undeformed stiffness: first the displacements u of the touching
+nodes and the liquid by the residual, then their forces q = (I + D W)^-1 D u, which are subtracted from the
+residual. G = (I + D W)^-1 D is computed explicitly, so that it is applied by one short product. The inverse
+is that of `block_inverse`; for nearly incompressible rubber it is pushed forward, see `pushed_forward`."""
 
 import functools
 import typing
@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from ..newton.nodes import empty_surface
 from ..newton.worlds import Worlds
 from ..program import Fork, Launcher
-from ..types import SINGLE, mat33
-from . import Residual, body_tangent, sides, small
-from . import touched as touch
+from ..types import SINGLE
+from . import Residual, body_tangent, right_hand_sides, touching_nodes, woodbury
 from .inverse import Inverse
 
 if typing.TYPE_CHECKING:
@@ -26,25 +26,25 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["FEW", "LANES_FEW", "THREADS_FEW", "DensePreconditioner"]
 
-FEW = 16  # worlds that do not fill the device: work is split finer there
-THREADS_FEW = 64  # of a block there, so that more multiprocessors take part
-LANES_FEW = 8  # that share what is summed into a node there on CUDA: one would wait for read after read
+FEW = 16  # so many worlds do not fill the device: work is split into smaller parts
+THREADS_FEW = 64  # of a block with few worlds, so that more multiprocessors take part
+LANES_FEW = 8  # threads that sum into one node with few worlds: a single one would wait for each read
 
 
 class DensePreconditioner:
     """For all worlds of one SkinData, see `precondition.Preconditioner`.
 
     Attributes:
-      needs_torch: its products are torch's.
+      needs_torch: whether torch computes its products.
 
     Args:
       model: the SkinModel.
-      surfaces: (outer, core) contact states, core None where there is none.
+      surfaces: (outer, core) contact states; core may be None.
       st: Worlds.
       chunk: nodes summed by one thread.
-      capacity: touching nodes that the small systems hold; contact beyond is left to conjugate gradients,
-        which then take longer.
-      bodies, drag: of bodies that give way, None where poses are prescribed.
+      capacity: most touching nodes of a Woodbury system; conjugate gradients correct for others, in more
+        iterations.
+      bodies, body_contact: of compliant bodies; None: poses are prescribed.
     """
 
     precision = SINGLE
@@ -72,12 +72,6 @@ class DensePreconditioner:
         size = self.liquid + 3 * capacity
         with wp.ScopedDevice(self.device):
             self._free = wp.array(index, dtype=int)
-            none = (
-                wp.zeros(0, dtype=int),
-                wp.zeros((0, nworld), dtype=int),
-                wp.zeros(0, dtype=wp.vec3i),
-                wp.zeros((0, nworld), dtype=mat33),
-            )
             self.slot = wp.zeros(self._nodes, dtype=int)
             self.node = wp.zeros((capacity, nworld), dtype=int)
             self._found, self._found_count = wp.zeros(self._nodes, dtype=int), wp.zeros(nworld, dtype=int)
@@ -93,27 +87,25 @@ class DensePreconditioner:
             self._all = wp.full(nworld, 1, dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
         lanes = LANES_FEW if self.device.is_cuda and nworld <= FEW else 1
-        self._body_block = Inverse(model, nworld, chunk, self._launch, lanes)
-        self.needs_torch = self._body_block.needs_torch
-        self._beside = Fork(self.device, nworld <= FEW).run  # most sizes of small systems find nothing to do
+        self._inverse = Inverse(model, nworld, chunk, self._norm, self._launch, lanes)
+        inverse, entries = self._inverse.inverse, right_hand_sides.InverseEntries()
+        entries.half, entries.rest, entries.scale = inverse.half, inverse.rest, inverse.scale
+        entries.free_index, self._entries = self._free, entries
+        self.needs_torch = self._inverse.needs_torch
+        self._in_parallel = Fork(self.device, nworld <= FEW).run  # most sizes have no system
         self._outer, self._row_group = surfaces[0], None
-        self._surfaces = []
-        for state in surfaces:
-            if state is None:
-                self._surfaces.append((none[2], none[0], none[0], none[1], none[3]))
-            else:
-                s = state.surface
-                self._surfaces.append((s.face, s.start, s.slot, state.touching, state.block))
+        with wp.ScopedDevice(self.device):
+            self._surfaces = [empty_surface(nworld) if s is None else s.forces for s in surfaces]
 
     def begin_step(self, program: Launcher, x: wp.array) -> None:
-        """The inverse at rest serves every step; where it is carried, into the shapes that are in x then."""
+        """Takes x, for the deformed shape; the undeformed inverse is valid for every step."""
         self._x = x
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
-        """Nothing: an inverse takes longer than the products that it would save."""
+        """Does nothing: a new inverse would take longer than the products that it saves."""
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Nothing, see `watch_products`."""
+        """Does nothing, see `watch_products`."""
 
     def update(
         self,
@@ -121,7 +113,7 @@ class DensePreconditioner:
         st: Worlds,
         residual: Residual,
         z_out: wp.array,
-        part_out: wp.array,
+        partial_out: wp.array,
         in_parallel: Callable[..., None],
     ) -> None:
         """See `precondition.Preconditioner`."""
@@ -133,24 +125,24 @@ class DensePreconditioner:
         def find():
             self._launch(
                 program,
-                touch.find_touched,
+                touching_nodes.list_touching_nodes,
                 self._nodes,
-                [self._free, *outer[1:4], *core[1:4], on],
+                [self._free, outer, core, on],
                 [self._found_count, self.slot, self._found, st.touched],
             )
             program.launch_blocks(
-                touch.survey,
+                touching_nodes.number_touching_nodes,
                 [w],
                 [m, norms, st, self._found],
                 [self._found_count, self.slot, self.node, self.size, self._norm, self.full],
             )
 
-        def carry():
-            if self._body_block.carried:
-                self._body_block.carried.measure(program, self._launch, self._x, on)
+        def push_forward():
+            if self._inverse.pushed:
+                self._inverse.pushed.measure(program, self._launch, self._x, on)
 
-        def meet():
-            self._meet(program, True, st, on, r, gradient)
+        def gather():
+            self._gather(program, True, st, on, r, gradient)
 
         def make():
             self._make_system(program, st, on, self._bodies)
@@ -158,107 +150,109 @@ class DensePreconditioner:
         def prepare():
             self._launch(
                 program,
-                small.small_stiffness,
+                woodbury.fill_stiffness,
                 (self._ring.shape[1], m, w),
-                [*outer, *core, self._ring, self.slot, self.node, self.size, on],
+                [outer, core, self._ring, self.slot, self.node, self.size, on],
                 blocks,
             )
-            if not self.liquid:  # which has to be met first
+            if not self.liquid:  # with a liquid, its displacements are needed first
                 make()
 
         self._given = st, r, gradient
-        in_parallel(find, carry) if self._body_block.carried else find()
-        in_parallel(meet, prepare)
+        in_parallel(find, push_forward) if self._inverse.pushed else find()
+        in_parallel(gather, prepare)
         if self.liquid:
             make()
-        self._balance(program, st, on, r, gradient, z_out, part_out)
+        self._finish(program, st, on, r, gradient, z_out, partial_out)
 
     def apply(
         self,
         program: Launcher,
         st: Worlds,
-        part: wp.array,
+        partial: wp.array,
         r: wp.array,
         gradient: wp.array,
         z_out: wp.array,
-        part_out: wp.array,
+        partial_out: wp.array,
     ) -> None:
-        """z = approximate inverse of the tangent times r in the running worlds; `part` holds the square of r
-        by chunks."""
-        program.launch_blocks(sides.measure_norm, [self.nworld], [part, st.running], [self._norm])
-        self._meet(program, False, st, st.running, r, gradient)
-        self._balance(program, st, st.running, r, gradient, z_out, part_out)
+        """z = approximate inverse of the tangent times r in the running worlds. partial: square of r by
+        chunks."""
+        program.launch_blocks(
+            right_hand_sides.measure_norm, [self.nworld], [partial, st.running], [self._norm]
+        )
+        self._gather(program, False, st, st.running, r, gradient)
+        self._finish(program, st, st.running, r, gradient, z_out, partial_out)
 
-    def _meet(self, program, first, st, on, r, gradient):
-        here, out = (self.node, self.size), (self._W, self._u, self._largest)
-        self._body_block.meet(program, first, st, on, r, gradient, self._norm, here, *out)
+    def _gather(self, program, first, st, on, r, gradient):
+        touching, out = (self.node, self.size), (self._W, self._u, self._largest)
+        self._inverse.gather(program, first, st, on, r, gradient, touching, *out)
 
     def _make_system(self, program, st, on, bodies=None):
-        """G of the present contact, once its springs and what the liquid does are known."""
-        inverse, body_block, w = self._body_block.inverse, self._body_block, self.nworld
-        # of many worlds each has one block; most touch with a third of the nodes that they may
+        """Computes G from the springs of contact and the displacements by the liquid."""
+        inverse, w = self._inverse, self.nworld
+        # with many worlds each has one block; most have a third of the touching nodes that they may have
         threads = self.capacity**2 if w <= FEW else 256
-        entries = [inverse.half, inverse.rest, inverse.scale, self._free, self.node, self.size]
-        given = [*entries, self.liquid, body_block.along, st, on, body_block.matrix, threads]
-        self._launch(program, small.small_compliance, (w, threads), given, [self._W])
+        nodes = [self._entries, self.node, self.size]
+        given = [*nodes, self.liquid, inverse.along, st, on, inverse.node_map.matrix, threads]
+        self._launch(program, woodbury.fill_compliance, (w, threads), given, [self._W])
         if bodies is not None:
             outer = self._surfaces[0]
-            touched = [self.liquid, *outer[1:4], self._body_contact.group, bodies, self._x]
+            touched = [self.liquid, outer, self._body_contact.group, bodies, self._x]
             given = [*touched, self.node, self.size, st, on, threads]
-            self._launch(program, small.add_bodies, (w, threads), given, [self._W])
+            self._launch(program, woodbury.add_bodies, (w, threads), given, [self._W])
         system = [self.liquid, self.size, self._link, self._spring, self._W, on, threads]
-        self._launch(program, small.small_system, (w, threads), system, [self._A])
+        self._launch(program, woodbury.fill_system, (w, threads), system, [self._A])
         self._invert(program, on)
-        self._launch(program, small.small_answer, (w, threads), system, [self._G])
+        self._launch(program, woodbury.multiply_springs, (w, threads), system, [self._G])
 
     def _invert(self, program, on):
-        """The inverse of A, in W's place."""
+        """Stores the inverse of A in W."""
         if self.device.is_cuda:
-            from .native import invert
+            from .batched_inverse import invert
 
-            invert(program, self._beside, self.liquid, self.size, on, self._A, self._W)
+            invert(program, self._in_parallel, self.liquid, self.size, on, self._A, self._W)
         else:
             self._launch(
                 program,
-                small.invert_serial,
+                woodbury.invert_serial,
                 self.nworld,
                 [self.liquid, self.size, on, self._A, self._pivot],
                 [self._W],
             )
 
-    def _balance(self, program, st, on, r, gradient, z_out, part_out):
-        """What contact and liquid answer, and the result."""
+    def _finish(self, program, st, on, r, gradient, z_out, partial_out):
+        """Computes the forces of contact and liquid, and the result z."""
         answer = [self.liquid, self.size, self._G, self._u, self._norm, st, on]
-        self._launch(program, small.small_forces, self._u.shape, answer, [self._q, self._largest])
-        here, q = (self.node, self.size), (self.slot, self._q, self._largest)
-        self._body_block.balance(program, st, on, r, gradient, self._norm, here, *q, z_out, part_out)
+        self._launch(program, woodbury.contact_forces, self._u.shape, answer, [self._q, self._largest])
+        forces = self.slot, self._q, self._largest
+        self._inverse.apply(program, st, on, r, gradient, *forces, z_out, partial_out)
 
     def measure_tangents(
         self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
     ) -> None:
-        """See `precondition.Preconditioner`. Of the inverse at rest, as those of many worlds on the CPU, and
-        of the skin alone."""
+        """See `precondition.Preconditioner`. By the inverse of the undeformed skin, as for many worlds on the
+        CPU, and without the compliance of the bodies."""
         outer, rows = self._outer, (self.capacity, self.nworld)
-        if self._body_block.carried or self._bodies is not None:
-            self._body_block.as_at_rest(lambda: self._remake_system(program))
+        if self._inverse.pushed or self._bodies is not None:
+            self._inverse.without_deformation(lambda: self._undeformed_system(program))
         if self._row_group is None:
             with wp.ScopedDevice(self.device):
                 self._row_group = wp.zeros(rows, dtype=int)
-                self._row_part = wp.zeros(rows, dtype=wp.spatial_matrixd)
+                self._row_tangent = wp.zeros(rows, dtype=wp.spatial_matrixd)
         surface, nsample = outer.surface, len(self.m.sample)
         touched = [surface.start, surface.slot, nsample, outer.touching, outer.trial_geom, geoms.struct.group]
         here = [self.size, self.node]
         program.launch(body_tangent.group_rows, rows, [*here, *touched], [self._row_group])
-        dragged = [self.liquid, *here, self._G, x, self._row_group]
-        program.launch(body_tangent.drag_rows, rows, dragged, [self._row_part])
-        sums = [self.size, self._row_group, self._row_part]
+        inputs = [self.liquid, *here, self._G, x, self._row_group]
+        program.launch(body_tangent.row_tangents, rows, inputs, [self._row_tangent])
+        sums = [self.size, self._row_group, self._row_tangent]
         program.launch(body_tangent.sum_rows, tangent_out.shape, sums, [tangent_out])
 
-    def _remake_system(self, program):
-        """Of all worlds, where they were looked at last; what carries them on is made anew then."""
+    def _undeformed_system(self, program):
+        """Computes the Woodbury systems of all worlds with the present `node_map`, at the last residual."""
         st, r, gradient = self._given
         if self.liquid:
-            self._meet(program, True, st, self._all, r, gradient)
+            self._gather(program, True, st, self._all, r, gradient)
         self._make_system(program, st, self._all)
 
 

@@ -1,5 +1,6 @@
-"""What the dense preconditioner asks of the inverse: what a residual does at the touching nodes and to the
-liquid, and the result. Of nearly incompressible rubber it is the inverse carried into the present shape."""
+"""Products with the inverse for the dense preconditioner: displacements of the touching nodes and of the
+liquid by a residual, and the result. For nearly incompressible rubber the inverse is pushed forward into the
+deformed shape."""
 
 import typing
 
@@ -9,8 +10,8 @@ import warp as wp
 from ..newton.worlds import Worlds
 from ..program import Launcher
 from ..types import real
-from . import sides, small
-from .carried import Matrices, carries
+from . import right_hand_sides, woodbury
+from .pushed_forward import PushForwardMatrices, pushes_forward
 
 __all__ = ["Inverse"]
 
@@ -23,11 +24,19 @@ class Inverse:
       launch: of a kernel, as `DensePreconditioner` does it. lanes: that share what is summed into a node.
 
     Attributes:
-      carried: `carried.Matrices`, or None where the inverse is as at rest.
+      carried: `pushed.PushForwardMatrices`, or None where the inverse is as at rest.
       needs_torch: see `dissected.Product`.
     """
 
-    def __init__(self, model: typing.Any, nworld: int, chunk: int, launch: typing.Callable, lanes: int):
+    def __init__(
+        self,
+        model: typing.Any,
+        nworld: int,
+        chunk: int,
+        norm: wp.array,
+        launch: typing.Callable,
+        lanes: int,
+    ):
         self.inverse = model.inverse
         self._chunk, self._launch, self._nworld = chunk, launch, nworld
         self._liquid, self._wet = int(model.has_liquid), model.wet_node
@@ -35,24 +44,30 @@ class Inverse:
         row = np.full(model.nvert, -1, np.int32)
         row[model.free] = self.inverse.row
         with wp.ScopedDevice(model.device):
-            self._row = wp.array(row, dtype=int)
+            row = wp.array(row, dtype=int)
             self.along = wp.zeros(self._nodes if self._liquid else (0, nworld), dtype=wp.vec3)
-            self._part = wp.zeros((2, *self._chunks), dtype=real)
-            self._none = wp.zeros((0, nworld), dtype=wp.mat33)
-        self.carried = None
-        if carries(model.elements, model.material.poissons_ratio):
-            self.carried = Matrices(model.elements, nworld, model.device, lanes)
-        self.matrix = self.carried.matrix if self.carried else self._none
+            self._partial = wp.zeros((2, *self._chunks), dtype=real)
+            none = wp.zeros((0, nworld), dtype=wp.mat33)
+        self.pushed = None
+        if pushes_forward(model.elements, model.material.poissons_ratio):
+            self.pushed = PushForwardMatrices(model.elements, nworld, model.device, lanes)
+        self._undeformed = self._node_map(row, none, norm)
+        self.node_map = self._node_map(row, self.pushed.matrix, norm) if self.pushed else self._undeformed
         self._product = self.inverse.product(nworld, two=bool(self._liquid))
         self.needs_torch = self._product.needs_torch
 
-    def as_at_rest(self, launches: typing.Callable[[], None]) -> None:
-        """What `launches` launches takes the inverse as it is at rest."""
-        kept, self.matrix = self.matrix, self._none
-        launches()
-        self.matrix = kept
+    def _node_map(self, row, matrix, norm):
+        out = right_hand_sides.NodeMap()
+        out.row, out.matrix, out.norm, out.scale = row, matrix, norm, self.inverse.back
+        return out
 
-    def meet(
+    def without_deformation(self, launches: typing.Callable[[], None]) -> None:
+        """Calls `launches` with the inverse of the undeformed skin."""
+        present, self.node_map = self.node_map, self._undeformed
+        launches()
+        self.node_map = present
+
+    def gather(
         self,
         program: Launcher,
         first: bool,
@@ -60,66 +75,62 @@ class Inverse:
         on: wp.array,
         r: wp.array,
         gradient: wp.array,
-        norm: wp.array,
-        touch: tuple,
+        touching: tuple,
         W_out: wp.array,
         u_out: wp.array,
         largest_out: wp.array,
     ) -> None:
-        """What the residual does to the liquid and at the touching nodes; at first, what the liquid's
-        direction does everywhere.
+        """Computes the displacements u of the liquid and the touching nodes by the residual r. first: also
+        the displacements of all nodes by the volume's gradient.
 
         Args:
-          touch: `node` and `size`, see `touched`.
+          touching: `node` and `size` of `DensePreconditioner`.
         """
-        product, back = self._product, self.inverse.back
-        nodes, liquid = [self._row, self._wet, gradient], self._liquid
-        second = product.second
+        product, nodes = self._product, [self.node_map, self._wet, gradient]
+        liquid, second = self._liquid, product.second
         if liquid and first:
             side, answer = second or (product.side, product.answer)
-            given = [*nodes, norm, on, self.matrix]
-            self._launch(program, sides.load_gradient, self._nodes, given, [side])
+            self._launch(program, right_hand_sides.load_gradient, self._nodes, [*nodes, on], [side])
             if not second:
                 product.run(program)
-                self._read_along(program, nodes, answer, norm, st, on)
-        given = [self._row, r, norm, on, self.matrix]
-        self._launch(program, sides.load_residual, self._nodes, given, [product.side])
+                self._read_along(program, nodes, answer, st, on)
+        self._launch(
+            program, right_hand_sides.load_residual, self._nodes, [self.node_map, r, on], [product.side]
+        )
         product.run(program, both=bool(liquid and first and second))
         if liquid and first and second:
-            self._read_along(program, nodes, answer, norm, st, on)
+            self._read_along(program, nodes, answer, st, on)
         if liquid:
-            onto = [self._chunk, *nodes, product.answer, norm, back, st, on, self.matrix]
-            self._launch(program, sides.measure_swelling, self._chunks, onto, [self._part])
-            program.launch_blocks(
-                small.sum_liquid, [self._nworld], [self._part, on, int(first)], [W_out, u_out]
-            )
-        here = [liquid, self._row, *touch, product.answer, norm, back, st, on, self.matrix]
-        self._launch(program, sides.small_side, touch[0].shape, here, [u_out, largest_out])
+            inputs = [self._chunk, *nodes, product.answer, st, on]
+            kernel = right_hand_sides.measure_volume_change
+            self._launch(program, kernel, self._chunks, inputs, [self._partial])
+            inputs = [self._partial, on, int(first)]
+            program.launch_blocks(woodbury.sum_liquid, [self._nworld], inputs, [W_out, u_out])
+        inputs = [liquid, self.node_map, *touching, product.answer, st, on]
+        kernel = right_hand_sides.gather_displacements
+        self._launch(program, kernel, touching[0].shape, inputs, [u_out, largest_out])
 
-    def _read_along(self, program, nodes, answer, norm, st, on):
-        direction = [self._chunk, *nodes, answer, norm, self.inverse.back, st, on, self.matrix]
-        self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
+    def _read_along(self, program, nodes, answer, st, on):
+        inputs = [self._chunk, *nodes, answer, st, on]
+        self._launch(program, right_hand_sides.read_along, self._chunks, inputs, [self.along, self._partial])
 
-    def balance(
+    def apply(
         self,
         program: Launcher,
         st: Worlds,
         on: wp.array,
         r: wp.array,
         gradient: wp.array,
-        norm: wp.array,
-        touch: tuple,
         slot: wp.array,
         q: wp.array,
         largest: wp.array,
         z_out: wp.array,
-        part_out: wp.array,
+        partial_out: wp.array,
     ) -> None:
-        """The result, once contact and liquid have answered q."""
-        product, row, liquid = self._product, self._row, (self._wet, gradient)
-        answers = [self._liquid, row, slot, r, *liquid, q, norm, largest, st, on, self.matrix]
-        self._launch(program, sides.load_balance, self._nodes, answers, [product.side])
+        """Computes z = inverse times r minus the forces q of contact and liquid."""
+        product, nodes, liquid = self._product, self.node_map, (self._wet, gradient)
+        inputs = [self._liquid, nodes, slot, r, *liquid, q, largest, st, on]
+        self._launch(program, right_hand_sides.load_difference, self._nodes, inputs, [product.side])
         product.run(program)
-        answer = [self._chunk, row, product.answer, norm, largest, self.inverse.back]
-        result = [*answer, r, *liquid, st, on, self.matrix]
-        self._launch(program, sides.read_answer, self._chunks, result, [z_out, part_out])
+        inputs = [self._chunk, nodes, product.answer, largest, r, *liquid, st, on]
+        self._launch(program, right_hand_sides.read_answer, self._chunks, inputs, [z_out, partial_out])

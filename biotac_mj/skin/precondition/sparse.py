@@ -1,5 +1,5 @@
-"""Preconditioner of the linear solves on the CPU: the rest stiffness' sparse factor, corrected exactly for
-contact and liquid.
+"""Preconditioner of the linear solves on the CPU: sparse factor of the undeformed stiffness, corrected
+exactly for contact and liquid.
 
 Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume.
 With U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's
@@ -8,8 +8,8 @@ identity gives
   (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T
   and g).
 
-Where bodies give way, contact is softer by their compliance A along rigid motions R of T: W + R A R^T stands
-for W in I + D W.
+With compliant bodies W is replaced by W + R A R^T in I + D W, with their compliance A and rigid motions R of
+T.
 """
 
 import typing
@@ -27,7 +27,7 @@ from ..program import Launcher
 from ..types import DOUBLE
 from . import Residual
 from .body_tangent import assemble, body_tangent
-from .carried import Carrier, carries
+from .pushed_forward import PushForward, pushes_forward
 from .supernodal import Elimination, SupernodalFactor, elimination_of
 
 if typing.TYPE_CHECKING:
@@ -37,16 +37,16 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["SparseFactor", "SparsePreconditioner"]
 
-_DENSE = 300  # springs on so few coordinates are multiplied faster with the zeros between them
-_FACTOR = 60  # products of the tangent: about what a factor costs
-_SYSTEM = 110_000  # of a small system's entries: about what takes as long as a product
+_DENSE = 300  # coordinates below which a dense matrix of springs is faster than a sparse one
+_FACTOR = 60  # cost of a factor in products of the tangent
+_SYSTEM = 110_000  # entries of a Woodbury system that cost as much as a product
 
 
 class SparseFactor:
     """A sparse factor on the CPU, see `supernodal`.
 
     Args:
-      elimination: of a matrix with the same pattern; None: `elimination_of` this one, kept as the attribute.
+      elimination: of a matrix with the same pattern; None: that of this one. Stored as an attribute.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class SparseFactor:
         elimination: Elimination | None = None,
     ):
         self.elimination = elimination or elimination_of(stiffness, vert[free])
-        with single_thread():  # its fronts are small: more threads wait for each other
+        with single_thread():  # its fronts are small: more threads would wait for each other
             self._solver = SupernodalFactor(stiffness, self.elimination, free)
         self.size = stiffness.shape[0]
         self._free = free
@@ -75,10 +75,10 @@ class SparseFactor:
         return self._solver.solve(rhs)
 
     def rows(self, nodes: np.ndarray) -> np.ndarray:
-        """Rows of the inverse that belong to free nodes: (3 len(nodes), size) float32.
+        """Rows of the inverse of free nodes: (3 len(nodes), size) float32.
 
-        A row is computed with the rest of its cluster of nodes, always the same one, so that it does not
-        depend on the order of requests."""
+        A row is always computed together with its cluster of nodes, so that it does not depend on the order
+        of calls."""
         local = self._index[nodes]
         out = np.empty((len(nodes), 3, self.size), np.float32)
         mine = self._cluster[local]
@@ -97,12 +97,12 @@ class SparseFactor:
 
 
 class SparsePreconditioner:
-    """For all worlds of one SkinData, world by world in double precision; see `precondition.Preconditioner`.
+    """Preconditioner of all worlds of one SkinData in double precision, see `precondition.Preconditioner`.
 
-    Nearly incompressible rubber, turned and strained, is no longer like that at rest: the inverse is carried
-    into the present shape (`carried`). Where that is not enough, a lone world whose solves have taken more
-    products than a factor costs gets that of its present shape, again and again, for this step alone, so that
-    a step remains a function of the state it starts from. Worlds share a factor: not where there are many.
+    For nearly incompressible rubber the inverse is pushed forward into the deformed shape (`pushed_forward`).
+    If the solves of a single world have taken more products than a factor costs, the deformed shape is
+    factored, for the present step only, so that a step is a function of its start state. Several worlds share
+    the undeformed factor.
     """
 
     precision = DOUBLE
@@ -119,7 +119,7 @@ class SparsePreconditioner:
         self._bodies, self._body_contact = bodies, body_contact
         self._model, self._surfaces = model, [s for s in surfaces if s]
         self._rest = self.factor = model.factor
-        # of the free nodes, with a zero behind them for the fixed ones
+        # change of the free nodes, and a zero behind them for the fixed nodes
         self._change = np.zeros(3 * len(model.free) + 3, np.float32)
         self._change_at = np.full(model.nvert, len(model.free))
         self._change_at[model.free] = np.arange(len(model.free))
@@ -130,9 +130,9 @@ class SparsePreconditioner:
         self._viscosity = st.viscosity.numpy()
         self._work = st.work.numpy()
         self._products, self._iterations = 0, st.iterations_cg.numpy()
-        self._rows = self._rest_rows = {}
-        self._small = [None] * nworld
-        self._carrier, self._carried = None, False  # of nearly incompressible rubber, see `carried`
+        self._rows = self._undeformed_rows = {}
+        self._woodbury = [None] * nworld
+        self._push_forward, self._pushed = None, False  # for nearly incompressible rubber
         self._gradient = self._along = None
         self.any_touch = st.touched
 
@@ -140,18 +140,18 @@ class SparsePreconditioner:
 
     def begin_step(self, program: Launcher, x: wp.array) -> None:
         elements, ratio = self._model.elements, self._model.material.poissons_ratio
-        if self._carrier is None and carries(elements, ratio):
-            self._carrier = Carrier(elements, x)
+        if self._push_forward is None and pushes_forward(elements, ratio):
+            self._push_forward = PushForward(elements, x)
         self._x = x.numpy()
         program.call(self._begin)
 
     def _begin(self):
         self._products = 0
-        self.factor, self._rows = self._rest, self._rest_rows
-        self._carried = self._carrier is not None
+        self.factor, self._rows = self._rest, self._undeformed_rows
+        self._pushed = self._push_forward is not None
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
-        """After a linear solve: renews the factor where solves take too long."""
+        """After a linear solve: renews the factor if solves take too long."""
         x = x.numpy()
 
         def watch():
@@ -170,13 +170,13 @@ class SparsePreconditioner:
 
     @property
     def _renews(self):
-        return self._model.material.poissons_ratio > 0.45 and len(self._small) == 1
+        return self._model.material.poissons_ratio > 0.45 and len(self._woodbury) == 1
 
     def _renew(self, x):
         self._products = 0
         self._work[0] += _FACTOR
         self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
-        self._carried = False
+        self._pushed = False
 
     # --- solves ---
 
@@ -200,17 +200,17 @@ class SparsePreconditioner:
             z[:, self._of(worlds)], partial[:, :, self._of(worlds)] = 0, 0
             for w in worlds:
                 touched[w] = any(t[:, w].any() for t in touching)
-                self._small[w] = None
+                self._woodbury[w] = None
             rest = (touched[worlds] == 0) & (square[0].sum(0)[worlds] < NEGLIGIBLE_RESIDUAL**2)
             worlds = worlds[~rest]
             if not len(worlds):
                 return
             these = self._of(worlds)
-            if self._carried:
-                self._carrier.measure(worlds)
+            if self._pushed:
+                self._push_forward.measure(worlds)
             if gradient is None:
                 y = self._solve(r[:, these], worlds)
-            else:  # two right-hand sides take less than twice as long as one
+            else:  # two right-hand sides take less than twice the time of one
                 sides = np.concatenate([r[:, these].swapaxes(0, 1), gradient[:, these].swapaxes(0, 1)])
                 y, along = np.split(self._solve(sides.swapaxes(0, 1), worlds), 2, axis=1)
                 if self._along is None:
@@ -218,9 +218,9 @@ class SparsePreconditioner:
                 self._gradient, self._along[:, these] = gradient, along
             for w in worlds:
                 along = None if gradient is None else self._along[:, w]
-                small = self._small[w] = self._small_system(w, along, self._carried)
-                if small is not None:
-                    self._work[w] += len(small[3]) ** 2 // _SYSTEM
+                system = self._woodbury[w] = self._woodbury_system(w, along, self._pushed)
+                if system is not None:
+                    self._work[w] += len(system[3]) ** 2 // _SYSTEM
             self._correct(worlds, y, r, z, partial)
 
         program.call(update)
@@ -246,19 +246,19 @@ class SparsePreconditioner:
         program.call(apply)
 
     def _solve(self, rhs, worlds):
-        """The inverse, carried into the present shapes, times right-hand sides (nvert, k nworlds, 3)."""
-        if not self._carried:
+        """The inverse, pushed forward, times right-hand sides (nvert, k nworlds, 3)."""
+        if not self._pushed:
             return self.factor.solve(rhs)
         each = np.tile(worlds, rhs.shape[1] // len(worlds))
-        return self._carrier.onward(each, self.factor.solve(self._carrier.back(each, rhs)))
+        return self._push_forward.apply(each, self.factor.solve(self._push_forward.pull_back(each, rhs)))
 
     def _of(self, worlds):
-        """An index for columns of these worlds; all of them are a view, not a copy."""
-        return slice(None) if len(worlds) == len(self._small) else worlds
+        """Index of the columns of these worlds; a slice, thus a view, for all of them."""
+        return slice(None) if len(worlds) == len(self._woodbury) else worlds
 
-    def _small_system(self, w, along, carried):
-        """Of world w: nodes that are touched, their rows of the inverse at rest, the system that is solved
-        there and the compliance in it; along: the inverse times the liquid's gradient (nvert, 3)."""
+    def _woodbury_system(self, w, along, carried):
+        """Woodbury system of world w: touching nodes, their rows of the undeformed inverse, solver,
+        compliance W. along: (nvert, 3) the inverse times the gradient of the liquid's volume."""
         faces, blocks = [], []
         for state in self._surfaces:
             active, block = state.active(w)
@@ -274,27 +274,28 @@ class SparsePreconditioner:
         D = assemble(nodes, faces, blocks, len(self._is_free))
         rows, W = self._compliance(w, nodes)
         if carried:
-            W = self._carrier.compliance(w, nodes, W)
+            W = self._push_forward.compliance(w, nodes, W)
         compliance, soft = np.zeros((size, size)), self._softness[w]
         compliance[:m, :m] = W * soft
         if self._gradient is not None:
             along = along * soft
             compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
             compliance[m, m] = np.vdot(self._gradient[:, w], along)
-        softer = compliance
+        with_bodies = compliance
         if self._bodies is not None and m:
-            softer = compliance.copy()
-            softer[:m, :m] += self._give(w, nodes) / (1 + self._viscosity[w])  # bodies creep as the skin does
-        return nodes, rows, _Solver(D, self._kappa[w], softer), compliance
+            with_bodies = compliance.copy()
+            # the bodies have the artificial viscosity of the skin
+            with_bodies[:m, :m] += self._body_compliance(w, nodes) / (1 + self._viscosity[w])
+        return nodes, rows, _Solver(D, self._kappa[w], with_bodies), compliance
 
-    def _give(self, w, nodes):
-        """R A R^T of the bodies that touch nodes (k,) of world w."""
+    def _body_compliance(self, w, nodes):
+        """R A R^T (3k, 3k) of the bodies that touch nodes (k,) of world w."""
         outer, n = self._surfaces[0], 3 * len(nodes)
         faces = np.flatnonzero(outer.touching.numpy()[:, w])
         group = np.full(len(self._is_free), -1)
         np.maximum.at(group, outer.surface.face_np[faces], self._body_contact.group.numpy()[faces, w, None])
         there, mine = np.unique(group[nodes], return_inverse=True)
-        mine[group[nodes] < 0] = len(there)  # the core alone touches them
+        mine[group[nodes] < 0] = len(there)  # touched by the core only
         rigid = np.zeros((len(nodes), 3, len(there) + 1, 6))
         rigid[np.arange(len(nodes)), :, mine] = rigid_motions(self._x[nodes, w], n).reshape(-1, 3, 6)
         rigid = rigid[:, :, : len(there)].reshape(n, -1)
@@ -302,8 +303,8 @@ class SparsePreconditioner:
         return rigid @ compliance.swapaxes(1, 2).reshape(rigid.shape[1], -1) @ rigid.T
 
     def _compliance(self, w, nodes):
-        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes
-        stays the same."""
+        """Rows of the inverse at `nodes`, and the block among the nodes; cached while the nodes do not
+        change."""
         key = nodes.tobytes()
         if w not in self._rows or self._rows[w][0] != key:
             rows = self.factor.rows(nodes)
@@ -311,22 +312,22 @@ class SparsePreconditioner:
         return self._rows[w][1:]
 
     def _correct(self, worlds, y, r, z, partial):
-        """From A0^-1 r of some worlds to z, r . z and gradient . z."""
+        """Computes z, r . z and gradient . z of some worlds from y = A0^-1 r."""
         for k, w in enumerate(worlds):
-            soft, small = self._softness[w], self._small[w]
+            soft, system = self._softness[w], self._woodbury[w]
             v = y[:, k] * soft
-            if small is not None:
-                nodes, rows, solver, _ = small
+            if system is not None:
+                nodes, rows, solver, _ = system
                 m = 3 * len(nodes)
                 u = v[nodes].reshape(-1)
                 if self._gradient is not None:
                     u = np.append(u, np.vdot(self._gradient[:, w], v))
                 q = solver(u) * soft
                 if m:
-                    push = self._carrier.push(w, nodes, q[:m]) if self._carried else q[:m]
-                    np.dot(rows.T, push.astype(np.float32), self._change[:-3])
+                    force = self._push_forward.pull_back_force(w, nodes, q[:m]) if self._pushed else q[:m]
+                    np.dot(rows.T, force.astype(np.float32), self._change[:-3])
                     change = self._change.reshape(-1, 3).take(self._change_at, 0)
-                    v -= self._carrier.onward([w], change[:, None])[:, 0] if self._carried else change
+                    v -= self._push_forward.apply([w], change[:, None])[:, 0] if self._pushed else change
                 if self._gradient is not None:
                     v -= q[m] * self._along[:, w]
             z[:, w] = v
@@ -342,18 +343,18 @@ class SparsePreconditioner:
         """See `precondition.Preconditioner`."""
         outer, nvert = self._surfaces[0], len(self._is_free)
         face, x, out = outer.surface.face_np, x.numpy(), tangent_out.numpy()
-        geom = outer.trial_geom.numpy().reshape(len(face), -1, len(self._small))
+        geom = outer.trial_geom.numpy().reshape(len(face), -1, len(self._woodbury))
 
         def measure():
             out[...] = 0
-            for w, small in enumerate(self._small):
+            for w, system in enumerate(self._woodbury):
                 active, blocks = outer.active(w)
-                if small is None or not len(active):
+                if system is None or not len(active):
                     continue
-                if self._carried and not self._renews:
-                    small = self._small_at_rest(w)
-                nodes, _, solver, compliance = small
-                if self._bodies is not None:  # the skin alone
+                if self._pushed and not self._renews:
+                    system = self._undeformed_system(w)
+                nodes, _, solver, compliance = system
+                if self._bodies is not None:  # without the compliance of the bodies
                     solver = solver.against(compliance)
                 group = geoms.groups[geom[active, :, w].max(1)]
                 for g in np.unique(group):
@@ -362,31 +363,30 @@ class SparsePreconditioner:
 
         program.call(measure)
 
-    def _small_at_rest(self, w):
-        """The small system without the present shape: tangents of many worlds are by the inverse at rest, as
-        CUDA has it."""
+    def _undeformed_system(self, w):
+        """Woodbury system of the undeformed inverse: tangents of several worlds use it, as on CUDA."""
         along = None
         if self._gradient is not None:
             along = self.factor.solve(self._gradient[:, w : w + 1])[:, 0]
-        return self._small_system(w, along, False)
+        return self._woodbury_system(w, along, False)
 
 
 class _Solver:
-    """q = (I + D W)^-1 D u, D of the springs (m, m) and, with a liquid, its bulk modulus over its volume."""
+    """q = (I + D W)^-1 D u. D has the contact springs (m, m) and, with a liquid, kappa."""
 
     def __init__(self, springs: np.ndarray, kappa: float, W: np.ndarray):
         few = sp.issparse(springs) or len(springs) < _DENSE
         self._springs, self._kappa = springs if few else sp.csr_matrix(springs), kappa
         matrix = self._stiffen(W)
         matrix.ravel()[:: len(W) + 1] += 1
-        # as LAPACK has it, no copy; scipy's lu_factor and lu_solve take as long again for small ones
+        # LAPACK's layout, without a copy; scipy's lu_factor and lu_solve take twice as long for small systems
         self._factor, self._pivots, _ = dgetrf(matrix.T, overwrite_a=1)
 
     def __call__(self, u: np.ndarray) -> np.ndarray:
         return dgetrs(self._factor, self._pivots, self._stiffen(u), trans=1, overwrite_b=1)[0]
 
     def against(self, W: np.ndarray) -> "_Solver":
-        """The same of another compliance."""
+        """A solver with the same springs and another compliance W."""
         return _Solver(self._springs, self._kappa, W)
 
     def _stiffen(self, u):

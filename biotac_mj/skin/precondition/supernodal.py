@@ -1,11 +1,11 @@
-"""Multifrontal factor of a symmetric positive definite sparse matrix, made for many fast solves on one core.
+"""Multifrontal factor of a symmetric positive definite sparse matrix, for many fast solves on one core.
 
-Groups of nodes are eliminated together (`dissection`), each with a dense front: A within the group, B to what
-is eliminated later, both after what was eliminated before has been added in (Duff and Reid 1983). S = A^-1
-and C = B S are kept. A solve is  b_later -= C b  up the tree and  x = S b - C^T x_later  down it: products
-with dense panels, nothing else. Panels are kept in single precision, which halves what a solve reads, and
-reading is what it takes; all sums are in double. The operator stays linear and symmetric to double precision,
-and differs from the inverse by 1e-6 in the energy norm (2e-5 at a Poisson's ratio of 0.4999)."""
+Groups of nodes are eliminated together (`nested_dissection`), each with a dense front: A within the group and
+B to nodes that are eliminated later, after the updates of earlier groups (Duff and Reid 1983). S = A^-1 and
+C = B S are stored. A solve computes  b_later -= C b  up the tree and  x = S b - C^T x_later  down it, by
+products with dense panels. Panels are in single precision, since a solve is limited by reading them; sums are
+in double. The operator is linear and symmetric to double precision, and differs from the inverse by 1e-6 in
+the energy norm (2e-5 at a Poisson's ratio of 0.4999)."""
 
 import hashlib
 import threading
@@ -16,20 +16,18 @@ import warp as wp
 from scipy.linalg import lapack
 
 from ...launches import recorded
-from .dissection import clusters, dissect
+from .nested_dissection import clusters, dissect
 
 __all__ = ["Elimination", "SupernodalFactor", "elimination_of"]
 
 wp.set_module_options({"enable_backward": False})
 
-_LANES = (
-    8  # numbers that are multiplied at once; rows of panels are filled up with zeros to whole groups of them
-)
+_LANES = 8  # numbers of a SIMD multiplication, to which rows of panels are padded with zeros
 _CLUSTER = 4  # nodes whose rows are computed together
-_FEW = 16  # right-hand sides whose launch is kept: packing its arguments would take a third of a solve
+_FEW = 16  # right-hand sides up to which a launch is cached: packing its arguments is a third of a solve
 
-# both sweeps for all right-hand sides; four rows of a panel at a time, for up to four sides, which share what
-# it takes to read and to widen them. The sums of a side are the same whatever is solved beside it.
+# Both sweeps for all right-hand sides, with four rows of a panel and up to four sides at a time, which share
+# reading and conversion. The sums of a side do not depend on the other sides.
 _SWEEPS = """
     typedef float narrow __attribute__((vector_size(32), aligned(4)));
     typedef double lanes __attribute__((vector_size(64), aligned(8)));
@@ -167,23 +165,22 @@ def substitute(
     # In and out:
     work: wp.array2d(dtype=wp.float64),
 ):
-    """Solves for the right-hand sides in `work`, one in a row; behind its first `size` entries a row is
-    scratch."""
+    """Solves for the right-hand sides in the rows of `work`; entries after the first `size` are scratch."""
     sweeps(size, front, row, panel, work)
 
 
 class Elimination:
-    """In which order a matrix is eliminated, and where its fronts have entries: of the pattern alone.
+    """Elimination order of a matrix and the pattern of its fronts; depends on the matrix's pattern only.
 
     Args:
-      matrix: (3n, 3n) sparse, symmetric; three coordinates to a node.
-      points: (n, 3) where the nodes are.
+      matrix: (3n, 3n) sparse, symmetric; three coordinates for each node.
+      points: (n, 3) positions of the nodes.
 
     Attributes:
       order: (n,) nodes in the order of elimination.
-      clusters: nodes in groups of neighbours: what touches together is computed together.
-      fronts: for each group its first coordinate, its coordinates in the new order that are eliminated later
-        (b,), and the groups below it.
+      clusters: groups of neighbouring nodes, whose rows are computed together.
+      fronts: for each group its first coordinate, its last, the coordinates of its front that are eliminated
+        later (b,), and the groups below it, all in the new order.
     """
 
     def __init__(self, matrix: sp.csc_matrix, points: np.ndarray):
@@ -217,8 +214,8 @@ _kept: dict[bytes, Elimination] = {}
 
 
 def elimination_of(matrix: sp.csc_matrix, points: np.ndarray) -> Elimination:
-    """The `Elimination` of a matrix, which skins of the same nodes and elements share, whatever their rubber:
-    it takes about as long as a factor."""
+    """The cached `Elimination` of a matrix. Skins of the same mesh share it, since it takes as long as a
+    factor."""
     parts = (np.ascontiguousarray(x) for x in (matrix.indptr, matrix.indices, points))
     key = hashlib.sha256(b"".join(x.tobytes() for x in parts)).digest()
     found = _kept.get(key)
@@ -235,8 +232,8 @@ class SupernodalFactor:
 
     Args:
       matrix: scipy sparse.
-      elimination: made of this matrix, or of one with the same pattern.
-      nodes: (n,) where the right-hand sides have the matrix's nodes.
+      elimination: of this matrix, or of one with the same pattern.
+      nodes: (n,) index of the matrix's nodes in right-hand sides.
 
     Raises:
       ValueError: the matrix is not positive definite.
@@ -244,10 +241,8 @@ class SupernodalFactor:
 
     def __init__(self, matrix: sp.csc_matrix, elimination: Elimination, nodes: np.ndarray):
         self.size, self._rows = matrix.shape[0], nodes[elimination.order]
-        self._place = np.argsort(elimination.order)  # of the matrix's nodes
-        self._answer = np.zeros(
-            0, int
-        )  # of each node of the right-hand sides; behind the last where it has none
+        self._place = np.argsort(elimination.order)  # position of each node in the order
+        self._answer = np.zeros(0, int)  # position of each node of the right-hand sides; the last: none
         where = (3 * elimination.order[:, None] + np.arange(3)).ravel()
         lower = sp.tril(matrix.tocsr()[where][:, where], format="csc")
         table, panels, rows, waiting = [], [], [], {}
@@ -266,8 +261,8 @@ class SupernodalFactor:
             factor, trouble = lapack.dpotrf(front[:a, :a], lower=1)
             if trouble:
                 raise ValueError(
-                    "the stiffness is not positive definite: elements are inverted, or parts of the skin "
-                    "are not held"
+                    "the stiffness is not positive definite: check for inverted elements, and for parts of "
+                    "the skin without fixed nodes"
                 )
             inverse = np.tril(lapack.dpotri(factor, lower=1)[0])
             inverse += np.tril(inverse, -1).T
@@ -289,15 +284,15 @@ class SupernodalFactor:
         ]
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        """Inverse times rhs: (nvert, nrhs, 3) -> the same shape; rows that are none of `nodes` are not looked
-        at, and zero."""
+        """Inverse times rhs: (nvert, nrhs, 3) -> the same shape. Rows that are not in `nodes` are ignored,
+        and zero in the result."""
         nvert, nrhs = rhs.shape[:2]
         if len(self._answer) != nvert:
             answer = np.full(nvert, len(self._rows))
             answer[self._rows] = np.arange(len(self._rows))
-            self._answer = answer  # whole, as threads share a factor
+            self._answer = answer  # assigned when complete, since threads share a factor
         values, sweep = self._sides(nrhs)
-        for side, value in enumerate(values):  # faster than by numbered rows of all sides
+        for side, value in enumerate(values):  # faster than indexing all sides at once
             np.take(rhs[:, side], self._rows, 0, value[:-1], "clip")
         sweep()
         values[:, -1] = 0
@@ -307,7 +302,7 @@ class SupernodalFactor:
         return out.swapaxes(0, 1)
 
     def rows(self, local: np.ndarray) -> np.ndarray:
-        """Rows of the inverse of the coordinates of the matrix's nodes (k,): (3k, 3n) float32."""
+        """Rows of the inverse for the matrix's nodes (k,): (3k, 3n) float32."""
         nrhs = 3 * len(local)
         values, sweep = self._sides(nrhs)
         values[...] = 0
@@ -316,8 +311,8 @@ class SupernodalFactor:
         return values.astype(np.float32)[:, self._place].reshape(nrhs, self.size)
 
     def _sides(self, nrhs):
-        """Right-hand sides [side, node, 3], which become the answers, and the launch that makes them so;
-        behind the last node is scratch."""
+        """Array of right-hand sides [side, node, 3], and the launch that replaces them by the answers; the
+        entry after the last node is scratch."""
         kept = self._kept.__dict__
         if nrhs not in kept:
             work = np.zeros((nrhs, self.size + self._scratch))

@@ -1,4 +1,4 @@
-"""Forces of the elements of all worlds by corners, and their tangent times a direction."""
+"""Forces of the elements on their corners, and the tangent times a direction, in all worlds."""
 
 import typing
 
@@ -8,7 +8,7 @@ import warp as wp
 from ..program import Launcher
 from ..types import SINGLE, Precision, mat33, real, vec3
 from .element_kernels import element_kernels
-from .lanes import ABREAST, THREADS
+from .point_lanes import GROUPED_WORLDS, THREADS
 from .points import Rubber
 
 if typing.TYPE_CHECKING:
@@ -18,8 +18,8 @@ __all__ = ["ElementForces", "module_for_cuda"]
 
 
 def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
-    """Of the kernels for many worlds, and the threads of its blocks: for `program.compile_ahead`. Options as
-    in `ElementForces`."""
+    """Module of the kernels for many worlds, and its block size, for `program.compile_ahead`. options: as in
+    `ElementForces`."""
     kernels = element_kernels(elements.corners, elements.law == 0, SINGLE, options)
     if elements.npoint == 1:
         return kernels.force_serial.module, 256
@@ -27,17 +27,17 @@ def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[w
 
 
 class ElementForces:
-    """The elements of all worlds: their forces by corners, and tangent times a direction.
+    """Forces of the elements of all worlds on their corners, and the tangent times a direction.
 
     Args:
       elements: Tetrahedra.
       rubber: `points.Rubber` of all worlds.
-      options: what the rubber has beyond its law, see `points.point_functions`.
+      options: of the rubber beyond its law, see `points.point_functions`.
       precision: of directions.
 
     Attributes:
-      start, slot: CSR lists of the corners of each node.
-      corner_force, corner: what `evaluate_corners` and `multiply_corners` wrote last [slot, world] [N].
+      start, slot: CSR lists of the corners at each node.
+      corner_force, corner: results of `evaluate_corners` and `multiply_corners` [slot, world] [N].
     """
 
     def __init__(
@@ -48,10 +48,11 @@ class ElementForces:
         self.start, self.slot = elements.start, elements.slot
         self._by_point = elements.npoint == 4 and self.device.is_cuda and precision.name == "single"
         self._kernels = element_kernels(elements.corners, elements.law == 0, precision, options)
-        group = ABREAST if self._nworld >= ABREAST else 1
+        group = GROUPED_WORLDS if self._nworld >= GROUPED_WORLDS else 1
         self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
-        self._block_dim = THREADS if self._nworld >= ABREAST else 64
-        # in double on CUDA they are for gradients, of few worlds, too: small blocks, on more multiprocessors
+        self._block_dim = THREADS if self._nworld >= GROUPED_WORLDS else 64
+        # in double precision on CUDA they are for gradients of few worlds: small blocks use more
+        # multiprocessors
         self._serial_block_dim = 64 if self.device.is_cuda and precision.name == "double" else 256
         corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
         with wp.ScopedDevice(self.device):
@@ -65,13 +66,13 @@ class ElementForces:
             self.corner = wp.zeros(corners, dtype=precision.vec)
 
     def evaluate_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
-        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds with a point
-        that is inside out (2), flatter than its law bears (1), or both (3)."""
+        """Computes the forces on the corners at x [nvert, nworld] in the worlds that are on. Marks worlds
+        with a point that is inverted (2), flatter than its law allows (1), or both (3)."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
 
     def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
-        """Tangent at x, where `evaluate_corners` was evaluated last, times p, by corners."""
+        """Computes the tangent at x, the nodes of the last `evaluate_corners`, times p, on the corners."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
 
@@ -87,23 +88,23 @@ class ElementForces:
         return outputs[0], outputs[1]
 
     def energy(self, x: wp.array) -> np.ndarray:
-        """(nelem, nworld) elastic energy of each element by its law [J]."""
+        """Elastic energy (nelem, nworld) of each element by its law [J]."""
         out = wp.zeros((self._count, self._nworld), dtype=real, device=self.device)
         inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]
         wp.launch(self._kernels.energy, out.shape, inputs, [out], device=self.device)
         return out.numpy()
 
     def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, ...]:
-        """What the forces of a single world depend on at each integration point, for whoever moves the nodes'
-        rest positions.
+        """Stress, dilatation and their derivatives at each integration point of a single world, for
+        derivatives by reference positions.
 
         Args:
           x: (nvert, 1) [m].
           change: (nelem, npoint, 3, 3) of the deformation gradient.
 
         Returns:
-          First Piola-Kirchhoff stress (nelem, npoint, 3, 3) [Pa]; how it changes where the element's mean
-          dilatation does not; the dilatation (nelem, npoint); its gradient (nelem, npoint, 3, 3).
+          First Piola-Kirchhoff stress (nelem, npoint, 3, 3) [Pa]; its derivative at constant mean dilatation;
+          the dilatation (nelem, npoint); its gradient (nelem, npoint, 3, 3).
         """
         shape, n = change.shape, change.shape[0] * change.shape[1]
         given = wp.array(np.ascontiguousarray(change).reshape(n, 1, 3, 3), dtype=mat33, device=self.device)

@@ -1,35 +1,26 @@
 """Forces of the elements' corners, their tangent times a direction, stress and energy.
 
-Positions and forces are double to the end: an inflated skin that is hardly touched balances forces far larger
-than its load, and their rounding would be felt. Tangents have the precision of directions. In double,
-deformation gradients and rotations are kept from force to product; in single, on CUDA, reading them back
-would cost more than computing them again.
+Positions and forces are in double precision: a filled skin under light contact balances forces far larger
+than its load, and their rounding errors would show. Tangents have the precision of directions. In double
+precision, deformation gradients and rotations are stored from force to product; in single, on CUDA, it is
+faster to compute them again than to read them.
 
-On CUDA the four integration points of an element are four threads of a warp, which exchange what they know:
-the mean dilatation, and their stresses, of which each thread makes the forces of its share of the ten nodes.
-Elsewhere one thread has an element.
-"""
+On CUDA the four integration points of an element are four threads of a warp. They exchange the mean
+dilatation and their stresses, and each computes the forces of two or three of the ten nodes. Otherwise one
+thread has an element."""
 
 import functools
 import types
+from typing import NamedTuple
 
 import warp as wp
 
 from ..types import Precision, mat33, real, vec3
-from .lanes import (
-    THREADS,
-    any_lane,
-    deformation_of_ten,
-    deformation_of_ten_single,
-    gradient_of_ten,
-    place,
-    push_of_points,
-    push_of_points_single,
-    sum_of_points,
-    sum_of_points_single,
-)
 from .law import (
     LAWS,
+    barrier_derivative,
+    barrier_energy,
+    barrier_stress,
     dilatation,
     dilatation_gradient,
     dilatation_hessian,
@@ -37,11 +28,20 @@ from .law import (
     polar,
     polar_single,
     polar_upright,
-    squeezed_derivative,
-    squeezed_energy,
-    squeezed_stress,
     stress,
     stress_derivative,
+)
+from .point_lanes import (
+    THREADS,
+    any_lane,
+    corner_forces,
+    corner_forces_single,
+    deformation_of_ten,
+    deformation_of_ten_single,
+    gradient_of_ten,
+    place,
+    sum_of_points,
+    sum_of_points_single,
 )
 from .points import Mesh, Rubber, deformation_of, point_functions
 
@@ -49,43 +49,85 @@ __all__ = ["element_kernels"]
 
 wp.set_module_options({"enable_backward": False})
 
-# det F below which a step of the line search is refused where friction elements measure isochoric strain
+# det F below which the line search rejects a step of rubber with friction elements, whose strain is isochoric
 _FLAT = 0.02
 
 
 def _deep_module():
-    """Where the CPU's product is compiled. Warp lets LLVM look for numbers to work on abreast in 4 operations
-    behind each other, to compile faster; in 12 it finds what saves a quarter of this kernel's time."""
+    """Module and compiler options of the product on the CPU. Warp limits LLVM's search for SIMD operations to
+    a depth of 4; a depth of 12 saves a quarter of this kernel's time."""
     flags = wp.config.cpu_compiler_flags
     deep = flags and flags.replace("-slp-recursion-max-depth=4", "-slp-recursion-max-depth=12")
     return {"module": "unique", "module_options": {"cpu_compiler_flags": deep}}
+
+
+class _Kind(NamedTuple):
+    """One kind of element, law and rubber, which has kernels of its own."""
+
+    corners: int
+    corotational: bool
+    precision: Precision
+    options: tuple
+
+    @property
+    def npoint(self) -> int:
+        return 1 if self.corners == 4 else 4
+
+    @property
+    def averaged(self) -> bool:
+        """Whether the mean dilatation of an element has a stiffness of its own."""
+        return self.corners == 10
+
+    @property
+    def is_single(self) -> bool:
+        return self.precision.name == "single"
+
+    @property
+    def module(self) -> str:
+        law = "corotational" if self.corotational else "laws"
+        return f"{__name__}.{self.corners}_{law}_{self.precision.name}_{'_'.join(self.options)}"
+
+    @property
+    def serial_module(self) -> str:
+        # in a module of their own where CUDA does not use them, since they take longest to compile
+        return f"{self.module}.serial" if self.averaged and self.is_single else self.module
+
+    @property
+    def gradients(self) -> type:
+        """Type of the shape functions' gradients by parent coordinates."""
+        return wp.types.matrix(shape=(self.corners, 3), dtype=real)
 
 
 @functools.cache
 def element_kernels(
     corners: int, corotational: bool, precision: Precision, options: tuple
 ) -> types.SimpleNamespace:
-    """Kernels of one kind of element, law and rubber. The corotational law has its own: what the others need
-    would take registers from it."""
-    law_name = "corotational" if corotational else "laws"
-    module = f"{__name__}.{corners}_{law_name}_{precision.name}_{'_'.join(options)}"
-    npoint = 1 if corners == 4 else 4
-    averaged = corners == 10
-    # a module of their own where they are not wanted: they take longest to compile
-    serial = f"{module}.serial" if averaged and precision.name == "single" else module
-    scalar, vec, mat = precision.scalar, precision.vec, precision.mat
-    thin, wide = precision.narrow, precision.widen
-    is_single = precision.name == "single"
+    """Kernels of one kind of element, law and rubber. The corotational law has kernels of its own, since the
+    other laws need more registers."""
+    kind = _Kind(corners, corotational, precision, options)
+    found = _serial_kernels(kind) | _reading_kernels(kind)
+    if kind.averaged and kind.is_single:
+        found |= _kernels_by_point(kind)
+    return types.SimpleNamespace(gradients=kind.gradients, **found)
+
+
+@functools.cache
+def _point_functions(kind: _Kind) -> types.SimpleNamespace:
+    """Stress, its derivative and dilatation at an integration point."""
+    corotational, averaged, options, is_single = (
+        kind.corotational,
+        kind.averaged,
+        kind.options,
+        kind.is_single,
+    )
+    scalar, vec, mat = kind.precision.scalar, kind.precision.vec, kind.precision.mat
+    thin, wide = kind.precision.narrow, kind.precision.widen
     polar_thin = polar_single if is_single else polar
-    # a step never ends inside out: on CUDA registers are worth more than the digits of such a rotation
+    # no step ends with an inverted element: on CUDA registers matter more than the digits of its rotation
     polar_full = polar_upright if is_single else polar
-    positions = wp.types.matrix(shape=(3, corners), dtype=real)
-    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
-    gradients = wp.types.matrix(shape=(corners, 3), dtype=real)
-    thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
     beyond = [name for name in options if name != "modulus"]
     uneven = "modulus" in options
-    at, deformation = point_functions(options), deformation_of(corners)
+    at = point_functions(options)
     beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
 
     @wp.func
@@ -110,7 +152,7 @@ def element_kernels(
     def stress_of(
         rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, pressure: real, F: mat33, R: mat33
     ):
-        """First Piola stress, of the mean dilatation too."""
+        """First Piola stress [Pa], with the pressure of the mean dilatation."""
         if wp.static(corotational):
             P = (mu + mu) * (F - R) + (lam * (wp.ddot(R, F) - real(3.0)) + pressure) * R
         else:
@@ -119,11 +161,11 @@ def element_kernels(
                 P += pressure * dilatation_gradient(rubber.law, F, R)
         if wp.static(len(beyond) > 0):
             P += beyond_stress(rubber, e, i, w, mu, lam, F, R)
-        return P + squeezed_stress(rubber.law, mu, F)
+        return P + barrier_stress(rubber.law, mu, F)
 
     @wp.func
     def direction_of(law: int, F: mat, R: mat):
-        """Derivative of the dilatation."""
+        """Derivative of the dilatation by F."""
         if wp.static(corotational):
             return R
         return thin(dilatation_gradient(law, wide(F), wide(R)))
@@ -132,7 +174,7 @@ def element_kernels(
     def change_of(
         rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, pressure: real, F: mat, R: mat, dF: mat
     ):
-        """Derivative of the stress along dF at this point's pressure."""
+        """Derivative of the stress along dF, at constant pressure of the mean dilatation."""
         if wp.static(corotational):
             m = scalar(mu)
             l = scalar(lam)
@@ -149,7 +191,7 @@ def element_kernels(
             )
             if wp.static(len(beyond) > 0):
                 dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
-            return dP + squeezed_derivative(rubber.law, m, F, dF)
+            return dP + barrier_derivative(rubber.law, m, F, dF)
         D = wide(dF)
         Q = wide(R)
         G = wide(F)
@@ -158,11 +200,11 @@ def element_kernels(
             total += pressure * dilatation_hessian(rubber.law, G, Q, D)
         if wp.static(len(beyond) > 0):
             total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
-        return thin(total) + squeezed_derivative(rubber.law, scalar(mu), F, dF)
+        return thin(total) + barrier_derivative(rubber.law, scalar(mu), F, dF)
 
     @wp.func
-    def share(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):
-        """Volume of a point, times the factor on the rubber's modulus there."""
+    def weighted_volume(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):
+        """Volume of point q times the element's factor on the modulus [m^3]."""
         if wp.static(uneven):
             return mesh.weight[e, q] * rubber.modulus[e, w]
         return mesh.weight[e, q]
@@ -175,7 +217,7 @@ def element_kernels(
 
     @wp.func
     def flaw(law: int, F: mat33):
-        """Of a point: 2 inside out, 1 flatter than the law bears, 3 both; small strain knows neither."""
+        """Defect of a point: 2 inverted, 1 flatter than the law allows, 3 both. Small strain has none."""
         found = int(0)
         if law != wp.static(LAWS["linear"]):
             volume = wp.determinant(F)
@@ -185,6 +227,130 @@ def element_kernels(
                 if law == wp.static(LAWS["neo_hookean"]) and not (volume > real(_FLAT)):
                     found += 1
         return found
+
+    return types.SimpleNamespace(
+        rotation=rotation,
+        rotation_thin=rotation_thin,
+        theta=theta,
+        stress_of=stress_of,
+        direction_of=direction_of,
+        change_of=change_of,
+        weighted_volume=weighted_volume,
+        local_lame=local_lame,
+        flaw=flaw,
+    )
+
+
+def _kernels_by_point(kind: _Kind) -> dict[str, wp.Kernel]:
+    """Forces and products of ten-node elements with a thread for each integration point, for CUDA."""
+    module, f = kind.module, _point_functions(kind)
+    rotation, rotation_thin, theta, stress_of = f.rotation, f.rotation_thin, f.theta, f.stress_of
+    direction_of, change_of, weighted_volume, flaw = f.direction_of, f.change_of, f.weighted_volume, f.flaw
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 5))
+    def force(
+        # In:
+        group: int,
+        nworld: int,
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        # Out:
+        pressure_out: wp.array2d(dtype=real),
+        corner_out: wp.array2d(dtype=vec3),
+        inverted_out: wp.array(dtype=int),
+    ):
+        at = place(wp.tid(), group, nworld)
+        e = at[0]
+        q = at[1]
+        w = wp.min(at[2], nworld - 1)
+        active = wp.where(at[2] < nworld, on[w], 0)
+        if any_lane(active) == 0:
+            return
+        F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, e, q, x, w)
+        R = rotation(F)
+        bad = flaw(rubber.law, F)
+        if active == 1 and bad > 0:
+            wp.atomic_max(inverted_out, w, bad)
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = wp.min(lam, cap * mu)
+        mean = sum_of_points(mesh.weight[e, q] * theta(rubber.law, F, R), group)
+        pressure = real(0.0)
+        if lam > local:
+            pressure = (lam - local) * mean / mesh.volume[e]
+            if active == 1 and q == 0:
+                pressure_out[e, w] = pressure
+        back = -weighted_volume(rubber, mesh, e, q, w) * wp.transpose(mesh.inverse[e, q])
+        H = stress_of(rubber, e, 4 * e + q, w, mu, local, pressure, F, R) * back
+        push = corner_forces(H, mesh.shape, q, group)
+        if active == 1:
+            corner_out[10 * e + q, w] = push[0]
+            corner_out[10 * e + q + 4, w] = push[1]
+            if q < 2:
+                corner_out[10 * e + q + 8, w] = push[2]
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 6))
+    def product(
+        # In:
+        group: int,
+        nworld: int,
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        p: wp.array2d(dtype=wp.vec3),
+        on: wp.array(dtype=int),
+        pressure: wp.array2d(dtype=real),
+        # Out:
+        corner_out: wp.array2d(dtype=wp.vec3),
+    ):
+        at = place(wp.tid(), group, nworld)
+        e = at[0]
+        q = at[1]
+        w = wp.min(at[2], nworld - 1)
+        active = wp.where(at[2] < nworld, on[w], 0)
+        if any_lane(active) == 0:
+            return
+        F = deformation_of_ten_single(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, x, w)
+        dF = gradient_of_ten(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, p, w)
+        R = rotation_thin(F)
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = wp.min(lam, cap * mu)
+        mean_pressure = real(0.0)
+        if lam > local:
+            mean_pressure = pressure[e, w]
+        dP = change_of(rubber, e, 4 * e + q, w, mu, local, mean_pressure, F, R, dF)
+        G = direction_of(rubber.law, F, R)
+        mean = sum_of_points_single(float(mesh.weight[e, q]) * wp.ddot(G, dF), group)
+        if lam > local:
+            dP += float((lam - local) / mesh.volume[e]) * mean * G
+        H = float(weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(mesh.inverse_single[e, q])
+        push = corner_forces_single(H, mesh.shape_single, q, group)
+        if active == 1:
+            corner_out[10 * e + q, w] = push[0]
+            corner_out[10 * e + q + 4, w] = push[1]
+            if q < 2:
+                corner_out[10 * e + q + 8, w] = push[2]
+
+    return {"force": force, "product": product}
+
+
+def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
+    """Forces and products with a thread for each element."""
+    corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
+    corotational, serial, gradients = kind.corotational, kind.serial_module, kind.gradients
+    scalar, vec, thin = kind.precision.scalar, kind.precision.vec, kind.precision.narrow
+    positions = wp.types.matrix(shape=(3, corners), dtype=real)
+    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
+    thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
+    f = _point_functions(kind)
+    rotation, rotation_thin, theta, stress_of = f.rotation, f.rotation_thin, f.theta, f.stress_of
+    direction_of, change_of, weighted_volume = f.direction_of, f.change_of, f.weighted_volume
+    local_lame, flaw = f.local_lame, f.flaw
 
     @wp.func
     def narrow_gradients(g: gradients):
@@ -196,99 +362,6 @@ def element_kernels(
             return out
         else:  # Warp compiles what follows a return
             return g
-
-    if averaged and is_single:  # a thread for each point: for CUDA
-
-        @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 5))
-        def force(
-            # In:
-            group: int,
-            nworld: int,
-            cap: real,
-            rubber: Rubber,
-            mesh: Mesh,
-            x: wp.array2d(dtype=vec3),
-            on: wp.array(dtype=int),
-            # Out:
-            pressure_out: wp.array2d(dtype=real),
-            corner_out: wp.array2d(dtype=vec3),
-            inverted_out: wp.array(dtype=int),
-        ):
-            at = place(wp.tid(), group, nworld)
-            e = at[0]
-            q = at[1]
-            w = wp.min(at[2], nworld - 1)
-            active = wp.where(at[2] < nworld, on[w], 0)
-            if any_lane(active) == 0:
-                return
-            F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, e, q, x, w)
-            R = rotation(F)
-            bad = flaw(rubber.law, F)
-            if active == 1 and bad > 0:
-                wp.atomic_max(inverted_out, w, bad)
-            mu = rubber.mu[w]
-            lam = rubber.lam[w]
-            local = wp.min(lam, cap * mu)
-            mean = sum_of_points(mesh.weight[e, q] * theta(rubber.law, F, R), group)
-            pressure = real(0.0)
-            if lam > local:
-                pressure = (lam - local) * mean / mesh.volume[e]
-                if active == 1 and q == 0:
-                    pressure_out[e, w] = pressure
-            back = -share(rubber, mesh, e, q, w) * wp.transpose(mesh.inverse[e, q])
-            H = stress_of(rubber, e, 4 * e + q, w, mu, local, pressure, F, R) * back
-            push = push_of_points(H, mesh.shape, q, group)
-            if active == 1:
-                corner_out[10 * e + q, w] = push[0]
-                corner_out[10 * e + q + 4, w] = push[1]
-                if q < 2:
-                    corner_out[10 * e + q + 8, w] = push[2]
-
-    if averaged and is_single:
-
-        @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 6))
-        def product(
-            # In:
-            group: int,
-            nworld: int,
-            cap: real,
-            rubber: Rubber,
-            mesh: Mesh,
-            x: wp.array2d(dtype=vec3),
-            p: wp.array2d(dtype=wp.vec3),
-            on: wp.array(dtype=int),
-            pressure: wp.array2d(dtype=real),
-            # Out:
-            corner_out: wp.array2d(dtype=wp.vec3),
-        ):
-            at = place(wp.tid(), group, nworld)
-            e = at[0]
-            q = at[1]
-            w = wp.min(at[2], nworld - 1)
-            active = wp.where(at[2] < nworld, on[w], 0)
-            if any_lane(active) == 0:
-                return
-            F = deformation_of_ten_single(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, x, w)
-            dF = gradient_of_ten(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, p, w)
-            R = rotation_thin(F)
-            mu = rubber.mu[w]
-            lam = rubber.lam[w]
-            local = wp.min(lam, cap * mu)
-            felt = real(0.0)
-            if lam > local:
-                felt = pressure[e, w]
-            dP = change_of(rubber, e, 4 * e + q, w, mu, local, felt, F, R, dF)
-            G = direction_of(rubber.law, F, R)
-            mean = sum_of_points_single(float(mesh.weight[e, q]) * wp.ddot(G, dF), group)
-            if lam > local:
-                dP += float((lam - local) / mesh.volume[e]) * mean * G
-            H = float(share(rubber, mesh, e, q, w)) * dP * wp.transpose(mesh.inverse_single[e, q])
-            push = push_of_points_single(H, mesh.shape_single, q, group)
-            if active == 1:
-                corner_out[10 * e + q, w] = push[0]
-                corner_out[10 * e + q + 4, w] = push[1]
-                if q < 2:
-                    corner_out[10 * e + q + 8, w] = push[2]
 
     @wp.kernel(module=serial, enable_backward=False)
     def force_serial(
@@ -338,9 +411,9 @@ def element_kernels(
                 if wp.static(corotational):
                     rotation_out[wp.static(npoint) * e + q, w] = R
             P = stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, R)
-            C -= (share(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])) * wp.transpose(
-                shape[q]
-            )
+            C -= (
+                weighted_volume(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])
+            ) * wp.transpose(shape[q])
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec3(C[0, a], C[1, a], C[2, a])
 
@@ -355,7 +428,7 @@ def element_kernels(
         kept_deformation: wp.array2d(dtype=mat33),
         kept_rotation: wp.array2d(dtype=mat33),
     ):
-        """Deformation gradient and rotation of a point."""
+        """Deformation gradient and rotation of point q."""
         i = wp.static(npoint) * e + q
         if wp.static(is_single):
             F = thin(X * shape[q] * mesh.inverse[e, q])
@@ -399,11 +472,11 @@ def element_kernels(
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = local_lame(mu, lam, cap)
-        felt = real(0.0)
+        mean_pressure = real(0.0)
         stiff = scalar(0.0)
         if wp.static(averaged):
             if lam > local:
-                felt = pressure[e, w]
+                mean_pressure = pressure[e, w]
                 mean = scalar(0.0)
                 for q in range(wp.static(npoint)):
                     B = thin(mesh.inverse[e, q])
@@ -417,17 +490,29 @@ def element_kernels(
             g = narrow_gradients(shape[q])
             F, R = point_state(e, q, w, X, shape, mesh, kept_deformation, kept_rotation)
             dF = D * g * B
-            dP = change_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, felt, F, R, dF)
+            dP = change_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, mean_pressure, F, R, dF)
             if wp.static(averaged):
                 if lam > local:
                     dP += stiff * direction_of(rubber.law, F, R)
-            C += (scalar(share(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(g)
+            C += (scalar(weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(g)
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
 
+    return {"force_serial": force_serial, "product_serial": product_serial}
+
+
+def _reading_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
+    """Stress, energy, and slopes at the integration points."""
+    npoint, module, deformation = kind.npoint, kind.module, deformation_of(kind.corners)
+    thin, wide = kind.precision.narrow, kind.precision.widen
+    f = _point_functions(kind)
+    rotation, theta, stress_of, direction_of = f.rotation, f.theta, f.stress_of, f.direction_of
+    change_of, weighted_volume, local_lame = f.change_of, f.weighted_volume, f.local_lame
+
     @wp.func
     def averaged_pressure(excess: real, law: int, mesh: Mesh, x: wp.array2d(dtype=vec3), e: int, w: int):
-        """What an element's mean dilatation makes of the part of lambda that is not local."""
+        """Pressure of an element's mean dilatation, for the part `excess` of lambda that is not local
+        [Pa]."""
         mean = real(0.0)
         for q in range(wp.static(npoint)):
             F = deformation(mesh, e, q, x, w)
@@ -445,7 +530,7 @@ def element_kernels(
         cauchy_out: wp.array2d(dtype=mat33),
         von_mises_out: wp.array2d(dtype=real),
     ):
-        """Mean Cauchy stress of each element, and the von Mises stress of this mean."""
+        """Mean Cauchy stress of element e, and its von Mises stress [Pa]."""
         e, w = wp.tid()
         mu = rubber.mu[w]
         lam = rubber.lam[w]
@@ -455,8 +540,8 @@ def element_kernels(
         for q in range(wp.static(npoint)):
             F = deformation(mesh, e, q, x, w)
             P = stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, rotation(F))
-            part = share(rubber, mesh, e, q, w) / mesh.volume[e] / wp.determinant(F)
-            sigma += part * (P * wp.transpose(F))
+            fraction = weighted_volume(rubber, mesh, e, q, w) / mesh.volume[e] / wp.determinant(F)
+            sigma += fraction * (P * wp.transpose(F))
         deviator = sigma - wp.trace(sigma) / real(3.0) * wp.identity(n=3, dtype=real)
         cauchy_out[e, w] = sigma
         von_mises_out[e, w] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
@@ -471,7 +556,7 @@ def element_kernels(
         # Out:
         energy_out: wp.array2d(dtype=real),
     ):
-        """Elastic energy of each element by its law."""
+        """Elastic energy of element e [J]."""
         e, w = wp.tid()
         mu = rubber.mu[w]
         lam = rubber.lam[w]
@@ -482,9 +567,9 @@ def element_kernels(
             F = deformation(mesh, e, q, x, w)
             R = rotation(F)
             mean += mesh.weight[e, q] * theta(rubber.law, F, R)
-            density = energy_density(rubber.law, mu, local, F, R) + squeezed_energy(rubber.law, mu, F)
-            total += share(rubber, mesh, e, q, w) * density
-        factor = share(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
+            density = energy_density(rubber.law, mu, local, F, R) + barrier_energy(rubber.law, mu, F)
+            total += weighted_volume(rubber, mesh, e, q, w) * density
+        factor = weighted_volume(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
         energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
 
     @wp.kernel(module=f"{module}.points", enable_backward=False)
@@ -517,13 +602,4 @@ def element_kernels(
             dilatation_out[i, w] = theta(rubber.law, F, R)
             direction_out[i, w] = wide(direction_of(rubber.law, thin(F), thin(R)))
 
-    found = {
-        "force_serial": force_serial,
-        "product_serial": product_serial,
-        "cauchy": cauchy,
-        "energy": energy,
-        "point_slopes": point_slopes,
-    }
-    if averaged and is_single:
-        found |= {"force": force, "product": product}
-    return types.SimpleNamespace(gradients=gradients, **found)
+    return {"cauchy": cauchy, "energy": energy, "point_slopes": point_slopes}

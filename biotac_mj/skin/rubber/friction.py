@@ -1,16 +1,15 @@
-"""Rubber with internal friction: loading and unloading differ at any speed, as Prandtl and Ishlinskii's
-friction elements beside the law.
+"""Rate-independent hysteresis of rubber: Prandtl-Ishlinskii friction elements in parallel with the law.
 
-Every branch is a spring (shear modulus g mu) in series with a friction element that slips when the spring's
-von Mises equivalent strain is `strain`. Within a step it has the potential
+A branch is a spring (shear modulus g mu) in series with a friction element that slips when the spring's von
+Mises equivalent strain is `strain`. Within a step it has the potential
 
     min over E'  of   g mu |dev(A - E')|^2  +  2 g mu r |E' - E_p|,         r = sqrt(3/2) strain
 
-of the strain A, with E_p the slip when the last step ended (Simo and Hughes 1998, ch. 1-3: radial return is
-its minimum). So its stress Q = 2 g mu dev(A - E') has at most the size 2 g mu r, its tangent is symmetric and
-exact, slip only dissipates, and nothing depends on time. A is the strain of Green and Lagrange, of
-neo_hookean the isochoric one, (J^(-2/3) F^T F - I) / 2, of linear the small strain; Q is the second Piola
-stress that belongs to it and turns with the body."""
+of the strain A, with E_p the slip at the end of the last step (Simo and Hughes 1998, ch. 1-3: radial return
+is its minimum). Its stress Q = 2 g mu dev(A - E') has at most the norm 2 g mu r, its tangent is symmetric and
+exact, and slip only dissipates. A is the Green-Lagrange strain, for neo_hookean the isochoric one, (J^(-2/3)
+F^T F - I) / 2, for linear the small strain. Q is the conjugate second Piola stress, and rotates with the
+body."""
 
 import warp as wp
 
@@ -33,7 +32,7 @@ def symmetric(A: mat33):
 
 @wp.func
 def strain(law: int, F: mat33):
-    """The strain A, whose deviator counts."""
+    """The strain A; only its deviator acts."""
     eye = wp.identity(n=3, dtype=real)
     if law == 3:
         return symmetric(F) - eye
@@ -57,7 +56,7 @@ def strain_change(law: int, F: mat33, dF: mat33):
 
 @wp.func
 def push_forward(law: int, F: mat33, Q: mat33):
-    """First Piola stress P of Q: P : dF = Q : dA."""
+    """First Piola stress P for Q, with P : dF = Q : dA."""
     if law == 3:
         return Q
     P = F * Q
@@ -86,7 +85,7 @@ def push_forward_change(law: int, F: mat33, Q: mat33, dF: mat33, dQ: mat33):
 
 @wp.func
 def sticking_fraction(T: mat33, most: real):
-    """Fraction of a trial strain T that does not slip: radial return to the size `most`."""
+    """Fraction of a trial strain T that does not slip: radial return to the norm `most`."""
     size = wp.sqrt(wp.ddot(T, T))
     if size > most:
         return most / size

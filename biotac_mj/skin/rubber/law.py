@@ -7,14 +7,13 @@ The four laws take the same two Lame-like constants and differ in the energy W(F
   neo_hookean  W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2  isochoric split: ANSYS, CalculiX
   linear       W = lambda/2 tr(e)^2 + mu e:e                          e = sym(F) - I: small rotations only
 
-None of them keeps rubber from being squeezed to nothing or turned inside out: at a sharp edge, or between a
-geom and the core, forces would balance there. So where less than a fifth of its volume is left, all but the
-linear law gain
+None of them prevents total compression or inversion: at a sharp edge, or between a geom and the core, there
+would be an equilibrium. Below a fifth of the volume, all but the linear law therefore have a barrier,
 
   W += mu J0 f(J / J0),   f(t) = (1 - t)^3 / t,   J = det F < J0 = 0.2,
 
-which is nothing above, with two derivatives, and grows without bound below. Newton's method passes shapes
-that no rubber can have: from J = 0.02 down the parabolas of f and of J^(-2/3) go on, so that it finds back.
+which is zero above with two derivatives, and unbounded below. Newton's method may pass inverted shapes: below
+J = 0.02, f and J^(-2/3) continue as parabolas, so that it can return.
 """
 
 import typing
@@ -32,17 +31,17 @@ __all__ = [
     "polar",
     "polar_single",
     "polar_upright",
-    "squeezed_derivative",
-    "squeezed_energy",
-    "squeezed_stress",
+    "barrier_derivative",
+    "barrier_energy",
+    "barrier_stress",
     "stress",
     "stress_derivative",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
-_SQUEEZED = wp.constant(wp.float64(0.2))  # J0
-_FLAT = wp.constant(wp.float64(0.02))  # J below which parabolas go on
+_COMPRESSED = wp.constant(wp.float64(0.2))  # J0
+_FLAT = wp.constant(wp.float64(0.02))  # J below which the parabolas continue
 
 LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
 
@@ -54,11 +53,11 @@ def axial(A: mat33):
 
 
 @wp.func
-def turn_towards(F: wp.mat33):
-    """The rotation with the largest trace of R^T F, turned there step by step (Mueller et al. 2016): F may be
-    inverted or flat.
+def rotation_by_steps(F: wp.mat33):
+    """The rotation with the largest trace of R^T F, by steps (Mueller et al. 2016); F may be inverted or
+    flat.
 
-    In few registers: the rare case must not slow the usual one.
+    It uses few registers, since a rare case must not slow down the usual one.
     """
     q = wp.quat_identity(float)
     for _ in range(60):
@@ -80,9 +79,9 @@ def turn_towards(F: wp.mat33):
 
 @wp.func
 def polar_single(F: wp.mat33):
-    """Rotation of the polar decomposition in single precision, by Newton's iteration where that is safe."""
+    """Rotation of the polar decomposition in single precision, by Newton's iteration if det F > 0.001."""
     if wp.determinant(F) < 1.0e-3:
-        return turn_towards(F)
+        return rotation_by_steps(F)
     X = F
     for _ in range(12):
         Y = 0.5 * (X + wp.transpose(wp.inverse(X)))
@@ -95,34 +94,33 @@ def polar_single(F: wp.mat33):
 
 @wp.func
 def orthogonal(R: mat33):
-    """A matrix that is a rotation but for rounding in single precision, made orthogonal."""
+    """Makes a rotation with rounding errors of single precision orthogonal."""
     return R * (real(1.5) * wp.identity(n=3, dtype=real) - real(0.5) * wp.transpose(R) * R)
 
 
 @wp.func
-def turn_left(S: mat33):
-    """Newton's step of the rotation with the largest trace, at most 0.3, S = R^T F: what is left to turn, in
-    the frame of R.
+def rotation_step(S: mat33):
+    """Newton step to the rotation with the largest trace, in the frame of R, of at most 0.3 rad; S = R^T F.
 
-    In single precision: where little is left, that gives the rest of its digits.
+    Single precision suffices, since a small step is accurate to its own digits.
     """
     s = narrow(S)
     H = wp.trace(s) * wp.identity(n=3, dtype=float) - 0.5 * (s + wp.transpose(s))
     turn = single(axial(S))
     if H[0, 0] > 0.0 and H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0] and wp.determinant(H) > 0.0:
         turn = wp.inverse(H) * turn
-    else:  # far away: as `turn_towards`
+    else:  # far from the solution, as in `rotation_by_steps`
         turn = turn / (wp.abs(wp.trace(s)) + 1.0e-9)
     return turn * wp.min(1.0, 0.3 / (wp.length(turn) + 1.0e-9))
 
 
 @wp.func
 def polar_upright(F: mat33):
-    """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal,
-    then turned by what is left (error squared). Where the determinant is small it is only near."""
+    """Rotation of the polar decomposition to double precision, from the one in single precision and one
+    Newton step. It is less accurate if the determinant is small."""
     R = orthogonal(widen(polar_single(narrow(F))))
     S = wp.transpose(R) * F
-    # what is left is 1e-7: single precision gives the rest of its digits
+    # the step is about 1e-7: single precision gives the remaining digits
     s = narrow(S)
     turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * single(axial(S))
     return R + R * wp.skew(double(turn))
@@ -140,11 +138,10 @@ def inverse_transposed(F: mat33):
 
 @wp.func
 def polar(F: mat33):
-    """Rotation of the polar decomposition to double precision, of any F: for the CPU, where digits cost less
-    than two ways to them."""
+    """Rotation of the polar decomposition to double precision for any F, for the CPU."""
     if wp.determinant(F) >= real(1.0e-3):
         X = F
-        for _ in range(2):  # always needed: without a look a processor begins the next point meanwhile
+        for _ in range(2):  # always needed: without a test the processor can start the next point meanwhile
             X = real(0.5) * (X + inverse_transposed(X))
         for _ in range(20):
             Y = real(0.5) * (X + inverse_transposed(X))
@@ -153,11 +150,11 @@ def polar(F: mat33):
             if change < real(1.0e-16):  # the next error is the square of this one
                 break
         return X
-    R = widen(polar_single(narrow(F)))  # `turn_towards` may have come near only
+    R = widen(polar_single(narrow(F)))  # `rotation_by_steps` may not have converged
     steps = int(15)  # a variable: unrolled, the loop would double the time to compile
     for _ in range(steps):
         R = orthogonal(R)
-        turn = turn_left(wp.transpose(R) * F)
+        turn = rotation_step(wp.transpose(R) * F)
         R = R + R * wp.skew(double(turn))
     return R
 
@@ -191,7 +188,7 @@ def cofactor_change(F: typing.Any, dF: typing.Any):
 def isochoric(J: real):
     """J^(-2/3) and its two derivatives."""
     j = wp.max(J, _FLAT)
-    over = J - j  # negative where the parabola goes on
+    over = J - j  # negative on the parabola
     value = wp.pow(j, -real(2.0) / real(3.0))
     slope = -real(2.0) / real(3.0) * value / j
     bend = -real(5.0) / real(3.0) * slope / j
@@ -307,13 +304,13 @@ def dilatation_hessian(law: int, F: mat33, R: mat33, dF: mat33):
 
 
 @wp.func
-def squeeze(J: typing.Any):
+def barrier(J: typing.Any):
     """f and its two derivatives with t at t = J / J0, in the precision of J."""
     one = type(J)(1.0)
     flat = type(J)(_FLAT)
-    room = type(J)(_SQUEEZED)
-    t = wp.max(J, flat) / room
-    over = J / room - t  # as in `isochoric`
+    limit = type(J)(_COMPRESSED)
+    t = wp.max(J, flat) / limit
+    over = J / limit - t  # as in `isochoric`
     bend = (one + one) / (t * t * t) - (one + one)
     slope = one + one + one - (t + t) - one / (t * t)
     value = one / t - (one + one + one) + ((one + one + one) - t) * t
@@ -321,29 +318,29 @@ def squeeze(J: typing.Any):
 
 
 @wp.func
-def squeezed_energy(law: int, mu: real, F: mat33):
-    """What is added to the energy of rubber without room [J/m^3]."""
+def barrier_energy(law: int, mu: real, F: mat33):
+    """Energy density of the barrier against total compression [J/m^3]."""
     J = wp.determinant(F)
-    if law == 3 or J >= _SQUEEZED:
+    if law == 3 or J >= _COMPRESSED:
         return real(0.0)
-    return mu * _SQUEEZED * squeeze(J)[0]
+    return mu * _COMPRESSED * barrier(J)[0]
 
 
 @wp.func
-def squeezed_stress(law: int, mu: real, F: mat33):
-    """The same of its stress [Pa]."""
+def barrier_stress(law: int, mu: real, F: mat33):
+    """First Piola stress of the barrier [Pa]."""
     J = wp.determinant(F)
-    if law == 3 or J >= _SQUEEZED:
+    if law == 3 or J >= _COMPRESSED:
         return mat33()
-    return mu * squeeze(J)[1] * cofactor(F)
+    return mu * barrier(J)[1] * cofactor(F)
 
 
 @wp.func
-def squeezed_derivative(law: int, mu: typing.Any, F: typing.Any, dF: typing.Any):
-    """The same of its stress' directional derivative [Pa], in the precision of F."""
+def barrier_derivative(law: int, mu: typing.Any, F: typing.Any, dF: typing.Any):
+    """Directional derivative of the barrier's stress [Pa], in the precision of F."""
     J = wp.determinant(F)
-    if law == 3 or J >= type(J)(_SQUEEZED):
+    if law == 3 or J >= type(J)(_COMPRESSED):
         return F - F
-    f = squeeze(J)
+    f = barrier(J)
     G = cofactor(F)
-    return mu * (f[2] / type(J)(_SQUEEZED) * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
+    return mu * (f[2] / type(J)(_COMPRESSED) * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))

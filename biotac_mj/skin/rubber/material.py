@@ -1,4 +1,4 @@
-"""What the skin is made of: constants of its rubber, presets."""
+"""Materials of the skin: constants of its rubber, presets."""
 
 import dataclasses
 import math
@@ -11,12 +11,12 @@ __all__ = ["CALIBRATED_FILL", "ELEMENTS", "PRESETS", "Material", "material"]
 ELEMENTS = ("linear", "quadratic")
 
 _SOFTEST, _HARDEST = 100.0, 1e15  # [Pa]: softer than any gel, harder than any solid
-_LEAST_GIVE = 1e-8  # of nu below 0.5: with less no rest stiffness is found to be positive
+_LEAST_DIFFERENCE = 1e-8  # of nu from 0.5: with less, rounding makes the stiffness indefinite
 
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """What the skin is made of.
+    """Material of the skin.
 
     Attributes:
       law: "corotational", "svk", "neo_hookean" or "linear".
@@ -24,19 +24,18 @@ class Material:
       poissons_ratio: nu, inside (-1, 0.5).
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
-      liquid: whether the preset fills the space between skin and core with the liquid.
-      element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see
-        `SkinOptions`.
-      rest_pressure: to which the preset is filled [Pa], see `SkinOptions`.
-      electrode_radius: of the film [m] with which the preset was fitted; None: the film's own, see
+      liquid: whether the preset has liquid between skin and core.
+      element: "linear" or "quadratic" elements of the preset; None: those of the geometry, see `SkinOptions`.
+      rest_pressure: pressure of the preset's filling [Pa], see `SkinOptions`.
+      electrode_radius: radius in the film with which the preset was fitted [m]; None: the film's own, see
         `sensor.film.read_film`.
       prony: ((g, tau [s]), ...) of stress relaxation, G(t) = G (1 + sum g exp(-t / tau)): E is the long-term
         modulus. Steps need their dt.
       mullins: (r, m [J/m^3], beta) of Ogden and Roxburgh's softening, or None; see `points`.
-      hysteresis: ((g, strain), ...) of friction elements in parallel: spring of g times the shear modulus
-        that slips at this von Mises strain, see `friction`.
-      stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. These four:
-        full tier.
+      hysteresis: ((g, strain), ...) of friction elements in parallel: springs of g times the shear modulus
+        that slip at this von Mises strain, see `friction`.
+      stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. The condensed
+        tier has none of the last four.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.
@@ -82,10 +81,10 @@ class Material:
                 "needs nu below 0.5, "
                 "the liquid's volume constraint does the rest"
             )
-        if self.poissons_ratio > 0.5 - _LEAST_GIVE:
+        if self.poissons_ratio > 0.5 - _LEAST_DIFFERENCE:
             raise ValueError(
                 f"Poisson's ratio is 0.5 less {0.5 - self.poissons_ratio:.1g}, too little for double "
-                f"precision: pass at most 0.5 - {_LEAST_GIVE:g}"
+                f"precision: pass at most 0.5 - {_LEAST_DIFFERENCE:g}"
             )
         if self.friction < 0:
             raise ValueError(f"friction {self.friction} is negative: pass a Coulomb coefficient >= 0")
@@ -133,7 +132,7 @@ class Material:
 
     @property
     def extensions(self) -> tuple[str, ...]:
-        """Names of what is in use beyond the law, of prony, mullins, hysteresis, stiffening."""
+        """Names of the effects beyond the law: prony, mullins, hysteresis, stiffening."""
         names = ("prony", "mullins", "hysteresis", "stiffening")
         return tuple(name for name in names if getattr(self, name) not in ((), None, 0.0))
 
@@ -157,13 +156,13 @@ class Material:
         return self.youngs_modulus / (3 * (1 - 2 * self.poissons_ratio))
 
 
-# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on
-# elements that do not lock: nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is
-# squeezed on the core; "rubber": nu 0.45, as the reference solutions). "paper" keeps to linear tetrahedra:
-# the stiffness of its mesh is in the fitted modulus.
-# "calibrated": FITTED to two real sensors pressed on a plate (docs/lab/real_match.md): E 0.56 to 0.75 MPa
-# with all gains 1; the filling as a share of E, beside none and twice as much; the electrodes' radius, of
-# which 0.8 and 1.1 mm leave less than the film's own 0.5 mm. Neo-Hookean with nu 0.45 fits no better.
+# Narang et al., ICRA 2021: constants fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on elements that
+# do not lock: nu 0.5 there, 0.499 here, whose force is that of 0.4999 to 0.1 % until the skin is compressed
+# on the core). "rubber": nu 0.45, as in the reference solutions. "paper" uses linear tetrahedra, since its
+# modulus was fitted with their stiffness. "calibrated": FITTED to two real sensors pressed on a plate
+# (docs/lab/real_match.md): E 0.56 to 0.75 MPa with all gains 1; the filling was compared with none and twice
+# as much; electrode radii of 0.8 and 1.1 mm leave smaller residuals than the film's own 0.5 mm. Neo-Hookean
+# with nu 0.45 does not fit better.
 PRESETS = {
     "default": Material(),
     "paper": Material(liquid=False, element="linear"),
@@ -173,14 +172,14 @@ PRESETS = {
 }
 
 
-# [m^3] of liquid beyond what the unstressed skin holds, FITTED to two real sensors pressed on a plate: 6.7e-8
-# to 1.14e-7 by sensor and by half of the rows (docs/lab/real_match.md, 'The tip'). For
-# `SkinOptions.fill_volume`; not the default, with which all else was fitted
+# [m^3] of liquid beyond the volume of the unstressed skin, FITTED to two real sensors pressed on a plate:
+# 6.7e-8 to 1.14e-7, depending on sensor and half of the rows (docs/lab/real_match.md, 'The tip'). For
+# `SkinOptions.fill_volume`; not the default, since the other constants were fitted without it
 CALIBRATED_FILL = 8.0e-8
 
 
 def material(choice: str | Material) -> Material:
-    """A preset's name or a Material, as a Material; ValueError names the presets."""
+    """Converts the name of a preset, or a Material, to a Material; ValueError names the presets."""
     if isinstance(choice, Material):
         return choice
     if choice not in PRESETS:

@@ -1,5 +1,5 @@
-"""What the points of a skin remember from step to step: overstresses, the largest energy so far, the slip of
-friction elements. See `points` for the equations."""
+"""History variables of the integration points: overstress, largest energy, slip of friction elements. See
+`points` for the equations."""
 
 import functools
 import types
@@ -23,7 +23,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def pull_back(law: int, F: mat33, P: mat33):
-    """Second Piola stress of the first."""
+    """Second Piola stress from the first."""
     if law == 3:
         return P
     S = wp.inverse(F) * P
@@ -31,10 +31,10 @@ def pull_back(law: int, F: mat33, P: mat33):
 
 
 @wp.func
-def share_of_term(term: wp.vec2d, dt: real):
-    """g h of a term of the series: what a step of the stress adds to its overstress."""
+def prony_weight(term: wp.vec2d, dt: real):
+    """g h of a term of the Prony series: overstress per step of the stress."""
     a = dt / term[1]
-    if a < real(1.0e-4):  # where the difference would lose digits, its series
+    if a < real(1.0e-4):  # a series, since the difference would lose digits
         return term[0] * (real(1.0) - a * (real(0.5) - a / real(6.0)))
     return term[0] * (real(1.0) - wp.exp(-a)) / a
 
@@ -47,13 +47,14 @@ def begin_worlds(
     # In and out:
     softness: wp.array(dtype=real),
 ):
-    """The gain of this step; what is as stiff as the rubber before its history counts."""
+    """The sum c of the Prony weights of this step in world w, and the compliance scale of the
+    preconditioner."""
     w = wp.tid()
     stiff = real(1.0)
     if rubber.prony.shape[0] > 0:
         gain = real(0.0)
         for k in range(rubber.prony.shape[0]):
-            gain += share_of_term(rubber.prony[k, w], dt[w])
+            gain += prony_weight(rubber.prony[k, w], dt[w])
         rubber.gain[w] = gain
         stiff += gain
     for b in range(rubber.branch.shape[0]):
@@ -63,6 +64,7 @@ def begin_worlds(
 
 @wp.kernel
 def begin_points(rubber: Rubber, dt: wp.array(dtype=real)):
+    """The initial stress H of point i in this step."""
     i, w = wp.tid()
     H = -rubber.gain[w] * rubber.last[i, w]
     for k in range(rubber.prony.shape[0]):
@@ -78,8 +80,8 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
     has = {name: name in options for name in ("prony", "mullins", "hysteresis")}
 
     @wp.func
-    def settled(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
-        """Second Piola stress that relaxes, of a point that has borne this much."""
+    def relaxing_stress(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
+        """Second Piola stress that relaxes [Pa], at the largest energy density `worst`."""
         R = mat33()
         if rubber.law == 0:
             R = polar(F)
@@ -90,8 +92,8 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         return S
 
     @wp.func
-    def borne(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
-        """The largest energy density with the present one."""
+    def largest_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
+        """Largest energy density, including the present one [J/m^3]."""
         if wp.static(not has["mullins"]):
             return worst
         R = mat33()
@@ -109,7 +111,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         dt: wp.array(dtype=real),
         failed: wp.array(dtype=int),
     ):
-        """Takes over the step that has ended at x; worlds that failed keep their past."""
+        """Updates the history variables of point q for the step that ended at x, unless the world failed."""
         e, q, w = wp.tid()
         if failed[w] == 1:
             return
@@ -118,12 +120,12 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
         if wp.static(has["prony"] or has["mullins"]):
-            worst = borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
-            S = settled(rubber, e, w, mu, lam, F, worst)
+            worst = largest_energy(rubber, e, w, mu, lam, F, rubber.worst[i, w])
+            S = relaxing_stress(rubber, e, w, mu, lam, F, worst)
             for k in range(rubber.prony.shape[0]):
                 term = rubber.prony[k, w]
                 Q = wp.exp(-dt[w] / term[1]) * rubber.overstress[k, i, w]
-                rubber.overstress[k, i, w] = Q + share_of_term(term, dt[w]) * (S - rubber.last[i, w])
+                rubber.overstress[k, i, w] = Q + prony_weight(term, dt[w]) * (S - rubber.last[i, w])
             rubber.last[i, w] = S
             rubber.worst[i, w] = worst
         if wp.static(has["hysteresis"]):
@@ -135,7 +137,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def forget(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3), mask: wp.array(dtype=bool)):
-        """Makes x the relaxed and virgin state, friction without stress there."""
+        """Resets point q to the relaxed, virgin state at x, without stress of the friction elements."""
         e, q, w = wp.tid()
         if not mask[w]:
             return
@@ -144,9 +146,9 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
         if wp.static(has["prony"] or has["mullins"]):
-            worst = borne(rubber, e, w, mu, lam, F, real(0.0))
+            worst = largest_energy(rubber, e, w, mu, lam, F, real(0.0))
             rubber.worst[i, w] = worst
-            rubber.last[i, w] = settled(rubber, e, w, mu, lam, F, worst)
+            rubber.last[i, w] = relaxing_stress(rubber, e, w, mu, lam, F, worst)
             for k in range(rubber.prony.shape[0]):
                 rubber.overstress[k, i, w] = mat33()
         for b in range(rubber.branch.shape[0]):
@@ -154,14 +156,14 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def recall(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3)):
-        """The stress that relaxes, at x, where the last step ended."""
+        """Computes the stress that relaxes at x, the end of the last step."""
         e, q, w = wp.tid()
         i = mesh.weight.shape[1] * e + q
         F = deformation(mesh, e, q, x, w)
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
-        worst = borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
-        rubber.last[i, w] = settled(rubber, e, w, mu, lam, F, worst)
+        worst = largest_energy(rubber, e, w, mu, lam, F, rubber.worst[i, w])
+        rubber.last[i, w] = relaxing_stress(rubber, e, w, mu, lam, F, worst)
 
     @wp.kernel(module=f"{module}.points", enable_backward=False)
     def point_slopes(
@@ -193,7 +195,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
 
 
 def rubber_of_worlds(model: Any, materials: list[Material], modulus: np.ndarray | None) -> Rubber:
-    """The constants of `materials`, one for each world, as `Rubber` on the model's device, without memory.
+    """The constants of `materials`, one for each world, as `Rubber` on the model's device, without history.
 
     Args:
       modulus: (nelem, nworld) factors on Young's modulus, or None.
@@ -218,21 +220,21 @@ def rubber_of_worlds(model: Any, materials: list[Material], modulus: np.ndarray 
 
 
 def _by_world(table, dtype):
-    """(nworld, k, 2) as [k, world] of vectors."""
+    """Converts (nworld, k, 2) to vectors [k, world]."""
     if not table.shape[1]:
         return wp.zeros((0, len(table)), dtype=dtype)
     return wp.array(np.ascontiguousarray(np.swapaxes(table, 0, 1)), dtype=dtype, ndim=2)
 
 
 class RubberMemory:
-    """Memory of the points of every world.
+    """History variables of the points of every world.
 
-    Made by `SkinData` where the model's material has `prony`, `mullins` or `hysteresis`.
+    Made by `SkinData` if the model's material has `prony`, `mullins` or `hysteresis`.
 
     Args:
       model: SkinModel.
-      rubber: constants of the worlds, to which the arrays of memory are added.
-      options: what the rubber has beyond its law, see `points.point_functions`.
+      rubber: constants of the worlds, to which the arrays are added.
+      options: of the rubber beyond its law, see `points.point_functions`.
     """
 
     def __init__(self, model: Any, rubber: Rubber, options: tuple[str, ...]):
@@ -249,43 +251,43 @@ class RubberMemory:
         self._kernels = _kernels(options, model.elements.corners)
 
     def begin_step(self, program: Launcher, dt: wp.array, softness: wp.array) -> None:
-        """Prepares a step; softness (nworld,) of the preconditioner becomes that of this step."""
+        """Starts a step; updates the compliance scale `softness` (nworld,) of the preconditioner."""
         program.launch(begin_worlds, len(softness), [self.rubber, dt], [softness])
         if self.rubber.prony.shape[0]:
             program.launch(begin_points, self.rubber.past.shape, [self.rubber, dt])
 
     def commit_step(self, program: Launcher, x: wp.array, dt: wp.array, failed: wp.array) -> None:
-        """Takes over the step that has ended at x in the worlds that did not fail."""
+        """Updates the history variables for the step that ended at x, in worlds that did not fail."""
         program.launch(self._kernels.commit, self._dim, [*self._constants, x, dt, failed])
 
     def forget(self, x: wp.array, mask: wp.array | None = None) -> None:
-        """Makes x [nvert, nworld] the relaxed and virgin state, of the worlds of mask (nworld,) bool."""
+        """Resets the worlds of mask (nworld,) bool to the relaxed, virgin state at x [nvert, nworld]."""
         self._launch(self._kernels.forget, [x, self._all if mask is None else mask])
 
-    def borne(self) -> np.ndarray:
-        """[point, world] largest energy densities so far [J/m^3]; empty where nothing is kept of them."""
+    def largest_energy(self) -> np.ndarray:
+        """Largest energy densities so far [point, world] [J/m^3]; empty without softening."""
         return self.rubber.worst.numpy().copy()
 
-    def bear(self, borne: np.ndarray, x: wp.array) -> None:
-        """Makes points that are at x after `forget` have borne as much, too."""
-        if borne.size:
-            self.rubber.worst.assign(np.maximum(borne, self.rubber.worst.numpy()))
+    def raise_energy(self, largest_energy: np.ndarray, x: wp.array) -> None:
+        """Raises the largest energy densities of points at x to at least these, after `forget`."""
+        if largest_energy.size:
+            self.rubber.worst.assign(np.maximum(largest_energy, self.rubber.worst.numpy()))
             self.recall(x)
 
     def recall(self, x: wp.array) -> None:
-        """Finds the stress that relaxes of points that are at x, by the largest energies so far."""
+        """Computes the stress that relaxes of points at x, from the largest energy densities."""
         if self.rubber.worst.size:
             self._launch(self._kernels.recall, [x])
 
     def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the memory of a single world depends on, at every integration point.
+        """Stress and energy on which the history variables of a single world depend, at every point.
 
         Args:
           x: (nvert, 1) [m]. change: (npoint, 3, 3) of the deformation gradient.
 
         Returns:
-          First Piola-Kirchhoff stress (npoint, 3, 3) of what remembers, before it softens [Pa]; how it
-          changes along `change`; its energy density (npoint,) [J/m^3].
+          First Piola-Kirchhoff stress (npoint, 3, 3) of the part with history, before softening [Pa]; its
+          derivative along `change`; its energy density (npoint,) [J/m^3].
         """
         device = self._model.device
         given = wp.array(np.ascontiguousarray(change[:, None]), dtype=mat33, device=device)
@@ -295,7 +297,7 @@ class RubberMemory:
         return tuple(a.numpy()[:, 0] for a in out)
 
     def at_present(self) -> Rubber:
-        """The rubber between steps: what it remembers is a stress, and time stands still."""
+        """The rubber between steps: the overstress is an initial stress, and does not relax."""
         now, rubber = Rubber(), self.rubber
         for name in Rubber.vars:
             setattr(now, name, getattr(rubber, name))

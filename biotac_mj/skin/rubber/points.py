@@ -1,25 +1,25 @@
-"""The rubber at an integration point: its law, and what it has beyond the law.
+"""The rubber at an integration point: its law, and effects beyond the law.
 
-Relaxation is finite linear viscoelasticity (Simo 1987; Holzapfel 2000, ch. 6): every term of the series adds
-an overstress Q_i to the second Piola-Kirchhoff stress S of the elastic law, which stays the long-term one,
+Relaxation is finite linear viscoelasticity (Simo 1987; Holzapfel 2000, ch. 6): every term of the Prony series
+adds an overstress Q_i to the second Piola-Kirchhoff stress S of the elastic law, which is the long-term one,
 
     dQ_i/dt + Q_i / tau_i = g_i dS/dt,    so that   G(t) = G_inf (1 + sum_i g_i exp(-t / tau_i))
 
-and S, taken as linear in time within a step, gives Q_i exactly from its last value. Softening is the
+and Q_i follows exactly from its last value if S is linear in time within a step. Softening is the
 pseudo-elasticity of Ogden and Roxburgh (1999): S is multiplied by
 
     eta = 1 - erf((W_max - W) / (m + beta W_max)) / r,    W_max the largest energy density so far.
 
-Both act on what has to do with shape. For neo_hookean that is the isochoric part; the other laws have no such
-split and the whole stress remembers, but for the dilatation that ten-node elements keep for an element's mean
-(lam beyond 5 mu). Second Piola stresses turn with the body, so that nothing here depends on rotations (but
-for the `linear` law, which never does).
+Both act on the isochoric part of neo_hookean. The other laws have no such split, and both act on the whole
+stress, except the mean dilatation of ten-node elements (lam beyond 5 mu). Second Piola stresses rotate with
+the body, so that the effects are objective (except for the `linear` law).
 
-Within a step the past is a constant H, S = (1 + c) eta S_elastic + H with c = sum_i g_i h_i: the elastic law
-again, stiffer, with an initial stress. Hence the tangent is symmetric and exact (algorithmic). Stiffening
-(`stiffening`) belongs to the elastic law, so it relaxes and softens too; friction (`friction`) stands beside.
+Within a step the history is a constant H: S = (1 + c) eta S_elastic + H with c = sum_i g_i h_i. This is the
+elastic law, stiffer and with an initial stress, so that the tangent is symmetric and exact (algorithmic).
+Stiffening (`stiffening`) is part of the elastic law, so that it relaxes and softens, too; friction
+(`friction`) acts in parallel.
 
-What a material does not have is left out of the code that is compiled: nobody pays for it.
+Effects that a material does not have are not compiled.
 """
 
 import functools
@@ -47,17 +47,17 @@ class Mesh:
     inverse: wp.array2d(dtype=mat33)  # of the parent's map [element, point]
     weight: wp.array2d(dtype=real)  # volume that a point stands for [element, point] [m^3]
     volume: wp.array(dtype=real)  # [element]
-    # for tangents in single precision: a processor converts a number slower than it multiplies many
+    # for tangents in single precision: stored, since conversion is slower than multiplication
     shape_single: wp.array2d(dtype=wp.vec3)
     inverse_single: wp.array2d(dtype=wp.mat33)
-    of_element: wp.array2d(dtype=int)  # nodes [element, 12], the last two no node's, of ten-node elements
+    of_element: wp.array2d(dtype=int)  # nodes of ten-node elements [element, 12], padded by two
 
 
 @wp.struct
 @declared("rubber")
 class Rubber:
-    """Constants of the rubber in every world and what its points remember, for which see `state.VARIABLES`;
-    arrays of what there is not are empty. A point's number is (points of an element) x element + point."""
+    """Constants of the rubber in every world, and history variables of its points, see `state.VARIABLES`.
+    Arrays of absent effects are empty. The index of a point is (points of an element) x element + point."""
 
     law: int
     mu: wp.array(dtype=real)  # [world]
@@ -73,7 +73,7 @@ class Rubber:
 
 @functools.cache
 def deformation_of(corners: int) -> wp.Function:
-    """Function (mesh, element, point, x, world) -> deformation gradient, for elements of so many nodes: a
+    """Function (mesh, element, point, x, world) -> deformation gradient, for elements of `corners` nodes: a
     loop of known length is a third faster on CUDA."""
 
     @wp.func
@@ -89,7 +89,7 @@ def deformation_of(corners: int) -> wp.Function:
 
 @wp.func
 def remembering(law: int, lam: real):
-    """Second constant of the part of the law that remembers."""
+    """Second constant of the part of the law with history."""
     if law == 2:
         return real(0.0)
     return lam
@@ -103,9 +103,10 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
       options: of "modulus", "prony", "mullins", "hysteresis", "stiffening".
 
     Returns:
-      beyond_stress, beyond_derivative: what is added to the law's stress and to its derivative.
-      remembered: the part of the law that remembers, its stress, the stress' derivative and energy density.
-      softening: factor eta on a stress, and its derivative with the energy.
+      beyond_stress, beyond_derivative: added to the law's stress and to its derivative.
+      remembered, remembered_derivative, remembered_energy: stress, derivative and energy density of the part
+        of the law with history.
+      softening: factor eta on a stress, and its derivative by the energy.
     """
     has = {name: name in options for name in ("modulus", "prony", "mullins", "hysteresis", "stiffening")}
 
@@ -191,7 +192,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
             dP = soft[0] * dP + (soft[1] * wp.ddot(P, dF)) * P
         dP = factor * dP - own
         if wp.static(has["prony"]):
-            if rubber.law != 3:  # there the past is a constant stress
+            if rubber.law != 3:  # for `linear`, H is a constant stress
                 dP += dF * rubber.past[i, w]
         if wp.static(has["hysteresis"]):
             A = strain(rubber.law, F)
@@ -201,11 +202,11 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
             for b in range(rubber.branch.shape[0]):
                 T = deviator(A - rubber.slip[b, i, w])
                 branch = rubber.branch[b, w]
-                share = sticking_fraction(T, branch[1])
-                modulus = real(2.0) * branch[0] * mu * share
+                sticking = sticking_fraction(T, branch[1])
+                modulus = real(2.0) * branch[0] * mu * sticking
                 Q += modulus * T
                 dQ += modulus * dA
-                if share < real(1.0):
+                if sticking < real(1.0):
                     dQ -= (modulus * wp.ddot(T, dA) / wp.ddot(T, T)) * T
             dP += push_forward_change(rubber.law, F, Q, dF, dQ)
         return dP

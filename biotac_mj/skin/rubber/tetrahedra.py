@@ -1,19 +1,19 @@
 """The skin's elements: tetrahedra of four nodes with constant strain, or of ten nodes with averaged
 dilatation.
 
-Ten nodes have four integration points: Gauss's, pulled towards the centroid by `CONTRACTION`. That lowers the
-energy of a strain's variation inside an element, of which a mesh as coarse as the wall has too much, by
-CONTRACTION^2 and leaves its mean alone: a strain that is constant is still exact (the alpha finite element
-method of Liu, Nguyen-Thoi and Lam 2008 scales strain gradients the same way).
+Ten-node elements have four integration points: Gauss points, moved towards the centroid by `CONTRACTION`.
+This lowers the energy of strain variation inside an element, which is too high where a mesh is as coarse as
+the wall, by CONTRACTION^2. A constant strain remains exact (the alpha finite element method of Liu,
+Nguyen-Thoi and Lam 2008 scales strain gradients in the same way).
 
-Each element's energy is  sum_q w_q W(F_q; lam_q) + V (lam - lam_q)/2 mean(theta)^2,  lam_q = min(lam,
-POINTWISE mu), with the law's measure of dilatation theta (`law.dilatation`; J - 1 for neo_hookean). What goes
-beyond lam_q is felt by the element's mean dilatation alone (Nagtegaal, Parks and Rice 1974; Simo, Taylor and
-Pister 1985): volume is kept per element, not at every point, which leaves the element free to bend. A mean
-dilatation for all of lam (POINTWISE = 0) would be too soft under local loads, since a pressure that is
-constant over large elements is crude. What varies inside an element vanishes with its size, so POINTWISE
-changes the error of a mesh, not the limit; so does CONTRACTION. With CONTRACTION = 1 and lam <= POINTWISE mu
-integration is full, as in CalculiX's C3D10. Four nodes have one point, which feels all of lam.
+The energy of an element is  sum_q w_q W(F_q; lam_q) + V (lam - lam_q)/2 mean(theta)^2,  lam_q = min(lam,
+POINTWISE mu), with the law's measure of dilatation theta (`law.dilatation`; J - 1 for neo_hookean). The part
+of lam beyond lam_q acts on the element's mean dilatation only (Nagtegaal, Parks and Rice 1974; Simo, Taylor
+and Pister 1985): volume is kept per element, not at every point, so that the element can bend. With a mean
+dilatation for all of lam (POINTWISE = 0) elements would be too soft under local loads, since a pressure that
+is constant over a large element is a poor approximation. Variation inside an element vanishes with its size,
+so that POINTWISE and CONTRACTION change the error of a mesh, not the limit. With CONTRACTION = 1 and lam <=
+POINTWISE mu integration is full, as in CalculiX's C3D10. Four-node elements have one point with all of lam.
 """
 
 import copy
@@ -31,14 +31,14 @@ __all__ = ["CONTRACTION", "POINTWISE", "Tetrahedra", "incidence"]
 
 POINTWISE = 5.0  # of mu; docs/lab/elements.md has the error of other values
 CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/lab/elements.md has the error
-_SQUEEZED = 0.2  # least stretch that `deformed` takes
+_LEAST_STRETCH = 0.2  # of `deformed`
 _NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
 
 def incidence(nvert: int, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """CSR lists of the corner slots (cell * ncorner + corner) that belong to each node: start (nvert+1,),
-    slot (ncell * ncorner,)."""
+    """CSR lists of the corners (cell * ncorner + corner) at each node: start (nvert+1,), slot (ncell *
+    ncorner,)."""
     flat = cells.ravel()
     slot = np.argsort(flat, kind="stable").astype(np.int32)
     start = np.zeros(nvert + 1, np.int32)
@@ -47,10 +47,10 @@ def incidence(nvert: int, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Tetrahedra:
-    """The elements of a skin at rest.
+    """The elements of the undeformed skin.
 
     Args:
-      vert: (nvert, 3) rest positions [m].
+      vert: (nvert, 3) reference positions [m].
       elem: (nelem, 4), or (nelem, 10): corners, then the nodes of `edge_nodes.EDGES`; edges may be curved.
       law: number of the material law, see `law.LAWS`.
       device: Warp device.
@@ -59,11 +59,11 @@ class Tetrahedra:
 
     Attributes:
       npoint: integration points of an element. corners: its nodes.
-      cap: the largest lam over mu that points feel.
-      mesh: `points.Mesh`. start, slot: CSR lists of the corners that belong to each node (Warp).
+      cap: largest lam over mu at points.
+      mesh: `points.Mesh`. start, slot: CSR lists of the corners at each node (Warp).
       node_volume: (nvert,) lumped [m^3].
-      gradient: (nelem, npoint, corners, 3) of the shape functions by rest positions [1/m].
-      weight: (nelem, npoint) volume that a point stands for [m^3]. elem: (nelem, corners) nodes.
+      gradient: (nelem, npoint, corners, 3) of the shape functions by reference positions [1/m].
+      weight: (nelem, npoint) volume of a point [m^3]. elem: (nelem, corners) nodes.
 
     Raises:
       ValueError: a tetrahedron is inverted or degenerate, or a curved edge folds one.
@@ -108,7 +108,7 @@ class Tetrahedra:
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
 
     def _measure(self, vert):
-        """Inverse of the parent's map and volume of the points, of a skin that lies there at rest."""
+        """Inverse of the parent map, and volume of the points, for reference positions `vert`."""
         elem = self.elem
         _refuse_degenerate(vert, elem)
         edges = np.einsum("eai,qak->eqik", vert[elem], self._shape)
@@ -125,10 +125,10 @@ class Tetrahedra:
         return inverse, weight
 
     def rest_at(self, vert: np.ndarray) -> None:
-        """Gives the nodes other rest positions (nvert, 3) [m].
+        """Sets other reference positions (nvert, 3) [m].
 
         Raises:
-          ValueError: a tetrahedron would be inverted, degenerate or folded; then nothing has changed.
+          ValueError: a tetrahedron would be inverted, degenerate or folded; then nothing changes.
         """
         inverse, weight = self._measure(vert)
         self.mesh.inverse.assign(inverse)
@@ -137,9 +137,9 @@ class Tetrahedra:
         self.mesh.volume.assign(weight.sum(1))
 
     def deformed(self, vert: np.ndarray) -> "Tetrahedra":
-        """Elements whose `rest_stiffness` is near the tangent of these in a deformed shape, and positive
-        definite: made in that shape, but for what is squeezed to nothing or inside out; only turned under the
-        corotational law, which measures volume change along the axes that turn.
+        """Elements whose `rest_stiffness` approximates the tangent in a deformed shape, and is positive
+        definite: elements of that shape, with stretches of at least 0.2. For the corotational law, which
+        measures volume change along rotated axes, they are only rotated.
 
         Args:
           vert: (nvert, 3) [m].
@@ -147,7 +147,7 @@ class Tetrahedra:
         there = copy.copy(self)
         left, stretch, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self.elem], self.gradient))
         left[..., 2] *= np.linalg.det(left @ right)[..., None]
-        stretch = np.maximum(stretch, _SQUEEZED)
+        stretch = np.maximum(stretch, _LEAST_STRETCH)
         if self.law == LAWS["corotational"]:
             stretch = np.ones_like(stretch)
         there.gradient = np.einsum("eqij,eqaj->eqai", (left / stretch[..., None, :]) @ right, self.gradient)
@@ -155,15 +155,15 @@ class Tetrahedra:
         return there
 
     def rest_stiffness(self, mu: float, lame: float) -> sp.csc_matrix:
-        """(3 nvert, 3 nvert) [N/m] for Lame constants [Pa]: every law here has the same linearisation, but
-        decides which part of the stiffness is averaged."""
+        """Stiffness (3 nvert, 3 nvert) [N/m] of the undeformed skin for Lame constants [Pa]. All laws have
+        the same linearisation, except for the part of the stiffness that is averaged."""
         second = lame + 2 / 3 * mu if self.law == LAWS["neo_hookean"] else lame
         local = min(second, self.cap * mu)
         pointwise = local + lame - second
         n, total = 3 * self.corners, sp.csc_matrix((3 * self.nvert, 3 * self.nvert))
         dof = (3 * self.elem[:, :, None] + np.arange(3, dtype=np.int32)).reshape(self.nelem, n)
         weight = self.weight if self.modulus is None else self.weight * self.modulus[:, None]
-        # up to 900 numbers an element: in slices
+        # in slices, since an element has up to 900 numbers
         for part in np.array_split(np.arange(self.nelem), 1 + self.nelem // 8192):
             g, w = self.gradient[part], weight[part]
             gw = w[:, :, None, None] * g

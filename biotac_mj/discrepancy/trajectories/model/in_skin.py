@@ -60,10 +60,10 @@ def solve_with_memory(
     data, out = SkinData(model), []
     for i, t in enumerate(trajectories):
         tool, pos = (t.tool, t.pos) if poses is None else poses[i]
-        borne = data.memory.borne() if data.memory else None
+        borne = data.memory.largest_energy() if data.memory else None
         data.reset()
         if data.memory:
-            data.memory.bear(borne, data.x)
+            data.memory.raise_energy(borne, data.x)
         scene = Scene([tool], model.device, model.material.friction)
         at, turn, row = _walk(pos, t.mat)
         dt, clocks = clock(row, t.time, 1.0)

@@ -1,31 +1,31 @@
-"""An element's integration points on CUDA: a thread each, four lanes of a warp, which exchange what they
-know."""
+"""Functions for the integration points of an element on CUDA, which are four lanes of a warp: deformation
+gradients, and exchange between the lanes."""
 
 import warp as wp
 
 from ..types import mat33, real, vec3
 
 __all__ = [
-    "ABREAST",
+    "GROUPED_WORLDS",
     "THREADS",
     "any_lane",
     "deformation_of_ten",
     "deformation_of_ten_single",
     "gradient_of_ten",
     "place",
-    "push_of_points",
-    "push_of_points_single",
+    "corner_forces",
+    "corner_forces_single",
     "sum_of_points",
     "sum_of_points_single",
 ]
 
-ABREAST = 8  # worlds whose threads lie side by side: what they read does too
-# of a block on CUDA. With so many blocks of a multiprocessor, as kernels ask for, they have fewer registers
-# than they would like, but more to do while they wait
+GROUPED_WORLDS = 8  # worlds whose threads are neighbours, so that they read neighbouring numbers
+# threads of a block on CUDA. The kernels prescribe the blocks of a multiprocessor, which limits registers but
+# hides the latency of reads
 THREADS = 128
 
-# The threads of an element's points are `group` lanes apart. All lanes of a warp take part, those of worlds
-# that are off too: lanes that are asked for by a mask of their own are gathered first, at every exchange.
+# The threads of an element's points are `group` lanes apart. All lanes of a warp take part in an exchange,
+# also those of skipped worlds, since a mask of the active lanes would have to be computed at every exchange.
 _BASE = """
     const int lane = threadIdx.x & 31;
     const int base = lane - ((lane / group) & 3) * group;
@@ -68,7 +68,8 @@ def sum_of_points(value: real, group: int) -> real: ...
 def sum_of_points_single(value: float, group: int) -> float: ...
 
 
-# Pointers instead of Warp's indices, whose arithmetic was two fifths of these kernels; arrays are contiguous.
+# Pointers instead of Warp's indices, whose arithmetic would be two fifths of these kernels; arrays are
+# contiguous.
 _DEFORMATION = """
     const int* node = elem.data + 12 * e;
     const char* at = (const char*)(x.data + w);
@@ -110,7 +111,7 @@ _CORNERS = f"""
 
 
 def _typed(snippet, wide, scalar):
-    """With C++ types of what is read and of what is computed."""
+    """The snippet with the C++ types of inputs and results."""
     for name, type in (("WIDE", wide), ("SCALAR(", f"static_cast<{scalar}>("), ("SCALAR", scalar)):
         snippet = snippet.replace(name, type)
     return snippet
@@ -152,18 +153,18 @@ def gradient_of_ten(
 ) -> wp.mat33: ...
 
 
-# Rows: what the stresses of all points, H at each, push the nodes q, q + 4 and q + 8 (at most 9) with.
+# Rows: forces on the nodes q, q + 4 and q + 8 (at most 9) by the stresses H of all points.
 @wp.func_native(_typed(_CORNERS, "double", "double"))
-def push_of_points(H: mat33, shape: wp.array2d(dtype=vec3), q: int, group: int) -> mat33: ...
+def corner_forces(H: mat33, shape: wp.array2d(dtype=vec3), q: int, group: int) -> mat33: ...
 
 
 @wp.func_native(_typed(_CORNERS, "float", "float"))
-def push_of_points_single(H: wp.mat33, shape: wp.array2d(dtype=wp.vec3), q: int, group: int) -> wp.mat33: ...
+def corner_forces_single(H: wp.mat33, shape: wp.array2d(dtype=wp.vec3), q: int, group: int) -> wp.mat33: ...
 
 
 @wp.func_native(f"""
-    // {ABREAST} worlds or one are abreast: shifts, and one division
-    const unsigned bits = group == 1 ? 0 : {ABREAST.bit_length() - 1}, i = t;
+    // a group has {GROUPED_WORLDS} worlds or one: shifts, and one division
+    const unsigned bits = group == 1 ? 0 : {GROUPED_WORLDS.bit_length() - 1}, i = t;
     const unsigned rest = i >> bits >> 2, blocks = (nworld + group - 1) >> bits, e = rest / blocks;
     return wp::vec_t<3, int>(e, i >> bits & 3, (rest - e * blocks << bits) + (i & group - 1));
 """)

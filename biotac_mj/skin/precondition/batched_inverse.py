@@ -1,4 +1,4 @@
-"""CUDA code for what Warp's kernels cannot say: threads of a block that work on one small matrix together."""
+"""Batched inverses of small matrices on CUDA: the threads of a block share one matrix in registers."""
 
 import functools
 import typing
@@ -13,18 +13,18 @@ __all__ = ["invert", "kernels_up_to"]
 
 wp.set_module_options({"enable_backward": False})
 
-# (tiles of 32 rows, warps, blocks of a multiprocessor): each takes the matrices that the one before is too
-# small for. A few rows in a block for many would wait for its barriers.
+# (tiles of 32 rows, warps, blocks of a multiprocessor): each size is for the matrices that are too large for
+# the one before. In a block for many rows, a small matrix would wait for the barriers.
 _SIZES = (1, 3, 8), (2, 7, 4), (3, 7, 3), (4, 7, 2), (6, 15, 1)
 _THREADS = 512  # of a block that works in global memory, one for each row
 
-# Gauss-Jordan exchange with row pivots, see `small.invert_serial`, eight columns at a time. The matrix lies
-# in registers: thread (r, c) of W warps has the entries (r + W i, c + 32 j). One more warp exchanges the
-# columns of a panel among themselves, lane c with the rows c + 32 m, and so makes M: what was exchanged is
-# M times the pivots' rows as they were, added to all other rows, and in place of the pivots'. Meanwhile the
-# others are still at the panel before: they take the next panel's columns first.
-# A condition like i == p / W on an unrolled index would make the compiler index the registers, which it
-# cannot but in memory: so conditions are ranges here.
+# Gauss-Jordan exchange with row pivots, see `woodbury.invert_serial`, by panels of eight columns. The matrix
+# is in registers: thread (r, c) of W warps has the entries (r + W i, c + 32 j). One more warp exchanges the
+# columns of a panel, lane c with the rows c + 32 m. This gives M: the other columns become M times the former
+# pivot rows, added to all other rows and replacing the pivot rows. Meanwhile the other warps work on the
+# panel before; they update the columns of the next panel first. A condition such as i == p / W on an unrolled
+# index would make the compiler index registers, and thus move them to local memory: conditions are therefore
+# ranges.
 _EXCHANGE = """
     const int NC = %(tiles)d, W = %(warps)d, NR = (32 * NC + W - 1) / W, P = 8, PITCH = 12;
     const int t = threadIdx.x, r = t / 32, c = t %% 32;
@@ -200,8 +200,8 @@ _EXCHANGE = """
     }
 """
 
-# the same in global memory, for matrices that registers do not hold: thread t has row t of the panel, and a
-# warp adds to a row what the panel says
+# the same in global memory, for matrices that do not fit into registers: thread t has row t of the panel, and
+# a warp updates a row by the panel
 _EXCHANGE_LARGE = """
     const int t = threadIdx.x, lane = t %% 32, P = 8;
     __shared__ __align__(16) float panel[%(threads)d][P];
@@ -317,7 +317,7 @@ def _kernel(least, tiles, warps, blocks):
 
 @functools.cache
 def _kernel_large(least):
-    """Kernel for matrices of more rows than that."""
+    """Kernel for matrices of more than `least` rows."""
 
     @wp.func_native(_EXCHANGE_LARGE % dict(threads=_THREADS))
     def exchange(world: int, n_in: int, A: wp.array3d(dtype=float), B: wp.array3d(dtype=float)): ...
@@ -340,7 +340,7 @@ def _kernel_large(least):
 
 
 def kernels_up_to(capacity: int = _THREADS) -> list[tuple[wp.Kernel, int]]:
-    """What inverts matrices of up to `capacity` rows, each with the threads of its block."""
+    """Kernels that invert matrices of up to `capacity` rows, with their block sizes."""
     found, least = [], 0
     for sizes in _SIZES:
         found.append(_kernel(least, *sizes))
@@ -359,15 +359,15 @@ def invert(
     A: wp.array,
     B: wp.array,
 ) -> None:
-    """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may
-    overwrite A. Which way a matrix goes is decided by its rows alone.
+    """B = A^-1 (nworld, n, n) for the first extra + 3 size[w] rows of every world that is on; may overwrite
+    A. The kernel for a matrix depends only on its number of rows.
 
     Args:
-      beside: launches functions that do not need each other's results.
+      in_parallel: launches functions that do not need each other's results.
     """
     nworld, capacity = A.shape[0], A.shape[1]
     if capacity > _THREADS:
-        raise ValueError(f"a small system of {capacity} rows: a block has {_THREADS} threads")
+        raise ValueError(f"a system of {capacity} rows is too large: a block has {_THREADS} threads")
     given = [extra, size, on, A]
     launches = [
         functools.partial(program.launch, kernel, (nworld, threads), given, [B], threads)

@@ -1,26 +1,23 @@
-"""Which nodes touch: numbered for each world."""
+"""The touching nodes of each world, numbered."""
 
 import warp as wp
 
+from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds, total_of
 from ..types import real
-from .sides import TINY
+from .right_hand_sides import TINY
 
-__all__ = ["find_touched", "survey"]
+__all__ = ["list_touching_nodes", "number_touching_nodes"]
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def find_touched(
+def list_touching_nodes(
     # In:
     free_index: wp.array(dtype=int),
-    outer_start: wp.array(dtype=int),
-    outer_slot: wp.array(dtype=int),
-    outer_touching: wp.array2d(dtype=int),
-    core_start: wp.array(dtype=int),
-    core_slot: wp.array(dtype=int),
-    core_touching: wp.array2d(dtype=int),
+    outer: SurfaceForces,
+    core: SurfaceForces,
     on: wp.array(dtype=int),
     # In and out:
     count: wp.array(dtype=int),
@@ -29,16 +26,16 @@ def find_touched(
     found_out: wp.array2d(dtype=int),
     any_out: wp.array(dtype=int),
 ):
-    """Lists the free nodes of touching faces of each world, as they come."""
+    """Appends node i to the list of its world if it is free and a face at it touches."""
     i, w = wp.tid()
     if on[w] == 0:
         return
     here = int(0)
-    for k in range(outer_start[i], outer_start[i + 1]):
-        here = wp.max(here, outer_touching[outer_slot[k] // 3, w])
-    if core_start.shape[0] > 0:
-        for k in range(core_start[i], core_start[i + 1]):
-            here = wp.max(here, core_touching[core_slot[k] // 3, w])
+    for k in range(outer.start[i], outer.start[i + 1]):
+        here = wp.max(here, outer.touching[outer.slot[k] // 3, w])
+    if core.start.shape[0] > 0:
+        for k in range(core.start[i], core.start[i + 1]):
+            here = wp.max(here, core.touching[core.slot[k] // 3, w])
     if here == 1:
         any_out[w] = 1
     if free_index[i] < 0:
@@ -49,7 +46,7 @@ def find_touched(
 
 
 @wp.kernel
-def survey(
+def number_touching_nodes(
     # In:
     capacity: int,
     partial: wp.array3d(dtype=real),
@@ -64,8 +61,8 @@ def survey(
     norm_out: wp.array2d(dtype=float),
     full_out: wp.array(dtype=int),
 ):
-    """Numbers the touching nodes of each world in their order; norms of the residual and of the liquid's
-    gradient. Starts the list anew."""
+    """Numbers the touching nodes of world w in ascending order, computes the norms of the residual and of the
+    volume's gradient, and empties the list."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
@@ -84,7 +81,7 @@ def survey(
     if t == 0:
         count[w] = 0
         size_out[w] = wp.min(n, capacity)
-        if n > capacity:  # the rest is left to conjugate gradients
+        if n > capacity:  # conjugate gradients correct for the others
             full_out[0] = wp.max(full_out[0], n)
         norm_out[0, w] = wp.max(float(wp.sqrt(rr)), TINY)
         norm_out[1, w] = wp.max(float(wp.sqrt(gg)), TINY)

@@ -6,8 +6,8 @@ import scipy.sparse.linalg
 import scipy.spatial
 import warp as wp
 
-from biotac_mj.skin.precondition.dissected import DissectedInverse
-from biotac_mj.skin.precondition.sides import LOW, RAISE
+from biotac_mj.skin.precondition.block_inverse import DissectedInverse
+from biotac_mj.skin.precondition.right_hand_sides import LOW, RAISE
 from biotac_mj.skin.program import Launcher, Program
 
 

@@ -1,8 +1,8 @@
-"""Nested dissection of a mesh: the order in which a sparse factor of its stiffness stays small (George 1973).
+"""Nested dissection of a mesh: an elimination order with little fill-in (George 1973).
 
-The nodes are cut in two across their longest direction; the fewest nodes that separate both sides are a
-smallest vertex cover of the cut edges (Koenig: a largest matching gives it). They come last, both sides are
-cut on in the same way."""
+The nodes are divided across their longest direction. The smallest separator is a minimum vertex cover of the
+edges between both sides, which a maximum matching gives (Koenig). It is eliminated last; both sides are
+divided in the same way."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,33 +12,33 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 __all__ = ["clusters", "cut", "dissect"]
 
-_LEAF = 25  # nodes that are not cut further
-_CUTS = (0.42, 0.5, 0.58)  # share of the nodes on one side
+_LEAF = 25  # nodes that are not divided further
+_CUTS = (0.42, 0.5, 0.58)  # fractions of the nodes on one side that are tried
 
 
 def dissect(neighbours: sp.csr_matrix, points: np.ndarray) -> list[np.ndarray]:
-    """Groups of nodes in the order of elimination: what is below a group in the tree comes before it.
+    """Groups of nodes in the order of elimination: groups below a group in the tree come before it.
 
     Args:
       neighbours: (n, n) pattern of the nodes' stiffness, symmetric.
-      points: (n, 3) where the nodes are.
+      points: (n, 3) positions of the nodes.
 
     Returns:
-      arrays of node numbers, each node in one of them.
+      Arrays of node indices; each node is in one of them.
     """
     groups = []
     stack = [(np.arange(len(points)), neighbours, False)]
     while stack:
-        nodes, near, done = stack.pop()
+        nodes, neighbours, done = stack.pop()
         if done or len(nodes) <= _LEAF:
             groups.append(nodes)
             continue
-        middle, *sides = cut(near, points[nodes], _CUTS, _fill)
+        middle, *sides = cut(neighbours, points[nodes], _CUTS, _fill)
         if len(middle):
             stack.append((nodes[middle], None, True))
         for side in sides[::-1]:
             if len(side):
-                stack.append((nodes[side], near[side][:, side], False))
+                stack.append((nodes[side], neighbours[side][:, side], False))
     return groups
 
 
@@ -47,36 +47,39 @@ def _fill(middle, left, right):
 
 
 def cut(
-    near: sp.csr_matrix, points: np.ndarray, shares: Sequence[float], cost: Callable[[int, int, int], float]
+    neighbours: sp.csr_matrix,
+    points: np.ndarray,
+    fractions: Sequence[float],
+    cost: Callable[[int, int, int], float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The best separator found across the longest direction and both sides of it: three index arrays.
+    """The best separator across the longest direction, and both of its sides: three index arrays.
 
     Args:
-      near, points: as for `dissect`.
-      shares: of the nodes on one side, that are tried.
-      cost: of so many nodes between and on each side.
+      neighbours, points: as for `dissect`.
+      fractions: of the nodes on one side, that are tried.
+      cost: of the sizes of separator, left and right side; the least is taken.
     """
     centered = points - points.mean(0)
     along = centered @ np.linalg.eigh(centered.T @ centered)[1][:, -1]
     order, n = np.argsort(along, kind="stable"), len(points)
     best, least = None, np.inf
-    for share in shares:
+    for fraction in fractions:
         first = np.zeros(n, bool)
-        first[order[: int(share * n)]] = True
-        middle = _separator(near, first)
-        rest = np.ones(n, bool)
-        rest[middle] = False
-        left, right = np.flatnonzero(rest & first), np.flatnonzero(rest & ~first)
-        worth = cost(len(middle), len(left), len(right))
-        if worth < least:
-            best, least = (middle, left, right), worth
+        first[order[: int(fraction * n)]] = True
+        middle = _separator(neighbours, first)
+        others = np.ones(n, bool)
+        others[middle] = False
+        left, right = np.flatnonzero(others & first), np.flatnonzero(others & ~first)
+        value = cost(len(middle), len(left), len(right))
+        if value < least:
+            best, least = (middle, left, right), value
     return best
 
 
-def _separator(near, first):
-    """Fewest nodes without which no edge leads from `first` (n,) to the others."""
+def _separator(neighbours, first):
+    """Smallest set of nodes that separates `first` (n,) from the other nodes."""
     a, b = np.flatnonzero(first), np.flatnonzero(~first)
-    cut = near[a][:, b].tocsr()
+    cut = neighbours[a][:, b].tocsr()
     rows, columns = np.flatnonzero(np.diff(cut.indptr)), np.unique(cut.indices)
     cut = cut[rows][:, columns]
     partner = maximum_bipartite_matching(cut, perm_type="column")  # of each row
@@ -95,17 +98,17 @@ def _separator(near, first):
 
 
 def clusters(points: np.ndarray, size: int) -> list[np.ndarray]:
-    """Nodes (n,) at points (n, 3) in groups of about `size` neighbours: halves along the longest side, again
-    and again."""
+    """Groups of about `size` neighbouring nodes, from repeated halving of points (n, 3) along the longest
+    side."""
     order = np.arange(len(points))
     stack, out = [order], []
     while stack:
-        part = stack.pop()
-        if len(part) <= size:
-            out.append(part)
+        nodes = stack.pop()
+        if len(nodes) <= size:
+            out.append(nodes)
             continue
-        axis = np.ptp(points[part], axis=0).argmax()
-        part = part[np.argsort(points[part, axis], kind="stable")]
-        stack += [part[len(part) // 2 :], part[: len(part) // 2]]
+        axis = np.ptp(points[nodes], axis=0).argmax()
+        nodes = nodes[np.argsort(points[nodes, axis], kind="stable")]
+        stack += [nodes[len(nodes) // 2 :], nodes[: len(nodes) // 2]]
     order = np.concatenate(out)
     return np.array_split(order, max(1, len(order) // size))

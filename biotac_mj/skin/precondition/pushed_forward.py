@@ -1,11 +1,10 @@
-"""The inverse of the rest stiffness, carried over into a deformed shape.
+"""The inverse of the undeformed stiffness, pushed forward into a deformed shape.
 
-Nearly incompressible rubber resists volume change along other directions once it has turned and strained, and
-the inverse A0^-1 at rest does not know them. Piola's transform, which keeps divergence, takes a motion w of
-the resting skin to F w of the deformed one: M A0^-1 M^T, with M the deformation gradient at each node, scaled
-to keep volume, holds volume where the deformed skin does. Under the corotational law, which measures volume
-change along axes that turn, M is the rotation. It is a function of the shape alone, symmetric and positive
-definite."""
+The directions along which nearly incompressible rubber resists volume change depend on the deformation. The
+Piola transform, which preserves divergence, maps a motion w of the undeformed skin to F w of the deformed
+skin. M A0^-1 M^T, with M the deformation gradient at each node scaled to unit determinant, therefore keeps
+volume where the deformed skin does. For the corotational law, which measures volume change along rotated
+axes, M is the rotation. The result depends on the shape only, and is symmetric and positive definite."""
 
 import typing
 from collections.abc import Callable
@@ -22,20 +21,22 @@ from ..types import mat33, narrow, real, sum_of_lanes, vec3
 if typing.TYPE_CHECKING:
     from ..rubber.tetrahedra import Tetrahedra
 
-__all__ = ["Carrier", "Matrices", "carries"]
+__all__ = ["PushForward", "PushForwardMatrices", "pushes_forward"]
 
 wp.set_module_options({"enable_backward": False})
 
-_SOUND = 0.1  # least determinant of a node's deformation gradient that is taken; else it is as at rest
-_LONGEST = 4.0  # norm of an M that is taken for halves, which have room for four times a right-hand side
+_LEAST_DETERMINANT = 0.1  # of a node's deformation gradient; below it M is the identity
+_MOST_NORM = (
+    4.0  # of M in half precision, whose range is four times a right-hand side; else M is the identity
+)
 
 
 @wp.func
-def carrying(F: mat33, turns: int):
-    """M of a deformation gradient."""
+def push_forward_matrix(F: mat33, turns: int):
+    """M of a deformation gradient F. turns: 1: M is the rotation."""
     det = wp.determinant(F)
     M = wp.identity(n=3, dtype=real)
-    if det > real(_SOUND):  # not where it is nan
+    if det > real(_LEAST_DETERMINANT):  # false for nan
         M = F / wp.cbrt(det)
         if turns == 1:
             U, _stretch, V = wp.svd3(F)
@@ -55,14 +56,14 @@ def _measure(
     # Out:
     matrix_out: wp.array2d(dtype=mat33),
 ):
-    """M of each node, from the mean deformation gradient of the elements at it."""
+    """M of node i, from the mean deformation gradient of the elements at it."""
     i, w = wp.tid()
     if on[w] == 0:
         return
     F = mat33()
     for k in range(start[i], start[i + 1]):
         F += wp.outer(x[other[k], w], gradient[k])
-    matrix_out[i, w] = carrying(F, turns)
+    matrix_out[i, w] = push_forward_matrix(F, turns)
 
 
 @wp.kernel
@@ -78,7 +79,7 @@ def _measure_by_lanes(
     # Out:
     matrix_out: wp.array2d(dtype=wp.mat33),
 ):
-    """The same in single precision, each sum by so many lanes of a warp."""
+    """M of node i in single precision, summed by `lanes` threads."""
     i, w, lane = wp.tid()
     if on[w] == 0:
         return
@@ -94,8 +95,8 @@ def _measure_by_lanes(
     a = sum_of_lanes(a, lanes)
     b = sum_of_lanes(b, lanes)
     c = sum_of_lanes(c, lanes)
-    M = carrying(mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]), turns)
-    if wp.ddot(M, M) > real(_LONGEST * _LONGEST):
+    M = push_forward_matrix(mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]), turns)
+    if wp.ddot(M, M) > real(_MOST_NORM * _MOST_NORM):
         M = wp.identity(n=3, dtype=real)
     matrix_out[i, w] = narrow(M)
 
@@ -109,7 +110,7 @@ def _turn(
     # In and out:
     side: wp.array2d(dtype=vec3),
 ):
-    """Each side times its world's M, or its transpose."""
+    """Multiplies right-hand side k at node i by M of its world, or by its transpose."""
     i, k = wp.tid()
     M = matrix[i, world[k]]
     if transposed == 1:
@@ -117,18 +118,18 @@ def _turn(
     side[i, k] = M * side[i, k]
 
 
-class Carrier:
+class PushForward:
     """The matrices M of all nodes and worlds of one SkinData on the CPU.
 
     Args:
       elements: of the skin. x: [nvert, nworld] nodes, a wp.array.
 
     Attributes:
-      matrix: (nvert, nworld, 3, 3), M where `measure` was asked last.
+      matrix: (nvert, nworld, 3, 3) M of the last `measure`.
     """
 
     def __init__(self, elements: "Tetrahedra", x: wp.array):
-        n, self._kept = elements.nvert, {}
+        n, self._launches = elements.nvert, {}
         start, other, gradient = _node_gradients(elements)
         with wp.ScopedDevice("cpu"):
             constants = [
@@ -138,38 +139,38 @@ class Carrier:
             ]
             self._on = wp.zeros(x.shape[1], dtype=int)
             self._matrix = wp.zeros((n, x.shape[1]), dtype=mat33)
-        self._asked, self.matrix = self._on.numpy(), self._matrix.numpy()
+        self._flags, self.matrix = self._on.numpy(), self._matrix.numpy()
         turns = int(elements.law == LAWS["corotational"])
         self._measure = recorded(_measure, x.shape, [*constants, turns, x, self._on], [self._matrix])
 
     def measure(self, worlds: np.ndarray) -> None:
-        """Finds M of worlds (k,) in their present shapes."""
-        self._asked[:] = 0
-        self._asked[worlds] = 1
+        """Computes M of worlds (k,) at their present nodes."""
+        self._flags[:] = 0
+        self._flags[worlds] = 1
         self._measure()
 
-    def onward(self, worlds: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """M w of motions w (nvert, k, 3), of these worlds (k,) one each."""
+    def apply(self, worlds: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """M w of motions w (nvert, k, 3), one for each of the worlds (k,)."""
         return self._turned(0, worlds, motion)
 
-    def back(self, worlds: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """M^T f of forces f (nvert, k, 3); as `onward`."""
+    def pull_back(self, worlds: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """M^T f of forces f (nvert, k, 3); as `apply`."""
         return self._turned(1, worlds, force)
 
     def _turned(self, transposed, worlds, sides):
         key = transposed, len(worlds)
-        if key not in self._kept:
+        if key not in self._launches:
             with wp.ScopedDevice("cpu"):
                 world = wp.zeros(len(worlds), dtype=int)
                 side = wp.zeros((len(self.matrix), len(worlds)), dtype=vec3)
             launch = recorded(_turn, side.shape, [self._matrix, world, transposed], [side])
-            self._kept[key] = world.numpy(), side.numpy(), launch
-        world, side, launch = self._kept[key]
+            self._launches[key] = world.numpy(), side.numpy(), launch
+        world, side, launch = self._launches[key]
         world[:], side[...] = worlds, sides
         launch()
         return side.copy()
 
-    def push(self, w: int, nodes: np.ndarray, force: np.ndarray) -> np.ndarray:
+    def pull_back_force(self, w: int, nodes: np.ndarray, force: np.ndarray) -> np.ndarray:
         """M^T f of forces f (3 k,) on the nodes (k,) of a world."""
         return np.einsum("nji,nj->ni", self.matrix[nodes, w], force.reshape(-1, 3)).ravel()
 
@@ -180,14 +181,14 @@ class Carrier:
         return np.matmul(half, M[None].swapaxes(2, 3)).swapaxes(1, 2).reshape(W.shape)
 
 
-class Matrices:
+class PushForwardMatrices:
     """The matrices M of all nodes and worlds of one SkinData on its device, for the dense preconditioner.
 
     Args:
-      elements: of the skin. nworld: how many. device: Warp device. lanes: that sum one.
+      elements: of the skin. nworld: number of worlds. device: Warp device. lanes: threads that sum one M.
 
     Attributes:
-      matrix: [nvert, nworld] M where `measure` was launched last, in single precision.
+      matrix: [nvert, nworld] M of the last `measure`, in single precision.
     """
 
     def __init__(self, elements: "Tetrahedra", nworld: int, device: wp.Device, lanes: int):
@@ -204,19 +205,19 @@ class Matrices:
             self.matrix = wp.zeros((elements.nvert, nworld), dtype=wp.mat33)
 
     def measure(self, program: Launcher, launch: Callable, x: wp.array, on: wp.array) -> None:
-        """Launches what finds M in the worlds that are on; launch: as `DensePreconditioner` does it."""
+        """Computes M in the worlds that are on. launch: launches a kernel, as in `DensePreconditioner`."""
         launch(program, _measure_by_lanes, self._dim, [*self._constants, x, on], [self.matrix])
 
 
-def carries(elements: "Tetrahedra", poissons_ratio: float) -> bool:
-    """Whether a skin's inverse is worth carrying: its law resists volume change, along directions that depend
-    on the shape, much more than shear."""
+def pushes_forward(elements: "Tetrahedra", poissons_ratio: float) -> bool:
+    """Whether the inverse is pushed forward: the law resists volume change much more than shear, along
+    directions that depend on the shape."""
     return poissons_ratio > 0.45 and elements.law in (LAWS["neo_hookean"], LAWS["corotational"])
 
 
 def _node_gradients(elements):
-    """Mean deformation gradient of the elements at each node, weighed by volume, as sums of outer products of
-    positions with vectors: start (nvert + 1,), other node (nnz,), vector (nnz, 3)."""
+    """Mean deformation gradient of the elements at each node, weighted by volume, as sums of outer products
+    of positions and vectors: start (nvert + 1,), other node (nnz,), vector (nnz, 3)."""
     elem, n, corners = elements.elem, elements.nvert, elements.corners
     mean = np.einsum("eq,eqaj->eaj", elements.weight, elements.gradient)
     volume = np.bincount(elem.ravel(), np.repeat(elements.weight.sum(1), corners), n)

@@ -1,24 +1,25 @@
-"""The small systems of the dense preconditioner: over the liquid and the touching nodes of each world.
+"""Woodbury systems of the dense preconditioner, over the liquid and the touching nodes of each world.
 
-The liquid comes first, then three rows for each touching node. D is sparse and kept by blocks: a node's links
-to the nodes of its faces, and their springs."""
+The liquid has the first row, each touching node three. D is sparse, and is stored by blocks: the links of a
+node to the nodes of its faces, and their springs."""
 
 import warp as wp
 
 from ..bodies import Bodies
 from ..contact.faces import block_index
+from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds, total_of
-from ..types import mat33, narrow, real, vec3, vec6
-from .sides import STIFF, entry, pull_of_liquid
+from ..types import narrow, real, vec3, vec6
+from .right_hand_sides import STIFF, InverseEntries, entry, liquid_scale
 
 __all__ = [
     "add_bodies",
     "invert_serial",
-    "small_answer",
-    "small_compliance",
-    "small_forces",
-    "small_stiffness",
-    "small_system",
+    "multiply_springs",
+    "fill_compliance",
+    "contact_forces",
+    "fill_stiffness",
+    "fill_system",
     "sum_liquid",
 ]
 
@@ -27,17 +28,18 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def sum_liquid(
-    part: wp.array3d(dtype=real),
+    partial: wp.array3d(dtype=real),
     on: wp.array(dtype=int),
     first: int,
     W_out: wp.array3d(dtype=float),
     u_out: wp.array2d(dtype=float),
 ):
+    """Sums the liquid's row of u and, at first, its diagonal entry of W."""
     w, t = wp.tid()
     if on[w] == 0:
         return
-    gy = total_of(part, 0, w, t)
-    gg = total_of(part, 1, w, t)
+    gy = total_of(partial, 0, w, t)
+    gg = total_of(partial, 1, w, t)
     if t == 0:
         u_out[w, 0] = float(gy)
         if first == 1:
@@ -45,12 +47,9 @@ def sum_liquid(
 
 
 @wp.kernel
-def small_compliance(
+def fill_compliance(
     # In:
-    inverse: wp.array2d(dtype=wp.float16),
-    rest: wp.array2d(dtype=wp.float16),
-    scale: float,
-    free_index: wp.array(dtype=int),
+    inverse: InverseEntries,
     node: wp.array2d(dtype=int),
     size: wp.array(dtype=int),
     has_liquid: int,
@@ -62,23 +61,23 @@ def small_compliance(
     # Out:
     W_out: wp.array3d(dtype=float),
 ):
-    """W over the liquid's direction and the touching nodes, by blocks; so many threads share a world's."""
+    """Compliance W between the liquid and the touching nodes, by blocks; `threads` threads for each world."""
     w, t = wp.tid()
     if on[w] == 0:
         return
     n = size[w]
-    soft = scale * float(st.softness[w])
+    soft = inverse.scale * float(st.softness[w])
     for p in range(t, n * n, threads):
         i = p // n
         j = p % n
-        a = 3 * free_index[node[i, w]]
-        b = 3 * free_index[node[j, w]]
+        a = 3 * inverse.free_index[node[i, w]]
+        b = 3 * inverse.free_index[node[j, w]]
         row = has_liquid + 3 * i
         column = has_liquid + 3 * j
-        block = wp.mat33()  # all of it before any is written, so that no read waits for another
+        block = wp.mat33()  # all reads before the writes, so that no read waits for another
         for k in range(3):
             for l in range(3):
-                block[k, l] = entry(inverse, rest, a + k, b + l) * soft
+                block[k, l] = entry(inverse, a + k, b + l) * soft
         if matrix.shape[0] > 0:
             block = matrix[node[i, w], w] * block * wp.transpose(matrix[node[j, w], w])
         for k in range(3):
@@ -95,16 +94,14 @@ def small_compliance(
 def _group_of(
     i: int,
     w: int,
-    start: wp.array(dtype=int),
-    slot: wp.array(dtype=int),
-    touching: wp.array2d(dtype=int),
+    outer: SurfaceForces,
     group: wp.array2d(dtype=int),
 ):
-    """Whose body touches node i, -1: none."""
+    """Group of the body that touches node i; -1: none."""
     found = int(-1)
-    for k in range(start[i], start[i + 1]):
-        if touching[slot[k] // 3, w] == 1:
-            found = wp.max(found, group[slot[k] // 3, w])
+    for k in range(outer.start[i], outer.start[i + 1]):
+        if outer.touching[outer.slot[k] // 3, w] == 1:
+            found = wp.max(found, group[outer.slot[k] // 3, w])
     return found
 
 
@@ -112,9 +109,7 @@ def _group_of(
 def add_bodies(
     # In:
     has_liquid: int,
-    start: wp.array(dtype=int),
-    slot: wp.array(dtype=int),
-    touching: wp.array2d(dtype=int),
+    outer: SurfaceForces,
     group: wp.array2d(dtype=int),
     b: Bodies,
     x: wp.array2d(dtype=vec3),
@@ -126,7 +121,7 @@ def add_bodies(
     # In and out:
     W: wp.array3d(dtype=float),
 ):
-    """W with the compliance R A R' of the bodies that touch the nodes."""
+    """Adds to W the compliance R A R' of the bodies that touch the nodes."""
     w, t = wp.tid()
     if on[w] == 0:
         return
@@ -134,12 +129,12 @@ def add_bodies(
     for p in range(t, n * n, threads):
         i = p // n
         j = p % n
-        g = _group_of(node[i, w], w, start, slot, touching, group)
-        h = _group_of(node[j, w], w, start, slot, touching, group)
+        g = _group_of(node[i, w], w, outer, group)
+        h = _group_of(node[j, w], w, outer, group)
         if g >= 0 and h >= 0:
             here = x[node[i, w], w]
             there = x[node[j, w], w]
-            A = b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])  # bodies creep as the skin does
+            A = b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])  # the artificial viscosity of the skin
             for l in range(3):
                 unit = vec3()
                 unit[l] = real(1.0)
@@ -153,45 +148,33 @@ def add_bodies(
 
 
 @wp.func
-def contact_between(
+def contact_stiffness_between(
     i: int,
     j: int,
     w: int,
-    start: wp.array(dtype=int),
-    slots: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
-    touching: wp.array2d(dtype=int),
-    block: wp.array2d(dtype=mat33),
+    surface: SurfaceForces,
 ):
-    """How stiffly the touching faces of a surface couple nodes i and j."""
+    """Contact stiffness of a surface between nodes i and j [N/m]."""
     total = wp.mat33()
-    for k in range(start[i], start[i + 1]):
-        f = slots[k] // 3
-        t = face[f]
+    for k in range(surface.start[i], surface.start[i + 1]):
+        f = surface.slot[k] // 3
+        t = surface.face[f]
         b = int(-1)
         for c in range(3):
             if t[c] == j:
                 b = c
         if b >= 0:
-            if touching[f, w] == 1:
-                a = slots[k] % 3
-                total += narrow(block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w])
+            if surface.touching[f, w] == 1:
+                a = surface.slot[k] % 3
+                total += narrow(surface.block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w])
     return total
 
 
 @wp.kernel
-def small_stiffness(
+def fill_stiffness(
     # In:
-    outer_face: wp.array(dtype=wp.vec3i),
-    outer_start: wp.array(dtype=int),
-    outer_slot: wp.array(dtype=int),
-    outer_touching: wp.array2d(dtype=int),
-    outer_block: wp.array2d(dtype=mat33),
-    core_face: wp.array(dtype=wp.vec3i),
-    core_start: wp.array(dtype=int),
-    core_slot: wp.array(dtype=int),
-    core_touching: wp.array2d(dtype=int),
-    core_block: wp.array2d(dtype=mat33),
+    outer: SurfaceForces,
+    core: SurfaceForces,
     ring: wp.array2d(dtype=int),
     slot: wp.array2d(dtype=int),
     node: wp.array2d(dtype=int),
@@ -201,7 +184,7 @@ def small_stiffness(
     link_out: wp.array3d(dtype=int),
     spring_out: wp.array3d(dtype=wp.mat33),
 ):
-    """D by its blocks: which touching nodes the contact couples each with (-1: none), and how stiffly."""
+    """Blocks of D: the touching nodes that contact couples node s with (-1: none), and their springs."""
     l, s, w = wp.tid()
     if on[w] == 0 or s >= size[w]:
         return
@@ -212,9 +195,9 @@ def small_stiffness(
         other = slot[j, w]
     link_out[w, s, l] = other
     if other >= 0:
-        K = contact_between(i, j, w, outer_start, outer_slot, outer_face, outer_touching, outer_block)
-        if core_start.shape[0] > 0:
-            K += contact_between(i, j, w, core_start, core_slot, core_face, core_touching, core_block)
+        K = contact_stiffness_between(i, j, w, outer)
+        if core.start.shape[0] > 0:
+            K += contact_stiffness_between(i, j, w, core)
         spring_out[w, s, l] = K
 
 
@@ -228,7 +211,7 @@ def read_block(A: wp.array3d(dtype=float), w: int, row: int, column: int):
 
 
 @wp.kernel
-def small_system(
+def fill_system(
     # In:
     has_liquid: int,
     size: wp.array(dtype=int),
@@ -290,7 +273,7 @@ def invert_serial(
         return
     n = has_liquid + 3 * size[w]
     for i in range(n):
-        pivot[w, i] = -1  # of row i: the column that it was exchanged with
+        pivot[w, i] = -1  # column with which row i was exchanged
     for k in range(n):
         p = int(-1)
         best = float(-1.0)
@@ -320,7 +303,7 @@ def invert_serial(
 
 
 @wp.kernel
-def small_answer(
+def multiply_springs(
     # In:
     has_liquid: int,
     size: wp.array(dtype=int),
@@ -332,8 +315,8 @@ def small_answer(
     # Out:
     G_out: wp.array3d(dtype=float),
 ):
-    """G = B D, stored transposed: threads that sum one entry each then read side by side. A spring is the
-    same from either of its nodes."""
+    """G = B D. It is stored transposed, so that threads which sum one entry each read neighbouring numbers. A
+    spring is equal for both of its nodes."""
     w, t = wp.tid()
     if on[w] == 0:
         return
@@ -362,13 +345,15 @@ def small_answer(
                 at = 1 + 3 * link[w, j, k]
                 if at > 0:
                     push = wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
-                    v += wp.transpose(spring[w, j, k]) * push  # from the left: slip's springs are lopsided
+                    v += (
+                        wp.transpose(spring[w, j, k]) * push
+                    )  # from the left, since the tangent of slip may be unsymmetric
             for b in range(3):
                 G_out[w, column + b, 0] = v[b]
 
 
 @wp.kernel
-def small_forces(
+def contact_forces(
     # In:
     has_liquid: int,
     size: wp.array(dtype=int),
@@ -381,7 +366,7 @@ def small_forces(
     q_out: wp.array2d(dtype=float),
     largest_out: wp.array(dtype=float),
 ):
-    """q = G u, and a bound of what it pushes with."""
+    """Forces q = G u, and a bound of their size."""
     w, i = wp.tid()
     if on[w] == 0:
         return
@@ -391,12 +376,12 @@ def small_forces(
     total = float(0.0)
     eights = n // 8
     for b in range(eights):
-        for k in range(8):  # whose reads do not wait for each other
+        for k in range(8):  # unrolled: the reads do not wait for each other
             total += G[w, 8 * b + k, i] * u[w, 8 * b + k]
     for k in range(8 * eights, n):
         total += G[w, k, i] * u[w, k]
     q_out[w, i] = total
     bound = wp.abs(total)
     if i < has_liquid:
-        bound *= norm[1, w] * pull_of_liquid(st, w)
+        bound *= norm[1, w] * liquid_scale(st, w)
     wp.atomic_max(largest_out, w, bound)
