@@ -1,4 +1,4 @@
-"""A launch of a kernel on the CPU, made once and run many times."""
+"""Kernel launches on the CPU, packed once and run many times."""
 
 import ctypes
 import functools
@@ -14,15 +14,14 @@ except ImportError:
 
 __all__ = ["in_a_row", "recorded", "repeated"]
 
-# Warp's kernels of the CPU take two addresses, bounds and arguments, which only its own code says: it was
-# read in these versions
+# versions of Warp in whose code the signature of CPU kernels was checked: addresses of bounds and arguments
 _KNOWN = ("1.19.",)
 
 wp.set_module_options({"enable_backward": False})
 
 
-# Each of `count` entries of four numbers is a launch (0, kernel, bounds, arguments), or others that are gone
-# through while a flag is not zero (1, flag, their entries, how many).
+# Each of `count` entries of four numbers is a launch (0, kernel, bounds, arguments), or a loop over other
+# entries while a flag is not zero (1, flag, entries, their number).
 @wp.func_native("""
     struct Row {
         static void run(const unsigned long long* entry, unsigned long long count) {
@@ -50,13 +49,12 @@ def recorded(
     outputs: Sequence = (),
     tiled: bool = False,
 ) -> Callable[[], None]:
-    """What runs a kernel over dim on the CPU with these arguments, numbers and structs as they are now.
+    """A function that runs a kernel over dim on the CPU, with the present values of numbers and structs.
 
-    Warp's own record of a launch (`wp.Launch`) packs its arguments each time it is launched, which takes 2.4
-    us for seven of them where many a kernel here takes as long; this takes 0.1. tiled: a kernel of blocks, of
-    one thread each here. No kernel may have Warp's tiles: they would lie in one place for all threads of the
-    host, and each kernel of their module would begin to fill it anew (`skin.types.sum_of_block` has none).
-    """
+    Warp's record of a launch (`wp.Launch`) packs its arguments at each launch, which takes 2.4 us for seven
+    arguments, as long as many kernels here; this takes 0.1 us. tiled: a kernel of blocks, which have one
+    thread on the CPU. Kernels must not have Warp tiles, whose memory all host threads share
+    (`skin.types.sum_of_block` has none)."""
     launch, options = (wp.launch_tiled, {"block_dim": 1}) if tiled else (wp.launch, {})
     command = launch(
         kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device="cpu", record_cmd=True, **options
@@ -65,15 +63,15 @@ def recorded(
         return command.launch
     arguments, _ = _pack(command.kernel, command.hooks, command.params, False)
     run = functools.partial(command.hooks.forward, ctypes.byref(command.params[0]), ctypes.byref(arguments))
-    run.kept = command, inputs, outputs  # their memory is what is worked on
+    run.kept = command, inputs, outputs  # keeps their memory alive
     addresses = ctypes.addressof(command.params[0]), ctypes.addressof(arguments)
     run.entry = 0, ctypes.cast(command.hooks.forward, ctypes.c_void_p).value, *addresses
     return run
 
 
 def in_a_row(launches: Sequence[Callable[[], None]]) -> list[Callable[[], None]]:
-    """The same, with what was `recorded` or `repeated` one after another as one function each: Python, whose
-    threads take turns, is asked once for all of them."""
+    """Joins consecutive `recorded` and `repeated` launches to single functions, so that Python's lock is
+    taken once for all of them."""
     made, row = [], []
     for launch in (*launches, None):
         if hasattr(launch, "entry"):
@@ -94,7 +92,7 @@ def _row(launches):
 
 
 def repeated(flag: wp.array, launches: Sequence[Callable[[], None]]) -> Callable[[], None]:
-    """Goes through launches while flag[0], of the CPU, is not zero."""
+    """A function that repeats launches while flag[0] (on the CPU) is not zero."""
     launches = in_a_row(launches)
     on = ctypes.cast(flag.ptr, ctypes.POINTER(ctypes.c_int32))  # read faster than through numpy
 

@@ -361,6 +361,6 @@ def test_bad_fillings():
         with pytest.raises(ValueError, match=f"rest_pressure 10000 is not below .* bulk_modulus {K:g}, both"):
             _ = ball(Material("linear", 1e6, 0.3), 1, 1, rest_pressure=1e4, bulk_modulus=K).rest
     with pytest.raises(
-        ValueError, match="no balance of skin and liquid beyond .* of rest_pressure 1e.06: .* take less"
+        ValueError, match="no equilibrium of skin and liquid beyond .* of rest_pressure 1e.06: .* take less"
     ):
         _ = ball(Material("neo_hookean", 1e5, 0.3), 1, 1, rest_pressure=1e6).rest

@@ -1,4 +1,4 @@
-"""SkinData: everything about a skin that changes, for every world."""
+"""SkinData: state and results of a skin in every world."""
 
 import types
 import typing
@@ -34,8 +34,8 @@ __all__ = ["ContactState", "SkinData"]
 
 
 class ContactState:
-    """Contact of one surface: what it remembers (anchors) and what the last evaluation wrote, for most see
-    `state.VARIABLES`. holder: its name there."""
+    """Contact of one surface: anchors, and results of the last evaluation; see `state.VARIABLES`, where
+    `holder` is its name."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ContactState:
         sizes = {"sample": nface * nsample, "face": nface, "vert": nvert, "world": nworld}
         self.surface, self.clearances = surface, ClearanceCache()
         allocate(holder, self, sizes, options, tier)
-        if not self.bond.size:  # no law of contact that tells them apart
+        if not self.bond.size:  # without a contact law they are equal
             self.bond = self.trial_geom
         self.trial_anchor = zeros(self.anchor.shape, vec3, tier)
         self.sample_force = zeros(self.anchor.shape, vec3, tier)  # of samples that touch [N]
@@ -78,7 +78,7 @@ class ContactState:
         x_last: wp.array,
         bound: wp.array,
     ) -> Contact:
-        """What kernels of this surface take: its arrays, and the fields of `Contact` that are given."""
+        """`Contact` of this surface for kernels: its arrays, and the given fields."""
         out, surface = Contact(), self.surface
         out.face, out.area, out.sample, out.stick_ratio = surface.face, surface.area, sample, stick_ratio
         out.stiffness, out.laws, out.x_last, out.bound = stiffness, laws, x_last, bound
@@ -89,12 +89,12 @@ class ContactState:
         return out
 
     def active(self, w: int) -> tuple[np.ndarray, np.ndarray]:
-        """Faces of world w that touch (n,) and their tangents (n, 6, 3, 3), on the host."""
+        """Touching faces (n,) of world w, and their tangents (n, 6, 3, 3), on the host."""
         if self._host is None or self.touching.device.is_cuda:
             self._host = (
                 self.touching.numpy(),
                 self.block.numpy(),
-            )  # on the CPU views, whatever they hold then
+            )  # views on the CPU, which follow the arrays
         touching, block = self._host
         faces = touching[:, w].nonzero()[0]
         return faces, block[6 * faces[:, None] + np.arange(6), w]
@@ -106,49 +106,49 @@ class SkinData:
     Args:
       model: the SkinModel.
       nworld: number of worlds.
-      material: None, or one Material of the model's law and kind for each world.
-      modulus: (nworld, nelem) factors on Young's modulus of the elements that are solved, of a model that has
-        a modulus; None takes the model's.
-      preconditioner: "sparse" (CPU: double precision) or "dense" (half precision, directions in single); None
-        takes what suits the model's device. With "dense", contact of a world beyond `contact_capacity`
-        touching nodes slows its solves.
-      tier: `state.FULL`, or CONDENSED for a `condensed` step of it, which has its own contact with the core:
-        then `core` is None.
+      material: None, or one Material of the model's law and effects for each world.
+      modulus: (nworld, nelem) factors on Young's modulus of the solved elements; the model must have a
+        modulus. None takes the model's.
+      preconditioner: "sparse" (CPU, double precision) or "dense" (half precision, directions in single
+        precision); None chooses by the model's device. With "dense", solves are slower if more than
+        `contact_capacity` nodes touch in a world.
+      tier: `state.FULL`, or CONDENSED for a `condensed` step, which has its own contact with the core, so
+        that `core` is None.
 
     Attributes (all arrays lead with nworld, copies on the host):
       vert_xpos: (nworld, nvert, 3) nodal positions in the BioTac frame [m].
       contact_force: (nworld, nvert, 3) nodal forces of the touching geoms on the skin [N].
       core_force: (nworld, nvert, 3) nodal forces of the core on the inner surface [N].
-      liquid_force: (nworld, nvert, 3) nodal forces of the liquid on the inner surface [N]; on the core it
-        pushes the opposite way.
+      liquid_force: (nworld, nvert, 3) nodal forces of the liquid on the inner surface [N].
       reaction: (nworld, 3) force of core, nail and clamp on the fixed nodes [N].
       wrench: (nworld, ngroup, 6) of the skin ON each group of geoms, torque about the BioTac frame's origin
         [N, N m].
-      pressure: (nworld,) of the liquid above its rest value [Pa].
+      pressure: (nworld,) of the liquid above that without contact [Pa].
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
       load_factor: (nworld,) fraction of the geoms' path in the last step at which positions, wrench, pressure
-        and tangent hold: 1 where it converged.
-      nonconverged: (nworld,) number of steps that did not, since reset.
+        and tangent are valid: 1 if it converged.
+      nonconverged: (nworld,) number of steps since the reset that did not converge.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
 
     On the device, [item, world] in Warp arrays that may be overwritten between steps:
       worlds: `newton.worlds.Worlds`, scalars of every world. rubber: `rubber.points.Rubber`.
-      rest_vert: (nvert, 1), or (nvert, nworld) of worlds with rests of their own: `rests`, else None.
-      laws: `contact.law.WorldLaws`. memory: RubberMemory of rubber that remembers, or None.
+      rest_vert: nodes without contact (nvert, 1), or (nvert, nworld) if worlds have rests of their own.
+      rests: `liquid.Rests` of worlds with rests of their own, else None.
+      laws: `contact.law.WorldLaws`. memory: RubberMemory, or None.
       x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
         and the pose of the BioTac frame in the world at the end of the step.
-      bodies: `bodies.Bodies` of geoms whose bodies give way, see `make_bodies_compliant`; None: poses are
-        prescribed. drag: what the skin does to them, a `newton.bodies.BodyContact`.
+      bodies: `bodies.Bodies` of compliant bodies, see `make_bodies_compliant`; None: poses are prescribed.
+      body_contact: their `newton.bodies.BodyContact`.
 
     Raises:
-      ValueError: materials that differ from the model's in kind, an unknown or impossible preconditioner, or
-        a modulus of another shape.
+      ValueError: materials with other effects than the model's, an unknown or impossible preconditioner, or a
+        modulus of another shape.
     """
 
-    # touching nodes in a world's dense small system. Of 63 of them or fewer registers hold the matrix; where
-    # geoms of a centimetre press more, leaving these to conjugate gradients took ten times as many products
+    # most touching nodes in a world's dense Woodbury system. The matrix of up to 63 nodes fits into
+    # registers; with geoms of a centimetre, which touch more, that limit took ten times as many products
     contact_capacity = 127
 
     def __init__(
@@ -185,7 +185,7 @@ class SkinData:
             self.worlds = Worlds()
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
-        self.rests, self.rests_alike = None, False  # whether all worlds keep the model's rest
+        self.rests, self.rests_alike = None, False  # the latter: all worlds must keep the model's rest
         self.worlds.wanted.fill_(1)
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
         self.worlds.density.assign([float(m.density) for m in materials])
@@ -202,7 +202,7 @@ class SkinData:
         self._touched, self._of_groups, self._counts = {}, {}, (0, 0)
         self.reset()
 
-    # --- what a step needs, made when first asked for ---
+    # --- parts of a step, made at the first access ---
 
     @property
     def mu(self) -> wp.array:
@@ -216,7 +216,7 @@ class SkinData:
 
     @property
     def chunk(self) -> int:
-        """Nodes summed by one thread: few worlds need many short sums, many worlds few long ones."""
+        """Nodes that one thread sums: few with few worlds, many with many worlds."""
         if not self.model.device.is_cuda:
             return self.model.nvert
         return 4 if self.nworld < 32 else 8 if self.nworld < 256 else 16
@@ -244,16 +244,16 @@ class SkinData:
 
     @property
     def precision(self) -> Precision:
-        """Of directions, a `types.Precision`."""
+        """Precision of directions, a `types.Precision`."""
         return self._chosen.precision
 
     def element_forces(self) -> ElementForces:
-        """The elements with memory of their own for what they write."""
+        """The elements, with result arrays of their own."""
         return ElementForces(self.model.elements, self.rubber, self.options, self.precision)
 
     def geom_memory(self, count: int, ngroup: int) -> tuple[wp.array, wp.array, wp.array]:
-        """What is remembered of geoms: their last motion [geom, world], which of them touch, and the wrenches
-        on groups [group, world, 6]."""
+        """Last motion of the geoms [geom, world], flags of those that touch, and wrenches on groups [group,
+        world, 6]."""
         self._counts, touched = (count, ngroup), self.touched(count)
         if ngroup not in self._of_groups:
             shape = (ngroup, self.nworld, 6)
@@ -261,7 +261,7 @@ class SkinData:
         return touched.motion, touched.touched_by, self._of_groups[ngroup]
 
     def touched(self, count: int) -> types.SimpleNamespace:
-        """What `state.VARIABLES` has of so many geoms that touch."""
+        """Arrays of the holder "touched" in `state.VARIABLES`, for `count` geoms."""
         if count not in self._touched:
             self._touched[count] = types.SimpleNamespace()
             with wp.ScopedDevice(self.model.device):
@@ -271,7 +271,7 @@ class SkinData:
     # --- set by the user ---
 
     def reset(self) -> None:
-        """Puts every world back to rest: the skin on its filling, nothing touching."""
+        """Resets every world to its state without contact, with its filling."""
         if self.liquid:
             self.liquid.reset()
         holders = [("data", self), ("worlds", self.worlds), ("outer", self.outer), ("core", self.core)]
@@ -288,7 +288,8 @@ class SkinData:
         self.set_external(None)
 
     def rest_at(self, rests: Rests) -> None:
-        """Gives each world its own rest and puts it there; before anything is recorded that looks at it."""
+        """Sets each world's own equilibrium without contact, and resets it. Call it before steps are
+        recorded."""
         self.rests = rests
         with wp.ScopedDevice(self.model.device):
             self.rest_vert = wp.array(np.ascontiguousarray(np.swapaxes(rests.vert, 0, 1)), dtype=vec3, ndim=2)
@@ -297,9 +298,9 @@ class SkinData:
         self.reset()
 
     def make_bodies_compliant(self, ngroup: int) -> None:
-        """From the next step on, the bodies of so many groups of geoms give way by `bodies.compliance` to
-        wrenches of the skin other than `bodies.predicted`, those with which their poses were predicted: write
-        these, and the origins, arms and spins, before each step."""
+        """Makes the bodies of `ngroup` groups of geoms compliant: they move by `bodies.compliance` times the
+        difference between the skin's wrench and `bodies.predicted`. Write these, and the origins, arms and
+        spins, before each step."""
         self._forget_steps()
         self._preconditioner, w, n = None, self.nworld, 6 * ngroup
         with wp.ScopedDevice(self.model.device):
@@ -320,11 +321,11 @@ class SkinData:
         self.steps.clear()
 
     def __del__(self):
-        if hasattr(self, "steps"):  # not where making it failed
+        if hasattr(self, "steps"):  # not if __init__ failed
             self._forget_steps()
 
     def set_external(self, force: ArrayLike | None) -> None:
-        """Loads the nodes in every step from now on, until `reset`.
+        """Loads the nodes in every step until `reset`.
 
         Args:
           force: (nworld, nvert, 3) [N], or None for no load.
@@ -335,7 +336,7 @@ class SkinData:
         shape = (self.nworld, self.model.nvert, 3)
         if force is None:
             if self.external is not None:
-                self._forget_steps()  # what was recorded knows of loads
+                self._forget_steps()  # they were recorded with loads
             self.external = None
             return
         force = np.asarray(force, float)
@@ -344,21 +345,21 @@ class SkinData:
                 f"external forces have shape {force.shape}: pass finite numbers of shape {shape}"
             )
         if self.external is None:
-            self._forget_steps()  # what was recorded knows of no loads
+            self._forget_steps()  # they were recorded without loads
             self.external = wp.zeros_like(self.x)
         self.external.assign(np.ascontiguousarray(np.swapaxes(force, 0, 1)))
 
     def set_liquid(self, bulk_modulus: ArrayLike | None = None, fill_volume: ArrayLike | None = None) -> None:
-        """Gives each world its liquid, from the next step on and through `reset`.
+        """Sets each world's liquid, from the next step on; `reset` keeps it.
 
         Args:
-          bulk_modulus: (nworld,) or a number [Pa]; 0: no liquid; math.inf keeps its volume.
-          fill_volume: (nworld,) or a number: liquid beyond what the model's options fill in [m^3]. The skin
-            swells in the next step.
+          bulk_modulus: (nworld,) or a number [Pa]; 0: no liquid; math.inf: incompressible.
+          fill_volume: (nworld,) or a number: liquid in addition to the model's filling [m^3]. The skin
+            inflates in the next step.
 
         Raises:
-          ValueError: a model without liquid, NaN, a negative bulk modulus, less than no liquid, or another
-            filling of skins of the condensed tier.
+          ValueError: a model without liquid, NaN, a negative bulk modulus, a negative amount of liquid, or
+            another filling of skins of the condensed tier.
         """
         if not self.model.has_liquid:
             raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")
@@ -393,7 +394,7 @@ class SkinData:
 
     @property
     def motion(self) -> np.ndarray:
-        """Of the geoms in the last step (nworld, ngeom, 3) [m]."""
+        """Motion (nworld, ngeom, 3) of the geoms in the last step [m]."""
         return _leading(self.geom_memory(*self._counts)[0])
 
     @property
@@ -436,7 +437,7 @@ class SkinData:
 
     def tangent(self, geoms: "GeomSet") -> np.ndarray:
         """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac
-        frame's origin, after a step."""
+        frame's origin after a step [N/m, N, N m]."""
         shape = (geoms.ngroup, self.nworld)
         out = wp.zeros(shape, dtype=wp.spatial_matrixd, device=self.model.device)
         if geoms.ngroup:
@@ -454,7 +455,8 @@ class SkinData:
 
 
 def _refuse_other_kinds(materials, own, options):
-    """Worlds share the code that is compiled: what they have beyond the law differs in numbers alone."""
+    """Refuses materials with other effects than the model's: worlds share compiled code, and may differ in
+    numbers only."""
     for m in materials:
         for name in ("rest_pressure", "electrode_radius"):
             if getattr(m, name) != getattr(own, name):
@@ -466,19 +468,19 @@ def _refuse_other_kinds(materials, own, options):
         if missing:
             raise ValueError(
                 f"a world's material has {' and '.join(missing)} and the model's has not: give the model's "
-                "material one as well, next to nothing if need be"
+                "material a small one as well"
             )
         for name in ("prony", "hysteresis"):
             count, wanted = len(getattr(m, name)), len(getattr(own, name))
             if count != wanted:
                 raise ValueError(
                     f"a world's material has {count} terms of {name} and the model's {wanted}: give it as "
-                    "many, with a strength of zero if need be"
+                    "many, with a strength of zero where it has none"
                 )
 
 
 def _modulus_of_worlds(model, modulus, nworld):
-    """(nelem, nworld) factors, or None."""
+    """Factors (nelem, nworld), or None."""
     if modulus is None:
         return None if model.modulus is None else np.repeat(model.modulus[:, None], nworld, 1)
     modulus, shape = np.asarray(modulus, float), (nworld, model.nelem)
@@ -503,5 +505,5 @@ def _choose(model, preconditioner):
 
 
 def _leading(array: wp.array) -> np.ndarray:
-    # never a view: the next step would change what the caller keeps
+    # a copy, since the next step would change a view
     return np.swapaxes(array.numpy(), 0, 1).copy()

@@ -1,4 +1,4 @@
-"""The skin at rest on its filling: inflated step by step, once for each geometry, material and options."""
+"""The filled skin without contact: inflated step by step, once for each geometry, material and options."""
 
 import copy
 import dataclasses
@@ -14,23 +14,22 @@ from .step import step
 
 __all__ = ["rest_state", "rest_worlds"]
 
-# Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no
-# residual for later steps.
-_UNDERWAY, _ARRIVED = 1e-2, 1e-5
-# Times the unstressed cavity: all lengths are then 1.26 times theirs, no fingertip any more, and a skin at a
-# given pressure is about to balloon without bound. CHOSEN; real fillings are below 1.1.
+# Tolerances of intermediate steps and of the last, which leaves no residual for later steps. Without contact
+# the scale is the smallest load, 1e-12 J.
+_INTERMEDIATE, _FINAL = 1e-2, 1e-5
+# Largest cavity over the unstressed one: all lengths are then 1.26 times larger, and a skin at a given
+# pressure is close to unbounded inflation. CHOSEN; real fillings are below 1.1.
 _MOST = 2.0
-# Of the liquid: with less the skin lies on its core everywhere, and whether it finds a balance there takes a
-# minute to tell.
+# Least fraction of the liquid: with less the skin lies on its core everywhere, and the solve takes a minute.
 _LEAST = 0.01
-_GENTLE = 0.02  # of Young's modulus: a rise of the pressure that skins follow in one step
+_PRESSURE_STEP = 0.02  # increase of the pressure in one step, over Young's modulus
 
 
 def rest_state(model: skin_model.SkinModel) -> Rest:
-    """The balance of skin and liquid without touching geoms.
+    """Equilibrium of skin and liquid without contact.
 
     Raises:
-      ValueError: the skin does not hold that much liquid or pressure.
+      ValueError: no equilibrium with that much liquid or pressure.
     """
     options, volume = model.options, model.liquid_volume
     vert = model.geometry.vert
@@ -47,7 +46,7 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
 
 
 def _refuse_filling(model, least, most):
-    """Of worlds whose skins take from `least` to `most` more liquid [m^3]."""
+    """Refuses additional liquid outside the possible range [m^3]; least, most: over all worlds."""
     empty = (_LEAST - 1) * model.liquid_volume
     if least < empty:
         raise ValueError(
@@ -67,21 +66,21 @@ def _most_liquid(model):
 
 
 def _inputs(model):
-    """All that the rest depends on."""
+    """All inputs of the equilibrium without contact, for the cache."""
     core = model.core_surface.face_np if model.has_core else None
     rubber = [model.element, model._elem, model.material, model.modulus]
     return [model.geometry, core, *rubber, model.options, model.device.is_cuda]
 
 
 def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> None:
-    """Gives worlds that differ on a filled skin each its own rest, as a single skin of its material and fill
-    has it, and puts them there.
+    """Sets each world of a filled skin to its own equilibrium without contact, that of a single skin of its
+    material and filling.
 
     Args:
-      data: whose liquids are set. materials: of each world; modulus: as for `SkinData`, or None.
+      data: SkinData whose liquids are set. materials: of each world. modulus: as for `SkinData`, or None.
 
     Raises:
-      ValueError: a skin does not hold that much liquid or pressure.
+      ValueError: no equilibrium with that much liquid or pressure.
     """
     model, liquid = data.model, data.liquid
     if not model.has_liquid:
@@ -111,10 +110,10 @@ def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> 
 
 
 def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
-    """`Rests` of worlds; by default of one, of the model's material."""
+    """`Rests` of worlds; by default of one world with the model's material."""
     options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
     materials = [model.material] if materials is None else materials
-    model.inverse if model.device.is_cuda else model.factor  # noqa: B018 - made here, the copy shares it
+    model.inverse if model.device.is_cuda else model.factor  # noqa: B018 - computed now, and shared by the copy
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
         options,
@@ -123,7 +122,7 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
         dynamics="quasistatic",
         mass_damping=0.0,
         stiffness_damping=0.0,
-        tolerance=_UNDERWAY,
+        tolerance=_INTERMEDIATE,
     )
     bare.material, *relaxed = (_relaxed(m) for m in (model.material, *materials))
     bare.rest = Rest(vert, 0.0, volume, volume)
@@ -132,7 +131,7 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     if bulk is not None:
         liquid.set(bulk)
     K, target, more = liquid.bulk_modulus, options.rest_pressure, options.fill_volume
-    if target and ((K > 0) & (K <= target)).any():  # it would have less than no volume without pressure
+    if target and ((K > 0) & (K <= target)).any():  # the volume without pressure would be negative
         raise ValueError(
             f"rest_pressure {target:g} is not below the liquid's bulk_modulus {K[K > 0].min():g}, both in "
             "Pa: give less pressure, or a stiffer liquid"
@@ -140,38 +139,41 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     natural = np.full(len(relaxed), volume + more)
     if target:
         pump = lambda s: liquid.keep_pressure(s * target * (K > 0))  # noqa: E731
-        gentle = _GENTLE * min(m.youngs_modulus for m in materials) / abs(target)
-        _go(bare, data, nothing, f"rest_pressure {target:g}", pump, min(0.25, gentle))
-        held = np.isfinite(K) & (K > 0)
-        natural = data.volume / np.where(held, 1 - liquid.gauge_pressure / np.where(held, K, 1.0), 1.0)
+        size = _PRESSURE_STEP * min(m.youngs_modulus for m in materials) / abs(target)
+        _inflate(bare, data, nothing, f"rest_pressure {target:g}", pump, min(0.25, size))
+        compressible = np.isfinite(K) & (K > 0)
+        strain = liquid.gauge_pressure / np.where(compressible, K, 1.0)
+        natural = data.volume / np.where(compressible, 1 - strain, 1.0)
     elif more:
-        _go(bare, data, nothing, f"fill_volume {more:g}", lambda s: liquid.fill(volume + s * more))
+        _inflate(bare, data, nothing, f"fill_volume {more:g}", lambda s: liquid.fill(volume + s * more))
     if np.any(extra):
-        _go(bare, data, nothing, f"fill_volume {np.max(extra):g}", lambda s: liquid.fill(natural + s * extra))
+        _inflate(
+            bare, data, nothing, f"fill_volume {np.max(extra):g}", lambda s: liquid.fill(natural + s * extra)
+        )
     return Rests(data.vert_xpos.copy(), liquid.gauge_pressure, data.volume, natural)
 
 
 def _relaxed(material):
-    """Virgin and after any time."""
+    """The virgin, fully relaxed material."""
     return dataclasses.replace(material, prony=(), mullins=None, hysteresis=())
 
 
-def _go(bare, data, nothing, what, put, size=0.25):
-    """Puts liquid in, put(share), in steps of `size` or less."""
+def _inflate(bare, data, nothing, what, fill, size=0.25):
+    """Fills the skin, fill(fraction), in steps of at most `size`."""
     options, done, least = bare.options, 0.0, size / 250
     while done < 1:
         size = min(size, 1 - done)
-        tolerance = _ARRIVED if done + size == 1 else _UNDERWAY
+        tolerance = _FINAL if done + size == 1 else _INTERMEDIATE
         bare.options = dataclasses.replace(options, tolerance=tolerance)
-        put(done + size)
+        fill(done + size)
         step(bare, data, nothing, second_solve=False)
         converged = data.converged.all()
         if converged and (data.volume <= _most_liquid(bare)).all():
             done += size
         elif converged or size < 2 * least:
             raise ValueError(
-                f"no balance of skin and liquid beyond {done:.1%} of {what}: this rubber does not hold it; "
-                "take less"
+                f"no equilibrium of skin and liquid beyond {done:.1%} of {what}: this rubber does not hold it;
+                " "take less"
             )
         else:
             size /= 2

@@ -1,4 +1,4 @@
-"""The geoms that touch a skin: what MuJoCo says of them, on the skin's device."""
+"""The geoms that touch a skin: types, sizes, friction and poses as in MuJoCo, on the skin's device."""
 
 from collections.abc import Iterable, Sequence
 
@@ -15,12 +15,12 @@ from .types import mat33, real, vec3
 
 __all__ = ["SIZES", "GeomSet", "check_rounding", "shapes_of"]
 
-# how many of a geom's three sizes say something
+# number of MuJoCo's three sizes that a geom type uses
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0, "skin": 0}
 
 
 def check_rounding(what: str, size: np.ndarray, radius: float) -> None:
-    """Raises ValueError for a fillet's radius [m] that a solid of sizes (k,) [m] has no room for."""
+    """Raises ValueError if a solid of sizes (k,) [m] is too small for fillets of this radius [m]."""
     if not 0 <= radius <= np.min(size, initial=np.inf):
         raise ValueError(
             f"rounding of {what} is {radius}: a fillet's radius lies between 0 and the smallest size"
@@ -28,7 +28,7 @@ def check_rounding(what: str, size: np.ndarray, radius: float) -> None:
 
 
 def shapes_of(types: Iterable[str]) -> str:
-    """Which shapes there are among types of geoms, see `contact.touch.contact_kernels`."""
+    """Kind of shapes among geom types, see `contact.touch.contact_kernels`."""
     return SKINS if "skin" in types else MESHES if "mesh" in types else SOLIDS
 
 
@@ -36,18 +36,18 @@ class GeomSet:
     """Geoms in the BioTac frame.
 
     Args:
-      types: names of MuJoCo geom types, or "skin" of another BioTac's, (ngeom,).
-      sizes: MuJoCo sizes, (ngeom, 3) [m]; shorter ones are filled with zeros.
+      types: (ngeom,) names of MuJoCo geom types, or "skin" for another BioTac's skin.
+      sizes: MuJoCo sizes (ngeom, 3) [m]; shorter ones are padded with zeros.
       friction: Coulomb coefficients (ngeom,).
-      groups: body number of each geom, 0..ngroup-1; None makes one group of all.
+      groups: (ngeom,) body of each geom, 0..ngroup-1; None: one group.
       rounding: fillet radius of boxes and cylinders (ngeom,) [m].
-      grids: one DistanceGrid for each mesh and each skin, in the order in which they appear.
-      own: DistanceGrid of the skin that they touch, at rest in the BioTac frame, where others are skins.
+      grids: one DistanceGrid for each mesh and each skin, in the order of `types`.
+      own: DistanceGrid of the undeformed skin that they touch; needed if `types` has a skin.
       nworld: number of worlds.
       device: Warp device.
 
     Attributes:
-      posed: whether they were anywhere: their first poses are also those of the step before.
+      posed: whether poses were set; the first poses are also those of the previous step.
 
     Raises:
       ValueError: unknown type, a size that is not positive, a fillet larger than the solid, NaN, or a mesh
@@ -78,7 +78,7 @@ class GeomSet:
                 "every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)"
             )
         if "skin" in types and not isinstance(own, DistanceGrid):
-            raise ValueError("skins meet halfway: pass own=, the DistanceGrid of the skin that they touch")
+            raise ValueError("a geom is a skin: pass own=, the DistanceGrid of the skin that it touches")
         size = np.zeros((count, 3))
         for row, given in zip(size, sizes, strict=True):
             row[: len(given)] = given
@@ -123,7 +123,7 @@ class GeomSet:
 
     @property
     def shapes(self) -> str:
-        """Which of them there are, see `contact.touch.contact_kernels`."""
+        """Kind of their shapes, see `contact.touch.contact_kernels`."""
         return shapes_of(self.types)
 
     def single_world(self) -> "GeomSet":
@@ -133,25 +133,25 @@ class GeomSet:
         return GeomSet(*made) if self.count else GeomSet([], [])
 
     def resolve(self, spacing: float, samples: int) -> None:
-        """For a skin with samples^2 contact samples in a face, which lie so far apart [m]: edges that it does
-        not resolve, of a smaller radius, are met as `contact.posed.meet` says."""
+        """Sets the windows around edges whose radius is below the spacing [m] of a skin's samples^2 contact
+        samples in a face, see `contact.posed.meet`."""
         size = self.struct.size.numpy().reshape(-1, 3)
-        curved = np.isin(self.types, "ellipsoid")  # whose edge is where it is thin
+        curved = np.isin(self.types, "ellipsoid")  # a thin one has an edge
         radius = np.where(curved, size.min(1) ** 2 / np.maximum(size.max(1), 1e-12), self._rounding)
         edged = curved | np.isin(self.types, ("box", "cylinder", "mesh"))
         self.struct.window.assign(np.where(edged & (radius < spacing), WINDOW / samples, 0.0))
 
     def advance(self) -> None:
-        """Makes the poses of this step those of the last one."""
+        """Stores the present poses as those of the last step."""
         wp.copy(self.struct.pos_last, self.struct.pos)
         wp.copy(self.struct.mat_last, self.struct.mat)
 
     def set_pose(self, pos: ArrayLike, mat: ArrayLike | None = None) -> None:
-        """Poses of the geoms in the BioTac frame.
+        """Sets the poses of the geoms in the BioTac frame.
 
         Args:
           pos: (ngeom, 3) or (nworld, ngeom, 3) [m].
-          mat: rotation matrices (ngeom, 3, 3) or (nworld, ngeom, 3, 3); None leaves them.
+          mat: rotation matrices (ngeom, 3, 3) or (nworld, ngeom, 3, 3); None: unchanged.
 
         Raises:
           ValueError: NaN or a wrong shape.
@@ -164,7 +164,7 @@ class GeomSet:
             self.advance()
 
     def set_friction(self, friction: ArrayLike) -> None:
-        """Coulomb coefficients (ngeom,) or (nworld, ngeom)."""
+        """Sets the Coulomb coefficients (ngeom,) or (nworld, ngeom)."""
         self._assign(self.struct.friction, friction, (), "friction coefficients")
 
     def _assign(self, target, value, item, what):

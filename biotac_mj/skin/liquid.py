@@ -1,19 +1,18 @@
 """The liquid between core and skin: one pressure per sensor that resists a change of the volume between them.
 
-The inner surface of the skin is closed, so the divergence theorem gives the cavity's volume and its gradient;
-the core inside is rigid and only subtracts a constant. Liquid is what is between the two: where the skin lies
-on the core there is none, so the overlap that penalty contact needs is no volume, and no pressure acts there.
-p = -K (V - Vn) / Vn with the bulk modulus K and the volume Vn that the liquid has without pressure; with
-infinite K the pressure is an unknown of its own (see `docs/lab/liquid.md`).
+The inner surface of the skin is closed, so that the divergence theorem gives the cavity's volume and its
+gradient; the rigid core subtracts a constant. There is no liquid where the skin lies on the core: the overlap
+of penalty contact does not count as volume, and no pressure acts there. p = -K (V - Vn) / Vn with the bulk
+modulus K and the volume Vn of the liquid without pressure; with infinite K the pressure is an unknown of its
+own (see `docs/lab/liquid.md`).
 
-Skin leaves the core gradually: the share s of a contact sample that is dry grows with the contact pressure c,
+The transition is gradual: the dry fraction s of a contact sample grows with the contact pressure c,
 
     s = min(c / 2 p_ref, 1),
 
-p_ref the liquid's pressure when the step began. What pushes the skin off, c + (1 - s) p, then grows with the
-overlap everywhere. Switched at c = 0 instead, the skin would have two states of balance: pressed off the core
-by liquid under it, or stuck to it without. Bonded faces need no such care: their nodes are held, so it does
-not matter that pressure is counted on them as well.
+with the liquid's pressure p_ref at the start of the step. The pressure on the skin, c + (1 - s) p, then grows
+with the overlap everywhere. With a jump at c = 0 there would be two equilibria, on and off the core. Bonded
+faces need no such transition, since pressure on their fixed nodes has no effect.
 """
 
 import dataclasses
@@ -51,8 +50,8 @@ def cavity_volume(
     # Out:
     volume_out: wp.array2d(dtype=real),
 ):
-    """Each inner face's share of the cavity's volume [face, world]; normals point into the cavity, hence the
-    sign."""
+    """Part of inner face f in the cavity's volume [face, world] [m^3]; normals point into the cavity, hence
+    the sign."""
     f, w = wp.tid()
     t = face[f]
     volume_out[f, w] = -wp.dot(x[t[0], w], wp.cross(x[t[1], w], x[t[2], w])) / real(6.0)
@@ -66,7 +65,7 @@ def volume_gradient(
     # Out:
     corner_out: wp.array2d(dtype=vec3),
 ):
-    """dV/dx of a closed surface: a third of each face's area vector to each of its corners."""
+    """dV/dx of a closed surface: a third of face f's area vector for each corner [m^2]."""
     f, w = wp.tid()
     t = face[f]
     g = -wp.cross(x[t[1], w] - x[t[0], w], x[t[2], w] - x[t[0], w]) / real(6.0)
@@ -77,7 +76,7 @@ def volume_gradient(
 
 @wp.func
 def contact_pressure(i: int, w: int, geom: wp.array2d(dtype=int), force: wp.array2d(dtype=vec3), area: real):
-    """Normal traction of the core on a sample that stands for an area [Pa]."""
+    """Normal traction of the core on a sample of this area [Pa]."""
     c = real(0.0)
     if geom[i, w] >= 0:
         c = wp.length(force[i, w]) / area
@@ -85,7 +84,7 @@ def contact_pressure(i: int, w: int, geom: wp.array2d(dtype=int), force: wp.arra
 
 
 @wp.func
-def dried(
+def dry_fraction(
     k: int,
     w: int,
     sample: wp.array(dtype=vec3),
@@ -95,8 +94,8 @@ def dried(
     geom: wp.array2d(dtype=int),
     force: wp.array2d(dtype=vec3),
 ):
-    """What the corners of face k lose of their wet thirds, and its overlap with the core that is no liquid
-    [m]."""
+    """Wet fraction that each corner of face k loses by contact with the core, and the overlap with the core
+    to subtract from the liquid's thickness [m]."""
     nsample = sample.shape[0]
     fraction = real(1.0) / real(nsample)
     full = real(2.0) * reference
@@ -134,8 +133,8 @@ def wet_faces(
     wet_out: wp.array2d(dtype=vec3),
     corner_out: wp.array2d(dtype=vec3),
 ):
-    """Volume under every chunk of inner faces, their wet parts, and what they add to the volume's gradient
-    ."""
+    """Volume of a chunk of inner faces, the wet fractions of their corners, and their part in the volume's
+    gradient."""
     c, w = wp.tid()
     if on[w] == 0:
         return
@@ -152,7 +151,7 @@ def wet_faces(
         k = slot[f]
         if k >= 0:
             if touching[k, w] == 1:
-                loss, overlap = dried(k, w, sample, area[k], stiffness[w], reference[w], geom, force)
+                loss, overlap = dry_fraction(k, w, sample, area[k], stiffness[w], reference[w], geom, force)
                 wet -= loss
                 total += overlap * wp.length(normal) / real(2.0)
         wet_out[f, w] = wet
@@ -170,15 +169,15 @@ def settle_pressure(
     offset: wp.array(dtype=real),
     kappa: wp.array(dtype=real),
     natural: wp.array(dtype=real),
-    kept: int,
+    keep_pressure: int,
     on: wp.array(dtype=int),
     # Out:
     volume_out: wp.array(dtype=real),
     pressure_out: wp.array(dtype=real),
-    borne_out: wp.array(dtype=real),
+    tangent_out: wp.array(dtype=real),
 ):
-    """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's
-    volume. kept: 1 where the tangent keeps the pressure that it has, see `newton.worlds.choose_length`."""
+    """Volume of the liquid and its pressure in world w. enclosed: the liquid's volume minus that of the faces
+    [m^3]. keep_pressure: 1: the tangent keeps its pressure, see `newton.worlds.choose_length`."""
     w, t = wp.tid()
     if on[w] == 0:
         return
@@ -188,8 +187,8 @@ def settle_pressure(
     volume_out[w] = volume
     pressure = offset[w] - kappa[w] * (volume - natural[w])
     pressure_out[w] = pressure
-    if kept == 0:
-        borne_out[w] = pressure
+    if keep_pressure == 0:
+        tangent_out[w] = pressure
 
 
 @wp.func
@@ -207,8 +206,8 @@ def soften_face(
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """Takes from a core face's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref)
-    of k."""
+    """Subtracts the decrease of the liquid's force with the dry fraction, p / (2 p_ref) k, from the tangent
+    of a core face."""
     nsample = sample.shape[0]
     fraction = area[f] / real(nsample)
     factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * fraction
@@ -243,7 +242,7 @@ def release_pressure(
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """See `soften_face`; only where the tangent was made anew."""
+    """`soften_face` of face f, if its tangent was evaluated."""
     f, w = wp.tid()
     if on[w] == 0:
         return
@@ -253,7 +252,7 @@ def release_pressure(
 
 @dataclasses.dataclass(frozen=True)
 class Rest:
-    """What a skin is without touching geoms.
+    """Equilibrium of a skin without contact.
 
     Attributes:
       vert: (nvert, 3) nodes [m].
@@ -269,8 +268,8 @@ class Rest:
 
 @dataclasses.dataclass(frozen=True)
 class Rests:
-    """`Rest` of many worlds: vert (nworld, nvert, 3), the others (nworld,); natural_volume is without what
-    `Liquid.extra` adds."""
+    """`Rest` of many worlds: vert (nworld, nvert, 3), the others (nworld,); natural_volume is without
+    `Liquid.extra`."""
 
     vert: np.ndarray
     pressure: np.ndarray
@@ -279,16 +278,15 @@ class Rests:
 
 
 class Liquid:
-    """The liquid of one SkinData: how much of it there is in every world, and what it did in the last step.
+    """The liquid of one SkinData: its amount, pressure and volume in every world.
 
     Args:
-      model: SkinModel; worlds: `newton.worlds.Worlds`, which hold the numbers on the device.
+      model: SkinModel. worlds: `newton.worlds.Worlds` with the numbers on the device.
 
     Attributes (nworld,), copies on the host:
-      bulk_modulus: K [Pa]. extra: liquid beyond the model's fill [m^3].
-      natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V
-        [Pa/m^3].
-      last_pressure: above the surroundings, of the last step [Pa]. rest_pressure: at rest.
+      bulk_modulus: K [Pa]. extra: liquid beyond the model's filling [m^3].
+      natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume = -dp/dV [Pa/m^3].
+      last_pressure: at the end of the last step, above the surroundings [Pa]. rest_pressure: without contact.
       gauge_pressure: above the surroundings [Pa], volume: [m^3] at the last evaluation.
     """
 
@@ -324,18 +322,17 @@ class Liquid:
         self._write("last_pressure", value)
 
     def reset(self) -> None:
-        """Gives every world its filling; pressures are `state`'s."""
+        """Resets the filling of every world; pressures are reset by `state`."""
         self.fill(self._natural + self.extra)
         self._write("volume", self._volume)
 
     def rest_at(self, pressure: np.ndarray, volume: np.ndarray, natural_volume: np.ndarray) -> None:
-        """Sets what the worlds are at rest, (nworld,) each, from the next `reset` on, see `Rests`."""
+        """Sets pressure, volume and natural volume without contact (nworld,), from the next `reset` on."""
         self.rest_pressure, self._volume, self._natural = pressure, volume, natural_volume
 
     def fill(self, natural_volume: ArrayLike) -> None:
-        """Takes as much liquid as has this volume without pressure [m^3]."""
-        # an incompressible liquid: the pressure of the last step is what the next starts from, and this
-        # stiffness only finds the change
+        """Sets the volume of the liquid without pressure [m^3]."""
+        # for an incompressible liquid the stiffness only determines the change from the last step's pressure
         K = self.bulk_modulus
         kappa = np.where(np.isfinite(K), K, WATER) / natural_volume if self._model.has_liquid else 0.0
         self._write("natural", natural_volume)
@@ -343,7 +340,7 @@ class Liquid:
         self._write("keeps_volume", (np.asarray(kappa) == 0) | np.isinf(K))
 
     def keep_pressure(self, pressure: ArrayLike) -> None:
-        """Takes liquid in and out so that its pressure above the surroundings stays this [Pa]."""
+        """Keeps the pressure above the surroundings at this value [Pa], with any amount of liquid."""
         self._write("kappa", 0.0)
         self._write("keeps_volume", 1)
         self._write("last_pressure", pressure)
@@ -379,7 +376,7 @@ class Liquid:
 
 
 def _each(name, value, nworld):
-    """(nworld,) of a number or (nworld,)."""
+    """Broadcasts a number or (nworld,) to (nworld,)."""
     value = as_numbers(name, value)
     if value.shape not in ((), (1,), (nworld,)):
         raise ValueError(f"{name} has shape {value.shape}: pass one number or ({nworld},)")

@@ -1,4 +1,4 @@
-"""SkinModel: everything about a skin that does not change while it moves, shared by all worlds."""
+"""SkinModel: the constants of a skin, shared by all worlds."""
 
 import dataclasses
 import functools
@@ -29,50 +29,50 @@ from .types import real, vec3
 
 __all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "filled", "solved_geometry"]
 
-# (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
+# (SkinModel) -> liquid.Rest; set by the module `fill`, which imports `step` and thus this module
 solve_rest = None
 
-# of the core's distance grid [m]: the core is round, and its spline keeps no edge of a triangle
-_GRID_SPACING = 4e-4
-_GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core [m]
-# times E: rubber that is not confined bears no such pressure of the core. Confined rubber does, the more the
-# less it can be compressed; what is deeper in the core than a geom may be as well is on the way through it
+_GRID_SPACING = 4e-4  # of the core's distance grid [m], whose spline smooths the edges of triangles
+_GRID_MARGIN = 3e-3  # of the core's distance grid around the core [m]
+# pressure of the core over E above which skin counts as passing through the core, if it is also deeper in it
+# than a geom may be; confined rubber may have such a pressure
 _CRUSHED = 50.0
 
 
 @dataclasses.dataclass(frozen=True)
 class SkinOptions:
-    """How the skin is solved.
+    """Options of the skin's solver.
 
     Attributes:
       element: "linear" (four nodes) or "quadratic" (ten nodes: does not lock); None takes the material's
-        choice, and where it has none the geometry's. Ten-node tetrahedra are solved as linear ones by their
-        eight parts; four-node ones as quadratic get a node on every edge, behind the geometry's own
+        choice, or else the geometry's. As linear elements, ten-node tetrahedra are divided into eight; as
+        quadratic ones, four-node tetrahedra get a node on every edge, after the geometry's own nodes
         (`with_edge_nodes`).
       dynamics: "quasistatic" (no inertia) or "implicit" (backward Euler with lumped masses).
-      liquid: fills the space between skin and core; None takes the material preset's choice.
-      bulk_modulus: of the liquid [Pa]; water has 2.2e9; math.inf keeps its volume.
-      fill_volume: liquid beyond what the unstressed skin holds [m^3]; less where negative. It inflates the
-        skin at rest.
-      rest_pressure: instead, the liquid's pressure at rest above the surroundings [Pa]; None takes the
-        material preset's choice where fill_volume is 0.
+      liquid: whether liquid fills the space between skin and core; None takes the material's choice.
+      bulk_modulus: of the liquid [Pa]; water has 2.2e9; math.inf: incompressible.
+      fill_volume: liquid beyond the volume of the unstressed skin [m^3], may be negative. It inflates the
+        skin without contact.
+      rest_pressure: alternatively, the liquid's pressure without contact, above the surroundings [Pa]; None
+        takes the material's choice if fill_volume is 0.
       core_contact: whether the inner surface can touch the rigid core.
-      core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core
-        contact [m].
-      max_core_depth: no skin fits between the core and a geom that reaches deeper into it than this [m].
-      contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference
-        solutions' ratio, with each world's own E.
+      core_clearance: inner faces closer to the core than this in the reference configuration have no contact
+        with the core [m].
+      max_core_depth: largest depth of a geom in the core [m]; no skin fits between a deeper geom and the
+      core.
+      contact_stiffness: pressure per overclosure k [Pa/m]; None: 180 E per millimetre, the ratio of the
+        reference solutions, with each world's own E.
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
-      contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None is Coulomb's
-        law. On the full tier.
+      contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None: Coulomb's
+        law. Full tier only.
       mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
-      tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below
-        this fraction of the energy norm of the load. This and the next three are of the full tier: steps of
-        the condensed one end at 1e-3, with limits of their own.
+      tolerance: a step has converged if the estimated energy norm of its error is below this fraction of that
+        of the load. This and the next three are for the full tier; steps of the condensed tier have a
+        tolerance and limits of their own.
       max_newton, max_cg: iteration limits of a try and of each linear solve.
-      max_work: evaluations of all forces and products with their tangent in a step, some 80 in a contact,
-        and what else takes as long; then the step goes no further than it has come.
+      max_work: limit of evaluations of all forces and products with their tangent in a step; a step in
+        contact takes some 80. The step then ends at its last equilibrium.
 
     Raises:
       ValueError: an option is out of its range.
@@ -149,12 +149,12 @@ class SkinOptions:
 
 
 def stiffness_of_contact(material: Material) -> float:
-    """Pressure per overclosure [Pa/m]: 180 E per millimetre, the reference solutions' ratio."""
+    """Pressure per overclosure [Pa/m]: 180 E per millimetre, the ratio of the reference solutions."""
     return 180e3 * material.youngs_modulus
 
 
 def filled(options: SkinOptions, material: Material) -> SkinOptions:
-    """The options with the material's filling, where they leave it to the material."""
+    """The options with the material's filling, unless they have their own."""
     if options.rest_pressure is not None:
         return options
     liquid = material.liquid if options.liquid is None else options.liquid
@@ -165,7 +165,7 @@ def filled(options: SkinOptions, material: Material) -> SkinOptions:
 def solved_geometry(
     geometry: SkinGeometry, material: Material, options: SkinOptions
 ) -> tuple[SkinGeometry, str]:
-    """The geometry with all nodes that the solver moves, and its element, see `SkinOptions.element`."""
+    """The geometry with all nodes of the solver, and its element, see `SkinOptions.element`."""
     element = options.element or material.element or geometry.element
     return (
         with_edge_nodes(geometry) if element == "quadratic" and geometry.element == "linear" else geometry
@@ -174,8 +174,8 @@ def solved_geometry(
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], its nodes (n,), and the
-    faces' corners at each of the skin's nodes, as CSR lists."""
+    """A contact surface of the skin: faces (nface, 3), reference areas (nface,) [m^2], its nodes (n,), and
+    CSR lists of the faces' corners at each of the skin's nodes."""
 
     face: wp.array
     area: wp.array
@@ -197,7 +197,7 @@ class Surface:
         )
 
     def rest_at(self, vert: np.ndarray) -> None:
-        """Gives the nodes other rest positions (nvert, 3) [m]."""
+        """Sets other reference positions (nvert, 3) [m]."""
         self.area.assign(_areas(vert, self.face_np))
 
 
@@ -206,15 +206,14 @@ def _areas(vert, face):
     return np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
 
 
-_STIFF_IN_VOLUME = 0.45  # Poisson's ratio above which half precision loses what volume resists
+_STIFF_IN_VOLUME = 0.45  # Poisson's ratio above which half precision loses the compliance to volume change
 
 
 class SkinModel:
     """Constants of a skin on one device.
 
-    With quadratic elements on a geometry of four-node tetrahedra `geometry` is the refined one: the nodes of
-    the given geometry come first and keep their numbers, so `vert_xpos[:, :given.nvert]` fits it; a node on
-    each edge follows.
+    With quadratic elements on a geometry of four-node tetrahedra, `geometry` has a node on each edge after
+    the nodes of the given geometry, so that `vert_xpos[:, :given.nvert]` belongs to these.
 
     Args:
       geometry: the skin.
@@ -222,20 +221,19 @@ class SkinModel:
       options: SkinOptions.
       device: "cpu" or a CUDA device of Warp.
       fixed: (n,) nodes of the given geometry that do not move, instead of its own.
-      core_faces: (n,) inner faces of the given geometry that can meet the core, instead of all that start
-        clear of it.
-      modulus: rubber that is not the same everywhere: factors on Young's modulus, (nelem,) one for each
-        element of the given geometry, or a function of rest positions (n, 3) [m] that gives (n,), asked at
-        the centroids of the elements that are solved.
+      core_faces: (n,) inner faces of the given geometry that can touch the core, instead of all that are
+        clear of it in the reference configuration.
+      modulus: factors on Young's modulus: (nelem,) for the elements of the given geometry, or a function of
+        reference positions (n, 3) [m] that returns (n,), evaluated at the centroids of the solved elements.
 
     Attributes:
-      modulus: (nelem,) of the elements that are solved, or None.
+      modulus: (nelem,) of the solved elements, or None.
       spacing: of contact samples [m].
-      elements: Tetrahedra. stiffness: at rest, over the free coordinates, sparse [N/m].
+      elements: Tetrahedra. stiffness: of the undeformed skin, over the free coordinates, sparse [N/m].
 
     Raises:
-      ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed, a modulus of another shape or not
-        positive.
+      ValueError: NaN, inverted tetrahedra, an unknown material, no fixed nodes, a modulus of another shape or
+        not positive.
     """
 
     def __init__(
@@ -314,7 +312,7 @@ class SkinModel:
         self.rest_volume, self.liquid_volume = self._volumes()
 
     def on_cpu(self) -> "SkinModel":
-        """The same model on the CPU, made when first asked for."""
+        """The same model on the CPU, made at the first call."""
         if not self.device.is_cuda:
             return self
         if self._on_cpu is None:
@@ -325,11 +323,11 @@ class SkinModel:
 
     @property
     def rubber_options(self) -> tuple[str, ...]:
-        """What the rubber has beyond its law, see `rubber.points.point_functions`."""
+        """Effects of the rubber beyond its law, see `rubber.points.point_functions`."""
         return (*([] if self.modulus is None else ["modulus"]), *self.material.extensions)
 
     def _moduli(self, modulus, given):
-        """(nelem,) factors on Young's modulus of the elements that are solved."""
+        """Factors (nelem,) on Young's modulus of the solved elements."""
         if callable(modulus):
             at = self.geometry.vert[self._elem[:, :4]].mean(1)
             factor, n, what = np.asarray(modulus(at), float), self.nelem, f"{self.nelem} positions"
@@ -342,8 +340,7 @@ class SkinModel:
 
     @functools.cached_property
     def ring(self) -> wp.array:
-        """The nodes that each shares a touching face with, itself too, (nvert, most), -1 where it has
-        fewer."""
+        """Nodes (nvert, most) that share a contact face with each node, including itself, padded by -1."""
         faces = [s.face.numpy() for s in (self.outer, self.core_surface if self.has_core else None) if s]
         faces, n = np.concatenate(faces).astype(np.int64), self.nvert
         pairs = np.unique(np.concatenate([n * faces[:, a] + faces[:, b] for a in range(3) for b in range(3)]))
@@ -354,7 +351,7 @@ class SkinModel:
         return wp.array(ring, dtype=int, device=self.device)
 
     def core(self, nworld: int) -> GeomSet:
-        """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
+        """The rigid core as the only geom that the inner surface can touch, without friction."""
         if nworld not in self._cores:
             grid = _core_grid(_Key(self.geometry.core_vert, self.geometry.core_face))
             self._cores[nworld] = GeomSet(
@@ -363,8 +360,8 @@ class SkinModel:
         return self._cores[nworld]
 
     def _core_faces(self) -> np.ndarray:
-        """Inner faces that can meet the core: those that start nearer to it than the clearance lie on it
-        (bonded, or faceted into it)."""
+        """Inner faces that can touch the core: not those closer to it than the clearance, which are bonded to
+        it or cut into it."""
         face = self.geometry.inner_face
         gap = wp.zeros(len(face) * len(self.sample), dtype=real, device=self.device)
         wp.launch(
@@ -377,7 +374,7 @@ class SkinModel:
         return face[gap.numpy().reshape(len(face), -1).min(1) > self.options.core_clearance]
 
     def _core_slots(self):
-        """Number of each inner face on the surface that can meet the core; -1: it cannot."""
+        """Index of each inner face among those that can touch the core; -1: it cannot."""
         face = self.geometry.inner_face
         slot = np.full(len(face), -1, np.int32)
         if self.has_core:
@@ -408,8 +405,8 @@ class SkinModel:
 
     @property
     def rest(self) -> liquid.Rest:
-        """The skin and its liquid without touching geoms: inflated where the options say so, solved when
-        first asked for."""
+        """Skin and liquid without contact, inflated if the options have a filling; solved at the first
+        access."""
         if self._rest is None:
             self._rest = solve_rest(self)
         return self._rest
@@ -420,27 +417,27 @@ class SkinModel:
 
     @functools.cached_property
     def stiffness(self) -> sp.csc_matrix:
-        """(3 nfree, 3 nfree) at rest, without the liquid, sparse [N/m]."""
+        """Stiffness (3 nfree, 3 nfree) of the undeformed skin without the liquid, sparse [N/m]."""
         return self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
 
     @functools.cached_property
     def factor(self) -> SparseFactor:
-        """Sparse factor of the rest stiffness of the free nodes, on the CPU."""
+        """Sparse factor of `stiffness`, on the CPU."""
         return self.factor_of(self.stiffness)
 
     @functools.cached_property
     def inverse(self) -> DissectedInverse:
-        """Inverse of the rest stiffness of the free nodes by dense blocks, as CUDA has it."""
+        """Inverse of `stiffness` by dense blocks, for CUDA."""
         points, thirds = self.geometry.vert[self.free], self.material.poissons_ratio > _STIFF_IN_VOLUME
         return DissectedInverse(self.stiffness, points, self.device, thirds)
 
     def factor_at(self, vert_xpos: np.ndarray) -> SparseFactor:
-        """The factor of the skin in a deformed shape, see `Tetrahedra.deformed`; always positive definite. On
-        the CPU.
+        """Sparse factor of the skin in a deformed shape, see `Tetrahedra.deformed`; always positive definite.
+        On the CPU.
 
-        Nearly incompressible rubber that has turned and strained resists volume change along other directions
-        than at rest, which the factor at rest does not know: preconditioned by it, conjugate gradients need
-        hundreds of iterations at nu 0.4999 where this one needs a few.
+        The directions along which nearly incompressible rubber resists volume change depend on the
+        deformation. At nu 0.4999 conjugate gradients need a few iterations with this factor, and hundreds
+        with that of the undeformed skin.
 
         Args:
           vert_xpos: (nvert, 3) [m].
@@ -449,7 +446,7 @@ class SkinModel:
         return self.factor_of(self._of_free(stiffness))
 
     def factor_of(self, stiffness: sp.csc_matrix) -> SparseFactor:
-        """Sparse factor of a stiffness with the pattern of the skin's, over the free coordinates."""
+        """Sparse factor of a matrix with the pattern of `stiffness`."""
         made = SparseFactor(stiffness, self.free, self.geometry.vert, self._elimination)
         self._elimination = made.elimination
         return made
@@ -460,7 +457,7 @@ class SkinModel:
 
 
 def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
-    """Raises ValueError where factors on Young's modulus are not n positive numbers, one for each `what`."""
+    """Raises ValueError unless `factor` has n positive factors on Young's modulus, one for each `what`."""
     if factor.shape != (n,):
         raise ValueError(
             f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"
@@ -478,8 +475,7 @@ def _core_grid(key):
 
 
 class _Key:
-    """Makes a pair of arrays hashable by content, so that models of one geometry share the core's distance
-    grid."""
+    """Arrays that are hashable by content, so that models of one geometry share the core's distance grid."""
 
     def __init__(self, *arrays):
         self.arrays = arrays

@@ -1,13 +1,13 @@
-"""Small vibrations of the resting skin and its liquid: modes, and the pressure that forces on the outside
-make.
+"""Small vibrations of the skin and its liquid without contact: modes, and the pressure by forces on the
+outside.
 
-M u'' + K u + kappa g g.u = f about the rest state, with the elements' lumped mass, their stiffness, g = dV/du
-of the cavity and kappa = K_liquid / V; the pressure is -kappa g.u. Few modes move it below a few kilohertz;
-what those left out would add is their static part, which one solve gives exactly.
+M u'' + K u + kappa g g.u = f about the equilibrium, with the elements' lumped mass and stiffness, g = dV/du
+of the cavity and kappa = K_liquid / V; the pressure is -kappa g.u. Few modes below a few kilohertz change it;
+the static part of the others follows exactly from one solve.
 
-The liquid has no mass here. As potential flow in the resting gap it would bring the mode that is heard most
-from 289 to 125 Hz (default skin); what slides and is pressed is most sensitive near 330 Hz (Fishel and Loeb,
-2012). In touch the gap is closed under the contact and the skin held there, so neither is right."""
+The liquid has no mass here. As potential flow in the gap it would lower the mode with the largest pressure
+from 289 to 125 Hz (default skin); a real sensor that slides under load is most sensitive near 330 Hz (Fishel
+and Loeb, 2012). In contact the gap is closed and the skin supported there, so that neither value is right."""
 
 import dataclasses
 
@@ -21,20 +21,20 @@ from .model import SkinModel
 
 __all__ = ["NMODE", "SkinModes", "skin_modes"]
 
-NMODE, _COUNT = 24, 48  # modes that are kept, of those that are looked for
+NMODE, _COUNT = 24, 48  # modes that are kept, and that are computed
 
 
 @dataclasses.dataclass(frozen=True)
 class SkinModes:
-    """Modes of the resting skin, those first that move the pressure most.
+    """Modes of the skin without contact, in descending order of their pressure.
 
     Attributes:
       node: (n,) nodes of the outer surface.
       rate: (nmode,) angular frequencies [rad/s].
       shape: (nmode, n, 3) displacement of the nodes, mass-normalised [kg^-1/2].
-      static_pressure: (nmode,) of a unit modal force r = shape . f [Pa / (N kg^-1/2)]; that of one
-        that moves is this times the response of an oscillator of unit static gain.
-      static: (n, 3) pressure of a steady force on each node, of all modes and of what is beyond [Pa/N].
+      static_pressure: (nmode,) by a unit modal force r = shape . f [Pa / (N kg^-1/2)]; the dynamic pressure
+        is this times the response of an oscillator of unit static gain.
+      static: (n, 3) pressure by a steady force on each node, of all modes and the remainder [Pa/N].
     """
 
     node: np.ndarray
@@ -45,7 +45,7 @@ class SkinModes:
 
 
 def skin_modes(model: SkinModel) -> SkinModes:
-    """Modes of a skin at rest, from disk where they were made before."""
+    """Modes of a skin without contact; cached on disk."""
     inputs = [model.geometry, model.material, model.options, model.has_liquid, model.modulus, _COUNT, NMODE]
     return SkinModes(**cached("modes", inputs, lambda: _make(model)))
 
@@ -55,32 +55,32 @@ def _make(model):
     n = len(dof)
     mass = np.repeat(model.material.density * model.elements.node_volume[model.free], 3)
     solve = splu(model.stiffness.tocsc()).solve  # the solver's own factor is in single precision
-    w, give = np.zeros(n), 1.0
+    w, volume_compliance = np.zeros(n), 1.0
     if model.has_liquid:
         gradient, bulk = _volume_gradient(model).ravel()[dof], model.options.bulk_modulus
         w = solve(gradient)
-        # volume that the cavity and the liquid give per unit pressure
-        give = gradient @ w + model.liquid_volume / (bulk if np.isfinite(bulk) else WATER)
+        # volume of cavity and liquid per unit pressure [m^3/Pa]
+        volume_compliance = gradient @ w + model.liquid_volume / (bulk if np.isfinite(bulk) else WATER)
 
     def compliance(f):
         f = np.ravel(f)
-        return solve(f) - w * (w @ f / give)
+        return solve(f) - w * (w @ f / volume_compliance)
 
     square, shape = eigsh(
-        sp.identity(n, format="csc"),  # not looked at: shifted to 0 and inverted it is the compliance
+        sp.identity(n, format="csc"),  # not used: shift-invert at 0 takes OPinv, the compliance
         min(_COUNT, n - 1),
         M=sp.diags(mass),
         sigma=0.0,
         OPinv=LinearOperator((n, n), compliance, dtype=float),
-        v0=np.random.default_rng(0).standard_normal(n),  # else every process would find its own signs
+        v0=np.random.default_rng(0).standard_normal(n),  # for equal signs in every process
     )
     node = np.unique(model.geometry.outer_face)
     full = np.zeros((len(square) + 1, 3 * model.nvert))
-    full[:-1, dof], full[-1, dof] = shape.T, -w / give
+    full[:-1, dof], full[-1, dof] = shape.T, -w / volume_compliance
     full = full.reshape(len(full), -1, 3)[:, node]
-    pressure = -(w * mass) @ shape / give
-    heard = np.abs(pressure) * np.sqrt((full[:-1] ** 2).sum((1, 2)))
-    order = np.argsort(-heard)[:NMODE]
+    pressure = -(w * mass) @ shape / volume_compliance
+    amplitude = np.abs(pressure) * np.sqrt((full[:-1] ** 2).sum((1, 2)))
+    order = np.argsort(-amplitude)[:NMODE]
     return {
         "node": node,
         "rate": np.sqrt(square)[order],
@@ -91,7 +91,7 @@ def _make(model):
 
 
 def _volume_gradient(model):
-    """(nvert, 3) dV/du of the cavity at rest [m^2]."""
+    """dV/du (nvert, 3) of the cavity in the reference configuration [m^2]."""
     face = model.geometry.inner_face
     a, b, c = np.moveaxis(model.geometry.vert[face], 1, 0)
     third = -np.cross(b - a, c - a) / 6

@@ -1,4 +1,5 @@
-"""Numbers in which worlds differ beyond their materials: law of contact, liquid, modulus of the elements."""
+"""Parameters that may differ between worlds besides materials: contact law, liquid, modulus of the
+elements."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,7 +23,7 @@ NAMES = (*_LAW, *_LIQUID, "modulus")
 def make_room(
     options: SkinOptions, modulus: np.ndarray | Callable | None, values: dict, nelem: int
 ) -> tuple[SkinOptions, np.ndarray | Callable | None]:
-    """Options and modulus of a model whose worlds can differ in these values.
+    """Options and modulus of a model whose worlds may differ in these values.
 
     Args:
       options: SkinOptions. modulus: of the model, or None.
@@ -48,7 +49,7 @@ def make_worlds(
     values: dict | None = None,
     tier: str = FULL,
 ) -> SkinData:
-    """SkinData of worlds that differ; a filled one rests where a single skin of its material and fill does.
+    """SkinData of worlds that differ; each has the state without contact of a single skin with its values.
 
     Args:
       materials: one for each world, or None.
@@ -57,7 +58,7 @@ def make_worlds(
       tier: FULL or CONDENSED, see `SkinData`.
 
     Raises:
-      ValueError: wrong shapes, or values that cannot be.
+      ValueError: wrong shapes, or impossible values.
     """
     values = values or {}
     modulus = values.get("modulus")
@@ -66,7 +67,7 @@ def make_worlds(
         n = model.nelem if np.shape(modulus)[1:] == (model.nelem,) else len(model.geometry.elem)
         if modulus.shape != (nworld, n):
             raise ValueError(f"modulus has shape {modulus.shape}: pass factors of shape ({nworld}, {n})")
-        modulus = np.repeat(modulus, model.nelem // n, 1)  # the parts of a ten-node one follow each other
+        modulus = np.repeat(modulus, model.nelem // n, 1)  # the parts of a ten-node element are consecutive
     data = SkinData(model, nworld, materials, modulus, tier=tier)
     law = {name: values[name] for name in _LAW if name in values}
     if law:

@@ -1,9 +1,8 @@
-"""Launches of kernels with loops and branches between them, made once and run many times.
+"""Programs: kernel launches with loops and branches, made once and run many times.
 
-On CUDA they are launched as they come, so that a caller's capture makes them nodes of its graph, loops and
-branches conditional ones (CUDA 12.4 and later). On the CPU a `Program` records them and plays the record:
-packing a launch's arguments takes Warp longer than many of the kernels run.
-"""
+On CUDA the launches can be captured by the caller, so that loops and branches become conditional nodes of its
+graph (CUDA 12.4 and later). On the CPU a `Program` records the launches and replays them, since Warp needs
+more time to pack the arguments of a launch than many of the kernels need to run."""
 
 import concurrent.futures
 import ctypes
@@ -19,9 +18,9 @@ __all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels", "f
 
 
 class Launcher:
-    """Launches at once, on one device."""
+    """Launches kernels immediately, on one device."""
 
-    _packed = None  # launches whose arguments are packed, while something is recorded on CUDA
+    _packed = None  # launches with packed arguments, during a recording on CUDA
 
     def __init__(self, device: wp.DeviceLike):
         self.device = wp.get_device(device)
@@ -34,7 +33,7 @@ class Launcher:
         outputs: Sequence = (),
         block_dim: int = 256,
     ) -> None:
-        """A kernel over dim."""
+        """Launches a kernel over dim."""
         self._send(wp.launch, kernel, dim, inputs, outputs, block_dim)
 
     def launch_blocks(
@@ -45,7 +44,7 @@ class Launcher:
         outputs: Sequence = (),
         block_dim: int = 128,
     ) -> None:
-        """A block of threads for each item of dim."""
+        """Launches a kernel with a block of threads for each item of dim."""
         self._send(wp.launch_tiled, kernel, dim, inputs, outputs, block_dim)
 
     def _send(self, launch, kernel, dim, inputs, outputs, block_dim):
@@ -53,33 +52,33 @@ class Launcher:
         if self._packed is None:
             launch(kernel, **how)
             return
-        # a step launches the same at several places, and packing is most of the time that recording takes
+        # a step has equal launches at several places, and packing is most of the time of a recording
         key = kernel, str(dim), block_dim, *(_same(a) for a in (*inputs, *outputs))
-        if key not in self._packed:  # with the arguments, which would free their numbers otherwise
+        if key not in self._packed:  # the arguments are kept, so that their ids are not used again
             self._packed[key] = launch(kernel, **how, record_cmd=True), how
         command = self._packed[key][0]
-        if command is not None:  # there is something to launch it over
+        if command is not None:  # dim is not empty
             command.launch()
 
     def loop(self, flag: wp.array, body: Callable[[], None]) -> None:
-        """body again and again while flag[0] is not zero."""
+        """Repeats body while flag[0] is not zero."""
         wp.capture_while(flag, body)
 
     def branch(
         self, flag: wp.array, body: Callable[[], None], otherwise: Callable[[], None] | None = None
     ) -> None:
-        """body if flag[0] is not zero, else `otherwise`."""
+        """Runs body if flag[0] is not zero, else `otherwise`."""
         wp.capture_if(flag, body, otherwise)
 
     def call(self, function: Callable[[], None]) -> None:
-        """A function of the host: on the CPU only, where arrays are its memory."""
+        """Calls a function of the host, on the CPU only."""
         if self.device.is_cuda:
             raise ValueError("a function of the host cannot be part of a program on CUDA")
         function()
 
 
 class _Modules(Launcher):
-    """Launches nothing: finds the modules of the kernels that would be, on every branch."""
+    """Launches nothing: collects the modules of all kernels, of every branch."""
 
     def __init__(self, device: wp.DeviceLike):
         super().__init__(device)
@@ -104,23 +103,23 @@ class _Modules(Launcher):
         pass
 
 
-# what compiles each module, or has: to ask Warp for it takes longer than to record a step
-_begun: dict[tuple, concurrent.futures.Future] = {}
+# future of each module's compilation: to query Warp takes longer than to record a step
+_compiling: dict[tuple, concurrent.futures.Future] = {}
 
 
 def compile_ahead(
     device: wp.DeviceLike, modules: Iterable[tuple[types.ModuleType | wp.Module, int]]
 ) -> list[concurrent.futures.Future]:
-    """Begins to compile modules of kernels for a CUDA device, behind what goes on and beside each other: Warp
-    would one by one, as they are launched.
+    """Starts to compile modules of kernels for a CUDA device, in the background and in parallel. Warp would
+    compile them one after another, when they are launched.
 
     Args:
-      device: Warp device; nothing happens where it is no CUDA device.
-      modules: Python's, whose kernels are all there once they are imported, or Warp's own, each with the
-        threads of the blocks that it is launched by; what takes long first.
+      device: Warp device; nothing is done for the CPU.
+      modules: Python modules, whose kernels all exist after the import, or Warp modules, each with its block
+        size; those that take long come first.
 
     Returns:
-      what `finish_compiling` waits for.
+      Futures for `finish_compiling`.
     """
     device = wp.get_device(device)
     if not device.is_cuda:
@@ -132,20 +131,20 @@ def compile_ahead(
         wanted[module, len(module.kernels), device.alias, threads] = module, threads
     pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
     for key, (module, threads) in wanted.items():
-        if key not in _begun:
-            _begun[key] = pool.submit(wp.load_module, module, device, block_dim=threads)
+        if key not in _compiling:
+            _compiling[key] = pool.submit(wp.load_module, module, device, block_dim=threads)
     pool.shutdown(wait=False)
-    return [_begun[key] for key in wanted]
+    return [_compiling[key] for key in wanted]
 
 
-def finish_compiling(begun: Iterable[concurrent.futures.Future] | None = None) -> None:
-    """Waits for what `compile_ahead` began, None: ever; who launches a kernel that cannot be compiled is
-    told."""
-    concurrent.futures.wait(list(_begun.values() if begun is None else begun))
+def finish_compiling(futures: Iterable[concurrent.futures.Future] | None = None) -> None:
+    """Waits for futures of `compile_ahead`, or for all (None). Compiler errors are raised when the kernel is
+    launched."""
+    concurrent.futures.wait(list(_compiling.values() if futures is None else futures))
 
 
 def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -> None:
-    """Compiles what record(launcher) launches on a CUDA device, and what `compile_ahead` began."""
+    """Compiles the kernels that record(launcher) launches on a CUDA device, and waits for `compile_ahead`."""
     modules = _Modules(device)
     record(modules)
     compile_ahead(device, modules.found)
@@ -153,19 +152,19 @@ def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -
 
 
 class Fork:
-    """Branches of a CUDA graph; on the CPU, or where they are not wanted, one after another.
+    """Parallel branches of a CUDA graph; on the CPU, or if not wanted, they run one after another.
 
-    Small kernels mostly wait: those of several parts of a skin, or of several skins, wait together.
+    Small kernels mostly wait for memory, and several of them wait at the same time.
     """
 
     def __init__(self, device: wp.DeviceLike, wanted: bool = True):
         self._device, self._streams = wp.get_device(device), []
-        self._abreast = wanted and self._device.is_cuda
+        self._parallel = wanted and self._device.is_cuda
 
     def run(self, *branches: Callable[[], None]) -> None:
-        """Calls branches, each of launches only (no loop, no branch), that write nothing that another one
-        reads or adds to. What is launched afterwards waits for all."""
-        if not self._abreast:
+        """Calls branches, which contain launches only (no loop, no branch) and do not write arrays that
+        another branch uses. Later launches wait for all of them."""
+        if not self._parallel:
             for branch in branches:
                 branch()
             return
@@ -184,13 +183,14 @@ class Fork:
 
 
 class Program(Launcher):
-    """What record(program) launches.
+    """The launches of record(program).
 
     Args:
       device: Warp device.
-      record: is called with the program, once on the CPU and at every `run` on CUDA; calls its methods.
+      record: called with the program, once on the CPU and at every `run` on CUDA; it calls the program's
+        methods.
 
-    What the arrays hold may change between runs; which arrays, and numbers given as such, may not.
+    The contents of arrays may change between runs; the set of arrays and plain numbers may not.
     """
 
     def __init__(self, device: wp.DeviceLike, record: Callable[["Program"], None]):
@@ -210,8 +210,8 @@ class Program(Launcher):
                 command()
 
     def forget(self) -> None:
-        """Lets go of the launches and of all that they work on: these may hold the program, and Python finds
-        circles late, which a skin is too large for."""
+        """Frees the launches and their arrays. This breaks the reference cycle with the program, so that
+        memory is freed now, instead of at the next garbage collection."""
         self._record, self._commands = None, []
 
     def _recorded(self, body):
@@ -274,12 +274,12 @@ class Program(Launcher):
 
 
 def _same(argument):
-    """What tells arguments apart: numbers by value, all others by being another thing."""
+    """Key of an argument: the value of a number, the identity of anything else."""
     return argument if isinstance(argument, (int, float)) else (None, id(argument))
 
 
 def _any(dim):
-    """Whether there is anything in dim to be launched over."""
+    """Whether dim is not empty."""
     return all(dim) if isinstance(dim, (tuple, list)) else dim
 
 

@@ -1,4 +1,4 @@
-"""A skin's material, options and modulus as users and files give them: names, dicts, arrays, files."""
+"""Reads a skin's material, options and modulus from names, dicts, arrays and files."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ _KEYS = ("skin", "modulus")
 
 
 class Settings(NamedTuple):
-    """What a SkinModel is made with: Material, SkinOptions, factors on Young's modulus (or None)."""
+    """Arguments of a SkinModel: Material, SkinOptions, factors on Young's modulus (or None)."""
 
     material: Material
     options: SkinOptions
@@ -41,8 +41,8 @@ def read_settings(
     Args:
       material: see `read_material`.
       options: {"skin": {...} or SkinOptions, "modulus": see `read_modulus`}, a JSON text of it or a file.
-      also: further keys of `options` that somebody else reads.
-      defaults: of SkinOptions, where `options` has no word on it.
+      also: further keys of `options`, which the caller reads.
+      defaults: of SkinOptions, for fields that `options` does not have.
 
     Raises:
       ValueError: unknown keys, or values that cannot be. FileNotFoundError: no such file.
@@ -123,9 +123,9 @@ def read_dict(choice: dict | str | pathlib.Path | None, what: str) -> dict:
 
 
 def plain(value: object, geometry: SkinGeometry | None = None) -> object:
-    """Settings as what JSON holds: Materials, ContactLaws and SkinOptions become dicts, arrays lists, and a
-    function of positions its values at the centroids of the geometry's elements."""
-    if isinstance(value, SkinOptions):  # what it says, not what it leaves to others
+    """Converts settings to JSON types: Materials, ContactLaws and SkinOptions to dicts, arrays to lists, and
+    a function of positions to its values at the centroids of the geometry's elements."""
+    if isinstance(value, SkinOptions):  # without defaults
         given = ((f.name, getattr(value, f.name), f.default) for f in dataclasses.fields(value))
         value = {name: one for name, one, default in given if one != default}
     if isinstance(value, (Material, ContactLaw)):

@@ -1,12 +1,11 @@
-"""What a skin's state is: every array that outlives a step, declared once.
+"""The state of a skin: every array that outlives a step is declared here once.
 
-`VARIABLES` says of each where it is, its shape and type, its value after a reset, and what it is to the next
-step. From it are made the arrays themselves (`allocate`), the fields of structs (`declared`), resets of some
-worlds and copies that are put back (`state_arrays`), the state of one world on the host (`SavedState`), and
-that as a row of numbers (`StateLayout`), which is what MuJoCo keeps in `mjData.plugin_state`. A new array is
-one line here.
+`VARIABLES` gives the place, shape, type, value after a reset and role of each array. It is used to make the
+arrays (`allocate`) and the fields of structs (`declared`), to reset some worlds and restore arrays
+(`state_arrays`), to save one world on the host (`SavedState`), and to convert that to a row of numbers
+(`StateLayout`) for `mjData.plugin_state`. A new array is one line here.
 
-Arrays are [item, world], with as many axes before the world as the declaration names."""
+Arrays are [item, world], with the declared axes before the world."""
 
 import dataclasses
 import operator
@@ -43,11 +42,11 @@ __all__ = [
 FULL, CONDENSED = "full", "condensed"  # tiers
 _BOTH = FULL, CONDENSED
 
-# what a variable is to the next step: what that starts from; where its Newton's method begins; what the last
-# step came to; none of these, but it must not outlive a reset
+# role of a variable in the next step: state; initial guess; result of the last step; scratch that a reset
+# clears
 MEMORY, GUESS, OUTCOME, WORK = "memory", "guess", "outcome", "work"
 
-# rows that a saved state has room for, by tier: samples that touch, contact coordinates with a force
+# most rows of a saved state's tables, by tier: touching samples, contact coordinates with a force
 ROOM = {"contacts": {FULL: 4096, CONDENSED: 2048}, "forces": {CONDENSED: 1024}}
 
 
@@ -56,22 +55,21 @@ class Variable:
     """An array of a skin's state.
 
     Attributes:
-      name: by which a saved state has it.
-      place: the holder of the array, and its attribute there; "host" has no array: a number that is only
-        saved.
-      axes: names of its axes before the world, whose sizes `allocate` and `StateLayout` are given.
-      dtype: of Warp.
-      reset: the number that a reset leaves; the name of an array of SkinData [item or one, world or one];
-        "virgin", which `RubberMemory.forget` finds; None: it is left as it is.
+      name: in a saved state.
+      place: holder of the array, and its attribute there; "host": no array, only a saved number.
+      axes: names of its axes before the world; `allocate` and `StateLayout` take their sizes.
+      dtype: Warp type.
+      reset: value after a reset: a number; the name of an array of SkinData [item or one, world or one];
+        "virgin": set by `RubberMemory.forget`; None: unchanged.
       role: MEMORY, GUESS, OUTCOME or WORK.
-      tiers: that have it. saved: those in which it is saved; by default MEMORY and GUESS are wherever they
-        are. What is not saved and yet memory follows from what is, see
-        `StateArrays.load`.
-      needs: options, see `options_of`, of which any brings it; (): it is always there.
-      rows: the table of a saved state that has it, where it is zero but for a few items. starts: whether it
-        says which; those without that follow, over the same items.
-      symmetric: saved by six of nine numbers.
-      outlives_rest: whether a skin that comes to rest between resets keeps it: it tells of geoms or steps.
+      tiers: that have it. saved: tiers in which it is saved; by default all if its role is MEMORY or GUESS.
+        Memory that is not saved is computed from other variables, see `StateArrays.load`.
+      needs: options (see `options_of`) any of which adds it; (): it always exists.
+      rows: table of a saved state, for arrays that are zero except for a few items. starts: whether it
+        determines the items of the table; the variables after it have the same items.
+      symmetric: six of nine numbers are saved.
+      outlives_rest: whether a skin that is reset to rest by itself keeps it, since it describes geoms or
+        steps.
     """
 
     name: str
@@ -97,11 +95,11 @@ class Variable:
         return self.place.partition(".")[2]
 
     def is_there(self, options: Iterable[str]) -> bool:
-        """Whether options bring it."""
+        """Whether these options add it."""
         return not self.needs or not set(self.needs).isdisjoint(options)
 
     def is_saved(self, tier: str) -> bool:
-        """Whether a saved state of a tier has it."""
+        """Whether it is in the saved state of a tier."""
         saved = self.saved
         if saved is None:
             saved = self.tiers if self.role in (MEMORY, GUESS) else ()
@@ -109,12 +107,12 @@ class Variable:
 
     @property
     def item(self) -> tuple[int, ...]:
-        """Shape of what is saved of an item."""
+        """Shape of the saved numbers of an item."""
         return (6,) if self.symmetric else tuple(getattr(self.dtype, "_shape_", ()))
 
 
 def _of_contact(surface: str) -> tuple[Variable, ...]:
-    """Of the contact of a surface, see `data.ContactState`. Nothing sticks to the core."""
+    """Variables of the contact of a surface, see `data.ContactState`. The core has no friction."""
     role, more = (MEMORY, {}) if surface == "outer" else (WORK, {"saved": ()})
     name = "" if surface == "outer" else f"{surface}_"
 
@@ -126,13 +124,13 @@ def _of_contact(surface: str) -> tuple[Variable, ...]:
     rows = {"rows": "contacts"} if surface == "outer" else {}
     first = rows and {"starts": True}
     return (
-        # geom of each sample that touched when the last step ended, and where in that geom's frame [m]
+        # geom that each sample touched at the end of the last step, and anchor in that geom's frame [m]
         variable("anchor_geom", ("sample",), int, -1, role, **rows, **first, **more),
         variable("anchor", ("sample",), vec3, None, role, **rows, **more),
         variable("kept", ("face",), int, 0, role, saved=()),  # faces with anchors
-        # the same, of the last evaluation
+        # geom of each sample at the last evaluation
         variable("trial_geom", ("sample",), int, -1),
-        # the geom that a sample is in contact with, or has been and is still in range of
+        # geom that a sample touches, or has touched and is still in the range of its adhesion
         variable("bond", ("sample",), int, -1, needs=("contact_law",)),
         variable("touching", ("face",), int, 0),
         variable("node_force", ("vert",), vec3, 0.0),
@@ -150,57 +148,56 @@ _STARTS = _FORCES | {"starts": True}
 _OF_STEPS = {"outlives_rest": True}
 
 VARIABLES = (
-    # whether a step was made since the reset; whether the skin is exactly at rest
+    # 1: a step was made since the reset; 1: the skin is exactly in its state without contact
     Variable("started", "host.started", (), real, 0.0, MEMORY, outlives_rest=True),
     Variable("resting", "host.resting", (), real, 0.0, MEMORY, tiers=(FULL,)),
-    # nodes when the last step ended [m], and by how much they moved in it; of the condensed tier they follow
-    # from the contact forces
+    # nodes at the end of the last step [m], and their motion in it; in the condensed tier they follow from
+    # the contact forces
     Variable("x", "data.x", ("vert",), vec3, "rest_vert", MEMORY, saved=(FULL,)),
     Variable("x_last", "data.x_last", ("vert",), vec3, "rest_vert", MEMORY, saved=()),
     Variable("increment", "data.increment", ("vert",), vec3, 0.0, GUESS, tiers=(FULL,)),
     Variable("total_force", "data.force", ("vert",), vec3, 0.0, WORK),
-    # of implicit dynamics when the last step ended: velocities of the nodes [m/s], pose of the BioTac frame
+    # of implicit dynamics at the end of the last step: velocities of the nodes [m/s], pose of the BioTac
+    # frame
     Variable("velocity", "data.velocity", ("vert",), vec3, 0.0, MEMORY, **_INERTIA),
     Variable("frame_pos", "data.frame_pos_last", (), vec3, None, MEMORY, **_INERTIA),
     Variable("frame_mat", "data.frame_mat_last", (), mat33, None, MEMORY, **_INERTIA),
-    # geoms when the last step ended: poses [m], and how far they moved in it. Where these were nowhere the
-    # next step takes where they are then
+    # geoms at the end of the last step: poses [m], and motion in it; NaN: the next step takes its own poses
     Variable("geom_pos", "geoms.pos_last", ("geom",), vec3, np.nan, MEMORY, **_OF_STEPS),
     Variable("geom_mat", "geoms.mat_last", ("geom",), mat33, None, MEMORY, **_OF_STEPS),
     Variable("motion", "touched.motion", ("geom",), vec3, 0.0, GUESS, tiers=(FULL,), **_OF_STEPS),
     Variable("touched_by", "touched.touched_by", ("geom",), int, 0, GUESS, saved=(), **_OF_STEPS),
     *_of_contact("outer"),
     *_of_contact("core"),
-    # of the liquid above the surroundings [Pa]: when the last step ended, and at the last evaluation
+    # pressure of the liquid above the surroundings [Pa]: at the end of the last step, at the last evaluation
     Variable("last_pressure", "worlds.last_pressure", (), real, "rest_pressure", MEMORY, saved=(FULL,)),
     Variable("world_pressure", "worlds.pressure", (), real, "rest_pressure", OUTCOME),
-    # how the last step went, see `newton.worlds.Worlds`
+    # outcome of the last step, see `newton.worlds.Worlds`
     Variable("nonconverged", "worlds.nonconverged", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
     Variable("reason", "worlds.reason", (), int, 0, OUTCOME, **_OF_STEPS),
     Variable("load_factor", "worlds.load_factor", (), real, 1.0, OUTCOME, **_OF_STEPS),
     Variable("iterations", "worlds.iterations", (), int, 0, OUTCOME, **_OF_STEPS),
     Variable("error", "worlds.error", (), real, 0.0, OUTCOME, **_OF_STEPS),
-    # of the rubber's points, see `rubber.points`: overstress Q [Pa], stress that relaxes S eta [Pa], largest
-    # energy density W_max [J/m^3], slip of friction branches; what relaxes follows from nodes and W_max
+    # history of the rubber's points, see `rubber.points`: overstress Q [Pa], relaxing stress S eta [Pa]
+    # (which follows from nodes and W_max), largest energy density W_max [J/m^3], slip of friction branches
     Variable("overstress", "rubber.overstress", ("term", "point"), mat33, 0.0, MEMORY, **_RELAXES),
     Variable("last", "rubber.last", ("point",), mat33, "virgin", MEMORY, saved=(), **_SETTLES),
     Variable("worst", "rubber.worst", ("point",), real, "virgin", MEMORY, **_SETTLES),
     Variable("slip", "rubber.slip", ("branch", "point"), mat33, "virgin", MEMORY, **_SLIPS),
-    # contact forces of the condensed tier: on the outer nodes, and on the inner ones that can meet the core,
-    # away from it [N]
+    # contact forces of the condensed tier on the outer nodes, and on the inner nodes that can touch the core,
+    # in the direction away from it [N]
     Variable("force", "condensed.force", ("outer_node",), vec3, 0.0, MEMORY, **_STARTS),
     Variable("core_force", "condensed.core_force", ("inner_node",), real, 0.0, MEMORY, **_STARTS),
-    # pressure of the liquid above that at rest [Pa]; what the cavity's volume has beyond its linear part
-    # [m^3]
+    # pressure of the liquid above that without contact [Pa]; nonlinear part of the cavity's volume [m^3]
     Variable("pressure", "condensed.pressure", (), real, 0.0, MEMORY, **_CONDENSED),
     Variable("bulge", "condensed.bulge", (), real, 0.0, MEMORY, **_CONDENSED),
-    # softening and swelling with which the forces were found, and as the step left them
+    # softening and swelling at which the forces were computed, and at the end of the step
     Variable("solved", "condensed.solved", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
     Variable("after", "condensed.after", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
-    # what the sensor `status` says of the tier
+    # tier of the last step, for the sensor `status`
     Variable("tier", "step.tier", (), int, 1, OUTCOME, **_CONDENSED),
-    # of `batch.skin.BatchSkin`: whether no step was made since the reset, in how many the skin stayed where
-    # it was, and what the last one came to
+    # of `batch.skin.BatchSkin`: 1: no step was made since the reset; number of steps without motion of the
+    # skin; results of the last step
     Variable("fresh", "batch.fresh", (), int, 1, MEMORY, saved=(), needs=("implicit",), **_OF_STEPS),
     Variable("stays", "release.stays", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
     Variable("batch_pressure", "batch.pressure", (), real, 0.0, OUTCOME),
@@ -214,8 +211,8 @@ def _of(holder):
 
 
 def options_of(extensions: Iterable[str], options: typing.Any) -> frozenset[str]:
-    """What brings variables: names of a material's extensions (`Material.extensions`), and of SkinOptions
-    "implicit" and "contact_law"."""
+    """Options that add variables: names of a material's extensions (`Material.extensions`), and "implicit"
+    and "contact_law" of SkinOptions."""
     found = {"implicit"} if options.dynamics == "implicit" else set()
     if options.contact_law is not None:
         found.add("contact_law")
@@ -223,7 +220,7 @@ def options_of(extensions: Iterable[str], options: typing.Any) -> frozenset[str]
 
 
 def declared(holder: str) -> Callable[[type], type]:
-    """Class decorator, below wp.struct: the declared arrays of a holder become fields of the struct."""
+    """Class decorator, to be used below wp.struct: adds the declared arrays of a holder as fields."""
 
     def add(cls):
         cls.__annotations__ = dict(getattr(cls, "__annotations__", {})) | {
@@ -235,9 +232,9 @@ def declared(holder: str) -> Callable[[type], type]:
 
 
 def zeros(shape: tuple[int, ...], dtype: type, tier: str = FULL) -> wp.array:
-    """An array [item, world] on the current device. In the condensed tier, where a block of threads has a
-    world, what belongs to a world lies together; in the full tier, where neighbouring threads have
-    neighbouring worlds, what belongs to an item does."""
+    """An array [item, world] on the current device. In the condensed tier, where a block of threads has one
+    world, the numbers of a world are contiguous; in the full tier, where neighbouring threads have
+    neighbouring worlds, those of an item."""
     if tier == CONDENSED and len(shape) == 2 and min(shape) > 1:
         return wp.zeros(shape[::-1], dtype=dtype).transpose()
     return wp.zeros(shape, dtype=dtype)
@@ -250,8 +247,8 @@ def allocate(
     options: Iterable[str] = (),
     tier: str = FULL,
 ) -> None:
-    """Gives a holder its arrays, on the current device, with the numbers of a reset; those that `options` do
-    not bring have no items.
+    """Makes the arrays of a holder on the current device, with the values of a reset; arrays that `options`
+    do not add have no items.
 
     Args:
       sizes: of the axes by name, and of "world". tier: of the skin, for `zeros`.
@@ -268,7 +265,7 @@ def allocate(
 
 
 def clear(holder: str, owner: typing.Any, data: typing.Any) -> None:
-    """Resets the arrays of a holder in all worlds; rubber is its own matter (`RubberMemory.forget`)."""
+    """Resets the arrays of a holder in all worlds, except the history of rubber (`RubberMemory.forget`)."""
     for v in _of(holder):
         array = operator.attrgetter(v.attribute)(owner)
         if v.reset is None or v.reset == "virgin" or not array.size:
@@ -284,15 +281,15 @@ def clear(holder: str, owner: typing.Any, data: typing.Any) -> None:
 
 class SavedState(types.SimpleNamespace):
     """State of one world on the host, by the names of `VARIABLES`: arrays without the axis of worlds,
-    numbers, and tables of rows (k, n) that have the number of an item, what it starts with and what follows
-    there. `contacts` (k, 5) has sample, geom and anchor (in the geom's frame) [m] of what touches."""
+    numbers, and tables (k, n), whose rows have the index of an item and the values of the table's variables.
+    `contacts` (k, 5) has sample, geom and anchor (in the geom's frame) [m] of touching samples."""
 
     def copy(self) -> typing.Self:
-        """One that shares no memory with it."""
+        """A deep copy."""
         return type(self)(**{k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()})
 
     def replace(self, **changes: typing.Any) -> typing.Self:
-        """One with others of its values."""
+        """A state with some values replaced."""
         return type(self)(**(vars(self) | changes))
 
 
@@ -300,12 +297,12 @@ _State = typing.TypeVar("_State", bound=SavedState)
 
 
 def variables_of(tier: str, options: Iterable[str]) -> list[Variable]:
-    """Those of a tier that options bring."""
+    """Variables of a tier with these options."""
     return [v for v in VARIABLES if tier in v.tiers and v.is_there(options)]
 
 
 def saved_variables(tier: str, options: Iterable[str]) -> tuple[list[Variable], dict[str, list[Variable]]]:
-    """Those of them that a saved state has by themselves, and by the name of a table of rows its own."""
+    """Saved variables of a tier: those outside tables, and those of each table by its name."""
     found = [v for v in variables_of(tier, options) if v.is_saved(tier)]
     rows = {}
     for v in found:
@@ -315,16 +312,16 @@ def saved_variables(tier: str, options: Iterable[str]) -> tuple[list[Variable], 
 
 
 class StateLayout:
-    """A saved state as a row of numbers: where what is in it.
+    """Layout of a saved state as a row of numbers.
 
     Args:
       tier: FULL or CONDENSED. options: see `options_of`.
-      sizes: of the axes by name; of those of rows none is needed.
+      sizes: of the axes by name, except those of tables.
 
     Attributes:
-      size: how many numbers. slices: where each variable and table is.
-      of_steps, of_skin: names of variables without rows that a skin which comes to rest keeps, and of those
-        that it does not.
+      size: number of numbers. slices: of each variable and table.
+      of_steps, of_skin: names of variables outside tables that a skin keeps, and does not keep, when it is
+        reset to rest by itself.
     """
 
     def __init__(self, tier: str, options: Iterable[str], sizes: dict[str, int]):
@@ -336,7 +333,7 @@ class StateLayout:
         self._columns = {name: _columns(of) for name, of in rows.items()}
         self._room = {name: ROOM[name][tier] for name in rows}
         counts = {name: int(np.prod(shape)) for name, shape in self._shapes.items()}
-        self._used = sum(counts.values())  # tables are behind all else, and mostly empty
+        self._used = sum(counts.values())  # the tables follow, and are mostly empty
         counts |= {name: 1 + self._room[name] * n for name, n in self._columns.items()}
         ends = np.cumsum(list(counts.values())).tolist()
         self.slices = {
@@ -345,7 +342,7 @@ class StateLayout:
         self.size = ends[-1]
 
     def part(self, state: np.ndarray, name: str) -> np.ndarray:
-        """View of a variable's numbers in a state (size,)."""
+        """View of the numbers of a variable in a state (size,)."""
         return state[self.slices[name]]
 
     def rows(self, state: np.ndarray, name: str) -> np.ndarray:
@@ -355,7 +352,7 @@ class StateLayout:
         return part[1 : 1 + n * count].reshape(count, n)
 
     def rest(self, kind: type[_State] = SavedState) -> _State:
-        """State after a reset, but for variables whose reset is no number: these are zero."""
+        """State after a reset; variables whose reset is no number are zero."""
         made = {}
         for name, shape in self._shapes.items():
             value = self._rest[name]
@@ -364,7 +361,7 @@ class StateLayout:
         return kind(**made, **{name: np.zeros((0, n)) for name, n in self._columns.items()})
 
     def read(self, state: np.ndarray, kind: type[_State] = SavedState) -> _State:
-        """What a state (size,) holds, as views of it."""
+        """The saved state of a state (size,), as views of it."""
         found = {}
         for name, shape in self._shapes.items():
             part = state[self.slices[name]]
@@ -372,10 +369,10 @@ class StateLayout:
         return kind(**found, **{name: self.rows(state, name) for name in self._columns})
 
     def write(self, saved: SavedState, state: np.ndarray) -> None:
-        """The inverse of `read`; what the saved state has not is zero, room that is not used stays as it is.
+        """Inverse of `read`. Missing values are zero; unused rows of tables are unchanged.
 
         Raises:
-          ValueError: more rows than there is room for.
+          ValueError: more rows than a table can have.
         """
         values = vars(saved)
         for name in self._shapes:
@@ -392,7 +389,7 @@ class StateLayout:
             part[1 : 1 + n * len(table)] = table.ravel()
 
     def key(self, state: np.ndarray) -> bytes:
-        """All that a state says, without the room that is not used."""
+        """Bytes of a state without unused rows, as a key."""
         return state[: self._used].tobytes() + b"".join(
             self.part(state, name)[: 1 + n * int(self.part(state, name)[0])].tobytes()
             for name, n in self._columns.items()
@@ -400,8 +397,8 @@ class StateLayout:
 
 
 def _columns(variables):
-    """Of a table: number of an item, and what each variable has of it. What starts has one number: items of a
-    vector are its components."""
+    """Columns of a table: the index of an item, and the numbers of each variable. The variable that starts a
+    table has one number; if it is a vector, its components are the items."""
     first = next(i for i, v in enumerate(variables) if v.starts)
     of = [variables[first]]
     for v in variables[first + 1 :]:

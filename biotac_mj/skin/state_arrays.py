@@ -1,5 +1,5 @@
-"""The arrays of a skin's state, as `state` declares them: resets of some worlds on the device, and the state
-of one world to the host and back."""
+"""The arrays of a skin's state, declared in `state`: resets of some worlds on the device, and transfer of one
+world to the host and back."""
 
 import operator
 import typing
@@ -14,7 +14,7 @@ from .transfer import Transfer
 
 __all__ = ["StateArrays"]
 
-# six numbers of a symmetric 3 x 3, and back
+# indices of the six numbers of a symmetric 3 x 3 matrix, and back
 _ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
 
@@ -24,10 +24,10 @@ class StateArrays:
     Args:
       data, geoms: of the skin.
       tier: FULL or CONDENSED.
-      holders: other holders of arrays by name. Variables whose holder is not there are left out.
+      holders: other holders of arrays by name. Variables of missing holders are omitted.
 
     Attributes:
-      arrays: by the names of variables.
+      arrays: by variable name.
     """
 
     def __init__(self, data: SkinData, geoms: GeomSet, tier: str = FULL, **holders: typing.Any):
@@ -59,12 +59,12 @@ class StateArrays:
     # --- some of the worlds, on the device ---
 
     def prepare(self) -> None:
-        """Makes what `reset` and `reset_skin` launch; before a capture."""
+        """Prepares `reset` and `reset_skin`; call it before a capture."""
         self._all = self._resets(lambda v: True)
         self._at_rest = self._resets(lambda v: not v.outlives_rest)
 
     def _resets(self, wanted):
-        """Writes the values of a reset into the arrays of wanted variables."""
+        """Transfer of reset values to the arrays of wanted variables."""
         pairs, gates = [], {}
         with wp.ScopedDevice(self._device):
             for v, array in self._found:
@@ -72,7 +72,7 @@ class StateArrays:
                     continue
                 if isinstance(v.reset, str):
                     value = self._sources[v.reset]
-                    if v.reset == "rest_pressure":  # there is none without liquid
+                    if v.reset == "rest_pressure":  # zero in worlds without liquid
                         gates[len(pairs)] = self._kappa
                 else:
                     value = wp.full((1,) * array.ndim, v.reset, dtype=v.dtype)
@@ -86,17 +86,17 @@ class StateArrays:
             self._memory.forget(self._x, mask)
 
     def reset_skin(self, mask: wp.array) -> None:
-        """The same of a skin that comes to rest by itself, whose geoms and steps are not forgotten."""
+        """Resets the skin of the worlds of mask, and keeps variables of geoms and steps."""
         self._at_rest.launch_where(mask)
 
     def of_role(self, *roles: str) -> list[wp.array]:
-        """Arrays of the variables in some roles."""
+        """Arrays of the variables with some roles."""
         return [array for v, array in self._found if v.role in roles]
 
     # --- a single world, on the host ---
 
     def save(self, kind: type[SavedState] = SavedState) -> SavedState:
-        """State of the first world, without what only the host knows."""
+        """State of the first world, without the variables of the host."""
         host = self._host()
         saved = {name: value(host[name]) for name, value in self._values}
         for name, blocks in self._rows.items():
@@ -109,14 +109,14 @@ class StateArrays:
         return kind(**saved)
 
     def save_of(self, holder: str) -> dict:
-        """That of one holder, by the names of variables."""
+        """State of one holder, by variable name."""
         host = self._host()
         names = {v.name for v in self._plain if v.holder == holder}
         return {name: value(host[name]) for name, value in self._values if name in names}
 
     def load(self, saved: SavedState) -> None:
-        """Sets the state of a single world; the inverse of `save`, with rows ascending by their items. What
-        the saved one has not is reset."""
+        """Sets the state of a single world; the inverse of `save`, with rows in ascending order of items.
+        Missing values are reset."""
         values, host, self._geoms.posed = vars(saved), self._host(), True
         for v in self._plain:
             value = values.get(v.name)
@@ -144,33 +144,33 @@ class StateArrays:
             self._memory.recall(self._x)
 
     def view(self, name: str) -> np.ndarray:
-        """Array of a variable in the first world as the host sees it: on the CPU its own memory."""
+        """Array of a variable in the first world on the host; a view on the CPU."""
         v = next(v for v, _ in self._found if v.name == name)
         return self.arrays[name].numpy()[_first(v)]
 
     def _host(self):
-        """What `save` and `load` read and write, of the first world."""
+        """Arrays of the first world that `save` and `load` use."""
         if self._views is None or self._device.is_cuda:
             self._views = {name: self.view(name) for name in self._loaded}
         return self._views
 
 
 def _first(v):
-    """Index of the first world; of a number per world a slice, which is a view."""
+    """Index of the first world; a slice for a number per world, so that the result is a view."""
     if not v.axes and not v.item:
         return slice(0, 1)
     return (*[slice(None)] * len(v.axes), 0)
 
 
 def _value_of(v):
-    """Function that takes from a variable in a world what is saved."""
+    """Function from a variable's array in a world to its saved value."""
     if v.symmetric:
         return lambda view: view[..., _ROW, _COLUMN]
     return np.copy if v.axes or v.item else lambda view: float(view[0])
 
 
 def _blocks(variables, arrays):
-    """Variables of a table of rows by what starts them."""
+    """Groups the variables of a table; each group begins with a variable that starts a table."""
     blocks = []
     for v in variables:
         if v.name not in arrays:
@@ -183,7 +183,7 @@ def _blocks(variables, arrays):
 
 
 def _rows(block, host):
-    """Items that a block starts with, numbered from its first one, and what they have."""
+    """Rows of a block: indices of its items, and their values."""
     column = host[block[0].name].reshape(-1)
     at = np.flatnonzero(column != block[0].reset)
     parts = [host[v.name].reshape(len(column), -1)[at] for v in block]
@@ -191,7 +191,7 @@ def _rows(block, host):
 
 
 def _put_rows(table, blocks, host):
-    """The inverse of `_rows` of all blocks; items without a row are reset."""
+    """Inverse of `_rows` for all blocks; items without a row are reset."""
     begin, number = 0, table[:, 0]
     for first, *others in blocks:
         column = host[first.name].reshape(-1)

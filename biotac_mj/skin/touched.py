@@ -1,9 +1,9 @@
-"""What bodies that touch the skin do to it besides pushing: the area of each, its slip, and what its force
-and a height under it do to the skin's modes. For the sensors of all worlds, after a step.
+"""Contact area and slip of each touching body, and the modal forces of its contact force and of a height
+under it. For the sensors of all worlds, after a step.
 
-A body's force acts on the samples that it touches, along itself; a height is a motion along it too, and what
-it makes is the tangent of the step. The speed of slip is that at which what holds the samples in friction
-moves over the body, on average."""
+The force of a body acts on the samples that it touches, in its own direction. A height is a motion in the
+same direction, and its force follows from the tangent of the step. The speed of slip is the mean speed of the
+friction anchors over the body."""
 
 import numpy as np
 import warp as wp
@@ -20,13 +20,14 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 _CHUNK = 96  # faces that one thread sums
-# of a chunk's sums: force on samples, area, force on samples that touched before, their anchors' way times it
-_LOAD, _AREA, _KNOWN, _WAY = range(4)
+# sums of a chunk: force on samples, area, force on samples that touched before, its product with their
+# anchors' motion
+_LOAD, _AREA, _LASTING, _PATH = range(4)
 
 
 def faces_of(modes: SkinModes, face: np.ndarray, nvert: int) -> np.ndarray:
-    """(nface, nmode + 1, 3) modal forces [N kg^-1/2 / N] and, last, steady pressure [Pa/N] of a unit force on
-    each face (nface, 3) of the outer surface of nvert nodes."""
+    """Modal forces [N kg^-1/2 / N] and, last, steady pressure [Pa/N] by a unit force on each face (nface, 3)
+    of the outer surface of nvert nodes: (nface, nmode + 1, 3)."""
     place = np.zeros(nvert, int)
     place[modes.node] = np.arange(len(modes.node))
     each = np.concatenate([modes.shape, modes.static[None]])[:, place[face]]
@@ -39,7 +40,7 @@ def sum_chunks(
     nsample: int,
     area: wp.array(dtype=real),
     group: wp.array(dtype=int),
-    heard: wp.array2d(dtype=vec3),
+    response: wp.array2d(dtype=vec3),
     kept: wp.array2d(dtype=int),
     geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
@@ -48,14 +49,14 @@ def sum_chunks(
     force: wp.array2d(dtype=vec3),
     # Out:
     sum_out: wp.array3d(dtype=vec6),
-    heard_out: wp.array4d(dtype=vec3),
+    response_out: wp.array4d(dtype=vec3),
 ):
-    """Of a chunk of faces: `sum_out` [group, chunk, world] by the threads of row 0, and what each row of
-    modes hears of the samples, as if the sizes of their forces had one direction [row, group, chunk, world].
-    One that begins or ceases to touch has no force, and is not heard as a knock."""
+    """Sums of a chunk of faces [group, chunk, world], by the threads of mode 0, and the response of mode m to
+    the samples, weighted by the size of their forces [mode, group, chunk, world]. A sample that makes or
+    loses contact has no force, so that it causes no knock."""
     m, c, w = wp.tid()
     for g in range(sum_out.shape[0]):
-        heard_out[m, g, c, w] = vec3()
+        response_out[m, g, c, w] = vec3()
         if m == 0:
             sum_out[g, c, w] = vec6()
     for f in range(c * _CHUNK, wp.min((c + 1) * _CHUNK, kept.shape[0])):
@@ -66,28 +67,28 @@ def sum_chunks(
                 if k >= 0:
                     g = group[k]
                     load = wp.length(force[i, w])
-                    if heard.shape[0] > 0:
-                        heard_out[m, g, c, w] = heard_out[m, g, c, w] + load * heard[m, f]
+                    if response.shape[0] > 0:
+                        response_out[m, g, c, w] = response_out[m, g, c, w] + load * response[m, f]
                     if m == 0:
                         one = vec6()
                         one[_LOAD] = load
                         one[_AREA] = area[f] / real(nsample)
                         if geom_last[i, w] == k:
-                            one[_KNOWN] = load
+                            one[_LASTING] = load
                             path = load * (anchor[i, w] - anchor_last[i, w])
                             for a in range(3):
-                                one[_WAY + a] = path[a]
+                                one[_PATH + a] = path[a]
                         sum_out[g, c, w] = sum_out[g, c, w] + one
 
 
 @wp.kernel
-def feel_bodies(
+def write_bodies(
     # In:
     dt: wp.array(dtype=real),
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
     sums: wp.array3d(dtype=vec6),
-    heard: wp.array4d(dtype=vec3),
+    response: wp.array4d(dtype=vec3),
     # Out:
     area_out: wp.array2d(dtype=real),
     force_out: wp.array2d(dtype=real),
@@ -95,7 +96,8 @@ def feel_bodies(
     drive_out: wp.array2d(dtype=real),
     gain_out: wp.array3d(dtype=real),
 ):
-    """One row of modes, the last of which is the steady pressure; row 0 tells area, force and slip too."""
+    """Modal force and gain of mode m, whose last row is the steady pressure; mode 0 also writes area, force
+    and slip."""
     m, w = wp.tid()
     drive = real(0.0)
     for g in range(sums.shape[0]):
@@ -103,13 +105,13 @@ def feel_bodies(
         mean = vec3()
         for c in range(sums.shape[1]):
             total += sums[g, c, w]
-            mean += heard[m, g, c, w]
+            mean += response[m, g, c, w]
         force = -vec3(wrench[g, w][0], wrench[g, w][1], wrench[g, w][2])
         size = wp.length(force)
         if m == 0:
-            path = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2])
-            if total[_KNOWN] > real(0.0):
-                path = path / total[_KNOWN]
+            path = vec3(total[_PATH], total[_PATH + 1], total[_PATH + 2])
+            if total[_LASTING] > real(0.0):
+                path = path / total[_LASTING]
             area_out[w, g] = total[_AREA]
             force_out[w, g] = size
             slip_out[w, g] = real(0.0)
@@ -132,17 +134,17 @@ def feel_bodies(
 
 
 class Touched:
-    """Of the skins of all worlds of a SkinData.
+    """Contact of the bodies with the skins of all worlds of a SkinData.
 
     Args:
-      data: of the skins. group: (ngeom,) body of each geom. ngroup: how many bodies.
-      modes: of the skin; None: `drive` and `gain` are not wanted.
+      data: of the skins. group: (ngeom,) body of each geom. ngroup: number of bodies.
+      modes: of the skin; None: without `drive` and `gain`.
 
     Attributes (wp.arrays float64, written by `end`):
-      area, force, slip: (nworld, ngroup) what each body touches [m^2], its force [N] and speed of slip [m/s].
+      area, force, slip: (nworld, ngroup) contact area of each body [m^2], force [N] and speed of slip [m/s].
       drive: (nworld, nmode) modal force of all contacts [N kg^-1/2].
-      gain: (nworld, ngroup, nmode + 1) modal forces that a height under each body makes [N kg^-1/2 / m], and
-        last its steady pressure [Pa/m].
+      gain: (nworld, ngroup, nmode + 1) modal forces by a height under each body [N kg^-1/2 / m] and, last,
+        its steady pressure [Pa/m].
     """
 
     def __init__(self, data: SkinData, group: np.ndarray, ngroup: int, modes: SkinModes | None = None):
@@ -150,39 +152,39 @@ class Touched:
         nface, self.device = len(model.outer.face_np), model.device
         nmode = 0 if modes is None else len(modes.rate)
         self._rows = nmode + 1
-        heard = np.zeros((0, nface, 3))
+        response = np.zeros((0, nface, 3))
         if modes is not None:
-            heard = np.ascontiguousarray(faces_of(modes, model.outer.face_np, model.nvert).swapaxes(0, 1))
+            response = np.ascontiguousarray(faces_of(modes, model.outer.face_np, model.nvert).swapaxes(0, 1))
         chunks = -(-nface // _CHUNK)
         with wp.ScopedDevice(self.device):
             self._group = wp.array(np.asarray(group, np.int32), dtype=int)
-            self._heard = wp.array(heard, dtype=vec3, ndim=2)
+            self._response = wp.array(response, dtype=vec3, ndim=2)
             self._geom, self._anchor = wp.empty_like(data.outer.anchor_geom), wp.empty_like(data.outer.anchor)
             self._geom.fill_(-1)
             self._sums = wp.zeros((ngroup, chunks, nworld), dtype=vec6)
-            self._heard_sums = wp.zeros((self._rows, ngroup, chunks, nworld), dtype=vec3)
+            self._response_sums = wp.zeros((self._rows, ngroup, chunks, nworld), dtype=vec3)
             self.area, self.force, self.slip = (wp.zeros((nworld, ngroup), dtype=real) for _ in range(3))
             self.drive = wp.zeros((nworld, nmode), dtype=real)
             self.gain = wp.zeros((nworld, ngroup, nmode + 1 if nmode else 0), dtype=real)
 
     def begin(self) -> None:
-        """Before a step. Launches only."""
-        if self._heard.shape[0]:  # without modes nobody asks for slip
+        """To be called before a step. Launches only."""
+        if self._response.shape[0]:  # slip is needed with modes only
             wp.copy(self._geom, self._data.outer.anchor_geom)
             wp.copy(self._anchor, self._data.outer.anchor)
 
     def end(self, wrench: wp.array, tangent: wp.array) -> None:
-        """After it. Launches only.
+        """To be called after a step. Launches only.
 
         Args:
           wrench: (ngroup, nworld) spatial_vectord of the skin ON each body [N, N m].
-          tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d motion; looked at where there are modes.
+          tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d motion; used with modes only.
         """
         d, nworld = self._data, self._data.nworld
         outer, shape = d.outer, (self._rows, self._sums.shape[1], nworld)
-        inputs = [len(d.model.sample), d.model.outer.area, self._group, self._heard, outer.kept]
+        inputs = [len(d.model.sample), d.model.outer.area, self._group, self._response, outer.kept]
         inputs += [outer.anchor_geom, outer.anchor, self._geom, self._anchor, outer.sample_force]
-        wp.launch(sum_chunks, shape, inputs, [self._sums, self._heard_sums], device=self.device)
-        inputs = [d.dt, wrench, tangent, self._sums, self._heard_sums]
+        wp.launch(sum_chunks, shape, inputs, [self._sums, self._response_sums], device=self.device)
+        inputs = [d.dt, wrench, tangent, self._sums, self._response_sums]
         outputs = [self.area, self.force, self.slip, self.drive, self.gain]
-        wp.launch(feel_bodies, (self._rows, nworld), inputs, outputs, device=self.device)
+        wp.launch(write_bodies, (self._rows, nworld), inputs, outputs, device=self.device)

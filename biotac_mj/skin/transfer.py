@@ -1,4 +1,4 @@
-"""Arrays [item, world] of any type written from others in some worlds, all of them by one launch."""
+"""Copies between arrays [item, world] of any type in some worlds, by one launch for all arrays."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -11,22 +11,22 @@ __all__ = ["Transfer", "words_of"]
 
 wp.set_module_options({"enable_backward": False})
 
-_CHUNK = 8  # items that a thread of CUDA writes; on the CPU one writes all of an array
+_CHUNK = 8  # items that a thread writes on CUDA; on the CPU one thread writes an array
 
 
 @wp.struct
 class Pair:
-    """Two arrays as words [item, world, word] of 64 bits, or where an item is no whole number of these, of
-    32; of the other there are none. A source with one item or one world serves all. Words are moved as
-    floating-point numbers, whatever they are: a store of these cannot change the arrays' strides, so that
-    compilers keep them in registers."""
+    """Two arrays as words [item, world, word] of 64 bits or, if the size of an item is no multiple of that,
+    of 32 bits; the arrays of the other size are empty. A source with one item or one world is used for all.
+    Words are copied as floating-point numbers, so that the compiler knows that a store does not change the
+    arrays' strides, and keeps them in registers."""
 
     source: wp.array3d(dtype=real)
     target: wp.array3d(dtype=real)
     half_source: wp.array3d(dtype=wp.float32)
     half_target: wp.array3d(dtype=wp.float32)
-    gate: wp.array(dtype=real)  # where there is one [world]: zero is written where it is zero
-    guess: int  # 1: it stays where the last step converged
+    gate: wp.array(dtype=real)  # [world], perhaps empty; zero is written in worlds where it is zero
+    guess: int  # 1: unchanged in worlds whose last step converged
 
 
 @wp.func
@@ -54,6 +54,7 @@ def write(pair: Pair, first: int, last: int, w: int):
 
 @wp.kernel
 def write_where(pairs: wp.array(dtype=Pair), task: wp.array(dtype=wp.vec3i), mask: wp.array(dtype=bool)):
+    """Copies the items of task t in world w, if its mask is set."""
     t, w = wp.tid()
     if mask[w]:
         at = task[t]
@@ -67,7 +68,7 @@ def write_wanted(
     wanted: wp.array(dtype=int),
     reason: wp.array(dtype=int),
 ):
-    """In wanted worlds; a guess only where the last step did not converge."""
+    """Copies the items of task t in a wanted world; guesses only if its last step did not converge."""
     t, w = wp.tid()
     if wanted[w] == 1:
         at = task[t]
@@ -76,14 +77,14 @@ def write_wanted(
 
 
 class Transfer:
-    """From arrays to others.
+    """Copies between pairs of arrays.
 
     Args:
       pairs: (source, target) [..., world] of one type; a source may have one item, or one world, for all.
       words: whether the pairs are words already, of any strides, see `Pair`.
       nworld: number of worlds. device: of the arrays.
-      gates: by the number of a pair an array (nworld,) double; zero is written where it is zero.
-      guesses: numbers of pairs that `launch_wanted` leaves alone where the last step converged.
+      gates: index of a pair -> array (nworld,) double; zero is written in worlds where it is zero.
+      guesses: indices of pairs that `launch_wanted` skips in worlds whose last step converged.
     """
 
     def __init__(
@@ -121,12 +122,12 @@ class Transfer:
             self._task = wp.array(task, dtype=wp.vec3i) if task else wp.zeros(0, dtype=wp.vec3i)
 
     def launch_where(self, mask: wp.array) -> None:
-        """In the worlds of mask, (nworld,) of bool. Launches only."""
+        """Copies in the worlds of mask (nworld,) bool. Launches only."""
         self._launch(write_where, mask)
 
     def launch_wanted(self, wanted: wp.array, reason: wp.array) -> None:
-        """In wanted worlds, (nworld,) int; reason: why the last step failed there, 0: it did not. Launches
-        only."""
+        """Copies in wanted worlds (nworld,) int. reason: (nworld,) why the last step did not converge; 0: it
+        did. Launches only."""
         self._launch(write_wanted, wanted, reason)
 
     def _launch(self, kernel, *masks):
@@ -135,7 +136,7 @@ class Transfer:
 
 
 def words_of(array: wp.array, dtype: type) -> wp.array:
-    """A wp.array [..., world], or the transpose of one [world, item], as words [item, world, word]."""
+    """An array [..., world], or the transpose of one [world, item], as words [item, world, word]."""
     size = wp.types.type_size_in_bytes(dtype)
     shape = (
         array.size // array.shape[-1],

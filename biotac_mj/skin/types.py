@@ -1,9 +1,8 @@
-"""Scalar and small tensor types of the kernels, all casts between them, and their sums over a block.
+"""Scalar, vector and matrix types of the kernels, casts between them, and sums over a block of threads.
 
 Positions and forces are in double precision on every device. Directions (of Newton's method, of conjugate
-gradients, of the preconditioner) are double on the CPU and single on CUDA, where they only steer the method;
-kernels that know such a direction are made for one `Precision`.
-"""
+gradients, of the preconditioner) are double on the CPU and single on CUDA, where they only steer the
+iteration; kernels with directions are made for one `Precision`."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -60,8 +59,8 @@ def narrow(A: mat33):
     )  # fmt: skip
 
 
-# Warp's own tiles do the same, but those of all threads of the host share one piece of memory on the CPU:
-# kernels that have any would have to wait for each other.
+# Warp's tiles do the same, but on the CPU all host threads share the memory of a tile: such kernels would
+# have to wait for each other.
 _OF_BLOCK = """
 #if defined(__CUDA_ARCH__)
     const int count = sizeof(own) / sizeof(double), warps = (blockDim.x + 31) / 32;
@@ -69,7 +68,7 @@ _OF_BLOCK = """
     double* number = (double*)&own;
     for (int i = 0; i < count; ++i)
         for (int far = 16; far > 0; far /= 2) number[i] += __shfl_down_sync(0xffffffffu, number[i], far);
-    __syncthreads();  // what a sum before left has been read
+    __syncthreads();  // all threads have read the result of an earlier sum
     if (threadIdx.x % 32 == 0)
         for (int i = 0; i < count; ++i) part[threadIdx.x / 32][i] = number[i];
     __syncthreads();
@@ -84,8 +83,8 @@ _OF_BLOCK = """
 
 @wp.func_native(_OF_BLOCK)
 def sum_of_block(own: real) -> real:
-    """Sum of a number or vector of each thread of a block of whole warps, always in the same order; all of
-    them take part and get it. On the CPU there is one."""
+    """Sum of a number or vector over the threads of a block of whole warps, in a fixed order. All threads
+    must take part, and get it. On the CPU a block has one thread."""
     ...
 
 
@@ -106,11 +105,11 @@ _OF_LANES = """
 """
 
 
-# Lanes that have ended may be named in a mask; those of one sum take part or have ended together.
+# A mask may contain lanes that have ended; the lanes of one sum take part or have ended together.
 @wp.func_native(_OF_LANES)
 def sum_of_lanes(p: vec3, lanes: int) -> vec3:
-    """Sum of a vector of each of so many neighbouring lanes of a warp, a power of two; all of them get it. On
-    the CPU there is one."""
+    """Sum of a vector over `lanes` neighbouring lanes of a warp, a power of two; all lanes get it. On the CPU
+    there is one."""
     ...
 
 
@@ -129,7 +128,7 @@ def same_matrix(A: mat33):
 
 
 class Precision(NamedTuple):
-    """Types of directions, and the casts between them and what is always double.
+    """Types of directions, and casts between them and double precision.
 
     Attributes:
       name: "single" or "double".
