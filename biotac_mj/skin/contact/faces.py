@@ -218,7 +218,8 @@ class NormalForces:
         self._run = Program(device, lambda program: program.launch(normal_forces, dim, given, [corner])).run
 
     def __call__(self, faces: np.ndarray) -> np.ndarray:
-        """Normal forces (nface,) [N], 0 on faces that are not in `faces`, indices of those that may be touched."""
+        """Normal forces (nface,) [N], 0 on faces that are not in `faces`, indices of those that may be
+        touched."""
         near = np.zeros(self._near.shape, np.int32)
         near[faces] = 1
         self._near.assign(near)

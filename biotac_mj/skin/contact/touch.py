@@ -382,8 +382,8 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         c: Contact,
         friction_mode: int,
     ):
-        """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block of
-        `BLOCK` threads with one sample each, or by a single thread."""
+        """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block
+        of `BLOCK` threads with one sample each, or by a single thread."""
         nsample = c.sample.shape[0]
         parallel_faces = int(1)
         first = int(0)

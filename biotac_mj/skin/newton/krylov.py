@@ -113,7 +113,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
     module = f"{__name__}.{precision.name}"
     scalar, vec, lower, raised = precision.scalar, precision.vec, precision.lower, precision.raised
 
-    @wp.func
+    @wp.func(inline=True)
     def face_product(s: int, w: int, surface: SurfaceForces, p: wp.array2d(dtype=vec)):
         """Contact tangent of face s // 3 times p, at its corner s % 3."""
         f = s // 3

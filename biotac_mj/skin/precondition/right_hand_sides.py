@@ -76,7 +76,7 @@ class InverseEntries:
     free_index: wp.array(dtype=int)  # number of a node among the free ones
 
 
-@wp.func
+@wp.func(inline=True)
 def push_forward(node_map: NodeMap, i: int, w: int, motion: wp.vec3):
     """Motion of node i for a motion of the undeformed skin, see `pushed_forward`."""
     if node_map.matrix.shape[0] > 0:
@@ -84,7 +84,7 @@ def push_forward(node_map: NodeMap, i: int, w: int, motion: wp.vec3):
     return motion
 
 
-@wp.func
+@wp.func(inline=True)
 def pull_back(node_map: NodeMap, i: int, w: int, force: wp.vec3):
     """Force on the undeformed skin for a force on node i."""
     if node_map.matrix.shape[0] > 0:
@@ -92,7 +92,7 @@ def pull_back(node_map: NodeMap, i: int, w: int, force: wp.vec3):
     return force
 
 
-@wp.func
+@wp.func(inline=True)
 def entry(inverse: InverseEntries, row: int, column: int):
     """Entry of the inverse over its scale."""
     value = float(inverse.half[row, column])

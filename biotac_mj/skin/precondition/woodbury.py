@@ -90,7 +90,7 @@ def fill_compliance(
                 W_out[w, row + k, 0] = v[k]
 
 
-@wp.func
+@wp.func(inline=True)
 def _group_of(
     i: int,
     w: int,
@@ -147,7 +147,7 @@ def add_bodies(
                     W[w, row, column] = W[w, row, column] + float(u[k])
 
 
-@wp.func
+@wp.func(inline=True)
 def contact_stiffness_between(
     i: int,
     j: int,
