@@ -4,8 +4,7 @@ electrodes by physics.
     spec = mujoco.MjSpec.from_file("scene.xml")
     handle = biotac_mj.attach(spec, ...)
 
-Importing registers the MuJoCo engine plugin and nothing heavy: the names below load their modules when they
-are first used."""
+The import only registers the MuJoCo engine plugin; the names below load their modules at the first access."""
 
 import os
 import typing

@@ -1,4 +1,4 @@
-"""What the command line's arguments may be: each says what is wrong with its text before any work begins."""
+"""Types of the command line's arguments, which check their text before any work begins."""
 
 import argparse
 import difflib
@@ -27,8 +27,8 @@ __all__ = [
 
 
 class Parser(argparse.ArgumentParser):
-    """Its errors are one line, and end with exit code 2. Options are written in full: what is short for one
-    today is short for two when the next is added."""
+    """A parser whose errors are one line, with exit code 2. Options must be written in full, since an
+    abbreviation may become ambiguous when options are added."""
 
     def __init__(self, *args: object, **settings: object):
         super().__init__(*args, **{"allow_abbrev": False} | settings)
@@ -38,7 +38,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As argparse's, but a verb itself answers what it does not know, before it misses anything."""
+        """As in argparse, but a verb reports unknown arguments itself, before missing ones."""
         if args is not None and not self._subparsers:
             for before, word in zip(("", *args), args):
                 if re.fullmatch(r"--[\w-]+=--", word):  # to argparse of some versions none, of others "--"
@@ -54,7 +54,7 @@ class Parser(argparse.ArgumentParser):
                     near = (meant + difflib.get_close_matches(given, known, 1))[:1]
                     self.error(f"no option {given}{f': did you mean {near[0]}?' if near else ''}")
         if self._subparsers and not (sys.argv[1:] if args is None else args):
-            self.print_help()  # who gave no verb wants to know which there are
+            self.print_help()  # without a verb, print the verbs
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"nothing takes {' '.join(unknown)}")
@@ -63,7 +63,7 @@ class Parser(argparse.ArgumentParser):
         return found, unknown
 
     def _refuse_inputs(self, found):
-        """Raises ValueError where a file that will be written is one that another argument names."""
+        """Raises ValueError if an output file is also named by another argument."""
         given = [
             (action, value) for action in self._actions for value in _flat(getattr(found, action.dest, ""))
         ]
@@ -80,7 +80,7 @@ class Parser(argparse.ArgumentParser):
                 refuse_inputs(option, file, *read, given=out)
 
     def _check_value(self, action, value):
-        """A verb that stands in a group is known there."""
+        """Checks a choice; suggests the group of a verb that belongs to one."""
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
             homes = [
                 f"`{inner.prog}`"
@@ -129,7 +129,7 @@ def quantity(kind: str, most: float = math.inf, least: float = -math.inf) -> Cal
 
 
 def place(text: str) -> float | str:
-    """One number of a place: a length or an angle, which its position tells; a plain number is of SI."""
+    """One number of a position: a length or an angle, depending on its place; a plain number is in SI."""
     for kind in ("length", "angle"):
         try:
             read_quantity("it", text, kind)
@@ -158,7 +158,7 @@ SEED = whole(0, 2**31 - 1)
 
 
 def device(text: str) -> str:
-    """The name of a device; whether it is there is known to what computes."""
+    """The name of a device; whether it exists is checked later."""
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?(,cuda:\d{1,3})*", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no device: give cpu, or cuda:0")
     return text
@@ -174,7 +174,7 @@ def add_ray(parser: argparse.ArgumentParser) -> None:
 
 
 def check_device(names: str) -> None:
-    """Refuses devices that are not here (ValueError); names: of Warp, several with commas."""
+    """Raises ValueError for devices that do not exist; names: of Warp, separated by commas."""
     import warp
 
     from .quiet import quiet_warp
@@ -187,13 +187,13 @@ def check_device(names: str) -> None:
 
 
 class _Output(str):
-    """A path of the command line; files: what will be written there."""
+    """A path of the command line; files: that will be written there."""
 
     files: tuple[pathlib.Path, ...] = ()
 
 
 def _flat(value: object) -> Iterator[str]:
-    """The texts of an argument, which may be a list of lists of them."""
+    """The texts of an argument, which may be nested lists."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, (list, tuple)):
@@ -202,7 +202,7 @@ def _flat(value: object) -> Iterator[str]:
 
 
 def output_folder(*names: str) -> Callable[[str], str]:
-    """A folder in which files of these names can be written, none of which another argument may name."""
+    """Type of a folder to which files of these names can be written; no other argument may name them."""
 
     def check(text):
         check_output(text, *names)
@@ -212,7 +212,7 @@ def output_folder(*names: str) -> Callable[[str], str]:
 
 
 def output_file(*more: str) -> Callable[[str], str]:
-    """A file that can be written, others beside it, and that no other argument may name."""
+    """Type of a file that can be written, with others in its folder; no other argument may name it."""
 
     def check(text):
         check_output_file(text, *more)

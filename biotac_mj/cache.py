@@ -1,9 +1,9 @@
-"""What is kept between processes: arrays on disk, found by a digest of everything that they were made of.
+"""Cache on disk: arrays, found by a digest of all inputs.
 
-A file is written under a temporary name and then renamed, so that none is ever seen half written. A damaged
-file is made again and replaced. A folder that cannot be written costs time and nothing else. The folder has a
-bound: every material has its own files, 200 MB where its compliance is kept, and a set of data draws
-thousands, so the files that were not used for longest are deleted."""
+A file is written to a temporary name and then renamed, so that no incomplete file is seen. A damaged file is
+made again. Without a writable folder the arrays are computed each time. The size of the folder is limited,
+since every material has its own files, up to 200 MB, and a data set has thousands of materials; the least
+recently used files are deleted."""
 
 import contextlib
 import dataclasses
@@ -25,8 +25,8 @@ from .files import replacing
 __all__ = ["Entry", "cache_folder", "cached", "digest", "key_of", "replace_file", "touch"]
 
 _FORMAT = "2"  # of keys and files
-_SKIN = ("geometry", "skin")  # the code of which most of it is made
-_LARGEST = 4  # of the whole folder unless BIOTAC_CACHE_GB says otherwise [GB]
+_SKIN = ("geometry", "skin")  # folders whose code makes most arrays
+_LARGEST = 4  # default limit of the folder, see BIOTAC_CACHE_GB [GB]
 _PACKAGE = pathlib.Path(__file__).parent
 
 
@@ -37,10 +37,11 @@ def cache_folder() -> pathlib.Path:
 
 
 def digest(*content: object) -> str:
-    """Of arrays (with type and shape), bytes, texts, numbers, and of dataclasses, dicts and lists of these.
+    """Digest of arrays (with type and shape), bytes, texts, numbers, and of dataclasses, dicts and lists of
+    these.
 
     Raises:
-      TypeError: anything else, whose bytes are not known.
+      TypeError: any other type.
     """
     found = hashlib.sha256(_FORMAT.encode())
     _add(found, content)
@@ -48,7 +49,8 @@ def digest(*content: object) -> str:
 
 
 def _add(found, item):
-    """Each item begins with its kind and size, so that no two lists of items are the same bytes."""
+    """Adds an item to a digest, after its kind and size, so that different lists of items have different
+    bytes."""
     if isinstance(item, np.generic):
         item = item.item()
     parts = ()
@@ -77,7 +79,7 @@ def _add(found, item):
 
 @functools.cache
 def _code(names):
-    """Digest of folders and modules of this package: what other code has made is not taken from the cache."""
+    """Digest of folders and modules of this package, so that arrays of other code are not used."""
     files = [
         file
         for name in names
@@ -90,20 +92,19 @@ def key_of(kind: str, inputs: Iterable, code: Iterable[str] = _SKIN) -> str:
     """The key of a result.
 
     Args:
-      kind: what it is.
-      inputs: everything that it depends on, as for `digest`: where a skin's geometry goes in, the whole
-        SkinGeometry.
-      code: folders and modules of the package that make it.
+      kind: of the result.
+      inputs: everything that it depends on, as for `digest`; a skin's geometry as the whole SkinGeometry.
+      code: folders and modules of the package that compute it.
     """
     return digest(kind, _code(tuple(code)), list(inputs))
 
 
 class Entry:
-    """The place of some arrays in the cache.
+    """A file of arrays in the cache.
 
     Args:
-      kind: the beginning of the file's name. inputs, code: see `key_of`.
-      folder: in place of the cache's, of a size that has no bound.
+      kind: start of the file's name. inputs, code: see `key_of`.
+      folder: another folder, without a limit of its size.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class Entry:
         self.path = (cache_folder() if folder is None else pathlib.Path(folder)) / f"{kind}-{self._key}.npz"
 
     def load(self) -> dict[str, np.ndarray] | None:
-        """The arrays, or None where they are not there or damaged."""
+        """The arrays, or None if the file is missing or damaged."""
         try:
             with np.load(self.path, allow_pickle=False) as file:  # the archive has a checksum of each array
                 found = dict(file)
@@ -130,7 +131,7 @@ class Entry:
         return found
 
     def save(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Writes them, where that is possible."""
+        """Writes the arrays, if the folder is writable."""
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, key=np.array(self._key), **arrays)
         replace_file(self.path, lambda file: file.write(buffer.getbuffer()), self._bounded)
@@ -142,7 +143,7 @@ def cached(
     make: Callable[[], dict[str, np.ndarray]],
     code: Iterable[str] = _SKIN,
 ) -> dict[str, np.ndarray]:
-    """The arrays that `make` makes of the inputs, from disk where they have been made before; see `Entry`."""
+    """The arrays that `make` returns for the inputs, from disk if they exist; see `Entry`."""
     entry = Entry(kind, inputs, code)
     found = entry.load()
     if found is None:
@@ -152,13 +153,13 @@ def cached(
 
 
 def touch(path: pathlib.Path) -> None:
-    """Notes that a file has been used now."""
+    """Sets the time of a file's last use."""
     with contextlib.suppress(OSError):
         os.utime(path)
 
 
 def _limit() -> float:
-    """Bytes that the folder may hold."""
+    """Limit of the folder's size [bytes]."""
     given = os.environ.get("BIOTAC_CACHE_GB") or _LARGEST
     try:
         found = float(given) * 1e9
@@ -170,8 +171,8 @@ def _limit() -> float:
 
 
 def _prune(newest: pathlib.Path) -> None:
-    """Deletes what was used longest ago until the folder is within its limit; never the newest file. A file
-    that a process has mapped lives on until that process ends (on Windows it stays: it cannot be deleted)."""
+    """Deletes the least recently used files until the folder is within its limit, but not the newest file. A
+    file that a process has mapped exists until that process ends (on Windows it cannot be deleted)."""
     files = []
     for file in newest.parent.iterdir():
         with contextlib.suppress(OSError):  # also where another process is doing the same

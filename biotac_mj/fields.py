@@ -27,7 +27,7 @@ _CALLED = {
 
 
 def refuse_unknown(given: Iterable[str], known: Iterable[str], what: str) -> None:
-    """Refuses names that are not known (ValueError), with the known one that is nearest."""
+    """Raises ValueError for unknown names, with the most similar known one."""
     known = list(known)
     for name in given:
         if name not in known:
@@ -37,10 +37,10 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], what: str) -> Non
 
 
 def check_types(settings: object, names: Iterable[str] | None = None, nan: bool = False) -> None:
-    """Refuses values of a dataclass that are not of its fields' types (ValueError).
+    """Raises ValueError for values of a dataclass that do not have the types of its fields.
 
     Args:
-      names: of the fields; None is all. nan: whether NaN is a number.
+      names: of the fields; None: all. nan: whether NaN is allowed.
     """
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
@@ -49,11 +49,10 @@ def check_types(settings: object, names: Iterable[str] | None = None, nan: bool 
 
 
 def either(name: str, value: object, given: object, where: str) -> object:
-    """A setting that has two places: `value` of its own argument, or what a dict `given` says of it; None is
-    nothing said.
+    """A setting with two sources: the argument `value`, or an entry of the dict `given`; None: not given.
 
     Raises:
-      ValueError: both say something, and not the same.
+      ValueError: both are given and differ.
     """
     other = given.get(name) if isinstance(given, Mapping) else None
     if value is None or other is None:
@@ -66,7 +65,7 @@ def either(name: str, value: object, given: object, where: str) -> object:
 
 
 def as_numbers(what: str, value: object) -> np.ndarray:
-    """An array of floats; ValueError of anything else."""
+    """Converts to an array of floats; raises ValueError for anything else."""
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
@@ -74,7 +73,7 @@ def as_numbers(what: str, value: object) -> np.ndarray:
 
 
 def as_real(what: str, value: object, least: float = -math.inf) -> float:
-    """A finite number; raises ValueError for anything else, or where it is below `least`."""
+    """Converts to a finite number; raises ValueError for anything else, or below `least`."""
     try:
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:
@@ -86,7 +85,7 @@ def as_real(what: str, value: object, least: float = -math.inf) -> float:
 
 
 def as_whole(what: str, value: object, least: int = -(2**31), most: int = 2**31 - 1) -> int:
-    """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
+    """Converts to an integer; raises ValueError for anything else, or outside [least, most]."""
     good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
     if not good or not least <= value <= most:
         raise ValueError(f"{what} is {short_repr(value)}: give a whole number from {least} to {most}")
@@ -94,7 +93,7 @@ def as_whole(what: str, value: object, least: int = -(2**31), most: int = 2**31 
 
 
 def check_entries(what: str, given: object, wanted: Mapping[str, type], optional: Iterable = ()) -> dict:
-    """The dict itself, with at least the wanted entries and each of its type.
+    """Returns a dict after a check that it has the wanted entries with their types.
 
     Raises:
       ValueError: it is no dict, or an entry is missing or of another type.
@@ -134,7 +133,7 @@ def _fits(value, kind):
 
 
 def _inside(parts):
-    """What the values of dict[str, KIND], list[KIND] or tuple[KIND, ...] are."""
+    """KIND of dict[str, KIND], list[KIND] or tuple[KIND, ...]."""
     return parts[0] if parts[-1] is Ellipsis else parts[-1]
 
 

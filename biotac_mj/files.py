@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and whether they could be, asked before the work."""
+"""Writes files completely or not at all, and checks before the work that they can be written."""
 
 import contextlib
 import fcntl
@@ -29,20 +29,20 @@ __all__ = [
     "write_npz",
 ]
 
-_MARK = ".biotac-"  # the name of a temporary begins with it
-_ROOM = 32  # letters that a temporary's name needs beyond the ending of the file's
+_MARK = ".biotac-"  # start of the names of temporary files
+_ROOM = 32  # characters that the name of a temporary file needs beyond the suffix
 
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathlib.Path]:
-    """Gives a temporary path with the same ending in the same folder; renames it to `path` if all went well,
-    else removes it. What a killed process left in the folder is removed first.
+    """Yields a temporary path with the same suffix in the same folder; renames it to `path` on success, else
+    removes it. First removes temporary files of killed processes from the folder.
 
     Args:
-      path: of the file, or with `folder` of a folder that is not there yet.
+      path: of the file, or with `folder` of a folder that does not exist.
 
     Raises:
-      ValueError: it is no path, or one of a folder that is there. OSError: it cannot be written.
+      ValueError: not a path, or the path of an existing folder. OSError: it cannot be written.
     """
     path = _path(path)
     if path.is_dir() or not path.name:
@@ -75,7 +75,7 @@ def _is_folder(path):
 
 
 def remove_leftovers(folder: pathlib.Path | str) -> None:
-    """Removes the temporaries of processes that have ended from a folder; those of others are locked."""
+    """Removes the temporary files of processes that have ended from a folder; those of others are locked."""
     for path in pathlib.Path(folder).glob(f"{_MARK}*"):
         with contextlib.suppress(OSError):  # locked, gone meanwhile, or on a disk without locks
             lock = _lock(path)
@@ -84,7 +84,7 @@ def remove_leftovers(folder: pathlib.Path | str) -> None:
 
 
 def _temporary(path, folder):
-    """A path nobody else has, and the handle that holds it (None on a disk without locks)."""
+    """A unique path, and the handle that locks it (None on a disk without locks)."""
     while True:
         if folder:
             made = tempfile.mkdtemp(dir=path.parent, prefix=_MARK)
@@ -103,10 +103,10 @@ def _temporary(path, folder):
 
 
 def _lock(path):
-    """A handle that holds the file until it is closed or its process ends.
+    """A handle that locks the file until it is closed or its process ends.
 
     Raises:
-      BlockingIOError: another one has it. OSError: it is gone, or its disk has no locks.
+      BlockingIOError: another process has locked it. OSError: it does not exist, or its disk has no locks.
     """
     handle = os.open(path, os.O_RDONLY)
     try:
@@ -126,9 +126,9 @@ def _remove(path):
 
 @contextlib.contextmanager
 def hdf5(path: pathlib.Path | str, **settings: object) -> Iterator["h5py.File"]:
-    """A new HDF5 file, which is at `path` as soon as it has been filled.
+    """A new HDF5 file, which appears at `path` when it is complete.
 
-    It is filled in memory: on a full disk HDF5 fails when it closes, and takes the process with it.
+    It is made in memory, since on a full disk HDF5 fails when it closes, and ends the process.
     """
     import h5py
 
@@ -140,7 +140,7 @@ def hdf5(path: pathlib.Path | str, **settings: object) -> Iterator["h5py.File"]:
 
 
 def write_npz(path: pathlib.Path | str, **arrays: np.ndarray) -> None:
-    """Arrays as a compressed .npz file."""
+    """Writes arrays to a compressed .npz file."""
     memory = io.BytesIO()
     np.savez_compressed(memory, allow_pickle=False, **arrays)
     with replacing(path) as temporary:
@@ -148,11 +148,11 @@ def write_npz(path: pathlib.Path | str, **arrays: np.ndarray) -> None:
 
 
 def check_output(folder: pathlib.Path | str, *names: str) -> None:
-    """Refuses a folder in which files of these names could not be written; makes nothing but room: see
+    """Checks that files of these names can be written to a folder; changes nothing, except for
     `remove_leftovers`.
 
     Raises:
-      ValueError: what is in the way.
+      ValueError: they cannot be written, with the reason.
     """
     folder = pathlib.Path(folder)
     try:
@@ -172,7 +172,7 @@ def check_output(folder: pathlib.Path | str, *names: str) -> None:
 
 
 def check_output_file(path: pathlib.Path | str, *more: str) -> None:
-    """The same for one file, and for others beside it."""
+    """`check_output` for one file, and for others in its folder."""
     path = _path(path)
     if os.path.isdir(path) or not path.name:
         raise ValueError(_is_folder(path))
@@ -180,10 +180,10 @@ def check_output_file(path: pathlib.Path | str, *more: str) -> None:
 
 
 def picture_kind(path: pathlib.Path | str) -> str:
-    """The kind of a picture by its name, as matplotlib says it; PNG where the name has none.
+    """Format of a picture from its name, for matplotlib; PNG without a suffix.
 
     Raises:
-      ValueError: no kind that can be written.
+      ValueError: an unknown format.
     """
     from matplotlib.backend_bases import FigureCanvasBase
 
@@ -196,8 +196,7 @@ def picture_kind(path: pathlib.Path | str) -> str:
 def refuse_inputs(
     option: str, path: pathlib.Path | str, *inputs: pathlib.Path | str | None, given: str = ""
 ) -> None:
-    """Raises ValueError where a file that will be written is one of those that are read; given: its folder,
-    where an option named that."""
+    """Raises ValueError if an output file is also an input. given: the folder, if an option named that."""
     for one in inputs:
         if one and os.path.exists(one) and os.path.exists(path) and os.path.samefile(path, one):
             where, remedy = f"{option} {path}", "give another name"
@@ -207,7 +206,7 @@ def refuse_inputs(
 
 
 def _nearest(folder):
-    """The folder, or what is there of the way to it."""
+    """The folder, or its nearest existing parent."""
     for path in (folder, *folder.parents):
         try:
             mode = os.stat(path).st_mode

@@ -1,6 +1,6 @@
-"""Packages whose names load their modules when they are first used.
+"""Packages whose names load their modules at the first access.
 
-`lazy_loader` does the same: it names no known names where one is unknown, and its stubs are parsed at every
+`lazy_loader` does the same, but does not suggest names when one is unknown, and parses its stubs at every
 import."""
 
 import importlib
@@ -13,12 +13,12 @@ __all__ = ["lazy"]
 def lazy(package: str, home: Mapping[str, str | None]) -> tuple[Callable, Callable]:
     """`__getattr__` and `__dir__` of a package.
 
-    Editors and type checkers do not run these: the package imports the same names once more under
+    Editors and type checkers do not run these, so the package also imports the names under
     `typing.TYPE_CHECKING`.
 
     Args:
-      package: its `__name__`. home: name -> the module that has it, relative to the package; None: the name
-        is that of a module itself.
+      package: its `__name__`. home: name -> module that has it, relative to the package; None: the name is a
+        module.
     """
 
     def get(name):

@@ -1,5 +1,4 @@
-"""Warp without its list of devices and of the modules it loads, which would go between a program's own
-lines."""
+"""Starts Warp without its list of devices and modules, which would mix with a program's own output."""
 
 import contextlib
 import os
@@ -12,13 +11,13 @@ import warp as wp
 __all__ = ["announce_compilation", "quiet_warp"]
 
 
-# C code of Warp 1.19 writes it to standard error, at every log level
+# written to standard error by C code of Warp 1.19, at every log level
 _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 
 
 def quiet_warp() -> None:
-    """Starts Warp and leaves it its warnings, but for the one that there is no GPU; does nothing with
-    BIOTAC_VERBOSE=1, or after the user set a log level."""
+    """Starts Warp with its warnings only, without the one about a missing GPU. Does nothing with
+    BIOTAC_VERBOSE=1, or if the user has set a log level."""
     if wp.config.log_level == wp.LOG_INFO and os.environ.get("BIOTAC_VERBOSE", "0") in ("", "0"):
         wp.config.log_level = wp.LOG_WARNING
         with _without(_NO_GPU):
@@ -27,8 +26,7 @@ def quiet_warp() -> None:
 
 @contextlib.contextmanager
 def _without(words):
-    """Leaves lines with these words out of what is written to the process's standard error, which C code does
-    without asking."""
+    """Removes lines with these words from the process's standard error, to which C code writes directly."""
     try:
         kept = os.dup(2)
     except OSError:  # there is none
@@ -48,7 +46,7 @@ def _without(words):
 
 
 def announce_compilation(device: wp.DeviceLike) -> None:
-    """Says so on standard error where Warp has yet to compile the skin's kernels for a kind of device."""
+    """Prints a note to standard error if Warp must first compile the skin's kernels for a kind of device."""
     cuda = wp.get_device(device).is_cuda
     cache = pathlib.Path(wp.config.kernel_cache_dir)
     if not any(cache.glob(f"wp_biotac_mj.skin.*/*.{'cu' if cuda else 'cpp'}")):

@@ -1,5 +1,4 @@
-"""Files that others made: whatever is wrong with one is an error of one line, which names file, cause and
-remedy."""
+"""Reads files of others: any defect becomes an error of one line that names file, cause and remedy."""
 
 import contextlib
 import json
@@ -29,7 +28,7 @@ _KINDS = {"finite": "fiu", "number": "fiu", "index": "iu", "flag": "biu", "text"
 
 
 class Array(typing.NamedTuple):
-    """What an array in a file must be.
+    """Requirements on an array in a file.
 
     shape: numbers, names (the same size wherever they occur) or None (any). kind: "finite" numbers, "number"
     (NaN allowed), "index" (integers >= 0), "flag" or "text".
@@ -40,18 +39,18 @@ class Array(typing.NamedTuple):
 
 
 class Unfit(ValueError):
-    """Of a file that can be read and holds something else: its text is complete."""
+    """A file that can be read has other contents; the message is complete."""
 
 
 @contextlib.contextmanager
 def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathlib.Path]:
-    """Calls of a library that reads `path`; whatever they raise becomes one line.
+    """Context of a library's calls that read `path`; any exception becomes one line.
 
     Args:
-      what: the file should be, as in "recorded press". remedy: what to do.
+      what: expected contents, such as "recorded press". remedy: advice in the message.
 
     Raises:
-      FileNotFoundError: no such file. ValueError: the file is another one, or damaged.
+      FileNotFoundError: no such file. ValueError: the file has other contents, or is damaged.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"the path of a {what} is {short_repr(path)}: {remedy}")
@@ -61,13 +60,13 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
         yield pathlib.Path(path)
     except Unfit:
         raise
-    except Exception as error:  # libraries raise what they like for broken files
+    except Exception as error:  # libraries raise any type for broken files
         lines = _unquoted(str(error).strip()).splitlines() or [type(error).__name__]
         raise ValueError(f"{path} is no {what} ({lines[0][:200]}): {remedy}") from error
 
 
 def _unquoted(text):
-    """Without the quotes that a KeyError puts around all of its text."""
+    """The text of an error, without the quotes of a KeyError."""
     return text[1:-1] if len(text) > 1 and text[0] == text[-1] in "'\"" else text
 
 
@@ -78,11 +77,11 @@ def check_arrays(
     remedy: str,
     sizes: dict | None = None,
 ) -> dict:
-    """The sizes that the names of the arrays' shapes stand for.
+    """Checks arrays, and returns the sizes of the named axes in their shapes.
 
     Args:
-      path: of the file, for the text. found: name -> array, or a data set of HDF5; values of "finite" and
-        "index" are checked where they are numpy's. sizes: known before.
+      path: of the file, for messages. found: name -> array or HDF5 data set; values of "finite" and "index"
+        are checked in numpy arrays only. sizes: known sizes.
 
     Raises:
       ValueError: an array is missing, or has another shape, type or values.
@@ -119,7 +118,7 @@ def read_hdf5(
     attributes: Iterable = (),
     also: Mapping[str, Array] | None = None,
 ) -> tuple[dict, dict]:
-    """Arrays and attributes of an HDF5 file; see `check_arrays`. also: arrays that may be missing."""
+    """Arrays and attributes of an HDF5 file, see `check_arrays`. also: optional arrays."""
     import h5py
 
     with reading(path, what, remedy), h5py.File(path) as file:
@@ -141,8 +140,7 @@ def read_npz(
     wanted: Mapping[str, Array] | None = None,
     also: Mapping[str, Array] | None = None,
 ) -> dict:
-    """Arrays of an .npz file, the wanted ones or all; see `check_arrays`. also: arrays that may be
-    missing."""
+    """Arrays of an .npz file, the wanted ones or all, see `check_arrays`. also: optional arrays."""
     with reading(path, what, remedy):
         if pathlib.Path(path).is_file() and not zipfile.is_zipfile(path):
             raise Unfit(f"{path} is no {what}, not even an .npz file: {remedy}")
@@ -156,20 +154,20 @@ def read_npz(
 
 
 def read_text(path: pathlib.Path | str, what: str, remedy: str) -> str:
-    """A file of text."""
+    """Contents of a text file."""
     with reading(path, what, remedy):
         return pathlib.Path(path).read_text(encoding="utf-8-sig")
 
 
 def read_json(path: pathlib.Path | str, what: str, remedy: str) -> dict:
-    """A dict in a file of JSON."""
+    """The dict in a JSON file."""
     text = read_text(path, what, remedy)
     with reading(path, what, remedy):
         return _dict(path, what, remedy, json.loads(text))
 
 
 def read_yaml(path: pathlib.Path | str, what: str, remedy: str) -> dict:
-    """A dict in a file of YAML."""
+    """The dict in a YAML file."""
     import yaml
 
     text = read_text(path, what, remedy)

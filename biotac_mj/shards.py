@@ -1,9 +1,9 @@
-"""A list of pure tasks and the files that they leave in a folder, done in this process, in several, or on a
-Ray cluster: the same files each time, behind one bar.
+"""Runs a list of independent tasks in this process, in several, or on a Ray cluster, with one progress bar.
+The files that they write do not depend on that.
 
-Work is a picklable object, called in each process that works: `work(values, folder, say)` takes values of
-tasks as they come, writes files to the folder and yields results. `say` takes a number, by which the bar
-moves, or a line of text."""
+`work` is a picklable object that is called in each process: `work(values, folder, say)` takes an iterator
+over the values of tasks, writes files to the folder and yields results. `say` takes a number, by which the
+bar moves, or a line of text."""
 
 import contextlib
 import dataclasses
@@ -30,7 +30,7 @@ __all__ = ["Task", "end_with_parent", "one_per_gpu", "run_tasks"]
 Work = Callable[[Iterable, pathlib.Path, Callable[[int | str], object]], Iterator]
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
-_TRIES = 5  # of a task whose process or machine went, one after another
+_TRIES = 5  # of a task whose process or machine failed
 _AGAIN = "run the command again, what is there is kept"
 
 
@@ -39,9 +39,9 @@ class Task:
     """One task.
 
     Attributes:
-      value: what the work is given; the result, and all files, follow from it alone.
-      size: its share of the bar.
-      last: name of the file that says that the task is done, and is therefore put into the folder last.
+      value: input of the work, which determines the result and all files.
+      size: weight in the progress bar.
+      last: name of the file that is moved to the folder last, and thus marks the task as done.
     """
 
     value: Any
@@ -61,20 +61,19 @@ def run_tasks(
     gpus: int = 0,
     progress: bool = True,
 ) -> Iterator:
-    """Yields the results of all tasks as they come.
+    """Yields the results of all tasks when they are finished.
 
     Args:
-      folder: where the files go. name, unit: of the bar.
-      ray: address of a Ray cluster ("auto": the one that this machine belongs to), or "local", as many
-        processes of Ray here as there are cores; None leaves Ray out. A task whose machine goes away is done
-        again by another one.
-      processes: {name: what is added to the environment}, a process for each; None works in this one.
-      cpus, gpus: what one task takes of a Ray node.
+      folder: for the files. name, unit: of the bar.
+      ray: address of a Ray cluster ("auto": that of this machine), or "local": one Ray process for each core;
+        None: without Ray. Tasks of a machine that fails are repeated on another one.
+      processes: {name: additional environment variables}, one process for each; None: this process.
+      cpus, gpus: of a Ray node for one task.
       progress: whether to show the bar and lines of text.
 
     Raises:
-      ValueError: what the work refused, Ray is not installed, or no cluster is at the address.
-      RuntimeError: the work failed, with its text.
+      ValueError: an error of the work's input, Ray is not installed, or no cluster is at the address.
+      RuntimeError: the work failed, with its message.
     """
     tasks, folder = list(tasks), pathlib.Path(folder)
     total = sum(task.size for task in tasks)
@@ -95,7 +94,7 @@ def run_tasks(
 
 
 def one_per_gpu(devices: Iterable[str]) -> dict[str, dict[str, str]]:
-    """`processes` of which each sees one of the devices ("cuda:0", "cuda:3"), and calls it cuda:0."""
+    """`processes` for devices ("cuda:0", "cuda:3"); each process sees one of them, as cuda:0."""
     visible = os.environ.get(_VISIBLE)
     names = visible.split(",") if visible else None
     numbers = {device: int(device.split(":")[1]) for device in devices}
@@ -103,9 +102,8 @@ def one_per_gpu(devices: Iterable[str]) -> dict[str, dict[str, str]]:
 
 
 def end_with_parent() -> None:
-    """Called in a process that multiprocessing started: it ends as soon as the one that started it is gone,
-    killed or not, instead of waiting for ever for more to do. Ctrl-C, which a terminal sends to all, is left
-    to that one."""
+    """Ends this child process when its parent has ended, also if that was killed; otherwise it would wait for
+    tasks for ever. Ctrl-C, which a terminal sends to all processes, is handled by the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end, args=(multiprocessing.parent_process(),), daemon=True).start()
 
@@ -116,7 +114,7 @@ def _end(parent):
 
 
 def _in_processes(work, tasks, folder, say, processes):
-    """They take the tasks from one queue as they come free; what they say comes through another."""
+    """Runs tasks in processes that take them from one queue; results and messages come through another."""
     context = multiprocessing.get_context("spawn")
     todo, news = context.Queue(), context.Queue()
     for task in [*tasks, *[None] * len(processes)]:
@@ -150,7 +148,7 @@ def _in_processes(work, tasks, folder, say, processes):
 
 @contextlib.contextmanager
 def _added(environment):
-    """The environment with these names; a process inherits them when it starts."""
+    """Adds variables to the environment, which a process inherits when it starts."""
     kept = {name: os.environ.get(name) for name in environment}
     os.environ.update(environment)
     try:
@@ -172,7 +170,7 @@ def _process(work, folder, name, todo, news):
 
 
 def _told(error):
-    """Kind and text of an error: what the user did is one line, what we did wrong needs its trace."""
+    """Kind and text of an error: one line for errors of the input, else with the traceback."""
     for kind in (FileNotFoundError, ValueError):
         if isinstance(error, kind):
             return kind, str(error)
@@ -205,7 +203,7 @@ def _on_ray(work, tasks, folder, say, address, cpus, gpus):
 
 @contextlib.contextmanager
 def _cluster(address):
-    """Ray, connected; what the caller had connected stays so."""
+    """Connects to Ray, unless the caller has connected already."""
     try:
         import ray
     except ImportError:
@@ -230,11 +228,12 @@ def _cluster(address):
         ray.shutdown()
 
 
-_works = {}  # key of a run -> its work, which keeps in this process what it has made
+_works = {}  # key of a run -> its work, which caches objects in this process
 
 
 def _task(key, work, value, wanted):
-    """What a process of Ray does: error (kind, text) or None, results, {name: bytes} of its files, lines."""
+    """Runs a task in a Ray process; returns error (kind, text) or None, results, {name: bytes} of files,
+    lines."""
     lines = []
     try:
         if versions() != wanted:

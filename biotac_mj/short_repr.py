@@ -1,4 +1,4 @@
-"""How a value that cannot be is shown in an error: short, and in one line."""
+"""Short representations of values, in one line, for error messages."""
 
 import re
 import reprlib
@@ -7,7 +7,8 @@ __all__ = ["short_repr"]
 
 
 class _Short(reprlib.Repr):
-    """By the type itself: reprlib goes by its name, and others call theirs `array` too."""
+    """Chooses by the type itself, since reprlib uses the type's name, and several types are called
+    `array`."""
 
     def __init__(self):
         super().__init__()
@@ -28,5 +29,5 @@ _short = _Short()
 
 
 def short_repr(value: object) -> str:
-    """The value as Python writes it, without its middle where that is long, in one line."""
+    """The value's repr in one line, without its middle if it is long."""
     return re.sub(r"\s*\n\s*", " ", _short.repr(value))

@@ -1,4 +1,4 @@
-"""trimesh, with Ctrl-C while it is loaded."""
+"""Loads trimesh so that Ctrl-C works during the import."""
 
 import signal
 import threading
@@ -7,8 +7,8 @@ __all__ = ["trimesh"]
 
 
 def _load():
-    """Loads trimesh, and lets Ctrl-C wait for the end of it: whatever is raised while trimesh loads what it
-    needs, a KeyboardInterrupt too, it takes for a package that is not there, and goes on without."""
+    """Loads trimesh, and delays Ctrl-C until it is loaded: trimesh takes any exception during the import of
+    an optional package, also a KeyboardInterrupt, for a missing package."""
     before = signal.getsignal(signal.SIGINT)
     waits = callable(before) and threading.current_thread() is threading.main_thread()
     came = []

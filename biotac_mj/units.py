@@ -1,4 +1,4 @@
-"""Quantities as people write them: "1.5mm", "-12deg", or plain numbers of SI."""
+"""Quantities with units: "1.5mm", "-12deg", or plain numbers in SI."""
 
 import math
 import re
@@ -7,7 +7,7 @@ from .short_repr import short_repr
 
 __all__ = ["SI", "UNITS", "question", "read_quantity"]
 
-# of each kind: units in SI, the SI unit first and what people think in second
+# units of each kind in SI; the SI unit first, the usual unit second
 UNITS = {
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6},
     "angle": {"rad": 1.0, "deg": math.pi / 180},
@@ -19,10 +19,10 @@ _TEXT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s]*)
 
 
 def read_quantity(name: str, value: object, kind: str) -> object:
-    """A quantity in SI: of a text its number times its unit; what is no text is left as it is.
+    """A quantity in SI: number times unit for a text; other types are returned unchanged.
 
     Args:
-      name: of the quantity, for the text. kind: of UNITS.
+      name: of the quantity, for messages. kind: of UNITS.
 
     Raises:
       ValueError: a text that is no number, or a unit of another kind.
@@ -41,7 +41,7 @@ def read_quantity(name: str, value: object, kind: str) -> object:
 
 
 def question(value: float, most: float, kind: str) -> str:
-    """What to ask of a plain number above `most` in size: whether it was meant in the usual unit; "" where
-    that is too much as well."""
+    """Question for messages whether a plain number above `most` was meant in the usual unit; "" if that is
+    too large, too."""
     usual, factor = list(UNITS[kind].items())[1]
     return f"did you mean {value:g}{usual}? " if abs(value) * factor <= most else ""

@@ -1,4 +1,4 @@
-"""Versions of what computed a result, kept with it."""
+"""Versions of the packages that computed a result, which are stored with it."""
 
 import numpy as np
 

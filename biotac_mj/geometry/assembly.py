@@ -1,5 +1,4 @@
-"""Puts a skin mesh and its rigid parts together: which surface is which, which nodes are held, where the
-electrodes are."""
+"""Assembles a skin mesh and its rigid parts: outer and inner surface, fixed nodes, electrodes."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,21 +10,21 @@ from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_faces, 
 
 __all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
 
-EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # a rigid body that is not there
-FIXED_WITHIN = 1e-5  # nodes within this distance of a rigid body are held [m] (Narang et al., ICRA 2021)
+EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # an absent rigid body
+FIXED_WITHIN = 1e-5  # nodes within this distance of a rigid body are fixed [m] (Narang et al., ICRA 2021)
 
 
 def split_surfaces(
     mesh: TetMesh, fixed: np.ndarray | None = None, core_vert: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The outer face (n, 3) and the inner one (m, 3) of a skin, normals out of the material.
+    """The outer surface (n, 3) and the inner surface (m, 3) of a skin, with normals out of the material.
 
-    A shell around a cavity has two closed surfaces. A dome or a block has one, which bonded faces cut: those
-    whose nodes are all held. Of what is left the part that lies nearer to the core is the inner one; a solid
-    pad has no inner one, and the outer one is all of its surface.
+    A shell around a cavity has two closed surfaces. A dome or a block has one, which is divided by bonded
+    faces, whose nodes are all fixed; the part closer to the core is the inner surface. A solid pad has no
+    inner surface, and all of its surface is the outer one.
 
     Args:
-      fixed: (n,) nodes that are held, for open skins. core_vert: (n, 3) [m] of the core, likewise.
+      fixed: (n,) fixed nodes, for open skins. core_vert: (n, 3) [m] of the core, likewise.
 
     Raises:
       ValueError: the boundary is neither.
@@ -122,12 +121,11 @@ def assemble(
     electrodes: tuple | None = None,
     design: Design = BIOTAC,
 ) -> SkinGeometry:
-    """A checked SkinGeometry from a shell, a dome or a block and the rigid bodies that hold it, each (vert
-    [m], face). Nail and clamp may be left out; a flat backing is a nail.
+    """A checked SkinGeometry from a shell, a dome or a block, and the rigid bodies that it is fixed to, each
+    (vert [m], face). Nail and clamp are optional; a flat backing is a nail.
 
     Raises:
-      ValueError: see `TetMesh.check` and `split_surfaces`; a rigid body that is open; no held node; wrong
-        units.
+      ValueError: see `TetMesh.check` and `split_surfaces`; an open rigid body; no fixed node; wrong units.
     """
     mesh.check()
     size = np.ptp(mesh.vert, axis=0).max() * 1e3

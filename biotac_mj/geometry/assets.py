@@ -1,4 +1,4 @@
-"""Where the shipped meshes are."""
+"""Paths of the shipped meshes."""
 
 import importlib.resources
 import pathlib

@@ -1,4 +1,4 @@
-"""The card of a skin: what it is, in numbers."""
+"""Numbers for the card of a skin."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the
     electrodes to the inner skin [mm].
 
-    Ten-node tetrahedra count as the eight four-node ones that they make. Thickness is the distance of each
-    inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the way from
-    the electrode along its normal to the inner surface."""
+    A ten-node tetrahedron counts as eight four-node ones. The thickness is the distance of each inner node
+    from the outer surface, the fluid volume is that of the cavity minus that of the core, and a gap is the
+    distance of an electrode from the inner surface along its normal."""
     from ..triangles import trimesh
 
     mesh = TetMesh(skin.vert, skin.tets)

@@ -1,11 +1,12 @@
 """Closest points of triangle meshes, in Warp: on a triangle (Ericson, Real-Time Collision Detection, 5.1.5),
-on which side of it, and by lists of the triangles that can be the nearest.
+the side of the surface, and lists of the triangles that can be the nearest.
 
-A query of a tree of boxes waits for one node after the other. Close to a known point few triangles come into
-question: a list of them, by their distance from that point, is read at once. From a point that is moved by d
-they are nearer by d at most, so the first few of them settle which is the nearest now.
+A query of a bounding volume hierarchy reads one node after the other. Near a known point only few triangles
+can be the nearest; a list of them, sorted by distance from that point, is read without waiting. For a point
+at a distance d from it, all distances change by at most d, so that the first entries determine the nearest
+triangle.
 
-Meshes are in millimetres: queries in single precision drop triangles that are tiny in metres.
+Meshes are in millimetres, since queries in single precision lose triangles that are tiny in metres.
 """
 
 import dataclasses
@@ -36,17 +37,17 @@ real, vec3 = wp.float64, wp.vec3d
 FACE = wp.constant(
     6
 )  # where a closest point is: a corner (0 to 2), the edge opposite to one (3 to 5), or this
-SLACK = 1e-4  # [mm] more than single precision rounds
+SLACK = 1e-4  # [mm] above the rounding of single precision
 _SLACK = wp.constant(real(SLACK))
 _FARTHEST = 1.0e5  # [mm] from the mesh at which a triangle is still found
 
 
 @wp.struct
 class TriangleLists:
-    """Triangles near to points, the nearest first. They lack none up to the list's reach, and none at all
-    where `reach` is empty."""
+    """Triangles near points, the nearest first. A list is complete up to its reach, or without limit if
+    `reach` is empty."""
 
-    begin: wp.array(dtype=int)  # of each list, and where the last one ends
+    begin: wp.array(dtype=int)  # start of each list, and end of the last one
     face: wp.array(dtype=int)
     away: wp.array(dtype=float)  # from the list's point [mm]
     reach: wp.array(dtype=float)  # [mm]
@@ -54,7 +55,7 @@ class TriangleLists:
 
 @dataclasses.dataclass(frozen=True)
 class Lists:
-    """The same of one mesh: count (nlist,), face, away (nentry,), reach (nlist,) or (0,)."""
+    """Lists of one mesh: count (nlist,), face, away (nentry,), reach (nlist,) or (0,)."""
 
     count: np.ndarray
     face: np.ndarray
@@ -74,8 +75,8 @@ def _double(p: vec3):  # noqa: F811
 
 @wp.func
 def closest_on_triangle(a: vec3, b: vec3, c: vec3, q: vec3):
-    """The point of a triangle that is closest to q, and where that is, see FACE. In double precision, as of
-    long triangles single finds the wrong one; a triangle without area is an edge or a point."""
+    """The point of a triangle closest to q, and its place (see FACE). In double precision, since single
+    precision fails for long triangles. A triangle without area is an edge or a point."""
     ab = b - a
     ac = c - a
     zero = real(0.0)
@@ -105,7 +106,7 @@ def closest_on_triangle(a: vec3, b: vec3, c: vec3, q: vec3):
 
 @wp.func
 def closest_on_face(corner: wp.array2d(dtype=Any), face: int, q: vec3):
-    """`closest_on_triangle` of a face by its corners (nface, 3)."""
+    """`closest_on_triangle` for a face of corner (nface, 3)."""
     at, place = closest_on_triangle(
         _double(corner[face, 0]), _double(corner[face, 1]), _double(corner[face, 2]), q
     )
@@ -122,15 +123,15 @@ def _distance(corner: wp.array2d(dtype=Any), face: int, q: vec3):
 def nearest_listed(
     lists: TriangleLists, k: int, corner: wp.array2d(dtype=Any), first: int, q: vec3, moved: real
 ):
-    """The face of list k that is the nearest to q [mm], which is so far [mm] from the list's point; -1 where
-    the list does not tell. corner: of all faces (nface, 3) [mm], those of the list's mesh from `first` on."""
+    """The face of list k that is closest to q, which has moved by `moved` [mm] from the list's point; -1 if
+    the list is too short. corner: (nface, 3) [mm] of all faces; those of the list's mesh start at `first`."""
     found = int(-1)
     best = real(wp.inf)
     end = lists.begin[k + 1]
     for n in range(lists.begin[k], end, 3):
         if real(lists.away[n]) - moved > best + _SLACK:  # and so are all that follow
             break
-        # read together: what is read after a branch waits for it
+        # read together, since a read after a branch waits for it
         face = wp.vec3i(
             lists.face[n],
             lists.face[wp.min(n + 1, end - 1)],
@@ -177,7 +178,7 @@ def _find(
     face_out: wp.array(dtype=int),
     away_out: wp.array(dtype=float),
 ):
-    """Counts, or lists where the lists have room; more than `most` count as none."""
+    """Counts the triangles of a list, or writes them if there is space; more than `most` count as none."""
     i = wp.tid()
     p = point[i]
     q = _double(p)
@@ -200,12 +201,12 @@ def _find(
 
 
 def list_nearest(mesh: wp.Mesh, point: np.ndarray, room: float, most: int = 1 << 30) -> Lists:
-    """Lists of all triangles that are no farther from each point than the nearest one and a room.
+    """For each point, the list of all triangles that are at most `room` further away than the nearest one.
 
     Args:
       mesh: in millimetres. point: (n, 3) [mm].
-      room: at least twice the motion for which a list is to tell the nearest triangle [mm].
-      most: triangles of a list; where there are more it is empty.
+      room: at least twice the motion for which the list must contain the nearest triangle [mm].
+      most: triangles of a list; longer lists are left empty.
     """
     n, room = len(point), room + SLACK
     with wp.ScopedDevice(mesh.device):
@@ -222,7 +223,7 @@ def list_nearest(mesh: wp.Mesh, point: np.ndarray, room: float, most: int = 1 <<
 
 
 def pack_lists(lists: list[Lists]) -> TriangleLists:
-    """Of several meshes, one after another, on Warp's present device."""
+    """Concatenates the lists of several meshes, on Warp's default device."""
     packed = TriangleLists()
 
     def joined(name, kind):
@@ -236,14 +237,14 @@ def pack_lists(lists: list[Lists]) -> TriangleLists:
 
 
 def pseudonormals(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """(nface, 6, 3) mean normals around the corners of each face, by angles, and along the edges opposite to
-    them: these tell on which side a point is whose closest point is there, however sharp that is (Baerentzen
-    and Aanaes 2005). Zero where other than two faces meet at an edge.
+    """Mean normals (nface, 6, 3) at the corners of each face, weighted by angles, and at the edges opposite
+    to them. They determine on which side of a corner or edge of any angle a point is (Baerentzen and Aanaes
+    2005). Zero at edges that do not have two faces.
 
     Args:
       vert: (n, 3) [m]. face: (nface, 3).
     """
-    # corners that faces do not share by number may be in one place all the same
+    # corners with different indices may be at the same place
     places, of_vert = np.unique(vert, axis=0, return_inverse=True)
     pairs = cKDTree(places).query_pairs(1e-8, output_type="ndarray")
     near = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(places),) * 2)

@@ -1,5 +1,5 @@
-"""What a fingertip of one make is: where its electrodes and their excitation are, its frame of slots, and
-what single sensors of it were measured to read (`docs/howto/pads.md`)."""
+"""Design of a make of fingertips: positions of electrodes and excitation, slots of a frame, and measured
+readings of single sensors (`docs/howto/pads.md`)."""
 
 import dataclasses
 import functools
@@ -34,23 +34,21 @@ _LEAST_SLOTS = 2  # PAC's, and one channel's
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """A make of fingertips. Places are in its published frame: x to the fingertip, z out of the nail [mm].
+    """A make of fingertips. Positions are in its published frame: x to the fingertip, z out of the nail [mm].
 
     Attributes:
-      name: what messages and cards call it.
-      title: what people call it, with its number of electrodes.
-      electrodes_mm: (nelectrode, 3) places of e1, e2, ... as published, near the core's surface.
-      excitation: of X1, X2, ..., at most MOST_EXCITATION: (k, 3) places [mm], or (k, 2) position x in the
+      name: in messages and on cards.
+      title: common name, with the number of electrodes.
+      electrodes_mm: (nelectrode, 3) published positions of e1, e2, ..., near the core's surface.
+      excitation: of X1, X2, ..., at most MOST_EXCITATION: (k, 3) positions [mm], or (k, 2) position x in the
         BioTac frame [m] and angle about the x axis from the pad's midline [rad] on a cylindrical core.
-      origin_mm: x of the BioTac frame's origin, which lies on the axis, in the published frame [mm], less
-        its sign.
-      slots: in a frame of the multiplexer, PAC's between all others'; those beyond the channels are empty.
-      sensor: which of `sensors` one is unless it is said.
-      sensors: {name: fields of a `sensor.presets.Sensor`}, as they were measured, or "ideal": what the film
-        conducts.
-      published: which of them are known by their rest counts alone.
-      patterns: from the spread of whose rest counts "random" sensors are drawn.
-      sources: {field: where it is from}.
+      origin_mm: negative x of the BioTac frame's origin, which lies on the axis, in the published frame [mm].
+      slots: in a frame of the multiplexer, with PAC between all others; those beyond the channels are empty.
+      sensor: default of `sensors`.
+      sensors: {name: fields of a `sensor.presets.Sensor`}, as measured, or "ideal": the film's conductance.
+      published: names of sensors of which only rest counts are known.
+      patterns: names of sensors whose rest counts give the spread of "random" sensors.
+      sources: {field: source}.
 
     Raises:
       ValueError: a value that cannot be.
@@ -96,7 +94,7 @@ class Design:
                 f"design {self.name!r} has {n} electrodes and {k} of excitation: at most "
                 f"{MOST_EXCITATION} of excitation and {MOST_DISCS} together can be simulated"
             )
-        least = _LEAST_SLOTS * (n + len(SINGLES) - 1)  # PAC's are the slots between
+        least = _LEAST_SLOTS * (n + len(SINGLES) - 1)  # PAC has the slots between
         if self.slots == 0:
             object.__setattr__(self, "slots", least)
         whole = isinstance(self.slots, int) and not isinstance(self.slots, bool)
@@ -130,44 +128,45 @@ class Design:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Columns of stored counts, of PAC the latest sample."""
+        """Columns of stored counts; PAC has its latest sample."""
         return (*self.electrodes, *SINGLES)
 
     @property
     def discs(self) -> tuple[str, ...]:
-        """Of the film, the excitation electrodes last."""
+        """Names of the film's discs, the excitation electrodes last."""
         return (*map(str.upper, self.electrodes), *(f"X{i + 1}" for i in range(len(self.excitation))))
 
     @property
     def widths(self) -> dict[str, int]:
-        """What a sensor reports in one frame, in the order in which it lies in sensor data."""
+        """Numbers of each channel in one frame, in the order of sensor data."""
         return {"electrodes": self.nelectrode, "pdc": 1, "pac": self.npac, "tac": 1, "tdc": 1}
 
     @functools.cached_property
     def mirror(self) -> np.ndarray:
-        """(nelectrode,) which electrode lies where each one is seen in the mirror of the plane z = 0 of the
-        BioTac frame."""
+        """Index (nelectrode,) of the electrode that mirrors each one in the plane z = 0 of the BioTac
+        frame."""
         place = np.array(self.electrodes_mm)
         return np.abs(place[:, None] * [1, -1, 1] - place).sum(-1).argmin(0)
 
     def in_biotac_frame(self, position: np.ndarray) -> np.ndarray:
-        """Positions (n, 3) [mm] of the published frame in the BioTac frame: (origin - x, z, y)."""
+        """Transforms positions (n, 3) [mm] from the published frame to the BioTac frame: (origin - x, z,
+        y)."""
         x, y, z = np.asarray(position, float).T
         return np.stack([self.origin_mm - x, z, y], axis=-1)
 
     @functools.cached_property
     def rest_counts(self) -> np.ndarray:
-        """(nelectrode,) mean over the sensors that are known by their rest."""
+        """Mean rest counts (nelectrode,) of the published sensors."""
         return np.mean(self.rests, axis=0)
 
     @property
     def rests(self) -> list:
-        """Rest counts of published sensors; where none is, of `patterns`, or else of all."""
+        """Rest counts of `published` sensors; without any, of `patterns`, or else of all."""
         return [self.sensors[name]["rest"] for name in self.published or self.patterns or self.sensors]
 
     @functools.cached_property
     def text(self) -> str:
-        """JSON of all fields, as `read_design` reads it and a stored skin holds it."""
+        """JSON of all fields, for `read_design` and stored skins."""
         return json.dumps(dataclasses.asdict(self))
 
     def of_sensor(self, name: str) -> dict:
@@ -190,7 +189,7 @@ def _parsed(text):
 
 
 def read_design(given: "str | pathlib.Path | Design" = "biotac") -> Design:
-    """A design by name, by the folder or the file (design.json) that holds it, or by its JSON text.
+    """A design from its name, its folder or file (design.json), or its JSON text.
 
     Raises:
       FileNotFoundError: no such file. ValueError: it is no design, or one that cannot be.
@@ -209,17 +208,17 @@ def read_design(given: "str | pathlib.Path | Design" = "biotac") -> Design:
 
 
 def designs() -> tuple[Design, ...]:
-    """Those that are shipped."""
+    """The shipped designs."""
     return tuple(map(read_design, DESIGNS))
 
 
 def design_of_channels(nelectrode: int) -> Design | None:
-    """The shipped design with so many electrodes, None where there is none."""
+    """The shipped design with this number of electrodes, or None."""
     return next((d for d in designs() if d.nelectrode == nelectrode), None)
 
 
 def check_nelectrode(design: Design, nelectrode: int, whose: str) -> None:
-    """A ValueError where what somebody recorded is of another fingertip than the skin that simulates it."""
+    """Raises ValueError if a recording has another number of electrodes than the skin's design."""
     if nelectrode != design.nelectrode:
         other = design_of_channels(nelectrode)
         remedy = "take the skin of its own design" if other is None else f"take a skin of {other.title}"

@@ -1,4 +1,4 @@
-"""Ten-node tetrahedra: a node on every edge of a four-node mesh, and the way back to four nodes."""
+"""Ten-node tetrahedra: adds a node on every edge of a four-node mesh."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,23 +12,21 @@ __all__ = ["EDGES", "with_edge_nodes"]
 # of the nodes 4..9, in the order of CalculiX's C3D10
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 
-# least fraction of a straight tetrahedron's volume that a curved one keeps: in its map at each node, and in
-# each of its parts
+# least volume of a curved tetrahedron over the straight one, in its map at each node and in each of its parts
 _FOLD = 0.3
 
 
 def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> SkinGeometry:
-    """Puts a node on every edge of a skin of four-node tetrahedra.
+    """Adds a node on every edge of a skin of four-node tetrahedra.
 
-    The nodes of `geometry` come first and keep their numbers. Every boundary face f becomes four (4 f .. 4 f
-    + 3). The new node of a boundary edge is fixed where both its ends are.
+    The nodes of `geometry` come first and keep their indices. Every boundary face f is divided into four (4 f
+    .. 4 f + 3). The new node of a boundary edge is fixed if both ends are.
 
     Args:
       geometry: a skin with elem (nelem, 4).
       project: None leaves new nodes in the middle of their edges; else a function from points (n, 3) and a
         name, "outer" or "inner", to the nearest points (n, 3) of that surface [m], applied to the new nodes
-        of boundary edges. Where that would fold or nearly fold a tetrahedron, its new nodes go only part of
-        the way.
+        of boundary edges. If that would fold a tetrahedron, or nearly, its new nodes move only in part.
 
     Returns:
       The same skin with elem (nelem, 10): corners, then edges in the order of `EDGES`.
@@ -89,7 +87,7 @@ def shape_gradients(points) -> np.ndarray:
 
 
 def _unfolded(straight, curved, elem):
-    """Edge nodes as far from `straight` to `curved` as no tetrahedron folds."""
+    """Edge nodes moved from `straight` towards `curved` as far as no tetrahedron folds."""
     corners = np.eye(4)
     gradient = shape_gradients(np.vstack([corners, corners[EDGES].mean(1)]))
     volume = np.linalg.det(straight[elem[:, 1:4]] - straight[elem[:, :1]])

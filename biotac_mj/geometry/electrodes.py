@@ -1,4 +1,4 @@
-"""Where the electrodes are published to be."""
+"""Published positions of the electrodes."""
 
 import numpy as np
 

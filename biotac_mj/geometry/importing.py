@@ -23,8 +23,8 @@ def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeomet
 
     The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of
     the same folder is read; together they must hold three closed bodies: the core (the largest), the nail
-    plate, and the clamp plate (further to +x than the nail). Nodes within 1e-5 m of them are held; electrodes
-    are Lin et al. 2013's, projected onto this core.
+    plate, and the clamp plate (further to +x than the nail). Nodes within 1e-5 m of them are fixed;
+    electrodes are those of Lin et al. 2013, projected onto this core.
 
     Raises:
       FileNotFoundError: no such path, or no mesh in the folder.
@@ -54,8 +54,8 @@ def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeomet
 
 
 def read_tet_mesh(path: pathlib.Path | str) -> TetMesh:
-    """Reads `.tet` (lines `v x y z w` and `t a b c d`, 0-based), `.msh` or `.vtu`; nodes of no tetrahedron
-    are dropped for the last two.
+    """Reads `.tet` (lines `v x y z w` and `t a b c d`, 0-based), `.msh` or `.vtu`; for the last two, nodes
+    without a tetrahedron are dropped.
 
     Raises:
       FileNotFoundError: no such file.

@@ -1,8 +1,8 @@
 """The eight indenters of Narang et al., ICRA 2021, as MuJoCo shapes. In the names the number is a diameter.
 
-The indenter frame: tip at the origin, pressing direction +y, so that the body lies in y <= 0. Dimensions
-were measured on the paper's meshes; handles and mounts, which never touch the skin, are left out. Edges of
-cylinders, cube and ring are rounded with 1 mm."""
+The indenter frame has its origin at the tip and presses along +y; the body lies in y <= 0. Dimensions were
+measured on the paper's meshes, without handles and mounts, which never touch the skin. Edges of cylinders,
+cube and ring have a radius of 1 mm."""
 
 import dataclasses
 

@@ -1,7 +1,7 @@
 """Shapes of pads: domes and blocks of tetrahedra on a flat backing, and the core under a dome.
 
-All lie in the BioTac frame: the backing's face is the plane y = 0, and the pad bulges to -y. Metres, or any
-other unit of length."""
+All are in the BioTac frame: the face of the backing is the plane y = 0, and the pad extends to -y. Metres, or
+any other unit of length."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ __all__ = ["block", "column_tetrahedra", "dome_core", "dome_shell", "ellipsoid_c
 
 
 def _disc(rings):
-    """Points (n, 2) of the unit disc on so many rings, 6 k on ring k, and triangles (m, 3),
+    """Points (n, 2) of the unit disc on `rings` rings, 6 k on ring k, and triangles (m, 3),
     counter-clockwise."""
     point, start, triangle = [np.zeros((1, 2))], [0, 1], []
     for k in range(1, rings + 1):
@@ -96,7 +96,7 @@ def plate(half_x: float, half_z: float, thickness: float, sides: int = 64) -> tu
 
 
 def block(size: ArrayLike, cells: ArrayLike) -> TetMesh:
-    """A box of so many cells along x, y, z under the plane y = 0; size (3,)."""
+    """A box under the plane y = 0, with cells (3,) along x, y, z; size (3,)."""
     (nx, ny, nz), (sx, sy, sz) = cells, size
     x, z = np.linspace(-sx / 2, sx / 2, nx + 1), np.linspace(-sz / 2, sz / 2, nz + 1)
     grid = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -110,11 +110,11 @@ def block(size: ArrayLike, cells: ArrayLike) -> TetMesh:
 
 
 def column_tetrahedra(triangle: np.ndarray, n: int, layers: int) -> np.ndarray:
-    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n +
-    column.
+    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); the index of a node is layer * n
+    + column.
 
-    Each prism is cut from its lowest-numbered column upwards, so that neighbours cut their common sides
-    alike."""
+    Each prism is divided from its column with the lowest index upwards, so that neighbours divide their
+    common sides equally."""
     turn = np.argsort(triangle, axis=1)
     odd = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], bool)  # whether a permutation that begins so is odd
     flip = odd[turn[:, 0], turn[:, 1]]

@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
-Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])  # turns a geom so that its z axis goes ahead
+Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])  # turns the z axis of a geom to the pressing direction
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])  # positions of a cross product's factors
 _SKEW = np.zeros((3, 9))
 for _i, (_j, _k) in enumerate(zip(_NEXT, _AFTER)):
@@ -34,20 +34,20 @@ _EYE, _DIAGONAL = np.eye(3), np.array([0, 4, 8])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n, 3) of (n, 3) and (n, 3): faster than np.cross on a few vectors."""
-    # fancy indexing takes twice as long
+    """Cross products (n, 3) of (n, 3) and (n, 3); faster than np.cross for a few vectors."""
+    # fancy indexing would take twice as long
     return a.take(_NEXT, 1) * b.take(_AFTER, 1) - a.take(_AFTER, 1) * b.take(_NEXT, 1)
 
 
 def skew(vector: ArrayLike) -> np.ndarray:
-    """(..., 3, 3) of (..., 3): skew(a) @ b = a x b."""
+    """Skew matrices (..., 3, 3) of (..., 3): skew(a) @ b = a x b."""
     vector = np.asarray(vector, dtype=float)
     return (vector @ _SKEW).reshape(*vector.shape, 3)
 
 
 def rotation(vector: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors (Rodrigues); scipy's makes ten times as many
-    calls, in every step of `mj_step`."""
+    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) (Rodrigues). scipy's function makes ten times as
+    many calls, which matters in every `mj_step`."""
     angle2 = (vector * vector).sum(axis=1)[:, None, None]
     k = skew(vector)
     if angle2.max(initial=0.0) < 1e-8:  # the series to the fourth order: exact to rounding
@@ -58,7 +58,7 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def matrix(quat: ArrayLike) -> np.ndarray:
-    """(..., 3, 3) rotations of (..., 4) unit quaternions."""
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     quat = np.asarray(quat, dtype=float)
     return np.stack(matrix_entries(*np.moveaxis(quat, -1, 0)), axis=-1).reshape(*quat.shape[:-1], 3, 3)
 
@@ -73,35 +73,35 @@ def matrix_entries(w: typing.Any, x: typing.Any, y: typing.Any, z: typing.Any) -
 
 
 def quaternion(mat: ArrayLike) -> np.ndarray:
-    """(..., 4) unit quaternions of (..., 3, 3) rotations."""
+    """Unit quaternions (..., 4) of rotation matrices (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(mat).as_quat(scalar_first=True)
 
 
 def unit(vector: ArrayLike) -> np.ndarray:
-    """(n,) of a vector (n,) of any length above 0, also of one whose square is no float."""
+    """Unit vector (n,) of a vector (n,) of any length above 0, also if its square overflows."""
     vector = np.asarray(vector, dtype=float)
     vector = vector / np.abs(vector).max()
     return vector / np.linalg.norm(vector)
 
 
 def quaternion_from_y(direction: np.ndarray) -> np.ndarray:
-    """(4,) of the smallest rotation that takes +y to a unit direction (3,)."""
+    """Quaternion (4,) of the smallest rotation from +y to a unit vector (3,)."""
     quat = np.array([1 + direction[1], direction[2], 0.0, -direction[0]])
     return quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (n, 3) at right angles to unit vectors (n, 3) and to each other."""
+    """Two unit vectors (n, 3) perpendicular to unit vectors (n, 3) and to each other."""
     first = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(direction, first)
 
 
 def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray) -> np.ndarray:
-    """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0
-    (n, 3, 3) to pos, mat."""
+    """Small motions (n, 6) (translation of the point at the origin, rotation vector) from poses pos0 (n, 3),
+    mat0 (n, 3, 3) to pos, mat."""
     turn = (mat @ mat0.transpose(0, 2, 1)).reshape(-1, 9)
     vector = 0.5 * (turn @ _SKEW.T)  # axis times sine of the angle
     sine = np.sqrt((vector * vector).sum(axis=1))
@@ -118,10 +118,10 @@ def displace(
     here: np.ndarray | None = None,
     spin: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses moved by (n, 6) small motions, the inverse of `displacement`: their own points go straight on, as
-    MuJoCo moves bodies that spin; `here` (n, 3) are these points where the motions were measured, if not at
-    pos. `spin` (n, 3) are rotation vectors that led to mat: bodies turn by both at once, which is not by one
-    after the other."""
+    """Poses after small motions (n, 6), the inverse of `displacement`. Reference points move along straight
+    lines, as MuJoCo moves rotating bodies; `here` (n, 3) are these points where the motions were measured, by
+    default pos. `spin` (n, 3) are rotation vectors that led to mat: bodies rotate by the sum of both vectors,
+    which differs from two rotations in sequence."""
     arm = pos if here is None else here
     turn = motion[:, 3:]
     if spin is not None:
@@ -132,17 +132,19 @@ def displace(
 def displacement_at_once(
     pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray, here: np.ndarray, spin: np.ndarray
 ) -> np.ndarray:
-    """(n, 6) motions with which `displace(pos0, mat0, motion, here, spin)` leads to pos, mat: exact to the
-    third order of turn and spin."""
+    """Motions (n, 6) for which `displace(pos0, mat0, motion, here, spin)` gives pos, mat; exact to third
+    order in turn and spin."""
     turn = displacement(pos, mat, pos0, mat0)[:, 3:]
-    both = cross(turn, spin)  # how two turns that follow each other are one (Baker, Campbell, Hausdorff)
+    both = cross(
+        turn, spin
+    )  # for the rotation vector of two rotations in sequence (Baker-Campbell-Hausdorff)
     turn = turn + 0.5 * both + cross(turn - spin, both) / 12
     return np.concatenate([pos - pos0 - cross(turn, here), turn], axis=1)
 
 
 def rigid_motions(x: np.ndarray, size: int) -> np.ndarray:
-    """Motion (size, 6) of the coordinates of points x (n, 3) per translation and rotation vector of a body
-    that holds them; zero in what follows the first 3 n rows."""
+    """Motion (size, 6) of the coordinates of points x (n, 3) on a rigid body, by its translation and rotation
+    vector; zero after the first 3 n rows."""
     out = np.zeros((size, 6))
     motion = out[: 3 * len(x)].reshape(-1, 3, 6)
     motion[:, :, :3] = np.eye(3)

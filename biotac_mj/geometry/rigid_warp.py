@@ -1,6 +1,6 @@
 """Rigid motions in Warp: poses, rotation vectors and small motions.
 
-A small motion has the translation of the origin's point first, then the rotation vector."""
+A small motion has the translation of the point at the origin first, then the rotation vector."""
 
 import warp as wp
 
@@ -41,7 +41,7 @@ def rotation(v: vec3):
 
 @wp.func
 def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
-    """Small motion from pose 0 to the other."""
+    """Small motion from pose 0 to pos, mat."""
     turn = mat * wp.transpose(mat0)
     v = real(0.5) * vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
     sine = wp.length(v)
@@ -53,21 +53,23 @@ def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
 
 @wp.func
 def displace_from(here: vec3, pos: vec3, mat: mat33, m: vec6):
-    """The pose moved by a small motion that was measured with the body's own point `here`."""
+    """The pose after a small motion that was measured with the body's reference point at `here`."""
     turn = vec3(m[3], m[4], m[5])
     return pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here), rotation(turn) * mat
 
 
 @wp.func
 def displace(pos: vec3, mat: mat33, m: vec6):
-    """The pose moved by a small motion, the inverse of `motion`: the body's own point goes straight on."""
+    """The pose after a small motion, the inverse of `motion`; the body's reference point moves along a
+    line."""
     return displace_from(pos, pos, mat, m)
 
 
 @wp.func
 def displace_at_once(pos: vec3, mat: mat33, m: vec6, here: vec3, spin: vec3):
-    """The pose moved by a small motion that was measured with the body's own point `here`, of a body that a
-    rotation vector spin led to mat: it turns by both at once, which is not by one after the other."""
+    """The pose after a small motion that was measured with the body's reference point at `here`. A rotation
+    vector `spin` led to mat; the body rotates by the sum of both vectors, which differs from two rotations in
+    sequence."""
     turn = vec3(m[3], m[4], m[5])
     p = pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here)
     return p, rotation(spin + turn) * wp.transpose(rotation(spin)) * mat
@@ -75,8 +77,8 @@ def displace_at_once(pos: vec3, mat: mat33, m: vec6, here: vec3, spin: vec3):
 
 @wp.func
 def motion_at_once(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33, here: vec3, spin: vec3):
-    """The small motion with which `displace_at_once` leads from pose 0 to the other: exact to the third order
-    of turn and spin (Baker, Campbell, Hausdorff)."""
+    """The small motion for which `displace_at_once` gives pos, mat from pose 0; exact to third order in turn
+    and spin (Baker-Campbell-Hausdorff)."""
     m = motion(pos, mat, pos0, mat0)
     turn = vec3(m[3], m[4], m[5])
     both = wp.cross(turn, spin)

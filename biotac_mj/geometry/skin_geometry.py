@@ -1,5 +1,4 @@
-"""What a skin is: a tetrahedral shell, its surfaces, the rigid parts that hold it and the
-electrodes."""
+"""Geometry of a skin: tetrahedral shell, its surfaces, the rigid parts that it is fixed to, electrodes."""
 
 import dataclasses
 import pathlib
@@ -14,8 +13,8 @@ from .tet_mesh import check_closed, enclosed_volume, indices
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
-# the eight four-node tetrahedra that ten nodes make: four at the corners, four around the octahedron's
-# diagonal 4-9
+# the eight four-node tetrahedra of a ten-node one: four at the corners, four around the octahedron's diagonal
+# 4-9
 PARTS = np.array(
     [
         [0, 4, 6, 7],
@@ -28,11 +27,11 @@ PARTS = np.array(
         [4, 9, 6, 7],
     ]
 )
-_SMALLEST, _LARGEST = 0.005, 0.1  # [m] that a skin measures
-_SOLID = 1e-12  # [m^3] that core, nail and clamp have at least: MuJoCo gives less no inertia
-_OFF = 1e-3  # [m] that an electrode may lie outside the core's box
+_SMALLEST, _LARGEST = 0.005, 0.1  # range of a skin's size [m]
+_SOLID = 1e-12  # least volume of core, nail and clamp [m^3], for which MuJoCo computes an inertia
+_OFF = 1e-3  # largest distance of an electrode outside the core's box [m]
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
-# how a skin is stored; indices are indices into what _INTO says
+# arrays of a stored skin; _INTO names the array that indices refer to
 STORED = {
     "name": Array((), "text"),
     "vert": Array((None, 3)),
@@ -56,20 +55,20 @@ class SkinGeometry:
     +x).
 
     Attributes:
-      name: what it is called in cards, data sets and messages.
-      vert: (nvert, 3) float64, nodes at rest [m].
+      name: on cards, in data sets and messages.
+      vert: (nvert, 3) float64, nodes in the reference configuration [m].
       elem: (nelem, 4) or (nelem, 10) int32, tetrahedra with positive volume; ten nodes are corners, then
         edges (`edge_nodes.EDGES`).
       outer_face: (nouter, 3) int32, the surface that touches the world; normals point out of the skin
         material.
       inner_face: (ninner, 3) int32, the surface towards the liquid; normals point out of the skin material,
         towards the core.
-      fixed: (nfixed,) int32, sorted nodes held by core, nail plate and clamp.
+      fixed: (nfixed,) int32, sorted nodes fixed to core, nail plate and clamp.
       core_vert, core_face: (n, 3) float64 [m], (m, 3) int32, the rigid core: closed, normals outwards.
       nail_vert, nail_face, clamp_vert, clamp_face: the same for nail plate and clamp plate.
       electrode_pos: (n, 3) float64, electrodes E1, E2, ... on the core's surface [m].
       electrode_normal: (n, 3) float64, unit outward normals of the core there.
-      design: whose skin it is, of n electrodes.
+      design: of the sensor, with n electrodes.
     """
 
     name: str
@@ -132,7 +131,7 @@ class SkinGeometry:
 
     @property
     def element(self) -> str:
-        """What the tetrahedra are: "linear" (four nodes) or "quadratic" (ten)."""
+        """Kind of the tetrahedra: "linear" (four nodes) or "quadratic" (ten)."""
         return "linear" if self.elem.shape[1] == 4 else "quadratic"
 
     @property
@@ -142,7 +141,7 @@ class SkinGeometry:
         return self.elem if self.element == "linear" else self.elem[:, PARTS].reshape(-1, 4)
 
     def check(self, name: object) -> None:
-        """Raises ValueError where it is no finger that a model can carry; name: of the skin in the text."""
+        """Raises ValueError if the model of this skin is impossible; name: of the skin in the message."""
         size = np.ptp(self.vert, axis=0).max(initial=0) if len(self.vert) else 0.0
         if not _SMALLEST <= size <= _LARGEST:
             raise ValueError(
@@ -175,8 +174,7 @@ class SkinGeometry:
                 )
 
     def save(self, path: pathlib.Path | str) -> pathlib.Path:
-        """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is
-        bit-equal."""
+        """Writes an .npz file with positions in float64, so that a reload is equal to the bit."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         write_npz(path, **{**fields, "design": self.design.text})
         return pathlib.Path(path)

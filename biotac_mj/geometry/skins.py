@@ -1,4 +1,4 @@
-"""Skins by name, by file, or as objects that a model can refer to."""
+"""Loads skins by name or file, and stores SkinGeometry objects so that a model can refer to them."""
 
 import copy
 import dataclasses
@@ -30,26 +30,26 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
 
     Raises:
       FileNotFoundError: no such skin.
-      ValueError: the file is not a stored skin, or it is no name.
+      ValueError: the file is not a stored skin, or the name is unknown.
     """
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(
             f"skin is {short_repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
     if name_or_path in _SHIPPED:
-        return copy.deepcopy(_shipped(name_or_path))  # each caller may change its own
+        return copy.deepcopy(_shipped(name_or_path))  # callers may change their copy
     return SkinGeometry.load(name_or_path)
 
 
 @functools.lru_cache(maxsize=len(_SHIPPED))
 def _shipped(name):
-    """A shipped skin: it is read and checked once a process, since each `attach` asks for it three times."""
+    """A shipped skin, cached in the process, since each `attach` loads it three times."""
     folder, _, mesh = name.rpartition("/")
     return SkinGeometry.load(asset_path(f"designs/{folder}/{mesh}.npz" if folder else f"skins/{mesh}.npz"))
 
 
 def design_of(skin: pathlib.Path | str | SkinGeometry) -> Design:
-    """Of a skin as `load_skin` or `skin_reference` knows it."""
+    """Design of a skin, given as for `load_skin` or `skin_reference`."""
     if isinstance(skin, str) and skin in _SHIPPED:
         return _shipped(skin).design
     return skin.design if isinstance(skin, SkinGeometry) else load_skin(skin).design
@@ -63,7 +63,7 @@ def shipped_skin(design: Design, mesh: str = "default") -> str:
 def skin_of_design(
     design: str | pathlib.Path | None, mesh: str | pathlib.Path | SkinGeometry | None
 ) -> str | pathlib.Path | SkinGeometry:
-    """What `skin_reference` takes, of a design's name or folder and of a mesh, which may be left out.
+    """The argument of `skin_reference` for a design's name or folder and an optional mesh.
 
     Raises:
       FileNotFoundError, ValueError: no such design, or the mesh is of another one.
@@ -85,7 +85,7 @@ def skin_of_design(
 
 def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGeometry]:
     """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object is stored in the user's cache,
-    named by all its content.
+    under a digest of its content.
 
     Raises:
       FileNotFoundError, ValueError: no such skin. OSError: it cannot be stored anywhere.
@@ -105,8 +105,8 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
 
 
 def _stored(skin):
-    """The file of a skin, in the cache's own folder, which is never pruned: models that were saved name it.
-    Where the cache cannot be written it is in the folder for temporary files."""
+    """The file of a skin, in a folder of the cache that is never pruned, since saved models refer to it; in
+    the folder for temporary files if the cache cannot be written."""
     name = f"{digest(skin)}.npz"
     for folder in (cache_folder(), pathlib.Path(tempfile.gettempdir()) / "biotac_mj"):
         path = folder / "skins" / name
@@ -118,7 +118,7 @@ def _stored(skin):
 
 
 def _holds(path, skin):
-    """Whether a file is there and has this very skin, bit for bit."""
+    """Whether a file exists and has this skin, bit for bit."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return all(

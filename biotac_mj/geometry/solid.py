@@ -1,5 +1,4 @@
-"""Triangle meshes as solids: whether a mesh bounds one, the convex hull of one that does not, the ground
-under a height field."""
+"""Triangle meshes as solids: tests whether a mesh bounds a solid, convex hulls, solids of height fields."""
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -8,8 +7,8 @@ __all__ = ["bounds_solid", "convex_hull", "fills_hull", "ground", "spread_points
 
 
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
-    """Whether a mesh (n, 3) [m], (m, 3) has an inside: every edge is passed as often one way as the other,
-    and faces look outwards. Vertices within 1 nm are one."""
+    """Whether a mesh (n, 3) [m], (m, 3) bounds a solid: every edge is traversed equally often in both
+    directions, and faces are oriented outwards. Vertices within 1 nm are merged."""
     if not len(face):
         return False
     _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
@@ -23,7 +22,7 @@ def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
 
 
 def convex_hull(vert: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mesh (k, 3) [m], (m, 3) of the convex hull of points (n, 3), faces outwards; None where they span no
+    """Mesh (k, 3) [m], (m, 3) of the convex hull of points (n, 3), faces outwards; None if they span no
     volume."""
     try:
         hull = ConvexHull(vert)
@@ -49,7 +48,7 @@ def ground(height: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray
     top = np.stack([x, y, size[2] * height], axis=-1).reshape(-1, 3)
     number = np.arange(nrow * ncol).reshape(nrow, ncol)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-    # each cell is cut from its lowest row and column to its highest, as MuJoCo does
+    # each cell is divided from its lowest row and column to its highest, as in MuJoCo
     upper = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in ((a, b, c), (a, c, d))])
     rim = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
     lower, next_rim = len(top) + np.arange(len(rim)), np.roll(rim, -1)
@@ -62,8 +61,8 @@ def ground(height: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def spread_points(vert: np.ndarray, face: np.ndarray, spacing: float, most: float = np.inf) -> np.ndarray:
-    """(k, 3) points on a mesh (n, 3) [m], (m, 3), about a spacing [m] from each other, vertices first of
-    all; a wider spacing where there would be more than about `most`."""
+    """Points (k, 3) on a mesh (n, 3) [m], (m, 3) with about this spacing [m], vertices first; the spacing is
+    wider if there would be more than about `most` points."""
     corner = vert[face]
     first, second = _sides(vert, face)
     area = np.linalg.norm(np.cross(first, second), axis=1).sum() / 2
@@ -79,7 +78,7 @@ def spread_points(vert: np.ndarray, face: np.ndarray, spacing: float, most: floa
 
 
 def fills_hull(vert: np.ndarray, face: np.ndarray) -> bool:
-    """Whether a closed mesh is convex: it holds what its convex hull does, to a thousandth."""
+    """Whether a closed mesh is convex: its volume is that of its convex hull to a thousandth."""
     hull = convex_hull(vert)
     return hull is None or _volume(vert, face) > (1 - 1e-3) * _volume(*hull)
 

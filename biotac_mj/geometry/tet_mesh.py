@@ -1,5 +1,4 @@
-"""A tetrahedral mesh and what can be asked of it: volumes, angles, boundary, and whether it may be
-simulated."""
+"""Tetrahedral meshes: volumes, angles, boundary, and checks whether they can be simulated."""
 
 import dataclasses
 import functools
@@ -12,20 +11,20 @@ __all__ = ["TetMesh", "indices"]
 # opposite to vertex i.
 _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 _FACE_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-# volume over longest edge^3 (0.118 for a regular one) below which a tetrahedron is flat to rounding of its
-# file
+# volume over longest edge^3 (0.118 for a regular one) below which a tetrahedron is flat within the rounding
+# of files
 _DEGENERATE = 1e-6
 _INT32 = np.iinfo(np.int32).min, np.iinfo(np.int32).max
 
 
 def indices(name: str, numbers: np.ndarray) -> np.ndarray:
-    """int32 of numbers that are whole and fit: a cast alone wraps round.
+    """Converts numbers to int32 indices; a cast alone would wrap large numbers.
 
     Args:
-      name: of the array, for the text.
+      name: of the array, for messages.
 
     Raises:
-      ValueError: a number is no index.
+      ValueError: a number is not an index.
     """
     out = np.ascontiguousarray(np.clip(np.nan_to_num(numbers), *_INT32), np.int32)
     if not np.array_equal(out, numbers):
@@ -40,7 +39,7 @@ class TetMesh:
 
     Attributes:
       vert: (nvert, 3) float64 [m].
-      elem: (nelem, 4) int32, 0-based; positive volume where (v1 - v0, v2 - v0, v3 - v0) is right-handed.
+      elem: (nelem, 4) int32, 0-based; the volume is positive if (v1 - v0, v2 - v0, v3 - v0) is right-handed.
     """
 
     vert: np.ndarray
@@ -87,15 +86,15 @@ class TetMesh:
         return np.ascontiguousarray(face[np.sort(first[count == 1])])
 
     def boundary_components(self) -> list[np.ndarray]:
-        """The boundary's connected parts, (nface_i, 3) each, by decreasing absolute enclosed volume.
+        """Connected components (nface_i, 3) of the boundary, in descending order of absolute enclosed volume.
 
-        A part with positive `enclosed_volume` is an outside, one with negative volume a cavity.
+        A component with positive `enclosed_volume` is an outer surface, one with negative volume a cavity.
         """
         parts = connected_faces(self.boundary)
         return sorted(parts, key=lambda part: -abs(enclosed_volume(self.vert, part)))
 
     def check(self) -> "TetMesh":
-        """Returns itself when it can be simulated.
+        """Returns itself if it can be simulated.
 
         Raises:
           ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or
@@ -148,7 +147,7 @@ class TetMesh:
 
 
 def connected_faces(face: np.ndarray) -> list[np.ndarray]:
-    """The connected parts (n_i, 3) of faces (n, 3), which share a node."""
+    """Connected components (n_i, 3) of faces (n, 3); connected faces share a node."""
     import scipy.sparse as sparse
 
     edge = np.concatenate([face[:, :2], face[:, 1:]])

@@ -1,5 +1,5 @@
-"""One press of an indenter into a BioTac: where it goes (`path`), the scene, the run (`pressing`), what is
-kept and written of it (`record`, `report`)."""
+"""One press of an indenter into a BioTac: its path (`path`), the scene, the simulation (`pressing`), the
+record and its files (`record`, `report`)."""
 
 import typing
 

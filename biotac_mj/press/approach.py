@@ -1,5 +1,5 @@
-"""Where an indenter meets the resting skin: points and normals of its surface, and the way to first touch by
-casting rays."""
+"""First contact of an indenter with the undeformed skin: points and normals of its surface, and the distance
+to first contact by ray casting."""
 
 import mujoco
 import numpy as np
@@ -8,14 +8,13 @@ from ..geometry.skin_geometry import SkinGeometry
 
 __all__ = ["first_touch", "is_inside", "nearest_point", "room", "surface_point"]
 
-# radius over which a normal is averaged [m]: about two edges of the default skin, so that it is the finger's
-# and not one triangle's
+# radius over which a normal is averaged [m]: about two edges of the default skin
 _PATCH = 1.5e-3
-_TOUCHING = 1e-5  # [m] skin that is glued to something solid may lie so deep in it
+_TOUCHING = 1e-5  # [m] largest depth of bonded skin in a solid
 
 
 def _hits(tri, origin, direction):
-    """Distances (m,) along a ray to the triangles tri (m, 3, 3), inf where it misses (Moeller and Trumbore,
+    """Distances (m,) along a ray to the triangles tri (m, 3, 3), inf if it misses (Moeller and Trumbore,
     1997)."""
     a, ab, ac = tri[:, 0], tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]
     p = np.cross(direction, ac)
@@ -26,13 +25,13 @@ def _hits(tri, origin, direction):
         q = np.cross(s, ab)
         v = q @ direction / det
         t = np.einsum("ij,ij->i", ac, q) / det
-        # a little wider than the triangle, so that no ray slips through between two
+        # slightly wider than the triangle, so that no ray passes between two
         return np.where((u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t >= 0), t, np.inf)
 
 
 def _closest(tri, point):
-    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: the foot on the plane if inside, else the
-    best of the three edges."""
+    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: its projection on the plane if that is
+    inside, else the closest point of the three edges."""
     a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -59,7 +58,7 @@ def _normal_at(tri, point):
 
 
 def surface_point(geometry: SkinGeometry, x: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """The point of the outer surface at a place along and around the finger.
+    """The point of the outer surface at a position along and around the finger.
 
     Args:
       geometry: the skin.
@@ -70,7 +69,7 @@ def surface_point(geometry: SkinGeometry, x: float, angle: float) -> tuple[np.nd
       point (3,) [m] and unit outward normal (3,).
 
     Raises:
-      ValueError: no surface there; the text says how far the skin reaches.
+      ValueError: no surface there; the message gives the extent of the skin.
     """
     tri = geometry.vert[geometry.outer_face]
     outward = np.array([0.0, -np.cos(angle), np.sin(angle)])
@@ -86,8 +85,7 @@ def surface_point(geometry: SkinGeometry, x: float, angle: float) -> tuple[np.nd
 
 
 def nearest_point(geometry: SkinGeometry, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The point of the outer surface that is nearest to position (3,) [m], and its unit outward normal
-    (3,)."""
+    """The point of the outer surface nearest to position (3,) [m], and its unit outward normal (3,)."""
     tri = geometry.vert[geometry.outer_face]
     candidates = _closest(tri, np.asarray(position, float))
     point = candidates[np.linalg.norm(candidates - position, axis=1).argmin()]
@@ -95,8 +93,8 @@ def nearest_point(geometry: SkinGeometry, position: np.ndarray) -> tuple[np.ndar
 
 
 def is_inside(vert: np.ndarray, face: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a point (3,) lies inside a closed mesh (n, 3) [m], (m, 3), by the angle that it fills there
-    (van Oosterom and Strackee, 1983)."""
+    """Whether a point (3,) is inside a closed mesh (n, 3) [m], (m, 3), by the solid angle (van Oosterom and
+    Strackee, 1983)."""
     a, b, c = np.moveaxis(vert[face] - np.asarray(point, float), 1, 0)
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -107,8 +105,8 @@ def is_inside(vert: np.ndarray, face: np.ndarray, point: np.ndarray) -> bool:
 
 
 def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> float:
-    """How far it is from a point (3,) of the outer surface along a direction (3,) to core, nail or clamp [m];
-    inf where these are missed."""
+    """Distance from a point (3,) of the outer surface along a direction (3,) to core, nail or clamp [m]; inf
+    if the ray misses them."""
     solids = (
         (geometry.core_vert, geometry.core_face),
         (geometry.nail_vert, geometry.nail_face),
@@ -121,7 +119,7 @@ def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> fl
 
 
 def _split(tri):
-    """Every triangle (m, 3, 3) into four."""
+    """Divides each triangle (m, 3, 3) into four."""
     a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     return np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
@@ -135,18 +133,18 @@ def first_touch(
     resolution: float = 2e-5,
     keep: int = 48,
 ) -> float:
-    """How far the geoms of a model travel along a direction until they first touch the resting skin.
+    """Distance that the geoms of a model travel along a direction until they first touch the undeformed skin.
 
-    Rays go from the skin's faces against the direction to the geoms; the faces nearest to a geom are split
-    again and again, so that the touch is found inside faces too.
+    Rays are cast from the skin's faces against the direction to the geoms. The faces closest to a geom are
+    divided repeatedly, so that contact inside faces is found, too.
 
     Args:
       geometry: the skin, in the world frame of the model.
-      model, data: hold the indenter's geoms and nothing else, placed before the skin, `mj_forward` done.
+      model, data: with the indenter's geoms only, in front of the skin, after `mj_forward`.
       direction: of travel (3,).
-      resolution: the nearest faces are split down to this edge [m]; on a sphere of radius r the touch is
-        found to resolution^2 / r.
-      keep: how many of them are split each time.
+      resolution: edge to which the nearest faces are divided [m]; on a sphere of radius r the distance is
+        accurate to resolution^2 / r.
+      keep: number of faces that are divided each time.
 
     Returns:
       travel [m].

@@ -1,6 +1,6 @@
-"""The shapes that press: the paper's eight by name, any MuJoCo geom, any closed mesh.
+"""Indenters: the paper's eight by name, any MuJoCo geom, any closed mesh.
 
-An indenter's frame has its tip in front and +y along the way it goes, as the paper's files have it.
+The frame of an indenter has its origin at the tip and presses along +y, as in the paper's files.
 """
 
 import dataclasses
@@ -25,12 +25,12 @@ class Indenter:
     """One rigid shape.
 
     Attributes:
-      name: how it was asked for.
+      name: the text that it was made from.
       type: MuJoCo's geom type by name.
       size: MuJoCo's sizes [m]; empty for a mesh.
       rounding: fillet radius of the edges of a box or cylinder [m].
       pos, quat: pose of the geom in the indenter's frame, (3,) [m] and (4,).
-      vert, face: (n, 3) [m], (m, 3), its surface in the indenter's frame: of a mesh exactly, else for
+      vert, face: (n, 3) [m], (m, 3), its surface in the indenter's frame; of a geom an approximation, for
         pictures and rays.
     """
 
@@ -58,7 +58,7 @@ def _surface(kind, size):
         mesh = trimesh.creation.box(extents=2 * np.array(size))
     else:
         mesh = trimesh.creation.box(extents=[2 * size[0], 2 * size[1], 1e-4])
-        mesh.apply_translation([0, 0, -5e-5])  # the plane itself is its front
+        mesh.apply_translation([0, 0, -5e-5])  # its front is the plane
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
@@ -97,7 +97,7 @@ def _from_geom(text):
 
 def _from_file(path):
     with reading(path, "indenter mesh", "give mesh:FILE of a closed surface (obj, stl, ply) in metres"):
-        raw = trimesh.load(path, force="mesh", process=False)  # which would drop what is not finite
+        raw = trimesh.load(path, force="mesh", process=False)  # processing would drop non-finite vertices
         sound = len(getattr(raw, "faces", ())) and np.isfinite(raw.vertices).all()
         mesh = trimesh.Trimesh(raw.vertices, raw.faces) if sound else None
     if not sound:
@@ -125,11 +125,10 @@ def _from_file(path):
 
 
 def make_indenter(text: str) -> Indenter:
-    """The indenter that a text asks for.
+    """Makes an indenter from a text: a name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and
+    sizes [m], or "mesh:FILE" in metres.
 
-    A name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in
-    metres. The z axis of a geom goes ahead: a capsule presses with its cap, a cylinder with its end, a plane
-    with its front.
+    A geom presses along its z axis: a capsule with its cap, a cylinder with its end, a plane with its front.
 
     Raises:
       ValueError: unknown name or type, sizes that do not fit it, or a mesh that is open, empty or not in
@@ -161,10 +160,10 @@ def make_indenter(text: str) -> Indenter:
 def add_indenter(
     spec: mujoco.MjSpec, body: "mujoco._specs.MjsBody", shape: Indenter, exact: bool = True, **geom: object
 ) -> "mujoco._specs.MjsGeom":
-    """Adds the indenter's geom, named "indenter", to a body of a spec whose frame is the indenter's.
+    """Adds the indenter's geom, named "indenter", to a body of a spec with the indenter's frame.
 
     Args:
-      exact: False gives shapes with rounded edges as meshes, which MuJoCo's rays see with their rounding.
+      exact: False: shapes with rounded edges become meshes, so that MuJoCo's rays see the rounding.
       geom: further properties of the geom.
     """
     if shape.type != "mesh" and (exact or not shape.rounding):

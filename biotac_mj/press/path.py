@@ -1,4 +1,4 @@
-"""What a press is, and the way of its indenter: to the depth, then along the skin."""
+"""Options of a press, and the path of its indenter: to the depth, then along the skin."""
 
 import dataclasses
 import itertools
@@ -24,44 +24,45 @@ _DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
 _LONGEST_STEP = 1.0  # [s]
 _ROUND = 2 * math.pi + 1e-9  # [rad]
 _FASTEST = 1.0  # [m/s]
-_MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
+_MOST_STEPS = 20_000  # each stores all nodes: a gigabyte for the default skin
 _PLAIN = "indenter depth slide timestep speed hold two_way".split()
-# keywords of `biotac_mj.attach` that a press says itself
+# keywords of `biotac_mj.attach` that a press sets itself
 _OF_PRESS = ("coupling", "geoms", "rounding", "thermal", "textures", "on_error")
 _KINDS = dict(depth="length", slide="length", speed="speed", timestep="time", hold="time")
-LEAD = 5e-6  # the indenter starts this far before first touch [m]
+LEAD = 5e-6  # the indenter starts this far before first contact [m]
 
 
 @dataclasses.dataclass(frozen=True, init=False)
 class PressOptions:
-    """What a press is: the fields below, and as further keywords what the BioTac is made with.
+    """Options of a press: the fields below, and settings of the BioTac as further keywords.
 
         PressOptions(indenter="ring_7mm", depth=1.5e-3, skin="coarse", material="calibrated")
 
-    Numbers are of SI; lengths, angles, times and speeds may be texts with a unit, as "1.5mm" or "30deg".
+    Numbers are in SI units; lengths, angles, times and speeds may be texts with a unit, such as "1.5mm" or
+    "30deg".
 
     Attributes:
       indenter: see `indenter.make_indenter`.
       location: (x [m], angle around the finger [rad]) or (x, y, z) [m], moved to the nearest point of the
         skin.
-      direction: of the press (3,); None is the inward normal of the skin at the location.
-      depth: travel from first touch [m].
+      direction: of the press (3,); None: the inward normal of the skin at the location.
+      depth: travel from first contact [m].
       slide: travel along slide_direction after the press [m].
-      slide_direction: (3,), of which the part across `direction` counts.
-      timestep: [s]. speed: of the indenter [m/s]. hold: rest at the end of the press and of the slide [s].
-      two_way: a servo with mass pushes the indenter and gives way, instead of a prescribed path.
-      thermal: what the indenter is of ("steel"), texture: of what surface ("cork"); see `SensorSettings`.
-        None leaves heat or vibration out.
-      settings: of the BioTac, as `biotac_mj.attach` takes them, but for what a press says itself: coupling,
-        geoms, rounding, thermal, textures and on_error.
+      slide_direction: (3,); its component perpendicular to `direction` is used.
+      timestep: [s]. speed: of the indenter [m/s]. hold: pause at the end of the press and of the slide [s].
+      two_way: whether a servo with mass and compliance moves the indenter, instead of a prescribed path.
+      thermal: material of the indenter ("steel"), texture: of its surface ("cork"); see `SensorSettings`.
+        None: without heat or vibration.
+      settings: of the BioTac, as for `biotac_mj.attach`, except coupling, geoms, rounding, thermal, textures
+        and on_error, which a press sets itself.
 
     Args:
-      textures: the same as texture, as attach calls it.
-      keywords: the fields, and the BioTac's settings by name, as `SettingKeywords` has them; friction is that
-        of the indenter too, and `options` may be a .json file.
+      textures: the same as texture, by the name that attach uses.
+      keywords: the fields, and the BioTac's settings by name, see `SettingKeywords`; friction is also that of
+        the indenter, and `options` may be a .json file.
 
     Raises:
-      ValueError: a value that cannot be. TypeError: an unknown keyword. FileNotFoundError: no such file.
+      ValueError: an impossible value. TypeError: an unknown keyword. FileNotFoundError: no such file.
     """
 
     indenter: str = "sphere_7mm"
@@ -94,12 +95,12 @@ class PressOptions:
         given["location"] = _location(given["location"])
         for name, value in given.items():
             object.__setattr__(self, name, value)
-        self.settings.config()  # refuses values that cannot be
+        self.settings.config()  # refuses impossible values
         self._check()
 
     @property
     def keywords(self) -> dict:
-        """What was asked for, by name."""
+        """The given options, by name."""
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "settings"}
         of_sensor = self.settings.keywords
         return {name: value for name, value in of_sensor.items() if name not in _OF_PRESS} | own
@@ -148,7 +149,7 @@ class PressOptions:
 
 
 def _location(value):
-    """Lengths, and the angle of a place along and around the finger, in SI."""
+    """Lengths, and the angle of a position along and around the finger, in SI."""
     if isinstance(value, (str, bytes)) or not np.iterable(value):
         raise ValueError(f"location is {short_repr(value)}: give x and an angle, or x, y and z")
     second = "angle" if len(value) == 2 else "length"
@@ -167,21 +168,21 @@ def _refuse_larger(name, value, most, why, kind):
 
 
 def _said(name, value):
-    """A length or time of a press as a person says it, whatever it was given in: 2.4 mm."""
+    """A length or time for messages, in the usual unit: 2.4 mm."""
     usual, factor = list(UNITS[_KINDS[name]].items())[1]
     return f"{value / factor:.6g} {usual}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """Way of an indenter's frame, which only translates.
+    """Path of an indenter's frame, which only translates.
 
     Attributes:
-      start: (3,) its origin at first touch [m].
+      start: (3,) its origin at first contact [m].
       quat: (4,) its orientation.
-      direction, slide_direction: (3,) unit vectors, across each other.
-      depth, slid: (n,) travel at each step [m]; row 0 is the start before first touch.
-      room: how much skin and liquid lie over core, nail or clamp at the location, along the direction [m].
+      direction, slide_direction: (3,) unit vectors, perpendicular to each other.
+      depth, slid: (n,) travel at each step [m]; row 0 is the start before first contact.
+      room: thickness of skin and liquid over core, nail or clamp at the location, along the direction [m].
     """
 
     start: np.ndarray
@@ -193,16 +194,16 @@ class Path:
     room: float
 
     def position(self, depth: float, slid: float = 0.0) -> np.ndarray:
-        """(3,) origin of the frame after travels [m]."""
+        """Origin (3,) of the frame after these travels [m]."""
         return self.start + depth * self.direction + slid * self.slide_direction
 
 
 def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions) -> Path:
-    """Where the indenter goes: from 5 um before it first touches the resting skin, in even steps to the
-    depth, then along the skin.
+    """Plans the path of the indenter: from 5 um before first contact with the undeformed skin, in equal steps
+    to the depth, then along the skin.
 
     Raises:
-      ValueError: no skin at the location, a location inside the core, an indenter that passes the skin, a
+      ValueError: no skin at the location, a location inside the core, an indenter that misses the skin, a
         direction out of the skin, or a slide along the direction.
     """
     if len(options.location) == 2:

@@ -1,4 +1,4 @@
-"""One press of an indenter into a BioTac with `mj_step`, and a picture of how it ended."""
+"""Simulates one press of an indenter into a BioTac with `mj_step`, and renders its end."""
 
 import dataclasses
 import time
@@ -24,8 +24,7 @@ class PressResult(typing.NamedTuple):
 
     Attributes:
       record: PressRecord.
-      picture: what the `render` that was given returned, (height, width, 3) uint8 by this module's; None
-        without one.
+      picture: result of the given `render`, (height, width, 3) uint8 for this module's; None without one.
     """
 
     record: PressRecord
@@ -33,8 +32,8 @@ class PressResult(typing.NamedTuple):
 
 
 def _read(handle, data):
-    """What one step left: (3,) force of the skin on the indenter [N], counts in the order of
-    `Design.channels`, all of PAC, non-converged steps."""
+    """Results of one step: force (3,) of the skin on the indenter [N], counts in the order of
+    `Design.channels`, all samples of PAC, number of steps that did not converge."""
     design = handle.design
     single = (handle.read(data, name)[-1:] for name in design.channels[design.nelectrode :])
     counts = np.concatenate([handle.read(data, "electrodes") if design.nelectrode else [], *single])
@@ -47,20 +46,20 @@ def press(
     render: Callable | None = None,
     progress: bool = True,
 ) -> PressResult:
-    """Presses an indenter into a BioTac, and keeps what was felt.
+    """Presses an indenter into a BioTac, and records the readings.
 
         record = press(PressOptions(depth=1e-3)).record
 
     Args:
-      options: what to press where.
+      options: of the press.
       render: called with (model, data) at the end, such as `press.render`; its result is returned beside the
         record.
       progress: whether to show a progress bar.
 
-    Warns where nothing was touched, and where the press is deeper than what lies over the core.
+    Warns if nothing was touched, and if the press is deeper than skin and liquid over the core.
 
     Raises:
-      ValueError, FileNotFoundError: an option is not possible; the text names cause and remedy.
+      ValueError, FileNotFoundError: an impossible option; the message names cause and remedy.
     """
     from ..coupling.steppers.fem import rest_geometry
     from ..geometry import SkinGeometry, load_skin
@@ -72,7 +71,7 @@ def press(
     mesh = skin_of_design(options.settings.skin.design, mesh)
     geometry = mesh if isinstance(mesh, SkinGeometry) else load_skin(mesh)
     indenter = make_indenter(options.indenter)
-    # the skin where its filling holds it: that is what the indenter meets first
+    # the filled skin, which the indenter touches first
     rest = rest_geometry(options.settings.config(geometry=geometry), geometry)
     path = plan_path(rest, indenter, options)
     room = f"{1e3 * path.room:.2f} mm of skin and liquid lie over core, nail or clamp at the location"
@@ -152,7 +151,7 @@ def press(
 def render(
     model: mujoco.MjModel, data: mujoco.MjData, width: int = 900, height: int = 640
 ) -> np.ndarray | None:
-    """(height, width, 3) uint8 of the scene through the camera "press"; None where no GL library works."""
+    """Picture (height, width, 3) uint8 of the scene from the camera "press"; None if no GL library works."""
     from ..view.offscreen import Offscreen, find_gl
 
     gl = find_gl()

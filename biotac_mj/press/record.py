@@ -1,4 +1,4 @@
-"""What a press leaves behind: the recorded arrays and the files `readings.csv` and `skin.h5`."""
+"""Record of a press: arrays, and the files `readings.csv` and `skin.h5`."""
 
 import csv
 import dataclasses
@@ -20,14 +20,14 @@ CSV_COLUMNS = (*_BEFORE, *CHANNELS, *_AFTER)  # of a BioTac
 
 @dataclasses.dataclass
 class PressRecord:
-    """One press, in the BioTac frame. n is the number of saved steps; row 0 is the rest, 5 um before first
-    touch.
+    """One press, in the BioTac frame. n is the number of saved steps; row 0 is the start, 5 um before first
+    contact.
 
     Attributes:
-      geometry: the skin at rest.
-      parameters: what was asked for; numbers and strings, so that JSON keeps it.
+      geometry: the undeformed skin.
+      parameters: the given options, as numbers and strings for JSON.
       time: (n,) [s].
-      depth: (n,) travel of the indenter along its direction from first touch [m].
+      depth: (n,) travel of the indenter along its direction from first contact [m].
       force: (n, 3) of the skin on the indenter [N].
       counts: (n, nchannel) in the order of `Design.channels` [counts].
       nonconverged: (n,) int, steps of the skin so far that did not converge.
@@ -35,8 +35,8 @@ class PressRecord:
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4), pose of the indenter's frame.
       indenter_vert, indenter_face: (p, 3) [m], (q, 3), its surface in that frame, for pictures.
       seconds: wall time of the steps [s].
-      pac: (n, 22) samples of each row's latest frame [counts], None where they were not kept.
-      contact_pressure: (n, nvert) float32 of the indenter on the nodes [Pa], None where it was not kept.
+      pac: (n, 22) samples of each row's latest frame [counts], or None.
+      contact_pressure: (n, nvert) float32 of the indenter on the nodes [Pa], or None.
     """
 
     geometry: SkinGeometry
@@ -75,13 +75,13 @@ class PressRecord:
 
     @property
     def electrode_change(self) -> np.ndarray:
-        """(n, nelectrode) change of the electrodes against row 0 [counts]."""
+        """Change (n, nelectrode) of the electrodes from row 0 [counts]."""
         n = self.geometry.design.nelectrode
         return self.counts[:, :n] - self.counts[0, :n]
 
     @property
     def deepest(self) -> int:
-        """The saved step to show: the last one at the greatest depth."""
+        """Index of the last saved step at the greatest depth, which pictures show."""
         return int(np.flatnonzero(self.depth >= self.depth.max() - 1e-9)[-1])
 
 

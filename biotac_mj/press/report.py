@@ -1,5 +1,5 @@
-"""The picture of a press and its table on the terminal. No window and no global state of matplotlib is
-touched."""
+"""The picture of a press, and its table on the terminal. It uses no window and no global state of
+matplotlib."""
 
 import pathlib
 
@@ -24,15 +24,14 @@ _TO_PAD_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
 def unroll(points: np.ndarray) -> np.ndarray:
-    """(n, 2) [mm] of (n, 3) [m]: along the finger, and around it from the pad's midline as an arc
-    on the core; BioTac frame."""
+    """Unrolls points (n, 3) [m] of the BioTac frame to (n, 2) [mm]: along the finger, and around it as an arc
+    on the core from the pad's midline."""
     return 1e3 * np.stack([points[:, 0], _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])], axis=1)
 
 
 def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
-    """The unrolled core, tip on the left, E1..E6 below: electrodes with their numbers and changes, in the
-    colours
-    that a change has in every picture, over contours of how far the skin moved."""
+    """Draws the unrolled core, tip on the left, E1..E6 below: electrodes with numbers and changes, in the
+    colours of all pictures, over contours of the skin's displacement."""
     geometry = record.geometry
     change = record.electrode_change[step]
     outer = np.unique(geometry.outer_face)
@@ -63,7 +62,7 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
 
 
 def draw_force(axes: Axes, record: PressRecord) -> None:
-    """Components and size of the force over depth; over time where the indenter slides at one depth."""
+    """Draws components and size of the force over depth, or over time if the indenter slides at one depth."""
     slides = bool(record.parameters.get("slide"))
     along = record.time if slides else 1e3 * record.depth
     for i, name in enumerate("xyz"):
@@ -75,7 +74,7 @@ def draw_force(axes: Axes, record: PressRecord) -> None:
 
 
 def draw_traces(axes: Axes, record: PressRecord, named: int = 6) -> None:
-    """Changes of the 19 electrodes over time; those that change most are named."""
+    """Draws the changes of the electrodes over time, with the names of those that change most."""
     change = record.electrode_change
     order = np.argsort(-np.abs(change).max(0))
     for i in order[named:]:
@@ -88,8 +87,8 @@ def draw_traces(axes: Axes, record: PressRecord, named: int = 6) -> None:
 
 
 def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
-    """What stands in for MuJoCo's render: deformed outer skin, nail and indenter as shaded triangles, seen
-    from beside the pad.
+    """Draws deformed outer skin, nail and indenter as shaded triangles, from the side of the pad, in place of
+    MuJoCo's rendering.
 
     Args:
       axes: with projection "3d".
@@ -98,7 +97,7 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
     indenter = record.indenter_vert @ matrix(record.indenter_quat[step]).T + record.indenter_pos[step]
     xpos = np.asarray(record.vert_xpos[step], float)
     moved = np.linalg.norm(xpos - geometry.vert, axis=1)
-    # lighter where the skin moved more, so that dimple and bulge show
+    # lighter where the displacement is larger, to show dimple and bulge
     glow = (moved / max(moved.max(), 1e-9))[geometry.outer_face].mean(1)[:, None]
     parts = [
         (
@@ -136,13 +135,13 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
 
 
 def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndarray | None = None) -> None:
-    """press.png: render, electrode map, force over depth, electrode traces.
+    """Writes press.png: rendering, electrode map, force over depth, electrode traces.
 
     Args:
       record: the press.
-      path: of the picture; its ending chooses the format.
-      render: (height, width, 3) uint8 of the step `record.deepest` from MuJoCo; None draws the surfaces with
-        matplotlib instead.
+      path: of the picture; its suffix gives the format.
+      render: (height, width, 3) uint8 of the step `record.deepest` from MuJoCo; None: matplotlib draws the
+        surfaces.
     """
     step = record.deepest
     figure = Figure(figsize=(13, 9), layout="constrained")
@@ -167,7 +166,7 @@ def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndar
 
 
 def table(record: PressRecord, files: tuple | list = ()) -> str:
-    """The end of a press in a few lines of text."""
+    """Summary of a press in a few lines of text."""
     force = np.linalg.norm(record.force, axis=1)
     change = record.electrode_change[record.deepest]
     pdc = record.counts[:, len(change)]

@@ -1,4 +1,4 @@
-"""The scene of a press: the BioTac on a fixed body, the indenter that is moved, camera and light."""
+"""The scene of a press: BioTac on a fixed body, indenter, camera and light."""
 
 import mujoco
 import numpy as np
@@ -15,8 +15,8 @@ __all__ = ["build_scene", "see_through"]
 _PREFIX = "biotac_"
 
 
-# The servo of a two-way press: 50 kN/m gives way by 0.02 mm per newton; with this mass it moves at 200 rad/s,
-# slow against a 4 ms step.
+# The servo of a two-way press: 50 kN/m deflects by 0.02 mm per newton; with this mass its frequency is 200
+# rad/s, which a 4 ms step resolves.
 _SERVO_STIFFNESS, _SERVO_MASS = 5e4, 1.25
 
 
@@ -82,14 +82,14 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
 
 def see_through(spec: mujoco.MjSpec, handle: Handle) -> None:
     """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are
-    seen."""
+    visible."""
     spec.skin(handle.prefix + "skin").rgba[3] = 0.45
     for name in handle.design.electrodes:
         spec.site(handle.prefix + name).size[0] = 7e-4
 
 
 def _add_camera(spec):
-    # from beside the pad, which looks up in the picture
+    # from the side of the pad, which points up in the picture
     eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
     z = eye / np.linalg.norm(eye)
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
