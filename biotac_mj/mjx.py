@@ -1,9 +1,9 @@
-"""BioTacs inside MJX: `put_model`, `make_data` and `step` with the names and the data of `mujoco.mjx`, to be
-jitted, scanned and vmapped. A step is one call of `mujoco_warp.step` with the skins in it (`batch`), through
-Warp's interface to JAX's foreign functions, as the Warp back end of MJX itself does it.
+"""BioTacs in MJX: `put_model`, `make_data` and `step` with the names and data of `mujoco.mjx`, which can be
+jitted, scanned and vmapped. A step is one call of `mujoco_warp.step` with the skins (`batch`), through Warp's
+interface to JAX's foreign functions, as in the Warp back end of MJX.
 
-All that outlives a step is in `Data`, so that steps are pure functions: the same data gives the same, to the
-bit. JAX traces `step` of one world; `vmap` makes worlds of a batch of it."""
+The whole state is in `Data`, so that steps are pure functions: equal data gives equal results, to the bit.
+JAX traces `step` for one world; `vmap` makes a batch of worlds."""
 
 import dataclasses
 import functools
@@ -84,7 +84,7 @@ class Data:
     overflow: "jax.Array"
 
     def replace(self, **changes: typing.Any) -> "Data":
-        """One with other values of some attributes."""
+        """A copy with other values of some attributes."""
         return dataclasses.replace(self, **changes)
 
 
@@ -95,13 +95,13 @@ _WRITTEN = tuple(name for name in _FIELDS if name != "skins")
 
 
 class Model:
-    """A model with BioTacs, for `step`. To JAX it is a constant: its numbers are not traced, and the same in
-    all worlds. Made by `put_model`.
+    """A model with BioTacs, for `step`, made by `put_model`. It is a constant for JAX: its numbers are not
+    traced, and equal in all worlds.
 
     Attributes:
       mjm: the MjModel.
-      rest: {field of Data: (1, ...)}, a world at its beginning. draws: where
-        its skins' words tell of seeds, see `batch.rows.Rows`.
+      rest: {field of Data: (1, ...)}, the initial state of a world. draws: position of the seeds in the words
+        of its skins, see `batch.rows.Rows`.
     """
 
     def __init__(self, mjm: mujoco.MjModel, prefixes: tuple, room: dict, settings: dict, device: str):
@@ -110,7 +110,7 @@ class Model:
         self.rest, self.draws = self.worlds(1).rest(), self.worlds(1).rows.draws
 
     def worlds(self, nworld: int) -> "_Worlds":
-        """mujoco_warp's Model and Data of so many worlds and their BioTacs, made when first asked for."""
+        """mujoco_warp's Model and Data of `nworld` worlds with their BioTacs, made at the first call."""
         if nworld not in self._worlds:
             made = self.mjm, nworld, self._prefixes, self._room, self._settings, self._device
             self._worlds[nworld] = _Worlds(*made)
@@ -118,7 +118,7 @@ class Model:
 
     @functools.cached_property
     def functions(self) -> dict:
-        """JAX's functions of the leaves of a Data, by name."""
+        """JAX functions of the leaves of a Data, by name."""
         return {name: _function(self, name) for name in ("step", "forward")}
 
 
@@ -136,10 +136,10 @@ def put_model(
     Args:
       mjm: an MjModel made from a spec that `batch.add` changed.
       prefix: as given to `batch.add`; of several BioTacs one each.
-      nconmax, njmax: contacts and constraint rows that a world has room for; None: what mujoco_warp makes of
-        the model in its reference pose.
-      settings, keywords: of every BioTac, as for `batch.attach`; the same in all worlds, but for the seed,
-        which is `make_data`'s.
+      nconmax, njmax: most contacts and constraint rows of a world; None: mujoco_warp's choice for the model
+        in its reference pose.
+      settings, keywords: of every BioTac, as for `batch.attach`; equal in all worlds, except for the seed, an
+        argument of `make_data`.
 
     Raises:
       ValueError, TypeError: see `batch.attach`. ModuleNotFoundError: JAX or mujoco_warp is missing.
@@ -159,13 +159,13 @@ def put_model(
 
 
 def make_data(model: Model, seed: "jax.typing.ArrayLike" = 0) -> Data:
-    """A world at its beginning, in place of `mjx.make_data`: MuJoCo's reference pose, skins and sensors at
-    rest. It may be vmapped over seeds.
+    """The initial state of a world, in place of `mjx.make_data`: MuJoCo's reference pose, skins and sensors
+    without contact. It can be vmapped over seeds.
 
     Args:
       model: of `put_model`.
-      seed: whole number >= 0, of the noise of the world's sensors, and of what `sensor="random"`, `randomise`
-        and lists of `thermal` and `textures` draw.
+      seed: integer >= 0, of the noise of the world's sensors, and of the draws of `sensor="random"`,
+        `randomise` and lists of `thermal` and `textures`.
     """
     import jax.numpy as jnp
 
@@ -184,7 +184,7 @@ def step(model: Model, data: Data) -> Data:
     `mujoco_warp.step` with `batch.attach`. It has no gradient: see `differentiable.rollout`.
 
     Args:
-      model: of `put_model`. data: of one world; `jax.vmap(step, (None, 0))` takes many, side by side.
+      model: of `put_model`. data: of one world; `jax.vmap(step, (None, 0))` takes a batch.
 
     Raises:
       ValueError: an array of another shape, or a gradient is wanted.
@@ -193,14 +193,14 @@ def step(model: Model, data: Data) -> Data:
 
 
 def forward(model: Model, data: Data) -> Data:
-    """In place of `mjx.forward`: what follows from the state without a step, such as `xpos`. Skins and
-    sensors stay as they are; arguments and errors as for `step`."""
+    """In place of `mjx.forward`: computes quantities that follow from the state without a step, such as
+    `xpos`. Skins and sensors are unchanged; arguments and errors as for `step`."""
     return _call(model, "forward", data)
 
 
 def readings(model: Model, data: Data, prefix: str = "biotac_") -> dict[str, "jax.Array"]:
-    """{channel: (..., dim)} of the BioTac with a prefix in `data.sensordata`: electrodes, pdc, pac, tac and
-    tdc [counts], contact_force [N, N m] and status, see `Handle.read`."""
+    """Readings {channel: (..., dim)} of the BioTac with a prefix, from `data.sensordata`: electrodes, pdc,
+    pac, tac and tdc [counts], contact_force [N, N m] and status, see `Handle.read`."""
     found = {}
     for name in SENSORS:
         i = mujoco.mj_name2id(model.mjm, mujoco.mjtObj.mjOBJ_SENSOR, prefix + name)
@@ -214,7 +214,7 @@ def readings(model: Model, data: Data, prefix: str = "biotac_") -> dict[str, "ja
 
 # --- JAX's side ---
 
-_NEXT = 0x9E3779B9  # seeds of a world's BioTacs are so far apart, as words
+_NEXT = 0x9E3779B9  # difference between the seeds of a world's BioTacs
 
 
 @functools.cache
@@ -241,7 +241,7 @@ def _call(model, name, data):
 
 
 def _function(model, name):
-    """Of the leaves of one world; vmapped, of many."""
+    """Function of the leaves of one world; vmapped, of many worlds."""
     import jax
     import jax.numpy as jnp
 
@@ -274,8 +274,8 @@ def _function(model, name):
 
 
 class _Worlds:
-    """mujoco_warp's Model and Data of `nworld` worlds, with BioTacs; a place to step in, which holds nothing
-    between two steps."""
+    """mujoco_warp's Model and Data of `nworld` worlds with BioTacs, used for steps; it has no state between
+    steps."""
 
     def __init__(self, mjm, nworld, prefixes, room, settings, device):
         import mujoco_warp as mjw
@@ -291,14 +291,14 @@ class _Worlds:
             self.rows = Rows(self._batches)
 
     def rest(self) -> dict[str, np.ndarray]:
-        """What every field of a Data (1, ...) is at the beginning, before any step was made here."""
+        """Initial value (1, ...) of every field of a Data, to be read before the first step."""
         self.rows.write()
-        fields = {name: getattr(self._d, name).numpy() for name in _WRITTEN}  # on the CPU views, so copied
+        fields = {name: getattr(self._d, name).numpy() for name in _WRITTEN}  # views on the CPU: copied below
         found = {name: value.copy() if name in _READ else 0 * value for name, value in fields.items()}
         return {**found, "skins": self.rows.row.numpy().copy()}
 
     def call(self, name, leaves):
-        """JAX's call of "step" or "forward" with arrays (nworld, ...) of `_READ` and the skins; gives those
+        """JAX call of "step" or "forward" with arrays (nworld, ...) of `_READ` and the skins; returns those
         of `_WRITTEN` and the skins."""
         if name not in self._calls:
             self._calls[name] = self._callable(name)
@@ -324,7 +324,7 @@ class _Worlds:
             rows.write()
             wp.copy(arrays[-1], rows.row)
 
-        if d.qpos.device.is_cuda:  # memory for loops is taken before the step is captured
+        if d.qpos.device.is_cuda:  # memory for loops is allocated before the step is captured
             with wp.ScopedDevice(d.qpos.device):
                 mjw.step(self._m, d)
         kinds = {**{field: getattr(d, field) for field in _WRITTEN}, "skins": rows.row}
@@ -337,7 +337,7 @@ class _Worlds:
             inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)
             for name, kind in run.__annotations__.items()
         )
-        # the loops of a step are nodes of a graph of Warp's, which JAX cannot take into its own
+        # the loops of a step are nodes of a Warp graph, which JAX cannot include in its own
         modes = wp.JaxCallableGraphMode
         mode = modes.WARP if d.qpos.device.is_cuda else modes.NONE
         function = wp.jax_callable(run, num_outputs=len(written), graph_mode=mode, vmap_method=None)

@@ -172,8 +172,8 @@ def _inflate(bare, data, nothing, what, fill, size=0.25):
             done += size
         elif converged or size < 2 * least:
             raise ValueError(
-                f"no equilibrium of skin and liquid beyond {done:.1%} of {what}: this rubber does not hold it;
-                " "take less"
+                f"no equilibrium of skin and liquid beyond {done:.1%} of {what}: this rubber does not hold "
+                "it; take less"
             )
         else:
             size /= 2

@@ -1,4 +1,4 @@
-"""What a BioTac looks like: in MuJoCo's viewer, in a picture, in the browser."""
+"""Views of a BioTac: MuJoCo's viewer, pictures, a page in the browser."""
 
 import typing
 

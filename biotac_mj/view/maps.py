@@ -1,5 +1,4 @@
-"""The electrodes of fingertips below a picture: tip on the left, E1..E6 below, in the colours that a change
-has in every picture."""
+"""Maps of electrodes below a picture: tip on the left, E1..E6 below, in the colours of all pictures."""
 
 import typing
 
@@ -15,7 +14,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["Maps"]
 
 _SCALE = 6.0  # [pixel / mm]
-_HEIGHT, _BAR = 180, 260  # of the strip, width of the scale of colours [pixel]
+_HEIGHT, _BAR = 180, 260  # height of the strip, width of the colour scale [pixel]
 
 
 class Maps:
@@ -33,10 +32,10 @@ class Maps:
         self._font = ImageFont.load_default(size=14)
 
     def below(self, picture: np.ndarray, changes: dict[str, np.ndarray]) -> "Image":
-        """A picture (height, width, 3) with a map for each fingertip and their scale below it.
+        """A picture (height, width, 3) with a map for each fingertip and the scale below it.
 
         Args:
-          changes: {what is written over a map: (nelectrode,) counts above those at rest}.
+          changes: {title of a map: (nelectrode,) changes from the reference counts}.
         """
         from PIL import Image, ImageDraw
 
@@ -69,8 +68,8 @@ class Maps:
 
     @staticmethod
     def quantize(pictures: "list[Image]", colors: int = 208) -> "list[Image]":
-        """Pictures of one palette for a GIF: so many colours of the middle one, and those of the electrodes,
-        whose dots are few pixels."""
+        """Pictures with one palette for a GIF: `colors` colours of the middle picture, and those of the
+        electrodes, whose dots have few pixels."""
         from PIL import Image
 
         ramp = (255 * electrode_colors(np.linspace(-FULL_CHANGE, FULL_CHANGE, 48))[:, :3]).astype(np.uint8)

@@ -1,8 +1,7 @@
-"""Pictures without a window: MuJoCo's renderer on whichever GL library works here.
+"""Pictures without a window, by MuJoCo's renderer with any working GL library.
 
-`mujoco.Renderer` is bound to the library that MUJOCO_GL named when mujoco was imported. Here the library is
-looked for when it is needed, and tried in a process of its own first, because a broken one may take the
-process with it."""
+`mujoco.Renderer` uses the library that MUJOCO_GL names when mujoco is imported. Here the library is searched
+when it is needed, and first tested in another process, since a broken one may crash the process."""
 
 import contextlib
 import functools
@@ -17,8 +16,8 @@ import numpy as np
 
 __all__ = ["SHOWN", "Offscreen", "find_gl", "frame_bodies", "show_bodies", "stage"]
 
-_MARGIN = 1.1  # of what is framed
-SHOWN = 3  # geom groups below are drawn unless somebody hides them
+_MARGIN = 1.1  # size of the picture over that of the framed geoms
+SHOWN = 3  # MuJoCo draws geom groups below this by default
 
 _PROBE = """
 import importlib, os, sys
@@ -46,10 +45,10 @@ def _works(gl):
 
 
 def find_gl() -> str | None:
-    """The GL library to render with: "egl", "osmesa" or "cgl"; None where there is none.
+    """The GL library to render with: "egl", "osmesa" or "cgl"; None without any.
 
-    MUJOCO_GL=egl and MUJOCO_GL=osmesa allow only that one, MUJOCO_GL=disable none, all else tries what the
-    system may have."""
+    MUJOCO_GL=egl and MUJOCO_GL=osmesa allow only that one, MUJOCO_GL=disable none; otherwise the libraries of
+    the system are tried."""
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     if asked in ("disable", "disabled", "off", "false", "0"):
         return None
@@ -60,8 +59,8 @@ def find_gl() -> str | None:
 
 
 def _take_platform(gl):
-    """PyOpenGL takes its platform once, for whoever imports it first: dm_control's viewer, say, with GLX,
-    where EGL finds no display. MuJoCo's functions are bound as they are first called, so ours is put there
+    """Sets PyOpenGL's platform, which its first import chooses (dm_control's viewer takes GLX, for example,
+    with which EGL finds no display). MuJoCo's functions are bound at their first call, so this comes
     before."""
     os.environ["PYOPENGL_PLATFORM"] = gl
     loaded = sys.modules.get("OpenGL.platform")
@@ -73,10 +72,9 @@ class Offscreen:
     """A GL context and a scene of one model; a context manager.
 
     Args:
-      model: whose `vis.global_.offwidth` and `offheight` bound the picture; raised here if they are too
-        small.
+      model: its `vis.global_.offwidth` and `offheight` limit the picture, and are increased if necessary.
       width, height: of the picture [pixel].
-      gl: what `find_gl` answered.
+      gl: result of `find_gl`.
 
     Raises:
       ValueError: gl is None, or no picture of that size can be drawn.
@@ -114,13 +112,13 @@ class Offscreen:
         self.close()
 
     def close(self) -> None:
-        """Frees the context; once is enough."""
+        """Frees the context; further calls do nothing."""
         self._stack.close()
 
     def render(
         self, data: mujoco.MjData, camera: mujoco.MjvCamera, option: mujoco.MjvOption | None = None
     ) -> np.ndarray:
-        """Draws the model as it is in data, with what its plugins show; returns (height, width, 3) uint8."""
+        """Draws the model with data, including the geoms of plugins; returns (height, width, 3) uint8."""
         self._context.make_current()
         option = option or mujoco.MjvOption()
         mujoco.mjv_updateScene(
@@ -133,8 +131,7 @@ class Offscreen:
 
 
 def stage(spec: mujoco.MjSpec) -> None:
-    """What all pictures have around their model: light from where the camera is, a white background, and
-    nothing cut off that is near the camera."""
+    """Sets the scene of all pictures: light from the camera, a white background, and a small near plane."""
     spec.stat.extent, spec.visual.map.znear = 0.2, 0.02
     spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.5, 0.6
     for texture in [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]:
@@ -144,8 +141,8 @@ def stage(spec: mujoco.MjSpec) -> None:
 
 
 def show_bodies(spec: mujoco.MjSpec) -> None:
-    """Of somebody's model all bodies, also those that have nothing but geoms to collide with, and nothing
-    else: no sites, which are as large as what a touch sensor is around, and no tendons."""
+    """Shows all bodies of a model, also those with collision geoms only, without sites (which are as large as
+    the volume of a touch sensor) and tendons."""
     for body in spec.bodies:
         if all(geom.group >= SHOWN for geom in body.geoms):
             for geom in body.geoms:
@@ -161,10 +158,10 @@ def frame_bodies(
     camera: mujoco.MjvCamera,
     aspect: float = 4 / 3,
 ) -> None:
-    """Moves a free camera so that the geoms of some bodies fill the picture; its direction stays.
+    """Moves a free camera, without turning it, so that the geoms of some bodies fill the picture.
 
     Args:
-      bodies: their numbers. camera: its azimuth and elevation [deg] are taken.
+      bodies: their ids. camera: its azimuth and elevation [deg] are kept.
       aspect: width of the picture over its height.
     """
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & (model.geom_group < SHOWN))

@@ -1,5 +1,5 @@
-"""A policy plays a task by touch: scores, a GIF, MuJoCo's viewer or the page in the browser, `biotac play
-TASK`."""
+"""Plays a task by touch with a policy: scores, a GIF, MuJoCo's viewer or the page in the browser (`biotac
+play TASK`)."""
 
 import pathlib
 import time as clock
@@ -21,7 +21,7 @@ from .offscreen import Offscreen, find_gl
 __all__ = ["play_task", "save_gif", "show_page", "show_window"]
 
 _SIZE = 480, 360  # of a GIF [pixel]
-_SHOWN, _LAST = 2.2, 0.6  # a GIF has episodes of so long in all, and shows the end of each so long [s]
+_SHOWN, _LAST = 2.2, 0.6  # duration of the episodes in a GIF, and of the last picture of each [s]
 
 
 def play_task(
@@ -39,14 +39,14 @@ def play_task(
     """Plays a task of `biotac_mj.tasks.batched` with a policy.
 
     Args:
-      policy: a file; None takes the one that comes with the package; "script" knows the truth; "random".
-      episodes: how many to score, in worlds side by side; None shows one after the other.
-      json: prints scores as JSON. render: GIF of episodes. window: MuJoCo's viewer in place of the page
-        at `port`.
-      seed: of beginnings. hand: of the rod's task.
+      policy: a file; None: the shipped one; "script": a script that uses the true state; "random".
+      episodes: number of episodes to score, in parallel worlds; None: show episodes one after the other.
+      json: print scores as JSON. render: GIF of episodes. window: MuJoCo's viewer instead of the page at
+      `port`.
+      seed: of initial states. hand: for the rod's task.
 
     Returns:
-      the scores of `episodes`.
+      The scores of `episodes`.
     """
     _, act, card = acting(task, policy, device)
     own = {"hand": hand} if hand else {}
@@ -86,7 +86,7 @@ class Mirror:
         self.node = np.unique(self.geometry.outer_face)
 
     def update(self) -> None:
-        """Takes the world as it is now."""
+        """Copies the present state of the world."""
         env, model, data = self.env, self.model, self.data
         data.qpos[:] = env.qpos[0].cpu().numpy()
         data.mocap_pos[:] = env.mocap_pos[0].cpu().numpy()
@@ -102,22 +102,22 @@ class Mirror:
             model.site_rgba[sites] = electrode_colors(change)
 
     def counts(self, finger: str) -> np.ndarray:
-        """(nelectrode,) of a finger."""
+        """Counts (nelectrode,) of a finger."""
         return self.data.sensor(f"{self.env.prefixes[finger]}electrodes").data.copy()
 
     def at_rest(self, finger: str) -> np.ndarray:
-        """(nelectrode,) when nothing was touched."""
+        """Counts (nelectrode,) of a finger without contact."""
         tare = self.env.rest_counts[0, list(self.env.batches).index(finger)].cpu().numpy()
         counts = tare[: len(self.geometry.electrode_pos)]
         return counts if counts.any() else self.counts(finger)
 
     def point(self, camera: mujoco.MjvCamera) -> None:
-        """Has a camera look at the task."""
+        """Points a camera at the task."""
         camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = self.env.camera
 
 
 def _decisions(env, act, mirror):
-    """Plays and yields the number of the decision that comes; for ever."""
+    """Plays for ever; yields the index of the next decision."""
     env.reset()
     while True:
         mirror.update()
@@ -127,7 +127,7 @@ def _decisions(env, act, mirror):
 
 
 def save_gif(env: BatchTask, act: Callable, path: pathlib.Path | str) -> None:
-    """Draws episodes of the first world, as fast as they went, until `_SHOWN` is over, with the electrodes of
+    """Writes a GIF of `_SHOWN` seconds of episodes of the first world, in real time, with the electrodes of
     each finger."""
     mirror, frames, lasts = Mirror(env), [], []
     maps, each = Maps(env.biotac["skin"]), round(1e3 * env.cfg.substeps * env.cfg.timestep)
@@ -162,7 +162,7 @@ def show_window(env: BatchTask, act: Callable) -> None:
 
 
 def show_page(env: BatchTask, act: Callable, port: int = 8080, seconds: float = np.inf) -> object:
-    """The page in the browser, until Ctrl-C or so many seconds of the task; returns it."""
+    """Shows the page in the browser until Ctrl-C, or for `seconds` of the task; returns the page."""
     from .web import Finger, Moment, Page
     from .web_scene import Scene
 

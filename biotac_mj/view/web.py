@@ -12,21 +12,21 @@ from .web_numbers import Numbers
 
 __all__ = ["FIELDS", "Field", "Finger", "Moment", "Page"]
 
-_WINDOW = 200  # samples that a trace of a simulation shows
-_MAP = 280, 190  # of the electrode map, along x and around the finger
-_SCALE = 200  # width of its colours' scale, below
-_FROM = np.array([-0.45, -0.65, 0.7])  # where the camera looks from: the tip's side, pad in sight
+_WINDOW = 200  # samples in a trace of a simulation
+_MAP = 280, 190  # size of the electrode map, along x and around the finger
+_SCALE = 200  # width of the colour scale below
+_FROM = np.array([-0.45, -0.65, 0.7])  # direction of the camera: from the tip's side, with the pad in sight
 _SEEN_THROUGH, _COLOURED = 0.55, 0.85  # opacity of the skin
 _BANDS = 8  # colours of a quantity on the skin
 
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """A quantity at the nodes that can be shown as the skin's colour.
+    """A quantity at the nodes that can be shown as the colour of the skin.
 
     Attributes:
-      unit, scale: shown is the value times scale in this unit.
-      colors: name of a colour map of matplotlib. bare: whether its lowest band has the colour of the skin.
+      unit, scale: the value times scale is shown in this unit.
+      colors: name of a matplotlib colour map. bare: whether its lowest band has the colour of the skin.
     """
 
     unit: str
@@ -35,7 +35,7 @@ class Field:
     bare: bool
 
     def bands(self) -> np.ndarray:
-        """(_BANDS, 3) RGB, of the least values first."""
+        """RGB colours (_BANDS, 3), for the lowest values first."""
         from matplotlib import colormaps
 
         colors = colormaps[self.colors](np.linspace(0, 1, _BANDS))[:, :3]
@@ -52,17 +52,17 @@ FIELDS = {
 
 @dataclasses.dataclass
 class Finger:
-    """What the page shows of one BioTac; its arrays are in the BioTac frame.
+    """Constants of one BioTac on the page, in the BioTac frame.
 
     Attributes:
       node: indices of the outer surface's nodes; face (m, 3): its triangles, indices into `node`.
       core_vert, core_face, electrode_pos (nelectrode, 3), electrode_normal (nelectrode, 3) [m]: of the
       geometry.
-      rest: (nelectrode,) counts that changes are taken from.
+      rest: (nelectrode,) reference counts of changes.
       fields: names of FIELDS that its moments have.
-      tool: (vert (n, 3) [m], face) of an indenter in its own frame, None without one.
+      tool: (vert (n, 3) [m], face) of an indenter in its own frame, or None.
       rows: (n, nelectrode + 3) time [s], changes and PDC above rest [counts], force [N] of a whole
-        recording; None where the page keeps what it has shown.
+        recording; None: the page collects them.
     """
 
     node: np.ndarray
@@ -80,7 +80,8 @@ class Finger:
     def of(
         cls, geometry: SkinGeometry, rest: np.ndarray, face: np.ndarray | None = None, **more: object
     ) -> "Finger":
-        """Of a SkinGeometry; face: of another skin around the same core. more: the other attributes."""
+        """Makes a Finger of a SkinGeometry. face: of another skin around the same core. more: the other
+        attributes."""
         node, face = np.unique(geometry.outer_face if face is None else face, return_inverse=True)
         solid = geometry.core_vert, geometry.core_face, geometry.electrode_pos, geometry.electrode_normal
         return cls(node, face.reshape(-1, 3), *solid, np.asarray(rest, float), **more)
@@ -88,13 +89,13 @@ class Finger:
 
 @dataclasses.dataclass
 class Moment:
-    """One BioTac at one time.
+    """State of one BioTac at one time.
 
     Attributes:
-      vert: (nnode, 3) [m] of the outer nodes, in the BioTac frame.
+      vert: (nnode, 3) outer nodes in the BioTac frame [m].
       counts: (nelectrode,). pdc: above rest [counts]. force: [N].
       pos, quat: of the BioTac frame in the world [m].
-      fields: {name of FIELDS: function without arguments that answers (nnode,) in SI units}.
+      fields: {name of FIELDS: function without arguments that returns (nnode,) in SI units}.
       tool: (pos, quat) of the indenter in the BioTac frame.
     """
 
@@ -113,14 +114,14 @@ class Page:
 
     Args:
       fingers: {name: Finger}.
-      host, port: where it listens.
+      host, port: of the server.
 
     Attributes:
       server: the ViserServer; url: of the page.
       field: the dropdown that chooses the skin's colour.
 
     Raises:
-      ValueError: viser is not installed, or a port that is none; the text says what to do.
+      ValueError: viser is not installed, or an invalid port; the message gives the remedy.
     """
 
     def __init__(self, fingers: dict[str, Finger], host: str = "127.0.0.1", port: int = 8080):
@@ -131,7 +132,7 @@ class Page:
         if not 0 < port < 65536:
             raise ValueError(f"port {port} is none: choose one from 1 to 65535")
         self.fingers = fingers
-        # browsers open connections in advance and close them unused, which is no error of a user's
+        # browsers open connections in advance and close them unused, which is not an error
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
@@ -161,7 +162,8 @@ class Page:
         scene = self.server.scene
         frame = scene.add_frame(f"/{name}", show_axes=False)
         vert, face = np.zeros((len(finger.node), 3), np.float32), finger.face.astype(np.uint32)
-        skin = [  # one mesh for each colour, as viser's have one; on the first, whole one lie the others
+        # a viser mesh has one colour: the first mesh is complete, and one for each colour covers parts of it
+        skin = [
             scene.add_mesh_simple(f"/{name}/skin{i or ''}", vert, face, color=_rgb(SKIN), visible=not i)
             for i in range(_BANDS)
         ]
@@ -213,7 +215,7 @@ class Page:
         self._log[name] = []
 
     def _aim(self, state):
-        """Points the camera at all fingers; once, as it is the user's afterwards."""
+        """Points the camera at all fingers, once; afterwards the user moves it."""
         from scipy.spatial.transform import Rotation
 
         place = np.concatenate(
@@ -261,8 +263,8 @@ class Page:
         self.server.flush()
 
     def _show_legend(self, chosen, most):
-        """Writes what the skin's colours mean; the value at their top, which only grows, so that colours keep
-        their meaning."""
+        """Writes the legend of the skin's colours. Their largest value only grows, so that colours keep their
+        meaning."""
         if chosen not in FIELDS:
             self._legend.content = ""
             return 1.0
@@ -270,7 +272,7 @@ class Page:
         self._most[chosen] = top = max(self._most[chosen], _round_up(most * field.scale))
         boxes = "".join(f'<span style="flex:1;background:rgb{_rgb(c)}">&nbsp;</span>' for c in field.bands())
         ticks = "".join(f"<span>{value * top:g}</span>" for value in (0, 0.25, 0.5, 0.75, 1))
-        bare = f"; green: below {top / _BANDS:g}" if field.bare else ""  # as the skin is
+        bare = f"; green: below {top / _BANDS:g}" if field.bare else ""  # the colour of the skin
         row = '<div style="display:flex;justify-content:space-between">'
         self._legend.content = (
             f'<div style="font-size:12px;margin:0 1em">{chosen} [{field.unit}]{bare}'
@@ -279,7 +281,7 @@ class Page:
         return top / field.scale
 
     def _paint(self, name, skin, vert, value, chosen):
-        """Each triangle that is not in the lowest band is also in the mesh that has its colour.
+        """Adds each triangle that is not in the lowest band to the mesh of its colour.
 
         value: (nface,) of the scale."""
         face, vert = self.fingers[name].face, np.asarray(vert, np.float32)
@@ -295,7 +297,7 @@ class Page:
                 mesh.faces = own.astype(np.uint32)
 
     def _rows(self, name, row):
-        """(n, 22) what the traces show at the time of a row: a recording up to there, or what came before."""
+        """Rows (n, 22) of the traces at the time of a row: the recording, or collected rows, up to it."""
         recorded = self.fingers[name].rows
         if recorded is not None:
             rows = recorded[: max(2, np.searchsorted(recorded[:, 0], row[0], "right"))]
@@ -315,7 +317,7 @@ def _rgb(color):
 
 
 def _round_up(value):
-    """The next of 1, 1.5, 2, 3, 5, 7.5 times a power of ten."""
+    """Rounds up to 1, 1.5, 2, 3, 5 or 7.5 times a power of ten."""
     if not value > 0:
         return 1.0
     unit = 10.0 ** np.floor(np.log10(value))
@@ -323,15 +325,14 @@ def _round_up(value):
 
 
 def _ring_colors(n):
-    """Of the traces of n electrodes, and of the rings around them on the map."""
+    """Colours of the traces of n electrodes, and of the rings around them on the map."""
     return [f"hsl({360 * i // n}, 70%, 45%)" for i in range(n)]
 
 
 def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
-    """SVG of electrodes (n, 3) [m] at their place along (tip left) and around the finger (E1..E6 below),
-    numbered, filled
-    with their change (n,) [counts], in rings of the colours that their traces have; below, what the fill
-    means."""
+    """SVG map of electrodes (n, 3) [m] along (tip left) and around the finger (E1..E6 below), with numbers,
+    filled by their change (n,) [counts], in rings of the colours of their traces, and a colour scale
+    below."""
     width, height = _MAP
     x = 16 + (position[:, 0] + 0.0185) / 0.021 * (width - 32)
     y = (height - 16) / 2 - np.arctan2(position[:, 2], -position[:, 1]) / 2.0 * (height / 2 - 20)

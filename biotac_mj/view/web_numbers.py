@@ -1,5 +1,4 @@
-"""Numbers of the electrodes in the browser's page: to each browser those that its camera looks at and that
-cover no other."""
+"""Numbers of the electrodes on the page: each browser shows those that face its camera and do not overlap."""
 
 import contextlib
 import threading
@@ -12,18 +11,18 @@ __all__ = ["Numbers", "legible"]
 
 _HEIGHT = 1e-3  # [m] of the letters
 _ROOM = 2e-3  # [m] between two numbers: as wide as the box of one with two digits
-_ABOVE = 8e-4  # [m] of the core, where a number is
-_FACING = 0.25  # cosine of normal and line of sight, below which an electrode is seen from the side or behind
+_ABOVE = 8e-4  # [m] height of a number above the core
+_FACING = 0.25  # least cosine between normal and line of sight
 
 
 def legible(eye: np.ndarray, pos: np.ndarray, normal: np.ndarray, room: float = _ROOM) -> np.ndarray:
-    """(n,) whether numbers at (n, 3) are shown to an eye [m]: those whose normal looks at it, the most first,
-    that leave room to the ones shown already."""
+    """Flags (n,) of the numbers at (n, 3) to show to an eye [m]: those that face it, in descending order, and
+    do not overlap the ones before."""
     sight = eye - pos
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     facing = (sight * normal).sum(1)
     direction = sight.mean(0) / np.linalg.norm(sight.mean(0))
-    across = pos - pos @ direction[:, None] * direction  # as the eye sees them beside each other
+    across = pos - pos @ direction[:, None] * direction  # projection in the direction of sight
     visible = np.zeros(len(pos), bool)
     for i in np.argsort(-facing):
         apart = np.linalg.norm(across[visible] - across[i], axis=1)
@@ -62,11 +61,11 @@ class Numbers:
         self.choose()
 
     def move(self, name: str, pos: np.ndarray, quat: np.ndarray) -> None:
-        """Tells where a finger is in the world [m]; `choose` acts on it."""
+        """Sets the pose of a finger in the world [m]; `choose` applies it."""
         self._pose[name] = np.asarray(pos), matrix(quat)
 
     def choose(self) -> None:
-        """Shows to each browser what it can read from where it looks."""
+        """Chooses the numbers for each browser by its camera."""
         places = [
             (p + x @ R.T, n @ R.T) for (x, n), (p, R) in zip(self._electrodes.values(), self._pose.values())
         ]

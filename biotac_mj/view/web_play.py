@@ -1,4 +1,4 @@
-"""What the page in the browser shows: a simulation that runs, or recorded presses."""
+"""Shows a running simulation or recorded presses on the page in the browser."""
 
 import pathlib
 import tempfile
@@ -42,12 +42,12 @@ def play_model(
     control: Callable | None = None,
     **server: object,
 ) -> Page:
-    """Steps a model and shows its BioTacs 25 times a second of its time; returns the page.
+    """Steps a model and shows its BioTacs at 25 Hz of model time; returns the page.
 
     Args:
       handles: {name: Handle}.
-      page: one to go on with.
-      seconds: how long [s of the model].
+      page: an existing page to use.
+      seconds: duration [s of the model].
       control: f(data), called before each step.
     """
     from .. import plugin
@@ -97,19 +97,19 @@ def play_model(
 
 
 def _served(fingers, **server):
-    """A Page, whose address is said: its port is another where the wanted one is taken."""
+    """Makes a Page and prints its address, whose port differs if the wanted one is in use."""
     page = Page(fingers, **server)
     print(f"  the page is at {page.url} until Ctrl-C", flush=True)
     return page
 
 
 def _under(geometry):
-    """f(vert (nvert, 3), node) -> thickness (nnode,) [m] of the film under nodes of the outer surface: at the
-    node of the inner one that is nearest at rest."""
+    """Function (vert (nvert, 3), node) -> thickness (nnode,) [m] of the film under nodes of the outer
+    surface, at the nearest inner node of the undeformed skin."""
     film, near = [], []
 
     def thickness(vert, node):
-        if not film:  # made when first asked for
+        if not film:  # made at the first call
             from scipy.spatial import cKDTree
 
             from ..sensor.film import FilmConduction
@@ -128,8 +128,8 @@ def play_file(
     rounds: float = np.inf,
     **server: object,
 ) -> Page:
-    """Shows recorded presses (skin.h5 of `biotac press`) beside each other again and again; returns the page,
-    whose slider goes to any time.
+    """Shows recorded presses (skin.h5 of `biotac press`) side by side in a loop; returns the page, whose
+    slider goes to any time.
 
     Raises:
       FileNotFoundError: no such file.
@@ -149,11 +149,11 @@ def play_file(
 def play_press(
     settings: dict, page: Page | None = None, rounds: float = np.inf, speed: float = 0.1, **server: object
 ) -> Page:
-    """Shows a press again and again, slowly; sliders say how deep and where, and it is pressed anew when one
-    is moved. Returns the page.
+    """Shows a press in a loop, slowly; sliders set depth and location, and start a new press when they are
+    moved. Returns the page.
 
     Args:
-      settings: of the press beside its depth and place, as `PressOptions` takes them.
+      settings: of the press except depth and location, as for `PressOptions`.
     """
     with tempfile.TemporaryDirectory() as folder:
         wanted = {"depth [mm]": 1.5, "along [mm]": -12.0, "around [deg]": 0.0}
@@ -162,7 +162,7 @@ def play_press(
             place = 1e-3 * wanted["along [mm]"], np.radians(wanted["around [deg]"])
             options = PressOptions(location=place, depth=1e-3 * wanted["depth [mm]"], **settings)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what presses on the core is seen to do so
+                warnings.simplefilter("ignore")  # the page shows a press on the core
                 record = press(options, progress=False).record
             file = pathlib.Path(folder) / "skin.h5"
             write_skin(record, file)
@@ -194,7 +194,7 @@ def play_press(
 
 
 def _play(presses, page, speed, rounds, again=lambda: False):
-    """Shows presses of a page; again(): whether they are others now."""
+    """Shows the presses on a page; again(): whether they have changed."""
     times = np.unique(np.concatenate([one.time for one in presses.values()]))
     gui = page.server.gui
     playing = gui.add_checkbox("play", True, order=0.5)
@@ -202,7 +202,7 @@ def _play(presses, page, speed, rounds, again=lambda: False):
 
     @slider.on_update
     def _(event):
-        if event.client is not None:  # a hand on it, not the film
+        if event.client is not None:  # moved by the user, not by the film
             playing.value = False
 
     at, done, was_playing = 0, 0, True
@@ -215,8 +215,8 @@ def _play(presses, page, speed, rounds, again=lambda: False):
         else:
             at = int(np.abs(times - slider.value).argmin())
             if was_playing:
-                # a browser may get the film's last place after the hand's: told once more where it is; what
-                # is already so would not be sent
+                # a browser may get the film's last position after the user's, so the position is sent again;
+                # an unchanged value would not be sent
                 now, slider.value = slider.value, float(times[-1])
                 slider.value = 0.0
                 slider.value = now
@@ -225,7 +225,7 @@ def _play(presses, page, speed, rounds, again=lambda: False):
         if not playing.value:
             clock.sleep(_FRAME)
         elif at + 1 < len(times):
-            # no more pictures than are seen: each is sent to every browser
+            # a limited picture rate, since each picture is sent to every browser
             coming = max(at + 1, int(np.searchsorted(times, times[at] + speed * _FRAME)))
             coming = min(coming, len(times) - 1)
             clock.sleep(float(times[coming] - times[at]) / speed)
@@ -261,7 +261,7 @@ class _Press:
         except (ValueError, FileNotFoundError):
             geometry = load_skin(
                 "default"
-            )  # of another skin only core and electrodes are lent: all share them
+            )  # core and electrodes are those of the shipped skin, which all skins share
         if geometry.nvert == vert.shape[1]:
             self._film = _under(geometry)
             fields.append("film thickness")
@@ -271,7 +271,7 @@ class _Press:
         self.finger = Finger.of(geometry, counts[0, :n], face, **more)
 
     def moment(self, time):
-        """What is shown at a time [s]: the step before it."""
+        """The moment at a time [s]: the last step before it."""
         i = max(0, int(np.searchsorted(self.time, time, "right")) - 1)
         node, pose = self.finger.node, self.pose[i]
         fields = {"film thickness": lambda: self._film(self.vert[i], node)}

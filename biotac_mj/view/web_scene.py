@@ -1,4 +1,4 @@
-"""The rest of a MuJoCo model in the browser's page: its visible geoms, moved with their bodies."""
+"""The other geoms of a MuJoCo model on the page in the browser."""
 
 import mujoco
 import numpy as np
@@ -9,10 +9,10 @@ __all__ = ["Scene"]
 
 
 class Scene:
-    """Adds the geoms of `model` to a viser server, those of `hidden` bodies and planes left out.
+    """Adds the visible geoms of `model` to a viser server, except planes and those of `hidden` bodies.
 
     Args:
-      server: ViserServer. model: MjModel. hidden: names of bodies that are shown otherwise.
+      server: ViserServer. model: MjModel. hidden: names of bodies that are drawn otherwise.
     """
 
     def __init__(self, server: object, model: mujoco.MjModel, hidden: tuple | list = ()):
@@ -37,20 +37,19 @@ class Scene:
             )
 
     def update(self, data: mujoco.MjData) -> None:
-        """Moves the bodies to where they are in `data`."""
+        """Moves the bodies to their poses in `data`."""
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = data.xpos[body].copy(), data.xquat[body].copy()
 
 
 def geom_color(model, g):
-    """(4,) of a geom, from its material if it has one."""
+    """RGBA (4,) of a geom, from its material if it has one."""
     material = int(model.geom_matid[g])
     return model.mat_rgba[material] if material >= 0 else model.geom_rgba[g]
 
 
 def geom_mesh(model, g):
-    """Vertices (n, 3) [m] and triangles (m, 3) of a geom in its frame; None for those without a surface of
-    finite size."""
+    """Vertices (n, 3) [m] and triangles (m, 3) of a geom in its frame; None without a finite surface."""
     from ..triangles import trimesh
 
     kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]

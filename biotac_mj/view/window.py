@@ -1,5 +1,5 @@
-"""A BioTac with its pad up and a ball lying on it, in MuJoCo's viewer or as a picture. Skin and electrodes
-are shown by the plugin."""
+"""A BioTac with a ball on its upward pad, in MuJoCo's viewer or as a picture. The plugin draws skin and
+electrodes."""
 
 import functools
 import os
@@ -24,28 +24,28 @@ from .offscreen import frame_bodies, show_bodies, stage
 
 __all__ = ["build_hand", "build_scene", "view"]
 
-# what matplotlib writes
+# formats that matplotlib writes
 _PICTURES = ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".gif", ".pdf", ".svg"
 
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 _BALL = "biotac_ball"  # in a hand's model, which may have a ball of its own
-_PLACE = -10e-3, 0.0  # of the pad that it touches: x [m] and angle around the finger
-_EYE = -0.3, -0.5, -0.8  # in the BioTac frame, from where is looked
-_SPRING, _PUSH = 50.0, 0.5  # of the ball before a hand's finger [N/m], [N] with which it lies on the pad
+_PLACE = -10e-3, 0.0  # contact point on the pad: x [m] and angle around the finger
+_EYE = -0.3, -0.5, -0.8  # direction of the camera in the BioTac frame
+_SPRING, _PUSH = 50.0, 0.5  # stiffness [N/m] and force on the pad [N] of the ball at a hand's finger
 
 
 def build_scene(
     skin: str | pathlib.Path | SkinGeometry = "default", **attach_options: object
 ) -> tuple[mujoco.MjSpec, Handle]:
-    """A fixed BioTac and a ball above its pad that moves in three directions without turning; weak springs
-    keep it over the pad.
+    """A fixed BioTac and a ball above its pad with three translational joints and weak springs, which keep it
+    over the pad.
 
     Args:
       skin: name, file or SkinGeometry.
       attach_options: see `biotac_mj.attach`.
 
     Returns:
-      spec, and the handle of `biotac_mj.attach`.
+      Spec, and the handle of `biotac_mj.attach`.
     """
     from ..coupling import attach
     from ..geometry import SkinGeometry, load_skin
@@ -86,19 +86,19 @@ def build_hand(
     mount: pathlib.Path | str | None = None,
     **attach_options: object,
 ) -> tuple[mujoco.MjSpec, dict]:
-    """A hand with BioTacs and a ball to press them with: on the fingers of the Menagerie's Shadow Hand, whose
-    palm is up; of other hands held by springs on the pad of the first finger.
+    """A hand with BioTacs and a ball that presses them: on the fingers of the Menagerie's Shadow Hand, whose
+    palm is up; for other hands, on springs at the pad of the first finger.
 
     Args:
-      path: MJCF of a hand that `HANDS` knows, or of one that `mount`, a file of `biotac hand mount`, is of.
+      path: MJCF of a hand in `HANDS`, or of the hand of `mount`, a file of `biotac hand mount`.
       skin: name, file or SkinGeometry; attach_options: see `biotac_mj.attach`.
 
     Returns:
-      spec, and {finger: handle} of `biotac_mj.attach_to_hand`.
+      Spec, and {finger: handle} of `biotac_mj.attach_to_hand`.
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: it is no hand, or none that is known.
+      ValueError: it is no hand, or an unknown one.
     """
     from ..geometry import load_skin
     from ..tasks.hands import HANDS, attach_to_hand, known_hand
@@ -129,7 +129,7 @@ def build_hand(
 
 
 def _ball_before(spec, mount, geometry):
-    """A body without weight that springs push against the pad of a mounted BioTac, whose frame it has."""
+    """A body without gravity that springs push against the pad of a mounted BioTac, in the BioTac frame."""
     from ..tasks.hands import find_link
 
     model = spec.copy().compile()
@@ -162,17 +162,16 @@ def view(
     port: int = 8080,
     options: dict | str | None = None,
 ) -> object:
-    """Opens the viewer and steps in real time as far as the machine goes; or renders; or serves a page.
+    """Opens the viewer and steps in real time, if the machine is fast enough; or renders; or serves a page.
 
     Args:
       skin, material, liquid, seed, device, tier, options: see `biotac_mj.attach`; liquid None takes the
         material's choice.
       render: path of a picture to write after `seconds` [s] instead.
-      hand, mount: file of a hand to show instead of one BioTac, with the condensed tier, and of its mounts if
-        its name is not known; see `build_hand`.
-      web: serve a page in the browser (`web`) at `port`: of a press, whose depth and place sliders say; of
-      the
-        simulation of a hand; or of the file `recording`, of several files beside each other.
+      hand, mount: files of a hand to show instead of one BioTac, with the condensed tier, and of its mounts
+        if it is unknown; see `build_hand`.
+      web: serve a page in the browser (`web`) at `port`: of a press, whose depth and location sliders set; of
+        the simulation of a hand; or of the file `recording`, or several files side by side.
 
     Raises:
       ValueError: no display for a window, or no GL library to render with.
@@ -253,13 +252,13 @@ def view(
 
 
 def _aim(camera):
-    """Looks at the pad from beside and above."""
+    """Points the camera at the pad, from the side and above."""
     camera.lookat[:] = [-0.008, 0, 0.004]
     camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
 
 
 def _aim_at_hand(spec, handles, model, data, camera):
-    """Shows all that hangs on the last common body of the links with BioTacs, and the ball."""
+    """Frames the subtree of the last common ancestor of the links with BioTacs, and the ball."""
     ball = spec.body(_BALL)
     if len(ball.joints) == 1:  # of the Shadow Hand, whose palm is up
         camera.azimuth, camera.elevation = 150, -35
@@ -270,7 +269,7 @@ def _aim_at_hand(spec, handles, model, data, camera):
         camera.azimuth, camera.elevation = look.azimuth, look.elevation
     chains = [_ancestors(model, model.body(handle.body).id) for handle in handles.values()]
     common = set.intersection(*map(set, chains))
-    # bodies come after their parents; fingers that hang on the world itself have no common body
+    # bodies come after their parents; fingers on the world body have no common ancestor
     tops = {max(common)} if common else {chain[-1] for chain in chains}
     shown = [b for b in range(model.nbody) if tops.intersection(_ancestors(model, b))]
     shown.append(model.body(_BALL).id)
@@ -278,7 +277,7 @@ def _aim_at_hand(spec, handles, model, data, camera):
 
 
 def _ancestors(model, body):
-    """A body and those that it hangs on, but for the world."""
+    """A body and its ancestors, without the world."""
     out = []
     while body:
         out.append(body)
@@ -287,7 +286,7 @@ def _ancestors(model, body):
 
 
 def _check_picture(path):
-    """Before the work: the suffix says what picture is written."""
+    """Checks the suffix of a picture before the work."""
     suffix = pathlib.Path(path).suffix
     if suffix.lower() not in _PICTURES:
         raise ValueError(
