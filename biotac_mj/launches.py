@@ -63,7 +63,7 @@ def recorded(
         return command.launch
     arguments, _ = _pack(command.kernel, command.hooks, command.params, False)
     run = functools.partial(command.hooks.forward, ctypes.byref(command.params[0]), ctypes.byref(arguments))
-    run.kept = command, inputs, outputs  # keeps their memory alive
+    run.references = command, inputs, outputs  # keeps their memory alive
     addresses = ctypes.addressof(command.params[0]), ctypes.addressof(arguments)
     run.entry = 0, ctypes.cast(command.hooks.forward, ctypes.c_void_p).value, *addresses
     return run
@@ -87,7 +87,7 @@ def in_a_row(launches: Sequence[Callable[[], None]]) -> list[Callable[[], None]]
 def _row(launches):
     entries = np.array([one.entry for one in launches], np.uint64)
     run = recorded(_run_row, 1, [wp.array(entries, dtype=wp.uint64, ndim=2, device="cpu")])
-    run.kept = *run.kept, launches
+    run.references = *run.references, launches
     return run
 
 
@@ -104,5 +104,5 @@ def repeated(flag: wp.array, launches: Sequence[Callable[[], None]]) -> Callable
     if launches and all(hasattr(one, "entry") for one in launches):
         entries = np.array([one.entry for one in launches], np.uint64)
         run.entry = 1, flag.ptr, entries.ctypes.data, len(entries)
-        run.kept = flag, entries, launches
+        run.references = flag, entries, launches
     return run

@@ -166,10 +166,10 @@ def _process(work, folder, name, todo, news):
             news.put((name, "result", result))
         news.put((name, "end", None))
     except Exception as error:
-        news.put((name, *_told(error)))
+        news.put((name, *_describe(error)))
 
 
-def _told(error):
+def _describe(error):
     """Kind and text of an error: one line for errors of the input, else with the traceback."""
     for kind in (FileNotFoundError, ValueError):
         if isinstance(error, kind):
@@ -254,4 +254,4 @@ def _task(key, work, value, wanted):
             }
         return None, results, files, lines
     except Exception as error:
-        return _told(error), [], {}, lines
+        return _describe(error), [], {}, lines

@@ -54,8 +54,8 @@ def follow_wrench(h: int, w: int, b: Bodies, m: wp.spatial_vectord, pos: vec3, m
     # the rotation by the sum of two rotation vectors is not the product of both rotations
     turn = rigid_warp.rotation(b.spin[h, w] + more) * wp.transpose(rigid_warp.rotation(b.spin[h, w]))
     origin = b.origin[h, w]
-    go = vec3(m[0], m[1], m[2]) + wp.cross(more, b.arm[h, w])
-    return origin + go + turn * (pos - origin), turn * mat
+    translation = vec3(m[0], m[1], m[2]) + wp.cross(more, b.arm[h, w])
+    return origin + translation + turn * (pos - origin), turn * mat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,5 +86,5 @@ class BodyMotion:
         poses."""
         m, origin = self.moved(np.zeros_like(self.wrench)), self.pos[group]
         turn = (rotation(self.spin + m[:, 3:]) @ rotation(-self.spin))[group]
-        go = (m[:, :3] + cross(m[:, 3:], self.arm))[group]
-        return origin + go + (turn @ (pos - origin)[:, :, None])[:, :, 0], turn @ mat
+        translation = (m[:, :3] + cross(m[:, 3:], self.arm))[group]
+        return origin + translation + (turn @ (pos - origin)[:, :, None])[:, :, 0], turn @ mat

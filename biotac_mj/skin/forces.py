@@ -90,7 +90,7 @@ class Forces:
         self._summed = *data.x.shape, self._lanes
         self.wrench_chunks = -(-len(model.outer.face) // self.wrench_chunk)
         with wp.ScopedDevice(model.device):
-            self._part = wp.zeros((2 * geoms.ngroup, self.wrench_chunks, data.nworld), dtype=vec3)
+            self._partial_wrench = wp.zeros((2 * geoms.ngroup, self.wrench_chunks, data.nworld), dtype=vec3)
         self._slots, self.node_forces = nodes.NodeSlots(), self._node_forces()
         self._slots.lanes = self._lanes
         self._slots.start, self._slots.slot = vectors.elements.start, vectors.elements.slot
@@ -194,9 +194,9 @@ class Forces:
         if g.ngroup:
             inputs = [self.wrench_chunk, g.struct, d.x, self.contact]
             chunks = self.wrench_chunks, d.nworld
-            self.launch(program, faces.partial_wrench, chunks, inputs, [self._part, touched_by])
+            self.launch(program, faces.partial_wrench, chunks, inputs, [self._partial_wrench, touched_by])
             sums = [2 * g.ngroup, d.nworld]
-            program.launch_blocks(faces.sum_wrench, sums, [self._part], [wrench], worlds.BLOCK)
+            program.launch_blocks(faces.sum_wrench, sums, [self._partial_wrench], [wrench], worlds.BLOCK)
 
     def commit_contacts(self, program: Launcher, on: wp.array) -> None:
         """Stores the friction anchors of an equilibrium."""

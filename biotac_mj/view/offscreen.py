@@ -49,11 +49,15 @@ def find_gl() -> str | None:
 
     MUJOCO_GL=egl and MUJOCO_GL=osmesa allow only that one, MUJOCO_GL=disable none; otherwise the libraries of
     the system are tried."""
-    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if asked in ("disable", "disabled", "off", "false", "0"):
+    wanted_library = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if wanted_library in ("disable", "disabled", "off", "false", "0"):
         return None
     candidates = (
-        [asked] if asked in ("egl", "osmesa") else ["cgl"] if sys.platform == "darwin" else ["egl", "osmesa"]
+        [wanted_library]
+        if wanted_library in ("egl", "osmesa")
+        else ["cgl"]
+        if sys.platform == "darwin"
+        else ["egl", "osmesa"]
     )
     return next((gl for gl in candidates if _works(gl)), None)
 
@@ -166,9 +170,9 @@ def frame_bodies(
     """
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & (model.geom_group < SHOWN))
     turn, lift = np.radians([camera.azimuth, camera.elevation])
-    ahead = np.array([np.cos(lift) * np.cos(turn), np.cos(lift) * np.sin(turn), np.sin(lift)])
+    forward = np.array([np.cos(lift) * np.cos(turn), np.cos(lift) * np.sin(turn), np.sin(lift)])
     right = np.array([np.sin(turn), -np.cos(turn), 0.0])
-    axes = np.array([right, np.cross(right, ahead), ahead])
+    axes = np.array([right, np.cross(right, forward), forward])
     corners = np.array([np.ravel(c) for c in np.meshgrid(*3 * [[-1.0, 1.0]])]).T
     local = model.geom_aabb[geoms, None, :3] + corners * model.geom_aabb[geoms, None, 3:]
     turned = np.einsum("gij,gcj->gci", data.geom_xmat[geoms].reshape(-1, 3, 3), local)

@@ -214,7 +214,7 @@ class Page:
         self._gui[name] = picture, plots
         self._log[name] = []
 
-    def _aim(self, state):
+    def _point_camera(self, state):
         """Points the camera at all fingers, once; afterwards the user moves it."""
         from scipy.spatial.transform import Rotation
 
@@ -233,7 +233,7 @@ class Page:
     def update(self, time: float, state: dict[str, Moment]) -> None:
         """Shows a moment of all fingers; time: [s]."""
         if not self._aimed:
-            self._aim(state)
+            self._point_camera(state)
         chosen = self.field.value
         values = {
             name: (m.fields[chosen]() if chosen in m.fields else np.zeros(len(m.vert)))[

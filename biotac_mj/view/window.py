@@ -226,14 +226,14 @@ def view(
     )
     if hand is None:
         spec, handle = build_scene(skin, tier=tier, **settings)
-        handles, aim = {"biotac": handle}, lambda model, data, camera: _aim(camera)
+        handles, point_camera = {"biotac": handle}, lambda model, data, camera: _point_camera(camera)
     else:
         spec, handles = build_hand(hand, mount=mount, tier="condensed", **settings)
-        aim = functools.partial(_aim_at_hand, spec, handles)
+        point_camera = functools.partial(_point_at_hand, spec, handles)
     model = spec.compile()
     data = mujoco.MjData(model)
     if render is not None:
-        return _render(model, data, render, seconds, aim)
+        return _render(model, data, render, seconds, point_camera)
     if web:
         from .web_play import play_model
 
@@ -242,7 +242,7 @@ def view(
 
     with viewer.launch_passive(model, data) as window:
         mujoco.mj_forward(model, data)
-        aim(model, data, window.cam)
+        point_camera(model, data, window.cam)
         while window.is_running():
             begin = time.perf_counter()
             mujoco.mj_step(model, data)
@@ -251,13 +251,13 @@ def view(
             time.sleep(max(0.0, model.opt.timestep - (time.perf_counter() - begin)))
 
 
-def _aim(camera):
+def _point_camera(camera):
     """Points the camera at the pad, from the side and above."""
     camera.lookat[:] = [-0.008, 0, 0.004]
     camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
 
 
-def _aim_at_hand(spec, handles, model, data, camera):
+def _point_at_hand(spec, handles, model, data, camera):
     """Frames the subtree of the last common ancestor of the links with BioTacs, and the ball."""
     ball = spec.body(_BALL)
     if len(ball.joints) == 1:  # of the Shadow Hand, whose palm is up
@@ -294,7 +294,7 @@ def _check_picture(path):
         )
 
 
-def _render(model, data, path, seconds, aim):
+def _render(model, data, path, seconds, point_camera):
     from matplotlib.image import imsave
 
     from .offscreen import Offscreen, find_gl
@@ -304,7 +304,7 @@ def _render(model, data, path, seconds, aim):
             mujoco.mj_step(model, data)
             plugin.check()
         camera = mujoco.MjvCamera()
-        aim(model, data, camera)
+        point_camera(model, data, camera)
         picture = screen.render(data, camera)
     with replacing(path) as temporary:
         imsave(temporary, picture)

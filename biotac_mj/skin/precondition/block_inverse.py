@@ -84,8 +84,8 @@ class DissectedInverse:
 
     def __init__(self, stiffness: sp.csc_matrix, points: np.ndarray, device: wp.Device, thirds: bool):
         self.device = device
-        parts = _dissect(stiffness, points)
-        pieces, separators, piece_separators = parts
+        dissection = _dissect(stiffness, points)
+        pieces, separators, piece_separators = dissection
         # at least one separator, which may be padding
         self.npiece, self.nseparator = len(pieces), _padded(3 * max(1, len(separators)))
         self.size = _padded(3 * max(map(len, pieces)))  # rows of a piece
@@ -99,7 +99,7 @@ class DissectedInverse:
             self.row[piece] = i * (self.size + self.width) + 3 * np.arange(len(piece))
         self.row[separators] = self.first + 3 * np.arange(len(separators))
 
-        exact = _blocks(stiffness.tocsr(), parts)
+        exact = _blocks(stiffness.tocsr(), dissection)
         D, G, S = exact.D, exact.G, exact.S
         largest = max(np.abs(a).max(initial=0.0) for a in (S, *D))
         # bounds of the forces on the separators and of their motions; scales are powers of two, which do not
@@ -124,17 +124,17 @@ class DissectedInverse:
         wanted = blocks, lift, separator
         halves = [a.astype(np.float16) for a in wanted]
         columns = [halves, halves]
-        kept = self._unpack(parts, *halves)
-        if thirds or not _sound(exact, *kept, parts.piece_separators):
+        rounded = self._unpack(dissection, *halves)
+        if thirds or not _sound(exact, *rounded, dissection.piece_separators):
             columns.append([(a - h).astype(np.float16) for a, h in zip(wanted, halves)])
-            kept = self._unpack(parts, *(h.astype(float) + c for h, c in zip(halves, columns[2])))
+            rounded = self._unpack(dissection, *(h.astype(float) + c for h, c in zip(halves, columns[2])))
         self.copies, self._columns = len(columns), columns
-        self._write_entries(parts, *kept)
+        self._write_entries(dissection, *rounded)
 
         # which separator's coordinate each row is that a piece has for them, and which rows each coordinate
         # has
         of_row = np.full((self.npiece, self.width), -1, np.int32)
-        for i, piece_separators in enumerate(parts.piece_separators):
+        for i, piece_separators in enumerate(dissection.piece_separators):
             of_row[i, : 3 * len(piece_separators)] = _coordinates(piece_separators)
         of_row = of_row.ravel()
         rows = np.flatnonzero(of_row >= 0)
@@ -165,23 +165,25 @@ class DissectedInverse:
         """Arrays for products with one right-hand side of each world, or with one and with two."""
         return Product(self, nworld, two)
 
-    def _unpack(self, parts, blocks, _lift, separator):
+    def _unpack(self, dissection, blocks, _lift, separator):
         """D and G of each piece, and S, from the rounded matrices."""
         D, G = [], []
-        for i, (piece, piece_separators) in enumerate(zip(parts.pieces, parts.piece_separators, strict=True)):
+        for i, (piece, piece_separators) in enumerate(
+            zip(dissection.pieces, dissection.piece_separators, strict=True)
+        ):
             rows, columns = slice(3 * len(piece)), slice(self.size, self.size + 3 * len(piece_separators))
             D.append(blocks[i, rows, rows].astype(float) * self.back)
             G.append(-blocks[i, rows, columns].astype(float) * self.motion_scale)
-        n = slice(3 * len(parts.separators))
+        n = slice(3 * len(dissection.separators))
         return D, G, separator[n, n].astype(float) * (self.force_scale * self.back)
 
-    def _write_entries(self, parts, D, G, S):
+    def _write_entries(self, dissection, D, G, S):
         """Sets `half`, `rest` and `scale`."""
-        at = _coordinates(parts.separators)
+        at = _coordinates(dissection.separators)
         # forces on the separators by unit forces at all nodes
         separator_force = np.zeros((3 * len(self.row), len(at)))
         separator_force[at, np.arange(len(at))] = 1.0
-        for piece, piece_separators, g in zip(parts.pieces, parts.piece_separators, G, strict=True):
+        for piece, piece_separators, g in zip(dissection.pieces, dissection.piece_separators, G, strict=True):
             separator_force[np.ix_(_coordinates(piece), _coordinates(piece_separators))] = -g
         if self.device.is_cuda:
             import torch
@@ -195,15 +197,15 @@ class DissectedInverse:
 
         separator_force, S = given(separator_force), given(S)
         made = (separator_force @ S) @ separator_force.T
-        for piece, d in zip(parts.pieces, D, strict=True):
+        for piece, d in zip(dissection.pieces, D, strict=True):
             rows = given(_coordinates(piece))
             made[rows[:, None], rows] += given(d)
         self.scale = float(abs(made).max())
         made /= self.scale
         if self.device.is_cuda:
             half = made.half()
-            self._kept = half, ((made - half) * LOW).half()  # whose memory the arrays share
-            self.half, self.rest = (wp.from_torch(a) for a in self._kept)
+            self._tensors = half, ((made - half) * LOW).half()  # whose memory the arrays share
+            self.half, self.rest = (wp.from_torch(a) for a in self._tensors)
         else:
             half = made.astype(np.float16)
             rest = ((made - half) * np.float32(LOW)).astype(np.float16)
@@ -553,11 +555,11 @@ def _dissect(stiffness, points):
     return best
 
 
-def _blocks(stiffness, parts):
-    at = _coordinates(parts.separators)
+def _blocks(stiffness, dissection):
+    at = _coordinates(dissection.separators)
     schur = stiffness[at][:, at].toarray()
     D, G, inside = [], [], []
-    for piece, piece_separators in zip(parts.pieces, parts.piece_separators, strict=True):
+    for piece, piece_separators in zip(dissection.pieces, dissection.piece_separators, strict=True):
         rows, columns = _coordinates(piece), _coordinates(piece_separators)
         own = stiffness[rows]
         to_separators = own[:, at[columns]].toarray()

@@ -52,9 +52,9 @@ def body_tangent(
     springs[:m, :m] = assemble(nodes, *blocks, nvert)
     rigid = rigid_motions(x[nodes], size)
     pull = springs @ rigid
-    give = compliance @ pull
-    give -= compliance @ solver(give)
-    stiffness = rigid.T @ pull - pull.T @ give
+    displacement = compliance @ pull
+    displacement -= compliance @ solver(displacement)
+    stiffness = rigid.T @ pull - pull.T @ displacement
     values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
     return (vectors * np.maximum(values, 0)) @ vectors.T
 

@@ -223,8 +223,8 @@ def _node_gradients(elements):
     volume = np.bincount(elem.ravel(), np.repeat(elements.weight.sum(1), corners), n)
     rows = np.repeat(elem, corners, axis=1).ravel()
     columns = np.tile(elem, corners).ravel()
-    parts = np.tile(mean, (1, corners, 1)).reshape(-1, 3) / volume[rows, None]
-    each = [sp.coo_matrix((part, (rows, columns)), shape=(n, n)).tocsr() for part in parts.T]
+    entries = np.tile(mean, (1, corners, 1)).reshape(-1, 3) / volume[rows, None]
+    each = [sp.coo_matrix((component, (rows, columns)), shape=(n, n)).tocsr() for component in entries.T]
     for matrix in each:
         matrix.sort_indices()
     return each[0].indptr, each[0].indices, np.stack([matrix.data for matrix in each], axis=1)

@@ -256,7 +256,7 @@ class SparsePreconditioner:
         """Index of the columns of these worlds; a slice, thus a view, for all of them."""
         return slice(None) if len(worlds) == len(self._woodbury) else worlds
 
-    def _woodbury_system(self, w, along, carried):
+    def _woodbury_system(self, w, along, pushed):
         """Woodbury system of world w: touching nodes, their rows of the undeformed inverse, solver,
         compliance W. along: (nvert, 3) the inverse times the gradient of the liquid's volume."""
         faces, blocks = [], []
@@ -273,7 +273,7 @@ class SparsePreconditioner:
             return None
         D = assemble(nodes, faces, blocks, len(self._is_free))
         rows, W = self._compliance(w, nodes)
-        if carried:
+        if pushed:
             W = self._push_forward.compliance(w, nodes, W)
         compliance, soft = np.zeros((size, size)), self._softness[w]
         compliance[:m, :m] = W * soft

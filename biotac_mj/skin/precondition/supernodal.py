@@ -186,10 +186,10 @@ class Elimination:
     def __init__(self, matrix: sp.csc_matrix, points: np.ndarray):
         n = len(points)
         coo = matrix.tocoo()
-        near = sp.coo_matrix(
+        neighbours = sp.coo_matrix(
             (np.ones(len(coo.row), np.int8), (coo.row // 3, coo.col // 3)), shape=(n, n)
         ).tocsr()
-        groups = dissect(near, points)
+        groups = dissect(neighbours, points)
         self.clusters = clusters(points, _CLUSTER)
         self.order = np.concatenate(groups)
         place = np.empty(n, int)
@@ -198,7 +198,9 @@ class Elimination:
         owner = np.repeat(np.arange(len(groups)), np.diff(ends, prepend=0))  # group of each place
         later, below = [], [[] for _ in groups]
         for k, group in enumerate(groups):
-            reached = [place[near.indices[near.indptr[v] : near.indptr[v + 1]]] for v in group]
+            reached = [
+                place[neighbours.indices[neighbours.indptr[v] : neighbours.indptr[v + 1]]] for v in group
+            ]
             nodes = np.unique(np.concatenate(reached + [later[c] for c in below[k]]))
             later.append(nodes[nodes >= ends[k]])
             if len(later[k]):
@@ -210,7 +212,7 @@ class Elimination:
 
 
 _KEPT = 8  # a few MB each
-_kept: dict[bytes, Elimination] = {}
+_cached: dict[bytes, Elimination] = {}
 
 
 def elimination_of(matrix: sp.csc_matrix, points: np.ndarray) -> Elimination:
@@ -218,12 +220,12 @@ def elimination_of(matrix: sp.csc_matrix, points: np.ndarray) -> Elimination:
     factor."""
     parts = (np.ascontiguousarray(x) for x in (matrix.indptr, matrix.indices, points))
     key = hashlib.sha256(b"".join(x.tobytes() for x in parts)).digest()
-    found = _kept.get(key)
+    found = _cached.get(key)
     if found is None:
         found = Elimination(matrix, points)
-        while len(_kept) >= _KEPT:
-            _kept.pop(next(iter(_kept)), None)
-        _kept[key] = found
+        while len(_cached) >= _KEPT:
+            _cached.pop(next(iter(_cached)), None)
+        _cached[key] = found
     return found
 
 
@@ -276,7 +278,7 @@ class SupernodalFactor:
             table.append((begin, a, len(later), begin_row, begin_panel))
             begin_panel, begin_row = begin_panel + panel.size, begin_row + len(later)
         self._scratch = max(a + b for _, a, b, _, _ in table) + _LANES
-        self._kept = threading.local()
+        self._cached = threading.local()
         self._panels = [
             wp.array(np.array(table, np.int32), dtype=int, ndim=2, device="cpu"),
             wp.array(np.concatenate(rows).astype(np.int32), dtype=int, device="cpu"),
@@ -313,13 +315,13 @@ class SupernodalFactor:
     def _sides(self, nrhs):
         """Array of right-hand sides [side, node, 3], and the launch that replaces them by the answers; the
         entry after the last node is scratch."""
-        kept = self._kept.__dict__
-        if nrhs not in kept:
+        cached = self._cached.__dict__
+        if nrhs not in cached:
             work = np.zeros((nrhs, self.size + self._scratch))
             shared = wp.array(work, dtype=wp.float64, ndim=2, device="cpu", copy=False)
             inputs = [self.size, *self._panels, shared]
             made = work[:, : self.size + 3].reshape(nrhs, -1, 3), recorded(substitute, 1, inputs)
             if nrhs > _FEW:
                 return made
-            kept[nrhs] = made
-        return kept[nrhs]
+            cached[nrhs] = made
+        return cached[nrhs]

@@ -59,22 +59,22 @@ class ElementForces:
             shape = np.ascontiguousarray(elements.mesh.shape.numpy())
             self._shape = wp.array(shape, dtype=self._kernels.gradients)
             self._pressure = wp.zeros((self._count if averaged else 0, self._nworld), dtype=real)
-            kept = elements.npoint * self._count if precision.name == "double" else 0
-            self._deformation = wp.zeros((kept, self._nworld), dtype=mat33)
-            self._rotation = wp.zeros((kept if elements.law == 0 else 0, self._nworld), dtype=mat33)
+            stored = elements.npoint * self._count if precision.name == "double" else 0
+            self._deformation = wp.zeros((stored, self._nworld), dtype=mat33)
+            self._rotation = wp.zeros((stored if elements.law == 0 else 0, self._nworld), dtype=mat33)
             self.corner_force = wp.zeros(corners, dtype=vec3)
             self.corner = wp.zeros(corners, dtype=precision.vec)
 
     def evaluate_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
         """Computes the forces on the corners at x [nvert, nworld] in the worlds that are on. Marks worlds
         with a point that is inverted (2), flatter than its law allows (1), or both (3)."""
-        kept = [] if self._by_point else [self._deformation, self._rotation]
-        self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
+        stored = [] if self._by_point else [self._deformation, self._rotation]
+        self._launch(program, "force", [x, on], [self._pressure, *stored, self.corner_force, inverted])
 
     def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
         """Computes the tangent at x, the nodes of the last `evaluate_corners`, times p, on the corners."""
-        kept = [] if self._by_point else [self._deformation, self._rotation]
-        self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
+        stored = [] if self._by_point else [self._deformation, self._rotation]
+        self._launch(program, "product", [x, p, on, self._pressure, *stored], [self.corner])
 
     def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
         """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""

@@ -425,8 +425,8 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
         X: positions,
         shape: wp.array(dtype=gradients),
         mesh: Mesh,
-        kept_deformation: wp.array2d(dtype=mat33),
-        kept_rotation: wp.array2d(dtype=mat33),
+        deformation_in: wp.array2d(dtype=mat33),
+        rotation_in: wp.array2d(dtype=mat33),
     ):
         """Deformation gradient and rotation of point q."""
         i = wp.static(npoint) * e + q
@@ -434,9 +434,9 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
             F = thin(X * shape[q] * mesh.inverse[e, q])
             return F, rotation_thin(F)
         elif wp.static(corotational):
-            return kept_deformation[i, w], kept_rotation[i, w]
+            return deformation_in[i, w], rotation_in[i, w]
         else:
-            return kept_deformation[i, w], mat33()
+            return deformation_in[i, w], mat33()
 
     @wp.kernel(enable_backward=False, **({"module": serial} if is_single else _deep_module()))
     def product_serial(
@@ -449,8 +449,8 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
         p: wp.array2d(dtype=vec),
         on: wp.array(dtype=int),
         pressure: wp.array2d(dtype=real),
-        kept_deformation: wp.array2d(dtype=mat33),
-        kept_rotation: wp.array2d(dtype=mat33),
+        deformation_in: wp.array2d(dtype=mat33),
+        rotation_in: wp.array2d(dtype=mat33),
         # Out:
         corner_out: wp.array2d(dtype=vec),
     ):
@@ -480,7 +480,7 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
                 mean = scalar(0.0)
                 for q in range(wp.static(npoint)):
                     B = thin(mesh.inverse[e, q])
-                    F, R = point_state(e, q, w, X, shape, mesh, kept_deformation, kept_rotation)
+                    F, R = point_state(e, q, w, X, shape, mesh, deformation_in, rotation_in)
                     dF = D * narrow_gradients(shape[q]) * B
                     mean += scalar(mesh.weight[e, q]) * wp.ddot(direction_of(rubber.law, F, R), dF)
                 stiff = scalar((lam - local) / mesh.volume[e]) * mean
@@ -488,7 +488,7 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
         for q in range(wp.static(npoint)):
             B = thin(mesh.inverse[e, q])
             g = narrow_gradients(shape[q])
-            F, R = point_state(e, q, w, X, shape, mesh, kept_deformation, kept_rotation)
+            F, R = point_state(e, q, w, X, shape, mesh, deformation_in, rotation_in)
             dF = D * g * B
             dP = change_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, mean_pressure, F, R, dF)
             if wp.static(averaged):

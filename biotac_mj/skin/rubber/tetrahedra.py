@@ -32,8 +32,11 @@ __all__ = ["CONTRACTION", "POINTWISE", "Tetrahedra", "incidence"]
 POINTWISE = 5.0  # of mu; docs/lab/elements.md has the error of other values
 CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/lab/elements.md has the error
 _LEAST_STRETCH = 0.2  # of `deformed`
-_NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric Gauss points, exact to degree 2
-_POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
+_GAUSS_NEAR, _GAUSS_FAR = (
+    (5 + 3 * 5**0.5) / 20,
+    (5 - 5**0.5) / 20,
+)  # barycentric Gauss points, exact to degree 2
+_POINTS = np.full((4, 4), _GAUSS_FAR) + (_GAUSS_NEAR - _GAUSS_FAR) * np.eye(4)
 
 
 def incidence(nvert: int, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -82,16 +85,16 @@ class Tetrahedra:
         self.corners = elem.shape[1]
         self.elem, self.modulus = elem, modulus
         if self.corners == 4:
-            self.npoint, self.cap, share = 1, 1e300, np.full(4, 1 / 4)
+            self.npoint, self.cap, volume_fraction = 1, 1e300, np.full(4, 1 / 4)
             shape = np.concatenate([-np.ones((1, 3)), np.eye(3)])[None]
             whole = 6
         else:
             self.npoint, self.cap = 4, POINTWISE
             # lumped as by the eight linear parts (Hinton, Rock and Zienkiewicz 1976)
-            share = np.array([1 / 32] * 4 + [7 / 48] * 6)
+            volume_fraction = np.array([1 / 32] * 4 + [7 / 48] * 6)
             shape = shape_gradients(0.25 + contraction * (_POINTS - 0.25))
             whole = 24
-        self._shape, self._whole, self._share = shape, whole, share
+        self._shape, self._whole, self._volume_fraction = shape, whole, volume_fraction
         inverse, weight = self._measure(vert)
         start, slot = incidence(self.nvert, elem)
         self.mesh = Mesh()
@@ -119,7 +122,7 @@ class Tetrahedra:
                 f"{len(folded)} of {len(elem)} quadratic tetrahedra are folded (first: {folded[0]}): "
                 "straighten their edges"
             )
-        inverse, volume = np.linalg.inv(edges), np.outer(weight.sum(1), self._share)
+        inverse, volume = np.linalg.inv(edges), np.outer(weight.sum(1), self._volume_fraction)
         self.node_volume = np.bincount(elem.ravel(), volume.ravel(), self.nvert)
         self.gradient, self.weight = np.einsum("qak,eqki->eqai", self._shape, inverse), weight
         return inverse, weight
@@ -164,21 +167,21 @@ class Tetrahedra:
         dof = (3 * self.elem[:, :, None] + np.arange(3, dtype=np.int32)).reshape(self.nelem, n)
         weight = self.weight if self.modulus is None else self.weight * self.modulus[:, None]
         # in slices, since an element has up to 900 numbers
-        for part in np.array_split(np.arange(self.nelem), 1 + self.nelem // 8192):
-            g, w = self.gradient[part], weight[part]
+        for elements in np.array_split(np.arange(self.nelem), 1 + self.nelem // 8192):
+            g, w = self.gradient[elements], weight[elements]
             gw = w[:, :, None, None] * g
             outer = np.einsum("eqai,eqbj->eaibj", gw, g, optimize=True)
             block = mu * np.swapaxes(outer, 2, 4) + pointwise * outer
             dot = np.einsum("eqak,eqbk->eab", gw, g, optimize=True)
             for i in range(3):
                 block[:, :, i, :, i] += mu * dot
-            block = block.reshape(len(part), n, n)
+            block = block.reshape(len(elements), n, n)
             if second > local:
-                mean = gw.sum(1).reshape(len(part), n)
+                mean = gw.sum(1).reshape(len(elements), n)
                 stiff = (second - local) / w.sum(1)
                 block += stiff[:, None, None] * mean[:, :, None] * mean[:, None, :]
-            rows = np.repeat(dof[part], n, axis=1).ravel()
-            cols = np.tile(dof[part], n).ravel()
+            rows = np.repeat(dof[elements], n, axis=1).ravel()
+            cols = np.tile(dof[elements], n).ravel()
             total += sp.coo_matrix((block.ravel(), (rows, cols)), shape=total.shape).tocsc()
         return total
 
