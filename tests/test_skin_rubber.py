@@ -128,7 +128,7 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
 def test_skin_that_lost_the_core_is_reported(monkeypatch):
     """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those
     deeper in the core than the limit counts, and it stays where it is within."""
-    contact, model = Forces._contact, SkinModel(load_skin("coarse"), "default")
+    contact, model = Forces._evaluate_contact, SkinModel(load_skin("coarse"), "default")
 
     def blind(self, program, state, *arguments):
         if state is not self.d.core:
@@ -147,7 +147,7 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
 
     good, deepest = press()
     assert all(good) and deepest.max() < 5e-5
-    monkeypatch.setattr(Forces, "_contact", blind)
+    monkeypatch.setattr(Forces, "_evaluate_contact", blind)
     good, deepest = press()
     assert not good[-1] and good[0] and deepest.max() < model.crushed_depth
 

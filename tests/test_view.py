@@ -95,7 +95,7 @@ def test_fingers_that_hang_on_the_world_are_framed_together():
     model = spec.compile()
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
     mujoco.mj_forward(model, data)
-    window._aim_at_hand(spec, handles, model, data, camera)
+    window._point_at_hand(spec, handles, model, data, camera)
     assert np.allclose(camera.lookat, 0, atol=0.01) and 0.1 < camera.distance < 0.5
 
 

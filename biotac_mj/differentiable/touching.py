@@ -163,7 +163,7 @@ def _meet(
     v = corner[i, 2] - corner[i, 0]
     met = meet(geoms, g, geom[i] % nworld, y, dn, weight[i], u, v, 1)
     at_out[i] = met.at
-    part_out[i] = met.part
+    part_out[i] = met.weight
     plane_out[i] = wp.vec4d()
     if wp.length_sq(met.at - weight[i]) > real(0.0):
         n = met.normal

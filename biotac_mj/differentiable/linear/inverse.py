@@ -153,7 +153,7 @@ class StepInverse:
             for i, (a, b) in enumerate(_PAIRS):
                 block[6 * face + i, world] = -own[:, a, :, b]
         skin.precondition.run()
-        self._r, self._z, self._part = (wp.to_torch(array) for array in (k.r, k.z, k.part))
+        self._r, self._z, self._part = (wp.to_torch(array) for array in (k.r, k.z, k.partial))
         self._chunk = torch.arange(len(self._r), device=self._r.device) // k.chunk
         single = self._r.dtype == torch.float32
         self.digits, self.restart = (_DIGITS, _BASIS) if single else (0.0, _MOST)
