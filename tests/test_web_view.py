@@ -195,6 +195,8 @@ def test_the_skins_colour_is_a_quantity_with_a_legend(shell):
             skin = page._scene["one"][1]
             return [m.faces if m.visible else m.faces[:0] for m in skin], [tuple(m.color) for m in skin]
 
+        assert page.field.value == "contact pressure"  # a page opens with a quantity
+        page.field.value = "none"
         (whole, *rest), _ = show(pressed)
         assert len(whole) == len(finger.face) and not any(map(len, rest)) and not page._legend.content
         page.field.value = "contact pressure"
@@ -215,7 +217,7 @@ def test_the_skins_colour_is_a_quantity_with_a_legend(shell):
 
 
 def test_a_press_is_made_anew_where_a_slider_says():
-    """Deeper and elsewhere; the page opens on one that plays, in colours of the contact's pressure."""
+    """Deeper and elsewhere; the page opens on one that plays."""
     sliders, forces = {}, []
 
     class Slider:
@@ -232,7 +234,7 @@ def test_a_press_is_made_anew_where_a_slider_says():
             return types.SimpleNamespace(value=value)
 
     class Shown:
-        server, field = types.SimpleNamespace(gui=Gui()), types.SimpleNamespace(value="none")
+        server = types.SimpleNamespace(gui=Gui())
         fingers = {"press": types.SimpleNamespace(rows=None)}
 
         def update(self, time, state):
@@ -244,7 +246,6 @@ def test_a_press_is_made_anew_where_a_slider_says():
     page = Shown()
     settings = dict(skin="coarse", tier="condensed", timestep=10e-3)
     assert play_press(settings, page, rounds=1, speed=100.0) is page
-    assert page.field.value == "contact pressure"
     assert 0.05 < max(forces) < 1.0  # of 0.5 mm, not of 1.5
     assert max(forces) <= page.fingers["press"].rows[:, -1].max() < 1.0
 

@@ -140,7 +140,9 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False)
         self._title = gui.add_markdown("**BioTac**")
         offered = [name for name in FIELDS if any(name in finger.fields for finger in fingers.values())]
-        self.field = gui.add_dropdown("colour", ("none", *offered), visible=bool(offered))
+        self.field = gui.add_dropdown(
+            "colour", ("none", *offered), initial_value=(*offered, "none")[0], visible=bool(offered)
+        )
         self._legend = gui.add_html("")
         numbers = gui.add_checkbox("numbers", True)
         self._numbers = Numbers(

@@ -170,8 +170,6 @@ def play_press(
 
         presses = {"press": pressed()}
         page = page or _served({"press": presses["press"].finger}, **server)
-        if "contact pressure" in presses["press"].finger.fields:
-            page.field.value = "contact pressure"
         made = dict(wanted)
         for name, low, high, step in (
             ("depth [mm]", 0.1, 2.4, 0.1),
