@@ -15,41 +15,38 @@ _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 @dataclasses.dataclass(frozen=True)
 class LearningConfig:
-    """Choices of models and training. Numbers in brackets refer to the ambiguities in docs/lab/learning.md.
+    """Choices of models and training, where the paper (Narang et al., ICRA 2021) leaves them open.
 
     Attributes:
-      mesh_order: K of the Chebyshev convolutions: 6, as in COMA and ACROSS [1].
+      mesh_order: K of the Chebyshev convolutions: 6, as in COMA and ACROSS.
       mesh_scale: displacements are divided by this length [m] instead of node-wise z-scores, which would
-        amplify solver noise at fixed nodes [2].
-        amplify solver noise [2].
-      reconstruction: "mse" or "l1" for the VAEs: MSE matches the RMS metric [3].
+        amplify solver noise at fixed nodes.
+      reconstruction: "mse" or "l1" for the VAEs: MSE matches the RMS metric.
       mesh_kl, electrode_kl: weight of the divergence, summed over the code, relative to the squared error
-        summed over the field (in units of its scale), without annealing [4].
-      mesh_points: number of points of the coarse skin at which the paper's networks read any skin [18].
+        summed over the field (in units of its scale), without annealing.
+      mesh_points: number of points of the coarse skin at which the paper's networks read any skin.
       mesh_channels, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for mean and log
-        variance follow the hidden layer [5]; no normalisation layers, no activation at the output, no bias in
-        the last convolution [11]. mesh_factors: ratios of the numbers of points of successive levels [12].
+        variance follow the hidden layer; no normalisation layers, no activation at the output, no bias in
+        the last convolution. mesh_factors: ratios of the numbers of points of successive levels.
       electrode_hidden, electrode_latent: of the paper.
       forward_hidden, inverse_hidden: the paper's widths are read as hidden layers, followed by a linear layer
-        to the code [6].
-      sample_codes: train projections on samples of the codes instead of their means; evaluation uses means
-        [7].
-      projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes) [8].
+        to the code.
+      sample_codes: train projections on samples of the codes instead of their means; evaluation uses means.
+      projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes).
       logarithm: the paper's networks and PointNet++ learn d ln Z, so that they work for sensors with other
-        counts at rest; False: tared counts, the paper's, for comparison only [17].
+        counts at rest; False: tared counts, the paper's, for comparison only.
       dropout: of the projections, the paper's.
       learning_rate, decay: Adam's, and its factor per epoch; the decay of 20 epochs is spread over any
-        training length [9].
+        training length.
       batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and PointNet++,
-        with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best
+        with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none. The best
         state on the validation interactions is kept.
       scale: unit of counts, 2048 for the paper's, after subtraction of row 0 of each interaction, before
-        touch [17].
+        touch.
       pod: number of principal components of the mesh. width: of our networks. mirror: training on the
         simulation also uses every touch mirrored in z; training on a sensor does not, since none is that
         symmetric (except `local_mirror`).
       window: time constants [s] of the causal averages of features.
-      members: number of networks in the best model's ensemble.
       members: networks that are averaged in the best model.
       graphs: on a GPU, replay training steps as CUDA graphs.
     """
