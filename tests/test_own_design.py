@@ -80,6 +80,26 @@ def test_a_flat_pad_without_electrodes_gives_force_and_depth(tmp_path, capsys):
     assert "electrodes" not in pad.read(data)
 
 
+def written(path, vert, elem):
+    lines = [f"tet {len(vert)} {len(elem)}", *(f"v {x:g} {y:g} {z:g}" for x, y, z in 1e-3 * np.asarray(vert))]
+    path.write_text("\n".join([*lines, *("t " + " ".join(map(str, row)) for row in elem)]))
+    return path
+
+
+def test_meshes_that_are_no_pad_are_refused(tmp_path):
+    cube = block((10, 4, 8), (3, 2, 3))
+    up = written(tmp_path / "up.tet", cube.vert + [0, 8, 0], cube.elem)
+    with pytest.raises(ValueError, match="the mesh ends at y = 8 mm, and a pad is held on the plane y = 0"):
+        new_design(tmp_path / "pad", PadShape(mesh=up))
+    pair = np.r_[cube.vert, cube.vert + [30, 0, 0]], np.r_[cube.elem, cube.elem + len(cube.vert)]
+    with pytest.raises(ValueError, match="the mesh has 2 separate parts"):
+        new_design(tmp_path / "pad", PadShape(mesh=written(tmp_path / "two.tet", *pair)))
+    shell = dome_shell((np.array([9.0, 9.0, 9.0]), 0.0), (np.array([7.5, 7.5, 7.5]), 0.0), 6)
+    inside = PadShape(mesh=written(tmp_path / "shell.tet", shell.vert, shell.elem), core=(8.4, 8.4, 8.4))
+    with pytest.raises(ValueError, match="the core reaches .* mm into the skin: no liquid fits"):
+        new_design(tmp_path / "pad", inside, SIX, GROUND)
+
+
 @pytest.mark.parametrize(
     "shape, places, said",
     [

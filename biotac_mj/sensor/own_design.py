@@ -6,10 +6,12 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
 from ..files import replacing
-from ..geometry.assembly import EMPTY, assemble, fixed_nodes
+from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
 from ..geometry.design import Design
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.importing import read_obj, read_tet_mesh
@@ -95,6 +97,7 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
     else:
         mesh = read_tet_mesh(shape.mesh)
         mesh = TetMesh(1e3 * mesh.vert, mesh.elem)
+        _check_mesh(mesh)
     wide = 1.05 * np.abs(mesh.vert[:, [0, 2]]).max(0)
     backing = plate(*wide * (np.sqrt(2) if shape.block else 1.0), _BACKING)
     core = EMPTY
@@ -107,6 +110,14 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
     skin = assemble(design.name, TetMesh(1e-3 * mesh.vert, mesh.elem), *bodies, design=design)
     if shape.liquid and not len(skin.inner_face):
         raise ValueError("the mesh has no surface towards the core: mesh a shell, or leave --core out")
+    if shape.liquid:
+        free = np.setdiff1d(np.arange(skin.nvert), skin.fixed)
+        room = 1e3 * CoreSurface(skin.core_vert, skin.core_face).closest(skin.vert[free])[0]
+        if room.min() <= 0:
+            raise ValueError(
+                f"the core reaches {-room.min():.3g} mm into the skin: no liquid fits; give a smaller "
+                "core, its .obj in metres"
+            )
     if element == "linear":
         return skin
     project = None
@@ -163,11 +174,28 @@ def new_design(
     return design
 
 
+def _check_mesh(mesh):
+    """Raises a ValueError where a mesh [mm] is none of one pad on the plane y = 0."""
+    n = len(mesh.vert)
+    joined = sparse.coo_array(
+        (np.ones(mesh.elem.size), (np.repeat(mesh.elem[:, 0], 4), mesh.elem.ravel())), (n, n)
+    )
+    parts = len(np.unique(connected_components(joined, directed=False)[1][mesh.elem]))
+    if parts > 1:
+        raise ValueError(f"the mesh has {parts} separate parts: give the mesh of one pad")
+    top = mesh.vert[mesh.elem, 1].max()
+    if abs(top) > 1e3 * FIXED_WITHIN:
+        raise ValueError(
+            f"the mesh ends at y = {top:.3g} mm, and a pad is held on the plane y = 0 and bulges to -y: move "
+            "it there"
+        )
+
+
 def _check_places(skin):
     """Raises a ValueError where an electrode is not on the core, or two of them would touch."""
     design, disc = skin.design, 2e3 * ELECTRODE_RADIUS  # [mm]
     place = design.in_biotac_frame(np.array([*design.electrodes_mm, *design.excitation]))
-    off = 1e3 * CoreSurface(skin.core_vert, skin.core_face).closest(1e-3 * place)[0]
+    off = 1e3 * np.abs(CoreSurface(skin.core_vert, skin.core_face).closest(1e-3 * place)[0])
     worst = int(off.argmax())
     if off[worst] > disc:
         raise ValueError(
