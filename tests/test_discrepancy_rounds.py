@@ -158,7 +158,7 @@ def test_beliefs_are_the_same_after_saving(first, tmp_path):
     data, some, report = first
     report.beliefs.save(tmp_path / "round", Springs(), data)
     kept, sim = Beliefs.load(tmp_path)
-    assert kept.text == report.beliefs.text and sim.skin == "coarse"
+    assert kept.text == report.beliefs.text and sim.skin == "coarse" and kept.beside == report.beliefs.beside
     for a, b in zip(kept.explanations, report.beliefs.explanations):
         assert a.ids == b.ids and a.nuisance == b.nuisance and a.weight == b.weight
         np.testing.assert_array_equal(a.information, b.information)
@@ -194,6 +194,21 @@ def test_more_effects_do_not_contradict_an_explanation():
     assert beliefs.odds == pytest.approx(0.97 / 0.03) and beliefs.decided
     doubted = Beliefs(some, 5e-5, {}, 0.0, ["power-law relaxation may be as good"])
     assert not doubted.decided and "power-law" in doubted.text
+    more = Beliefs(some, 5e-5, {}, 0.0, beside=0.1)
+    assert more.told_apart and not more.decided and "may be there as well, 10%" in more.text
+
+
+def test_excluded_effects_are_less_likely_than_unseen_ones():
+    """Of effects that are not there: relaxation, which presses show, and liquid lost, which springs do not
+    know."""
+    some = [by_id(name) for name in ("latency", "relax", "fluidloss")]
+    data = measured([(some[0], {**some[0].default(), "delay": 0.06})], n=8)
+    beliefs = diagnose(Springs(), data, effects=some, progress=False).beliefs
+    likely = {one.ids[-1]: one.weight for one in beliefs.unseen}
+    assert likely["fluidloss"] > 10 * likely["relax"]
+    assert beliefs.beside == pytest.approx(
+        sum(likely.values()) / (beliefs.explanations[0].weight + sum(likely.values()))
+    )
 
 
 @pytest.mark.parametrize("alone, agrees", [(0.02, False), (0.06, True), (0.9, True)])

@@ -132,7 +132,8 @@ class Beliefs:
     Attributes:
       explanations; unseen: the likeliest with one more effect of the catalogue each, of which the data show
       little. repeatability: of poses [m]. noise: as `measurement_noise` has it. end: of the session's
-        clock [s]. doubts: why a diagnosis is not sure of the likeliest one.
+        clock [s]. doubts: why a diagnosis is not sure of the likeliest one. beside: probability that
+      one of the unseen is there, but for those that no data of this kind show.
     """
 
     explanations: list[Explanation]
@@ -141,6 +142,7 @@ class Beliefs:
     end: float
     doubts: list[str] = dataclasses.field(default_factory=list)
     unseen: list[Explanation] = dataclasses.field(default_factory=list)
+    beside: float = 0.0
 
     @property
     def rivals(self) -> list[Explanation]:
@@ -155,9 +157,14 @@ class Beliefs:
         return float((1 - against) / max(against, 1e-9))
 
     @property
-    def decided(self) -> bool:
-        """Whether nothing more has to be asked."""
+    def told_apart(self) -> bool:
+        """Whether the likeliest explanation is decided against all that contradict it."""
         return self.odds >= ODDS and not self.doubts
+
+    @property
+    def decided(self) -> bool:
+        """Whether nothing more has to be asked: nor is it likely that something is there besides."""
+        return self.told_apart and self.beside < SETTINGS.rate
 
     @property
     def against_none(self) -> str:
@@ -175,8 +182,10 @@ class Beliefs:
     def text(self) -> str:
         """What is decided, in words."""
         first, *others = self.rivals
-        if self.decided:
-            return f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
+        if self.told_apart:
+            text = f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
+            hardly = f"; an effect that these data hardly show may be there as well, {self.beside:.0%}"
+            return text + ("" if self.decided else hardly)
         against = sum(one.weight for one in others)
         rest = ", ".join(f"{one.name} {one.weight:.0%}" for one in others if one.weight > 0.02)
         likely = f"{first.name} {1 - against:.0%}{', ' * bool(rest)}{rest}"
@@ -192,6 +201,7 @@ class Beliefs:
             "noise": {k: None if v is None else np.asarray(v).tolist() for k, v in self.noise.items()},
             "explanations": [_written(one) for one in self.explanations],
             "unseen": [_written(one) for one in self.unseen],
+            "beside": self.beside,
         }
         with replacing(folder / "beliefs.json") as temporary:
             temporary.write_text(json.dumps(document, indent=1, allow_nan=False))
@@ -223,7 +233,7 @@ class Beliefs:
         )
         noise = {k: None if v is None else np.array(v) for k, v in document["noise"].items()}
         rest = document["repeatability"], noise, document["end"], document["doubts"], unseen
-        return cls(explanations, *rest), sim
+        return cls(explanations, *rest, document["beside"]), sim
 
 
 def _written(one):
@@ -275,15 +285,17 @@ def believed(comparison: "Comparison", search: "Search", doubts: list[str], chos
     out = [dataclasses.replace(one, weight=float(w)) for one, w in zip(out, probable)]
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     out.sort(key=lambda one: -one.weight)
-    unseen = _unseen(out, search)
-    return Beliefs(out, comparison.repeatability, comparison.noise, end, doubts, unseen)
+    unseen, hidden = _unseen(out, search), {effect.id for effect in search.hidden}
+    beside = sum(one.weight for one in unseen if one.ids[-1] not in hidden)
+    beside = float(beside / (out[0].weight + beside))
+    return Beliefs(out, comparison.repeatability, comparison.noise, end, doubts, unseen, beside)
 
 
 def _unseen(explanations, search):
     """The likeliest explanation with each effect of the catalogue that none of the others adds to it."""
     first, known = explanations[0], {frozenset(one.ids) for one in explanations}
     out = []
-    for gain, effect in search.unseen:
+    for gain, effect in [*search.unseen, *((0.0, effect) for effect in search.hidden)]:
         if effect.wiring or effect.id in first.ids or frozenset([*first.ids, effect.id]) in known:
             continue
         weight = first.weight * float(np.exp(min(gain, 0.0))) / len(CATALOGUE)

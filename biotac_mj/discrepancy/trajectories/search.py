@@ -69,7 +69,7 @@ class Search:
     Attributes:
       fit: Fit with all effects. found: Candidates in their order. rounds: lists of Candidate, best first.
       fits: of every explanation that was tried, by the ids of its effects. unseen: [(evidence beside what was
-      found, by straight lines [nats], effect)] of the last round, and of effects that the data cannot show.
+      found, by straight lines [nats], effect)] of the last round. hidden: effects that the data cannot show.
     """
 
     fit: Fit
@@ -77,6 +77,7 @@ class Search:
     rounds: list[list[Candidate]]
     fits: dict[frozenset, Fit]
     unseen: list[tuple] = dataclasses.field(default_factory=list)
+    hidden: list = dataclasses.field(default_factory=list)
 
 
 def found(

@@ -153,7 +153,7 @@ def diagnose(
         stated = comparison.calibrated(first.nuisance)
         bar.update()
         comparison, null, search = _explained(stated, usable, chosen, seed, bar)
-        search.unseen += [(0.0, one) for one in hidden]
+        search.hidden = hidden
         bar.update()
         report = _settle(comparison, null, search, chosen, aside, notes, usable)
         bar.update()
