@@ -1,10 +1,8 @@
-"""The balance of one skin, by the threads of a block: Newton's method on the contact law over the
-candidates.
+"""Equilibrium of one skin by the threads of a block: Newton's method on the contact law over the candidates.
 
-Where friction, or a skin that snaps, leads Newton's method round in circles, the skin creeps: each iteration
-is a step of time of rubber with viscosity, which resists its motion as stiffer rubber would. It
-slides and snaps to where real skin comes to rest; near there the steps grow and are Newton's again, so what
-is found is a balance without viscosity."""
+If Newton's method cycles, because of friction or snap-through, artificial viscosity is added: each iteration
+is then an implicit time step of rubber whose viscosity is proportional to its elasticity. Near equilibrium
+the viscosity falls to zero, so that results contain none."""
 
 import functools
 
@@ -24,7 +22,7 @@ __all__ = ["CUT", "TOLERANCE", "evaluation", "newton_from", "take_step"]
 
 wp.set_module_options({"enable_backward": False})
 
-TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps is heard as chatter
+TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps would cause chatter
 # at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
 # where a search along a step has caught the jump so closely, as a fraction of the tolerance
 _ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
@@ -37,7 +35,7 @@ _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
 @wp.func
 def _swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
-    """Puts the geoms where they are held, and the other way round."""
+    """Swaps the poses of the geoms with those of the last equilibrium."""
     sync()
     for g in range(t, geoms.count, threads):
         pos = geoms.pos[g, w]
@@ -61,8 +59,8 @@ def _find_motion(
     c: Constants,
     s: Scratch,
 ):
-    """Makes vector[TRY], displacements of the nodes, their motion from vector[U], of those that touch
-    relative to the geoms, which have moved from where they were held."""
+    """Replaces displacements vector[TRY] by the motion from vector[U], for touching nodes relative to the
+    geoms, which have moved since the last equilibrium."""
     nsample = c.sample.shape[0]
     for k in range(t, nnode, threads):
         i = c.node[s.node[w, k]]
@@ -86,7 +84,7 @@ def _find_motion(
 
 @functools.cache
 def evaluation(shapes: str) -> wp.Function:
-    """The phase EVALUATE of skins that meet such shapes, see `contact.touch`."""
+    """The phase EVALUATE. shapes: see `contact.touch`."""
     touch_faces = contact_kernels(False, False, shapes).touch_faces
 
     @wp.func
@@ -106,8 +104,8 @@ def evaluation(shapes: str) -> wp.Function:
         c: Constants,
         s: Scratch,
     ):
-        """Forces vector[G] of the contact law at displacements vector[at] of the candidates, and which
-        touch."""
+        """Forces vector[G] of the contact law at displacements vector[at] of the candidates, and flags of
+        those that touch."""
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
@@ -230,8 +228,8 @@ def newton_from(foretold: int, before: Linear, l: Linear, most: real, tolerance:
 
 @wp.func
 def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
-    """Whether a step has the right length, after contact was evaluated at its end; if so it is made, if not
-    another length is to be tried."""
+    """Line search after an evaluation of contact at the end of a step: accepts the step, or chooses another
+    length. Returns whether it was accepted."""
     d.tried += 1
     mine = real(0.0)
     for j in range(t, n, threads):
@@ -286,7 +284,7 @@ def take_step(
     c: Constants,
     s: Scratch,
 ):
-    """The phase NEWTON: after an evaluation of contact judges a step, or finds the next one, or ends."""
+    """The phase NEWTON: after an evaluation of contact, tests a step, computes the next one, or ends."""
     d = s.solve.newton[w]
     o = s.solve.increment[w]
     n = 3 * o.nnode + o.nin

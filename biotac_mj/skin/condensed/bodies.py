@@ -1,9 +1,9 @@
-"""How the bodies that touch a skin give way while it is solved, by the threads of a block.
+"""Compliant bodies in a solve, by the threads of a block.
 
-A body goes to its predicted pose with the wrench that was predicted; with another one it goes elsewhere by
-the compliance of its inertia and of what holds it. So to contact a body is a compliance of rank six beside
-the skin's own (`docs/design.md`). The geoms stand where a wrench near the balance puts their bodies, and
-while Newton's method changes the wrench the nodes are moved against them instead."""
+A body is at its predicted pose under the predicted wrench; another wrench moves it by the compliance of its
+inertia and of its other constraints. To contact, a body is thus a compliance of rank six in series with the
+skin's own (`docs/design.md`). The geoms are at the poses for a wrench near equilibrium; while Newton's method
+changes the wrench, the nodes are moved relative to them instead."""
 
 import warp as wp
 
@@ -29,12 +29,12 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.spatial_vectord
-_LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
+_LEVER = wp.constant(real(1e-2))  # lever arm of rotations [m]
 
 
 @wp.func
 def _group_of(w: int, i: int, geoms: Geoms, touch: Contact, c: Constants):
-    """The group of geoms that touched outer node i when the last step ended; the first, where none did."""
+    """Group of geoms that touched outer node i at the end of the last step; the first, if none did."""
     v = c.node[i]
     nsample = c.sample.shape[0]
     for m in range(c.start[v], c.start[v + 1]):

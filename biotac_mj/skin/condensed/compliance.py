@@ -1,14 +1,13 @@
-"""What a unit force at a node of the skin's surface does everywhere: rows of the inverse of the rest
-stiffness, kept on disk.
+"""Displacements of the skin by unit forces at its surface: rows of the inverse stiffness, cached on disk.
 
 A contact coordinate is one of the three directions of a free outer node, or the direction away from the core
-of an inner node (the liquid lubricates the core, so there is no friction there and one direction is enough).
-Rows are rounded to half precision (5e-4 of the row's largest entry at most) and belong to Young's modulus
-one, so that one file serves all moduli: 196 MB for the default skin, with what contact coordinates do to each
-other.
+of an inner node (there is no friction on the core, so that one direction suffices). Rows are in half
+precision (with an error of at most 5e-4 of the row's largest entry) and for a Young's modulus of one, so that
+one file is
+valid for all moduli: 196 MB for the default skin, with the compliance between contact coordinates.
 
-The file's name is a digest of the stiffness. Which one that is for a model is kept too, so that the stiffness
-is made, and its factor, only where something is not in the cache."""
+The name of the file is a digest of the stiffness. The digest of a model's stiffness is cached as well, so
+that stiffness and factor are computed only if a file is missing."""
 
 import functools
 import pathlib
@@ -33,7 +32,7 @@ _FORMAT = "3"  # `between` float32, scales float32, rows float16, and a checksum
 
 
 class _Matrices(typing.NamedTuple):
-    """Of `count` contact coordinates: among each other, and over all `size` coordinates."""
+    """Compliances of `count` contact coordinates: among each other, and over all `size` coordinates."""
 
     between: np.ndarray
     largest: np.ndarray
@@ -41,7 +40,7 @@ class _Matrices(typing.NamedTuple):
 
 
 def _read(path: pathlib.Path, count: int, size: int) -> _Matrices:
-    """Mapped from a file: processes share its memory.
+    """Maps the arrays from a file, whose memory processes share.
 
     Raises:
       OSError: the file cannot be read. ValueError: it is damaged.
@@ -61,22 +60,22 @@ def _read(path: pathlib.Path, count: int, size: int) -> _Matrices:
 
 
 class SurfaceCompliance:
-    """Rows of the inverse rest stiffness for contact coordinates.
+    """Rows of the inverse stiffness for contact coordinates.
 
     Args:
       model: SkinModel on the CPU.
       outer: (nouter,) free outer nodes; node i has the coordinates 3 i .. 3 i + 2.
       inner: (ninner,) free inner nodes; node j has the coordinate 3 nouter + j.
       direction: (ninner, 3) of the inner nodes' forces, unit vectors.
-      cache: whether to keep the rows on disk.
+      cache: whether to cache the rows on disk.
 
     Attributes:
       size: coordinates of the free nodes, the length of a row.
       count: contact coordinates.
       rows: (count, size) float16, displacement of the free nodes per unit force along each contact coordinate
         [m/N], times E, over its largest entry: largest (count,) float32.
-      between: (count, count) float32, of contact coordinates per unit force along others. Rows are rounded
-        one by one, so it is the mean of both ways.
+      between: (count, count) float32, displacement of contact coordinates per unit force along others; the
+        mean of both orders, since rows are rounded separately.
     """
 
     def __init__(
@@ -98,7 +97,7 @@ class SurfaceCompliance:
 
     @functools.cached_property
     def stiffness(self) -> sp.csc_matrix:
-        """Over the free coordinates, where the skin rests on its filling [N/m]."""
+        """Stiffness over the free coordinates, of the filled skin without contact [N/m]."""
         with single_thread():
             return rest_tangent(self._model) if self._model.rest.pressure else self._model.stiffness
 
@@ -109,8 +108,8 @@ class SurfaceCompliance:
             return model.factor_of(self.stiffness) if model.rest.pressure else model.factor
 
     def vector(self, field: np.ndarray) -> np.ndarray:
-        """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E; refined once, as the
-        factor is rounded. Kept on disk."""
+        """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E. Refined once, since the
+        factor is rounded; cached on disk."""
 
         def make():
             free = self._model.free
@@ -162,13 +161,13 @@ class SurfaceCompliance:
     # --- the file  ---
 
     def _open(self):
-        """What is in the cache, put there first if need be."""
+        """The cached matrices, computed if necessary."""
         path = self._path
         try:
             found = _read(path, self.count, self.size)
             touch(path)
             return found
-        except (OSError, ValueError):  # not there, not to be read, or damaged
+        except (OSError, ValueError):  # missing, unreadable or damaged
             pass
         made = self._make()
 
@@ -183,7 +182,7 @@ class SurfaceCompliance:
             return made
         try:
             return _read(path, self.count, self.size)
-        except (OSError, ValueError):  # another process has put something else there
+        except (OSError, ValueError):  # another process has replaced it
             return made
 
     @functools.cached_property
@@ -194,7 +193,7 @@ class SurfaceCompliance:
         return cache_folder() / f"compliance-{cached('stiffness', self._inputs(), make)['stiffness']}.rows"
 
     def _inputs(self):
-        """All that the stiffness and the coordinates depend on."""
+        """All inputs of the stiffness and the coordinates."""
         model, m = self._model, self._model.material
         mesh = [model.geometry, model._elem, model.free, model.element]
         rest = [model.rest.vert, model.rest.pressure, model.has_liquid] if model.rest.pressure else []
@@ -204,7 +203,7 @@ class SurfaceCompliance:
 
     def _digest(self):
         stiffness = self.stiffness
-        # rounded, so that the modulus divided out leaves no trace in the last digits
+        # rounded, so that division by the modulus does not change the digest
         content = [
             (stiffness.data * self._scale).astype(np.float32),
             stiffness.indices,

@@ -1,12 +1,11 @@
-"""What a skin does differently from a linear one, in three numbers: fitted to the full FEM
-(`benchmarks/condensed.py --fit`).
+"""Corrections of the linear skin, fitted to the full FEM (`benchmarks/condensed.py --fit`).
 
-softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q sqrt(w) e^2),  H = h w,  w = 1 + (r / b)^2: contact
-           forces move the skin by s times as much.
-           Skin rolls around what is pressed into it by d, the more so the less its forces are spread (by r,
-           their radius of gyration); squeezed between geom and core by the fraction e of its thickness,
-           rubber stiffens (q > 0).
-swelling   c = 1 / (1 + p / (k E)): pressure moves the skin by c times as much. It is stretched.
+softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q sqrt(w) e^2),  H = h w,  w = 1 + (r / b)^2: factor on
+the
+           displacement by contact forces. The skin wraps around a geom at the depth d, the more the smaller
+           the radius of gyration r of the forces is; compressed between geom and core by the fraction e of
+           its thickness, rubber stiffens (q > 0).
+swelling   c = 1 / (1 + p / (k E)): factor on the displacement by pressure, since the skin is stretched.
 """
 
 import dataclasses
@@ -15,12 +14,12 @@ from typing import Any
 
 __all__ = ["FITTED", "Correction", "correction", "is_measured", "softening_of", "swelling_of"]
 
-_TOUCH = 0.01  # squeezed fraction from which on the skin counts as squeezed
+_TOUCH = 0.01  # compressed fraction of the thickness above which the skin counts as compressed
 
 
 # for Python and for Warp
 def softening_of(depth: Any, spread: Any, squeezed: Any, h: Any, most: Any, width: Any, squeeze: Any) -> Any:
-    """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed
+    """s at the largest displacement [m], the mean square spread of the forces [m^2] and the compressed
     fraction; constants as in `Correction`."""
     one = type(depth)(1.0)
     wide = one + spread / (width * width)
@@ -29,14 +28,14 @@ def softening_of(depth: Any, spread: Any, squeezed: Any, h: Any, most: Any, widt
 
 
 def swelling_of(pressure: Any, modulus: Any, stretch: Any) -> Any:
-    """c at a pressure above that at rest and a Young's modulus [Pa]."""
+    """c at a pressure above that without contact, and a Young's modulus [Pa]."""
     one = type(pressure)(1.0)
     return one / (one + max(pressure, type(pressure)(0.0)) / (stretch * modulus))
 
 
 def is_measured(squeezed: Any, spread: Any, most: Any, narrow: Any) -> bool:
-    """Whether the error is known of skin squeezed by a fraction under forces of that mean square spread
-    [m^2]: by at most `most`, and where it is squeezed not wider than `narrow` [m]."""
+    """Whether the error is known for skin that is compressed by a fraction under forces of this mean square
+    spread [m^2]: by at most `most` and, if it is compressed, with a spread of at most `narrow` [m]."""
     wide = squeezed > type(squeezed)(_TOUCH) and spread > narrow * narrow
     return squeezed <= most and not wide
 
@@ -48,10 +47,9 @@ class Correction:
     Attributes:
       depth: h [m]. most: s_max. width: b [m]. stretch: k. squeeze: q.
       poissons_ratio: least and largest Poisson's ratio that was compared with the full FEM.
-      squeezed: up to which fraction of its thickness the skin may be squeezed until the error exceeds what
-        the docs state.
-      narrow: how far the forces of squeezed skin may be spread: wider, rubber is stiffer than the correction
-        knows [m].
+      squeezed: compressed fraction of the thickness up to which the documented error is valid.
+      narrow: spread of the forces on compressed skin up to which it is valid; with a wider spread rubber is
+        stiffer than the correction [m].
     """
 
     depth: float
@@ -64,8 +62,8 @@ class Correction:
     narrow: float = math.inf
 
     def measured(self, poissons_ratio: float, squeezed: float, spread: float = 0.0) -> bool:
-        """Whether the error has been measured there and is not worse than the docs state; the squeezed
-        share, and the mean square spread of the forces [m^2]."""
+        """Whether the error was measured and is at most the documented one. squeezed: compressed fraction of
+        the thickness. spread: mean square spread of the forces [m^2]."""
         low, high = self.poissons_ratio
         return low <= poissons_ratio <= high and is_measured(squeezed, spread, self.squeezed, self.narrow)
 
@@ -78,8 +76,8 @@ FITTED = {
 
 
 def correction(law: str) -> Correction:
-    """Of a material law; those that were not fitted have that of the corotational one and count as not
-    measured."""
+    """Correction of a material law; laws that were not fitted have that of the corotational law, and count as
+    not measured."""
     return FITTED.get(law) or dataclasses.replace(
         FITTED["corotational"], poissons_ratio=(0.0, 0.0), squeezed=0.0
     )

@@ -1,4 +1,4 @@
-"""The linear skin behind the condensed tier: what is made of a model once, and shared by all skins of it."""
+"""The linear skin of the condensed tier: constants of a model, shared by all its skins."""
 
 import typing
 import weakref
@@ -41,8 +41,8 @@ def _core_gaps(
     # Out:
     gap_out: wp.array2d(dtype=real),
 ):
-    """Distance of the samples of inner faces to the core, with the skin shifted; `everywhere` by its
-    spline."""
+    """Distance of the samples of an inner face from the core, with the skin shifted [m]; everywhere: 1: by
+    the core's spline at any distance."""
     f, i = wp.tid()
     t = face[f]
     b = sample[i]
@@ -55,21 +55,21 @@ def _core_gaps(
 
 
 class LinearSkin:
-    """Of a model: which nodes may touch, and what forces on them do.
+    """Contact nodes of a model, and the displacements by forces on them.
 
     Args:
       model: SkinModel on the CPU, quasi-static.
-      cache: whether to keep the compliance on disk (see `compliance`).
+      cache: whether to cache the compliance on disk (see `compliance`).
 
     Attributes:
-      node: (nouter,) free outer nodes. number: (nvert,) their numbers, -1: it is held, or not there.
+      node: (nouter,) free outer nodes. number: (nvert,) their indices; -1: fixed, or not an outer node.
       opposite: (nouter,) the node across the wall from each.
-      inner: (ninner,) free inner nodes that can meet the core. away: (ninner, 3) directions away from it.
-      core_gap: (nface, nsample) gaps of the inner faces' samples at rest [m].
+      inner: (ninner,) free inner nodes that can touch the core. away: (ninner, 3) directions away from it.
+      core_gap: (nface, nsample) gaps of the inner faces' samples without contact [m].
       compliance: SurfaceCompliance of these.
       give: (nfree, 3) [m/Pa], times E, displacement of the free nodes by the liquid's pressure; give_at:
         (count,) along contact coordinates. liquid_give: of the cavity's volume [m^3/Pa], times E.
-      gradient: (nfree, 3) of the cavity's volume [m^2]. cavity: its volume at rest [m^3].
+      gradient: (nfree, 3) of the cavity's volume [m^2]. cavity: its volume without contact [m^3].
       correction: Correction of the material's law.
     """
 
@@ -92,7 +92,7 @@ class LinearSkin:
 
     @classmethod
     def of(cls, model: "SkinModel", cache: bool = True) -> "LinearSkin":
-        """That of a model, made once while anything uses it."""
+        """The LinearSkin of a model, cached while it is used."""
         mine = _made.setdefault(model, weakref.WeakValueDictionary())
         found = mine.get(cache)
         if found is None:
@@ -136,7 +136,7 @@ class LinearSkin:
             if here.any():
                 off = max(off, ((self._spline_gap + self._slope @ motion - found)[here]).max() / length)
                 near |= here
-        # of what never came near nothing is known but that it comes no nearer than it moves
+        # for samples that were never near, the motion itself is the only bound
         self._bend = np.where(near.any(1), min(1.5 * off + 0.05, 2.0), 2.0)
 
     def _fill(self, model, rest):
@@ -165,7 +165,7 @@ class LinearSkin:
         self.give_at = np.concatenate([self.give[position(self.node)].ravel(), along])
 
     def constants(self, model: "SkinModel") -> Constants:
-        """What kernels know of it, made once for each device.
+        """Constants for kernels, made once for each device.
 
         Args:
           model: the same SkinModel, on that device.
@@ -210,7 +210,7 @@ class LinearSkin:
             c.inner_start, c.inner_slot = surface.start, surface.slot
             rings = _rings(surface.face_np, self._numbers(self.inner), len(self.inner))
         c.inner_ring_start, c.inner_ring, c.inner_term_start, c.inner_term = map(_ints, rings)
-        # the spline rounds edges of the core by micrometres: what starts outside stays outside
+        # the spline rounds edges of the core by micrometres: samples that are outside must not start inside
         c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
         c.inner_gap = wp.array(self._spline_gap, dtype=real, ndim=2)
         c.inner_slope = wp.array(self._slope, dtype=vec3, ndim=2)
@@ -224,7 +224,9 @@ class LinearSkin:
         return c
 
 
-_made = weakref.WeakKeyDictionary()  # of models; a LinearSkin does not hold its model, or neither would go
+_made = (
+    weakref.WeakKeyDictionary()
+)  # by model; a LinearSkin must not refer to its model, which would keep both
 
 
 def _ints(values):
@@ -232,8 +234,7 @@ def _ints(values):
 
 
 def _rings(face, number, count):
-    """Neighbours of `count` numbered nodes in CSR lists, and what each pair takes from faces, in CSR
-    lists."""
+    """CSR lists of the neighbours of `count` numbered nodes, and of the blocks of faces for each pair."""
     f, a, b = (x.ravel() for x in np.meshgrid(np.arange(len(face)), range(3), range(3), indexing="ij"))
     one, other = number[face[f, a]], number[face[f, b]]
     here = (one >= 0) & (other >= 0)

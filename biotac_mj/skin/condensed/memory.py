@@ -1,4 +1,4 @@
-"""What a condensed skin remembers between steps, and what a step comes to."""
+"""State of a condensed skin between steps, and outcome of a step."""
 
 import dataclasses
 import typing
@@ -13,41 +13,41 @@ MAX_FORCES, MAX_CONTACTS = (ROOM[name][CONDENSED] for name in ("forces", "contac
 
 
 def layout_of(ngeom: int) -> StateLayout:
-    """Of a skin that so many geoms may touch, as a row of numbers."""
+    """Layout of the state of a skin with `ngeom` geoms, as a row of numbers."""
     return StateLayout(CONDENSED, (), {"geom": ngeom})
 
 
 class Memory(SavedState):
-    """What the skin remembers between steps, by the names of `state.VARIABLES`; `started` is whether a step
-    was made, and `forces` (k, 2) has contact coordinates with a force, ascending, and the forces [N]."""
+    """State of a skin between steps, by the names of `state.VARIABLES`. `started`: whether a step was made;
+    `forces` (k, 2): contact coordinates with a force, in ascending order, and the forces [N]."""
 
     @classmethod
     def rest(cls, ngeom: int) -> typing.Self:
-        """Of a skin at rest that nothing has come near yet."""
+        """State of a skin without contact, and without previous poses of geoms."""
         return layout_of(ngeom).rest(cls)
 
     @property
     def coordinate(self) -> np.ndarray:
-        """(k,) contact coordinates with a force."""
+        """Contact coordinates (k,) with a force."""
         return self.forces[:, 0].astype(int)
 
     @property
     def force(self) -> np.ndarray:
-        """(k,) on them [N]."""
+        """Forces (k,) on these coordinates [N]."""
         return self.forces[:, 1]
 
     @property
     def softening(self) -> float:
-        """By which the forces were found."""
+        """Softening at which the forces were computed."""
         return float(self.solved[0])
 
     @property
     def swelling(self) -> float:
-        """The same of the liquid's pressure."""
+        """Swelling at which the forces were computed."""
         return float(self.solved[1])
 
     def key(self) -> tuple:
-        """What the nodes depend on."""
+        """All variables on which the nodes depend."""
         return self.forces.tobytes(), self.pressure, self.solved.tobytes()
 
 
@@ -56,15 +56,15 @@ class Outcome:
     """A solved step.
 
     Attributes:
-      memory: what to remember.
+      memory: state after the step.
       wrench, tangent: (ngroup, 6), (ngroup, 6, 6) of the skin on the geoms.
       vert_xpos: (nvert, 3) nodes [m].
-      measured: whether the error of such a step has been measured.
-      converged: whether this holds for the poses that were asked for. load_factor: else, the fraction of the
-        geoms' path at which it does.
-      iterations, error: Newton's, and the relative residual in the energy norm.
-      load: (k,) size of the force on each of the memory's contacts [N].
-      cost: as a fraction of what a hard step may cost.
+      measured: whether the error of such a step was measured.
+      converged: whether the results are valid for the given poses. load_factor: fraction of the geoms' path
+        at which they are valid.
+      iterations, error: of Newton's method, and relative residual in the energy norm.
+      load: (k,) size of the force on each contact of the state [N].
+      cost: as a fraction of the limit for a difficult step.
     """
 
     memory: Memory

@@ -1,4 +1,4 @@
-"""What the condensed tier cannot do, refused by name."""
+"""Refuses settings that the condensed tier does not support, by name."""
 
 from ..model import SkinOptions
 
@@ -6,10 +6,10 @@ __all__ = ["refuse"]
 
 
 def refuse(rubber: tuple[str, ...], options: SkinOptions, has_liquid: bool, on_cuda: bool) -> None:
-    """Refuses settings of a skin that the condensed tier does not have.
+    """Refuses settings of a skin that the condensed tier does not support.
 
     Args:
-      rubber: what the material has beyond its law, `Material.extensions`.
+      rubber: effects of the material beyond its law, `Material.extensions`.
       options: SkinOptions. has_liquid: whether the skin is filled. on_cuda: whether it is on a CUDA device.
 
     Raises:

@@ -1,5 +1,4 @@
-"""Stiffness of a skin that rests on its filling, as a sparse matrix: what the condensed tier is linear
-about."""
+"""Tangent stiffness of the filled skin without contact, as a sparse matrix, for the condensed tier."""
 
 import typing
 
@@ -19,9 +18,9 @@ __all__ = ["rest_tangent"]
 
 def rest_tangent(model: "SkinModel") -> sp.csc_matrix:
     """Tangent of elastic forces and of the liquid's pressure at `model.rest`, over the free coordinates
-    [N/m]; as if all of the skin were off its core, whose contact is not in it.
+    [N/m], without contact with the core.
 
-    Columns come from products with the tangent; nodes without a common neighbour are probed together.
+    Columns are computed by products with the tangent, for all nodes without a common neighbour at a time.
 
     Args:
       model: SkinModel on the CPU.
@@ -54,7 +53,7 @@ def rest_tangent(model: "SkinModel") -> sp.csc_matrix:
 
 
 def _neighbours(nvert, elem):
-    """Which nodes share an element (nvert, nvert)."""
+    """Sparse pattern (nvert, nvert) of nodes that share an element."""
     belongs = sp.coo_matrix(
         (np.ones(elem.size, bool), (np.repeat(np.arange(len(elem)), elem.shape[1]), elem.ravel())),
         (len(elem), nvert),
@@ -64,7 +63,7 @@ def _neighbours(nvert, elem):
 
 
 def _colors(pattern):
-    """Numbers (nvert,) such that nodes with the same one have no common neighbour."""
+    """Colours (nvert,) such that nodes of the same colour have no common neighbour."""
     near = ((pattern.astype(np.int32) @ pattern.astype(np.int32)) > 0).tocsr()
     color = np.full(near.shape[0], -1)
     for node in range(near.shape[0]):

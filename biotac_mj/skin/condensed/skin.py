@@ -1,8 +1,8 @@
-"""One skin of the condensed tier, on the CPU: a function from a memory and poses to what becomes of them.
+"""One skin of the condensed tier on the CPU, as a function of its state and the geoms' poses.
 
-The step is that of many worlds (`step`), of which this is one; here is what a single skin has besides: it is
-put into any state at once, geoms that are too deep in the core are drawn back one by one, and a skin that
-gets nowhere on its own way is solved once more, as if the geoms came straight from outside."""
+The step is that of many worlds (`step`). A single skin also loads any state, moves geoms that are too deep in
+the core out of it one by one, and is solved again with geoms that come straight from outside if the first
+solve does not converge."""
 
 import dataclasses
 import math
@@ -31,12 +31,12 @@ if typing.TYPE_CHECKING:
 __all__ = ["CondensedSkin"]
 
 _OF_BODIES = "compliance", "predicted", "origin", "arm", "spin"
-_VIEWS = 16  # of several BioTacs that share a skin
-_FAR = 1e-3  # geoms that move further and let go of the skin are not followed there [m]
-_LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
-_EFFORT = 1200.0  # evaluations' worth of a step's first way: about 0.25 s on the coarse skin
-_ANOTHER = 0.5  # of that, for another way where the first one leads nowhere
-_SPENT = 0.95  # of the effort: what is left is not worth another way
+_VIEWS = 16  # stored views of the broad phase, for several BioTacs that share a skin
+_FAR = 1e-3  # motion above which geoms that leave the skin are not followed [m]
+_LEVER = 1e-2  # lever arm of rotations, about the size of a fingertip [m]
+_EFFORT = 1200.0  # limit of the first solve of a step, in evaluations: about 0.25 s on the coarse skin
+_ANOTHER = 0.5  # limit of a second solve over that of the first
+_SPENT = 0.95  # fraction of the effort after which no second solve is started
 
 
 class CondensedSkin:
@@ -45,11 +45,11 @@ class CondensedSkin:
     Args:
       model: SkinModel on the CPU, quasi-static.
       geoms: GeomSet of one world.
-      cache: whether to keep the compliance on disk (see `compliance`).
-      patience: fraction of the effort that a hard step may cost before it ends short of its poses.
+      cache: whether to cache the compliance on disk (see `compliance`).
+      patience: limit of the cost of a difficult step over `_EFFORT`; then it ends before its poses.
 
     Raises:
-      ValueError: what the tier cannot do, see `refusals`.
+      ValueError: unsupported settings, see `refusals`.
     """
 
     def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True, patience: float = 2.5):
@@ -70,7 +70,7 @@ class CondensedSkin:
         self._nodes, self._views = {}, self._view()
 
     def _view(self):
-        """Arrays of the one world, as numpy sees them, that a solve takes and gives besides its state."""
+        """Numpy views of the world's arrays that a solve reads and writes besides its state."""
         d, g = self._data, self.geoms.struct
         _, touched_by, wrench = d.geom_memory(self.geoms.count, self.geoms.ngroup)
         of_items = {"x": d.x, "x_last": d.x_last, "node_force": d.outer.node_force, "wrench": wrench}
@@ -94,18 +94,18 @@ class CondensedSkin:
         allowed: float = 1.0,
         bodies: BodyMotion | None = None,
     ) -> Outcome:
-        """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
-        alone.
+        """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a pure function of its
+        arguments.
 
-        Where that fails the geoms are followed there in parts; what comes back then holds for the poses in
-        its memory, which are those asked for where `load_factor` is 1. Where geoms are so deep inside the
-        core that no skin fits, it follows them to where one does; `load_factor` is then the fraction of their
-        path into the skin.
+        If that fails, the geoms are followed in load increments. The outcome is valid for the poses in its
+        memory, which are the given ones if `load_factor` is 1. Geoms that are so deep inside the core that no
+        skin fits are followed until it does not; `load_factor` is then the fraction of their path into the
+        skin.
 
         Args:
-          allowed: of what a hard step may cost, by `patience`.
-          bodies: how the geoms' bodies give way; what comes back then holds for the poses in its memory, to
-            which its wrenches bring them. None: their poses are prescribed.
+          allowed: fraction of the limit by `patience`.
+          bodies: compliance of the geoms' bodies; the outcome is then valid for the poses in its memory, to
+            which its wrenches move the bodies. None: poses are prescribed.
 
         Raises:
           ValueError: NaN in a pose.
@@ -134,7 +134,8 @@ class CondensedSkin:
         return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
 
     def _follow(self, memory, pos, mat, effort, bodies=None):
-        """To poses without one that is too deep. effort: [what it may cost], of which it takes its part."""
+        """Solves for poses that are not too deep. effort: [limit of the cost], from which it subtracts its
+        cost."""
         far, let_go = np.inf, (pos, mat)
         if bodies is not None:  # where the bodies go without the skin
             let_go = bodies.without(self.geoms.struct.group.numpy(), pos, mat)
@@ -142,7 +143,7 @@ class CondensedSkin:
             motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
             far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
-            if self.untouched(*let_go):  # the skin is left alone, or lets go
+            if self.untouched(*let_go):  # the geoms do not touch the skin, or leave it
                 return self.at_rest(*let_go)
         most = effort[0]
         out, blocked = self._solve(memory, pos, mat, most)
@@ -154,19 +155,19 @@ class CondensedSkin:
         presses = memory.started and len(memory.forces)
         if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
             return out
-        # the way there, if there is one, leads through the core or does not begin; or nobody knows it
+        # the path leads through the core, has no first equilibrium, or is not known
         another, _ = self._solve(self.outside(pos, mat), pos, mat, _ANOTHER * most)
         effort[0] -= self._views["spent"][0]
-        # a skin that presses is not given up for one that hardly touches yet, or not at all
+        # an equilibrium with contact is preferred to one with hardly any, or none
         keeps = another.load_factor == 0 or (far <= _FAR and not another.converged)
         return out if presses and keeps else another
 
     def _solve(self, memory, pos, mat, most):
-        """From a memory to poses, as far as that goes; and whether the core was in the way."""
+        """Solves from a state to poses, as far as possible; returns also whether a geom is in the core."""
         v = self._views
         self._load(memory)
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
-        v["tier"][0] = -1  # where no balance is found, its error is not known
+        v["tier"][0] = -1  # without an equilibrium the error is not known
         self._run()
         load_factor = float(v["load_factor"][0])
         if load_factor > 0:
@@ -187,7 +188,7 @@ class CondensedSkin:
         return out, v["deep"][0] == 1
 
     def _load(self, memory):
-        """Puts the world into a memory's state."""
+        """Loads a state."""
         nodes, v = self.nodes(memory), self._views
         self._state.load(memory)
         v["x"][:] = v["x_last"][:] = nodes
@@ -204,19 +205,20 @@ class CondensedSkin:
     # --- at rest, and near it  ---
 
     def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether no sample of the resting skin touches the geoms, posed so, and none is inside the core."""
+        """Whether geoms at these poses touch no sample of the undeformed skin, and none is inside the
+        core."""
         return self.proximity.clear(pos, mat, 0.0)
 
     def overlaps(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether geoms, posed so, have a sample of the resting skin inside."""
+        """Whether geoms at these poses contain a sample of the undeformed skin."""
         return not self.untouched(pos, mat) and self.proximity.overlaps(pos, mat)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
-        """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
+        """Whether the undeformed skin is further than `margin` [m] from geoms at these poses."""
         return self.proximity.clear(geom_pos, geom_mat, margin)
 
     def at_rest(self, pos: np.ndarray, mat: np.ndarray) -> Outcome:
-        """Of geoms at these poses, which touch nothing."""
+        """Outcome for geoms at these poses, which do not touch the skin."""
         memory, n = Memory.rest(self.geoms.count), self.geoms.ngroup
         memory.started = 1.0
         memory.geom_pos, memory.geom_mat = np.array(pos), np.array(mat)
@@ -224,14 +226,15 @@ class CondensedSkin:
         return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
 
     def outside(self, pos: np.ndarray, mat: np.ndarray) -> Memory:
-        """Memory of the resting skin with the geoms moved out of it, from (ngeom, 3) [m], (ngeom, 3, 3)."""
+        """State of the skin without contact, with the geoms moved out of it from (ngeom, 3) [m], (ngeom, 3,
+        3)."""
         out = self.proximity.outside(pos, mat)
         return self.at_rest(out, mat).memory
 
     # --- what a memory says  ---
 
     def nodes(self, memory: Memory) -> np.ndarray:
-        """(nvert, 3) of a memory [m]; not to be written to."""
+        """Nodes (nvert, 3) of a state [m]; read only."""
         if not len(memory.forces) and memory.pressure == 0:
             return self.rest
         found = self._nodes.get(memory.key())
@@ -249,15 +252,15 @@ class CondensedSkin:
         self._nodes[memory.key()] = nodes
 
     def contact_force(self, memory: Memory) -> np.ndarray:
-        """(nvert, 3) of what touches on the nodes [N]."""
+        """Forces (nvert, 3) of the geoms on the nodes [N]."""
         out, outer = np.zeros((self.model.nvert, 3)), memory.coordinate < 3 * len(self.linear.node)
         node, axis = np.divmod(memory.coordinate[outer], 3)
         out[self.linear.node[node], axis] = memory.force[outer]
         return out
 
     def normal_force_of_faces(self, memory: Memory, touched: np.ndarray) -> np.ndarray:
-        """(nface,) normal push of the geoms on the outer faces [N]; 0 on those that are not among `touched`,
-        numbers of faces."""
+        """Normal forces (nface,) of the geoms on the outer faces [N]. touched: (n,) indices of the faces that
+        are evaluated; the others get 0."""
         v = self._views
         v["x"][:], v["pos"][:], v["mat"][:] = self.nodes(memory), memory.geom_pos, memory.geom_mat
         return self._normal_forces(touched)

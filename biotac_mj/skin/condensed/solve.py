@@ -1,6 +1,6 @@
-"""The kernels of a step of skins, a block for each world: on CUDA one for each phase of `states`, launched
-again and again until all worlds are done; on the CPU one with all phases, since a launch costs more than most
-of them."""
+"""Kernels of a step, with a block of threads for each world: on CUDA one kernel for each phase of `states`,
+launched repeatedly until all worlds have finished; on the CPU one kernel with all phases, since a launch
+takes longer than most of them."""
 
 import functools
 import types
@@ -20,12 +20,12 @@ __all__ = ["BLOCK", "whole_step", "phases"]
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = 256  # threads of a world, as `touch.BLOCK`
+BLOCK = 256  # threads of a world, equal to `touch.BLOCK`
 
 
 @functools.cache
 def whole_step(shapes: str) -> wp.Kernel:
-    """All phases of skins that meet such shapes, see `contact.touch`: for the CPU."""
+    """Kernel with all phases, for the CPU. shapes: see `contact.touch`."""
     evaluate = evaluation(shapes)
 
     @wp.kernel(module=f"{__name__}.{shapes}", enable_backward=False)
@@ -149,7 +149,7 @@ def _conclude(
     tier_out: wp.array(dtype=int),
     going_out: wp.array(dtype=int),
 ):
-    """Sets going[0] where a world is not done."""
+    """Sets going[0] if a world has not finished."""
     w, t = wp.tid()
     if s.solve.phase[w] == BALANCED:
         conclude_balance(
@@ -160,8 +160,8 @@ def _conclude(
 
 
 def phases(shapes: str) -> types.SimpleNamespace:
-    """The kernels for CUDA: `begin` once, then `search`, `evaluate`, `conclude` and
-    `newton` in turns, so that a world goes through as many of its phases in a turn as there can be."""
+    """Kernels for CUDA: `begin` once, then `search`, `evaluate`, `conclude` and `newton` repeatedly; a world
+    can pass several phases in one round."""
     return types.SimpleNamespace(
         begin=_begin, search=_search, evaluate=_evaluate(shapes), newton=_take_step, conclude=_conclude
     )

@@ -1,5 +1,5 @@
-"""What a solve of one skin stands at between its phases: so each phase can be a kernel of its own, and a
-world that is done, or in another phase, is passed over."""
+"""State of a solve of one skin between its phases. Each phase can thus be a kernel of its own, which skips
+worlds that have finished or are in another phase."""
 
 import warp as wp
 
@@ -20,14 +20,14 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-# what comes next: nothing; the broad phase of an increment; contact; a step of Newton's method; what its end
-# means for the increment and the step
+# next phase: none; broad phase of an increment; evaluation of contact; step of Newton's method; decision
+# about increment and step
 DONE, SEARCH, EVALUATE, NEWTON, BALANCED = (wp.constant(i) for i in range(5))
 
 
 @wp.struct
 class Linear:
-    """The skin of a solve, u = W f + shift: W = scale * compliance - swell bulk_stiffness a a'."""
+    """The linear skin of a solve, u = W f + shift: W = scale * compliance - swell bulk_stiffness a a'."""
 
     scale: real  # softening over E [1/Pa]
     bulk_stiffness: real  # pressure per volume [Pa/m^3]
@@ -37,28 +37,28 @@ class Linear:
 
 @wp.struct
 class LoadStepping:
-    """Of a step: how far the geoms have come, as a fraction of their motion."""
+    """Load stepping of a step, in fractions of the geoms' motion."""
 
-    known: int  # whether it is known where they come from
-    holds: int  # whether the skin stays as it is remembered, since no balance was found
-    deep: int  # whether the core was in the way
+    known: int  # whether the previous poses are known
+    holds: int  # whether the skin keeps its last state, since no equilibrium was found
+    deep: int  # whether a geom is in the core
     iterations: int
     at: real
-    to: real  # which load factor is tried
-    part: real  # of this increment
-    longest: real  # increment
+    to: real  # trial load factor
+    part: real  # size of the increment
+    longest: real  # largest increment
     length: real  # of the motion [m]
-    modulus: real  # Young's [Pa]
-    left: real  # what this increment may cost
-    spent: real  # what the step has cost, an evaluation of contact being one
+    modulus: real  # Young's modulus [Pa]
+    left: real  # limit of the increment's cost
+    spent: real  # cost of the step, in evaluations of contact
     error: real
 
 
 @wp.struct
 class Increment:
-    """What an increment came to so far."""
+    """State of a load increment."""
 
-    ok: int  # 1: a balance, `CUT`, or 0
+    ok: int  # 1: an equilibrium, `CUT`, or 0
     deep: int
     measured: int
     iterations: int
@@ -66,13 +66,13 @@ class Increment:
     ncore: int
     nnode: int
     nin: int
-    solving: int  # whether Newton's method was begun
-    searches: int  # how often the broad phase has looked for candidates
-    passes: int  # how often pressure and softening were found
+    solving: int  # whether Newton's method has started
+    searches: int  # number of searches for candidates by the broad phase
+    passes: int  # number of updates of pressure and softening
     view: int  # of `broadphase.choose_view`
     travel: real
     near: wp.int64
-    reach: real  # faces nearer than this are candidates [m]
+    reach: real  # faces closer than this are candidates [m]
     spent: real
     error: real
     pressure: real
@@ -84,17 +84,17 @@ class Increment:
 
 @wp.struct
 class Newton:
-    """Of Newton's method, see `balance`."""
+    """State of Newton's method, see `balance`."""
 
-    found: int  # whether a balance is, as `Increment.ok`
+    found: int  # whether an equilibrium was found, as `Increment.ok`
     iterations: int
     foretold: int  # 1: contact is to be evaluated where the geoms are held, 2: it has been
     fresh: int  # vector of displacements that the forces bring about, to be found; -1: none
     at: int  # vector of displacements at which contact is to be evaluated
-    searching: int  # along a step
-    tried: int  # lengths of it
-    ends: int  # whether what is to be evaluated is where it ends
-    most: real  # what it may cost
+    searching: int  # whether a line search is in progress
+    tried: int  # step lengths that were tried
+    ends: int  # whether the next evaluation is the last
+    most: real  # limit of the cost
     tolerance: real
     spent: real
     error: real
@@ -114,7 +114,7 @@ class Newton:
 
 @wp.struct
 class Solve:
-    """Of all worlds."""
+    """State of the solves in all worlds."""
 
     phase: wp.array(dtype=int)
     stepping: wp.array(dtype=LoadStepping)

@@ -1,6 +1,6 @@
-"""Load stepping of one skin, by the threads of a block: the geoms are followed to where they are asked to be,
-at once where that can be, else in increments, as far as the skin finds a balance. Each function below is a
-phase of `states`; `solve` launches them."""
+"""Load stepping of one skin, by the threads of a block: the geoms are moved to their new poses in one
+increment if possible, else in several, as far as the skin finds an equilibrium. The functions below are
+phases of `states`; `solve` launches them."""
 
 import warp as wp
 
@@ -35,14 +35,16 @@ _is_measured = wp.func(is_measured)
 _REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
 # the geoms move at most so far at once, at least [m]
 _PART, _LEAST = (wp.constant(real(x)) for x in (2e-3, 1e-5))
-_SHORTEST = wp.constant(real(1.0 / 32.0))  # of a motion of many increments
-_LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
+_SHORTEST = wp.constant(real(1.0 / 32.0))  # least increment of a motion
+_LEVER = wp.constant(real(1e-2))  # lever arm of rotations [m]
 # first increment of a motion that failed at once, and [m]
 _FIRST, _SHORT = (wp.constant(real(x)) for x in (0.125, 1e-4))
 _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
-_PASSING = wp.constant(real(1e-2))  # error that will do where geoms only pass, in one pass
+_PASSING = wp.constant(real(1e-2))  # tolerance of intermediate increments, which have one pass
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
-_STANDS = wp.constant(real(5e-6))  # motion of bodies by the last change of their wrenches that ends it [m]
+_STANDS = wp.constant(
+    real(5e-6)
+)  # motion of bodies by the last change of their wrenches that ends the step [m]
 
 
 @wp.func
@@ -62,7 +64,7 @@ def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constant
 
 @wp.func
 def _load(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
-    """vector[F] of the candidates from the forces that a solve begins with."""
+    """Sets vector[F] of the candidates to the initial forces of a solve."""
     for k in range(t, nnode, threads):
         f = s.force[w, s.node[w, k]]
         for a in range(3):
@@ -74,7 +76,7 @@ def _load(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: S
 
 @wp.func
 def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
-    """The other way round; what is no candidate has no force."""
+    """Stores vector[F] as forces of the nodes; nodes that are no candidates have none."""
     for i in range(t, c.node.shape[0], threads):
         f = vec3()
         k = s.place[w, i]
@@ -91,8 +93,8 @@ def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: 
 
 @wp.func
 def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
-    """Makes forces of no balance safe: the law's own at each node, which push and lie in friction's cone, but
-    no more than what the skin balances where it is."""
+    """Limits forces that are not in equilibrium: those of the contact law at each node, which push and lie in
+    the friction cone, but at most the forces that the skin balances at its displacements."""
     for k in range(t, nnode, threads):
         square = real(0.0)
         product = real(0.0)
@@ -113,7 +115,7 @@ def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
 
 @wp.func
 def _largest_motion(w: int, geoms: Geoms):
-    """How far a point of a geom has moved since the step began, about [m]."""
+    """Approximate largest motion of a point of the geoms in this step [m]."""
     most = real(0.0)
     for g in range(geoms.count):
         turn = geoms.mat[g, w] - geoms.mat_last[g, w]
@@ -124,7 +126,7 @@ def _largest_motion(w: int, geoms: Geoms):
 
 @wp.func
 def _begin_increment(p: LoadStepping, most: real):
-    """The next increment, from where the last one ended."""
+    """Starts the next increment at the end of the last one."""
     p.to = p.at + p.part
     if p.to > real(1.0) - real(1e-9):
         p.to = real(1.0)
@@ -148,7 +150,7 @@ def begin_step(
     r: Remembered,
     st: Worlds,
 ):
-    """Where the geoms come from and go to."""
+    """Starts a step: previous and new poses of the geoms."""
     if st.wanted[w] == 0:
         if t == 0:
             s.solve.phase[w] = DONE
@@ -226,8 +228,8 @@ def search(
     r: Remembered,
     st: Worlds,
 ):
-    """The phase SEARCH: finds what may touch, first where an increment begins, from what is remembered, then
-    where it has brought the skin, until nothing new is near."""
+    """The phase SEARCH: finds the candidates, first at the start of an increment, then at its displacements,
+    until there are no new ones."""
     p = s.solve.stepping[w]
     o = s.solve.increment[w]
     sync()
@@ -322,7 +324,7 @@ def _commit(
     st: Worlds,
     rest_pressure: real,
 ):
-    """Where an increment came to is remembered; friction goes on from there."""
+    """Stores the state at the end of an increment, with the friction anchors."""
     for i in range(t, c.node.shape[0], threads):
         r.force[i, w] = s.force[w, i]
     for i in range(t, c.inner.shape[0], threads):
@@ -358,8 +360,8 @@ def _conclude_pass(
     s: Scratch,
     st: Worlds,
 ):
-    """What the end of Newton's method means for the increment: which phase comes next, BALANCED where the
-    increment is over."""
+    """Ends a pass of Newton's method; returns the increment and the next phase, BALANCED if the increment has
+    ended."""
     d = s.solve.newton[w]
     l = d.linear
     o.ok = d.found
@@ -417,7 +419,7 @@ def _conclude_pass(
 
 @wp.func
 def _go_on(w: int, t: int, threads: int, most: real, p: LoadStepping, o: Increment, geoms: Geoms, s: Scratch):
-    """How the load goes on after an increment that came to something, or not; and whether it does."""
+    """Accepts or cuts back the load increment, and chooses the next; returns whether there is one."""
     on = int(1)
     arrived = o.ok  # whether what was found last is where the load goes on
     if p.holds == 1:
@@ -474,7 +476,7 @@ def conclude_balance(
     node_force: wp.array2d(dtype=vec3),
     tier: wp.array(dtype=int),
 ):
-    """The phase BALANCED: what the end of Newton's method means for the increment, and that for the step."""
+    """The phase BALANCED: decides about the increment and the step after Newton's method has ended."""
     p = s.solve.stepping[w]
     o = s.solve.increment[w]
     sync()
