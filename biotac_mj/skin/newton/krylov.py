@@ -109,7 +109,11 @@ def choose_beta(partial: wp.array3d(dtype=real), st: Worlds):
 
 @functools.cache
 def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
-    """Kernels with directions, for one precision of these."""
+    """Kernels of conjugate gradients and of the line search, for one precision of directions."""
+    return types.SimpleNamespace(**_product_kernels(precision), **_search_kernels(precision))
+
+
+def _product_kernels(precision):
     module = f"{__name__}.{precision.name}"
     scalar, vec, lower, raised = precision.scalar, precision.vec, precision.lower, precision.raised
 
@@ -262,6 +266,17 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         if st.running[w] == 1:
             p[i, w] = z[i, w] + scalar(st.beta[w]) * p[i, w]
 
+    return {
+        "assemble_product": assemble_product,
+        "measure_product": measure_product,
+        "update_solution": update_solution,
+        "next_direction": next_direction,
+    }
+
+
+def _search_kernels(precision):
+    module, vec, raised = f"{__name__}.{precision.name}", precision.vec, precision.raised
+
     @wp.kernel(module=module, enable_backward=False)
     def first_length(
         # In:
@@ -323,12 +338,4 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         partial_out[0, c, w] = slope
         partial_out[2, c, w] = pressure_response
 
-    return types.SimpleNamespace(
-        assemble_product=assemble_product,
-        measure_product=measure_product,
-        update_solution=update_solution,
-        next_direction=next_direction,
-        first_length=first_length,
-        move=move,
-        measure_slope=measure_slope,
-    )
+    return {"first_length": first_length, "move": move, "measure_slope": measure_slope}

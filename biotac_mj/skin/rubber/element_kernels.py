@@ -105,7 +105,8 @@ def element_kernels(
     """Kernels of one kind of element, law and rubber. The corotational law has kernels of its own, since the
     other laws need more registers."""
     kind = _Kind(corners, corotational, precision, options)
-    found = _serial_kernels(kind) | _reading_kernels(kind)
+    found = {"force_serial": _serial_force(kind), "product_serial": _serial_product(kind)}
+    found |= _reading_kernels(kind)
     if kind.averaged and kind.is_single:
         found |= _kernels_by_point(kind)
     return types.SimpleNamespace(gradients=kind.gradients, **found)
@@ -339,29 +340,14 @@ def _kernels_by_point(kind: _Kind) -> dict[str, wp.Kernel]:
     return {"force": force, "product": product}
 
 
-def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
-    """Forces and products with a thread for each element."""
+def _serial_force(kind: _Kind) -> wp.Kernel:
+    """Forces with a thread for each element."""
     corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
     corotational, serial, gradients = kind.corotational, kind.serial_module, kind.gradients
-    scalar, vec, thin = kind.precision.scalar, kind.precision.vec, kind.precision.narrow
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
-    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
-    thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
     f = _point_functions(kind)
-    rotation, rotation_thin, theta, stress_of = f.rotation, f.rotation_thin, f.theta, f.stress_of
-    direction_of, change_of, weighted_volume = f.direction_of, f.change_of, f.weighted_volume
+    rotation, theta, stress_of, weighted_volume = f.rotation, f.theta, f.stress_of, f.weighted_volume
     local_lame, flaw = f.local_lame, f.flaw
-
-    @wp.func
-    def narrow_gradients(g: gradients):
-        if wp.static(is_single):
-            out = thin_gradients()
-            for a in range(wp.static(corners)):
-                for c in range(3):
-                    out[a, c] = scalar(g[a, c])
-            return out
-        else:  # Warp compiles what follows a return
-            return g
 
     @wp.kernel(module=serial, enable_backward=False)
     def force_serial(
@@ -416,6 +402,32 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
             ) * wp.transpose(shape[q])
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec3(C[0, a], C[1, a], C[2, a])
+
+    return force_serial
+
+
+def _serial_product(kind: _Kind) -> wp.Kernel:
+    """Products with a thread for each element."""
+    corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
+    corotational, serial, gradients = kind.corotational, kind.serial_module, kind.gradients
+    scalar, vec, thin = kind.precision.scalar, kind.precision.vec, kind.precision.narrow
+    positions = wp.types.matrix(shape=(3, corners), dtype=real)
+    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
+    thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
+    f = _point_functions(kind)
+    rotation_thin, direction_of, change_of = f.rotation_thin, f.direction_of, f.change_of
+    weighted_volume, local_lame = f.weighted_volume, f.local_lame
+
+    @wp.func
+    def narrow_gradients(g: gradients):
+        if wp.static(is_single):
+            out = thin_gradients()
+            for a in range(wp.static(corners)):
+                for c in range(3):
+                    out[a, c] = scalar(g[a, c])
+            return out
+        else:  # Warp compiles what follows a return
+            return g
 
     @wp.func
     def point_state(
@@ -498,7 +510,7 @@ def _serial_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
 
-    return {"force_serial": force_serial, "product_serial": product_serial}
+    return product_serial
 
 
 def _reading_kernels(kind: _Kind) -> dict[str, wp.Kernel]:
