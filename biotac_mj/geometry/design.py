@@ -25,8 +25,8 @@ __all__ = [
     "read_design",
 ]
 
-DESIGNS = ("biotac", "biotac_sp")  # that are shipped
-MOST_DISCS = 32  # of electrodes and excitation together: the film is solved in tiles of so many columns
+DESIGNS = ("biotac", "biotac_sp")  # shipped with the package
+MOST_DISCS = 32  # electrodes and excitation: the number of columns of a tile in which the film is solved
 MOST_EXCITATION = 4
 SINGLES = ("pdc", "pac", "tdc", "tac")  # columns of stored counts after the electrodes
 _LEAST_SLOTS = 2  # PAC's, and one channel's
@@ -192,7 +192,8 @@ def read_design(given: "str | pathlib.Path | Design" = "biotac") -> Design:
     """A design from its name, its folder or file (design.json), or its JSON text.
 
     Raises:
-      FileNotFoundError: no such file. ValueError: it is no design, or one that cannot be.
+      FileNotFoundError: the file does not exist.
+      ValueError: the text is not a valid design.
     """
     if isinstance(given, Design):
         return given

@@ -51,7 +51,7 @@ def press(
         record = press(PressOptions(depth=1e-3)).record
 
     Args:
-      options: of the press.
+      options: options of the press.
       render: called with (model, data) at the end, such as `press.render`; its result is returned beside the
         record.
       progress: whether to show a progress bar.

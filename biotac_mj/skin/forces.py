@@ -39,7 +39,7 @@ class Vectors:
         surfaces = [s for s in (data.outer, data.core) if s]
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
-            self.x_start = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
+            self.x_start = wp.zeros((n, w), dtype=vec3)  # nodes at the start of the load increment
             self.norms = wp.zeros((4, self.nchunk, w), dtype=real)
             self.partial = wp.zeros((3, self.nchunk, w), dtype=real)
             self.viscous_work = wp.zeros((n, w), dtype=data.precision.scalar)

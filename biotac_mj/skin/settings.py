@@ -59,11 +59,12 @@ def read_settings(
 
 
 def read_material(choice: Material | dict | str | pathlib.Path | None) -> Material:
-    """A preset's name, a dict of Material's fields, JSON of one (a text, or a file, maybe one that `biotac
-    calibrate` wrote), a Material or None (the default), as a Material.
+    """The Material of a preset's name, a dict of its fields, JSON text or a JSON file (such as `biotac calibrate`
+    writes), a Material, or None (the default).
 
     Raises:
-      ValueError: anything else. FileNotFoundError: no such file.
+      ValueError: `choice` is none of these.
+      FileNotFoundError: the file does not exist.
     """
     if choice is None or isinstance(choice, Material):
         return choice or PRESETS["default"]

@@ -117,7 +117,7 @@ _EXCHANGE = """
             const float* panel = &panels[q & 1][0][0];
             const int tile = q / 4, next = (q + 1) / 4, lane = c - P * (q & 3), after = c - P * ((q + 1) & 3);
             const int width = min(P, n - P * q);
-            // pivot rows as they were; what is left there is zero
+            // broadcast the pivot rows before elimination; zero them in the tile
             #pragma unroll
             for (int s = 0; s < P; ++s) {
                 const int p = s < width ? chosen[q & 1][s] : -1;

@@ -26,13 +26,13 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["FEW", "LANES_FEW", "THREADS_FEW", "DensePreconditioner"]
 
-FEW = 16  # so many worlds do not fill the device: work is split into smaller parts
-THREADS_FEW = 64  # of a block with few worlds, so that more multiprocessors take part
-LANES_FEW = 8  # threads that sum into one node with few worlds: a single one would wait for each read
+FEW = 16  # up to this number of worlds do not fill the device: work is split more finely
+THREADS_FEW = 64  # block size with few worlds: small, so that more multiprocessors take part
+LANES_FEW = 8  # threads that sum one node with few worlds: a single thread would wait for each read
 
 
 class DensePreconditioner:
-    """For all worlds of one SkinData, see `precondition.Preconditioner`.
+    """The dense preconditioner of all worlds of one SkinData, see `precondition.Preconditioner`.
 
     Attributes:
       needs_torch: whether torch computes its products.

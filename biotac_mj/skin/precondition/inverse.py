@@ -17,15 +17,20 @@ __all__ = ["Inverse"]
 
 
 class Inverse:
-    """Products of the dissected inverse with a right-hand side of each world, and what is made of them.
+    """Applies the block inverse (`block_inverse`) to the right-hand sides of all worlds.
 
     Args:
-      model: the SkinModel. nworld: how many. chunk: nodes summed by one thread.
-      launch: of a kernel, as `DensePreconditioner` does it. lanes: that share what is summed into a node.
+      model: the SkinModel.
+      nworld: number of worlds.
+      chunk: nodes that one thread sums.
+      norm: norms of the residual and of the volume's gradient [2, world].
+      launch: launches a kernel, see `DensePreconditioner`.
+      lanes: threads that sum the matrices of one node.
 
     Attributes:
-      carried: `pushed.PushForwardMatrices`, or None where the inverse is as at rest.
-      needs_torch: see `dissected.Product`.
+      pushed: `PushForwardMatrices`, or None if the inverse of the undeformed skin is used.
+      node_map: rows, matrices and scales by which kernels read and write the inverse's vectors.
+      needs_torch: see `block_inverse.Product`.
     """
 
     def __init__(

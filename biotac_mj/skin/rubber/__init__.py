@@ -1,1 +1,1 @@
-"""The rubber: its laws, what it has beyond them, and the tetrahedra that it is made of."""
+"""The rubber: material laws, memory (viscoelasticity), friction and the kernels of its tetrahedra."""
