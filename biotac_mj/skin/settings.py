@@ -59,7 +59,7 @@ def read_settings(
 
 
 def read_material(choice: Material | dict | str | pathlib.Path | None) -> Material:
-    """The Material of a preset's name, a dict of its fields, JSON text or a JSON file (such as `biotac calibrate`
+    """The Material of a preset's name, a dict of its fields, JSON text or file (as `biotac calibrate`
     writes), a Material, or None (the default).
 
     Raises:

@@ -80,28 +80,27 @@ class NoFilmError(ValueError):
 
 class FilmConduction:
     """Impedances of the sensing electrodes from the deformed skin. Constant after construction, without
-        state.
+    state.
 
-        Args:
-          geometry: the skin, its core and its electrodes.
-          conductivity: of the liquid [S/m].
-    ELECTRODE_RADIUS = 0.5e-3  # [m] of the discs (chosen: not published)
-          residual_film: thickness where the skin touches the core, kept by the asperities of its inner face [m]
-            (chosen; catalogue range 20-100 um).
-          electrode_radius: of all discs [m] (chosen: not published).
-          excitation: positions of X1, X2, ... if not the design's: (k, 2), x [m] and angle about the x axis from
-            the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), points near the core [m];
-            BioTac frame.
-          sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes the
-            skin at rest give its rest counts. "" is the design's own. None: all factors one, pure physics.
+    Args:
+      geometry: the skin, its core and its electrodes.
+      conductivity: of the liquid [S/m].
+      residual_film: thickness where the skin touches the core, kept by the asperities of its inner face [m]
+        (chosen; catalogue range 20-100 um).
+      electrode_radius: of all discs [m] (chosen: not published).
+      excitation: positions of X1, X2, ... if not the design's: (k, 2), x [m] and angle about the x axis from
+        the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), points near the core [m];
+        BioTac frame.
+      sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes the
+        skin at rest give its rest counts. "" is the design's own. None: all factors one, pure physics.
 
-        Attributes:
-          cell_constant: (n,), factor on the film's impedance.
-          rest: (n,) impedance of the skin at rest [ohm].
-          excitation_pos: (k, 3), X1, X2, ... on the core [m].
+    Attributes:
+      cell_constant: (n,), factor on the film's impedance.
+      rest: (n,) impedance of the skin at rest [ohm].
+      excitation_pos: (k, 3), X1, X2, ... on the core [m].
 
-        Raises:
-          ValueError: a parameter out of range, or an electrode that the film does not cover.
+    Raises:
+      ValueError: a parameter out of range, or an electrode that the film does not cover.
     """
 
     _power = 1.0  # exponent of the conductance over thickness
