@@ -1,4 +1,4 @@
-"""The condensed skins of some worlds: what a step works on, and its launches."""
+"""A step of condensed skins in many worlds: its arrays and launches."""
 
 import dataclasses
 import types
@@ -27,8 +27,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
-    """Of a step's kernels on CUDA those that take long to compile, for skins that meet such shapes
-    (`GeomSet.shapes`): for `program.compile_ahead`."""
+    """Modules of a step's kernels on CUDA that take long to compile, with their block sizes, for
+    `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
     kernels = [kernel.module for kernel in vars(phases(shapes)).values()]
     return [(module, BLOCK) for module in [*kernels, results]] + [(penetration, 256)]
 
@@ -49,31 +49,31 @@ class Room:
 
     @classmethod
     def of_worlds(cls, nworld: int) -> "Room":
-        """That many worlds have memory for."""
+        """Capacity that fits the memory for `nworld` worlds."""
         return cls(240 if nworld <= 1024 else 144, faces=768, nodes=448, core_faces=384, core_nodes=240)
 
 
 class CondensedStep:
-    """A step of all wanted worlds by the condensed tier, as `skin.step` has one of the full tier: poses in
+    """A step of all wanted worlds by the condensed tier, with the interface of `skin.step`: poses in
     `geoms.struct`, positions, wrenches and pressures out.
 
     Args:
       model: SkinModel on any device. linear: LinearSkin of the same model on the CPU.
-      data: of the skins. geoms: what touches them.
-      room: for contact; None: as much as suits the number of worlds.
-      groups: how many groups of geoms have bodies that give way; 0: none, poses are prescribed.
+      data: of the skins. geoms: that touch them.
+      room: capacity for contact; None: by the number of worlds.
+      groups: number of groups of geoms with compliant bodies; 0: poses are prescribed.
 
     Attributes:
       remembered: `Remembered` between steps.
-      most, spent: (nworld,) what a step may cost (`SkinOptions.max_work`), and what it has, in evaluations of
+      most, spent: (nworld,) limit of a step's cost (`SkinOptions.max_work`), and its cost, in evaluations of
         contact.
-      deep: (nworld,) int, 1 where the core was in the way.
-      bodies: `Bodies`; the caller writes their compliance, predicted wrenches and own points before a launch.
+      deep: (nworld,) int, 1: a geom is in the core.
+      bodies: `Bodies`; the caller writes compliance, predicted wrenches and reference points before a launch.
       touch: `Contact` of the outer surface.
-      tier: (nworld,) int, what the sensor `status` says: 1, or -1 beyond what the error was measured for.
+      tier: (nworld,) int, for the sensor `status`: 1, or -1 outside the range of measured errors.
 
     Raises:
-      ValueError: what the tier cannot do, see `refusals`.
+      ValueError: unsupported settings, see `refusals`.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class CondensedStep:
 
         Args:
           tangent: (ngroup, nworld) spatial_matrixd for -d wrench / d motion, or None.
-          launcher: what launches, where it is not at once.
+          launcher: collects the launches; None: launch immediately.
         """
         launcher = launcher or Launcher(self._model.device)
         self.begin(launcher)
@@ -122,8 +122,7 @@ class CondensedStep:
         self.end(tangent, launcher)
 
     def begin(self, launcher: Launcher | None = None) -> None:
-        """The first part: on the CPU the whole solve, on CUDA `go_on` has to follow until all worlds
-        are done."""
+        """First part: on the CPU the whole solve; on CUDA, call `go_on` until all worlds have finished."""
         m, d, geoms = self._model, self._data, self._geoms
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         from_outside = [c.center, c.radius, geoms.struct]
@@ -140,8 +139,7 @@ class CondensedStep:
         )
 
     def go_on(self, going: wp.array, launcher: Launcher | None = None) -> None:
-        """A step of Newton's method of the worlds that are not done, on CUDA; sets going[0] where one is
-        not."""
+        """One round of phases in the worlds that have not finished, on CUDA; sets going[0] if one has not."""
         m, d, k = self._model, self._data, self._phases
         launcher = launcher or Launcher(m.device)
         known = [self._geoms.struct, self._constants, d.x, self.touch]
@@ -156,7 +154,7 @@ class CondensedStep:
             launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=BLOCK)
 
     def end(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
-        """Wrenches and tangents of what the solves came to."""
+        """Last part: wrenches and tangents of the solves."""
         m, d, geoms = self._model, self._data, self._geoms
         _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
@@ -168,14 +166,14 @@ class CondensedStep:
         launch(conclude, dim, known, [touched_by, wrench, tangent], **how)
 
     def recall(self, launcher: Launcher) -> None:
-        """Puts the nodes where what is remembered has them. Launches only, on the CPU."""
+        """Computes positions of the nodes from `remembered`. Launches only, on the CPU."""
         d = self._data
         known = [self._model.law, self._constants, d.worlds, self.remembered]
         launcher.launch(recall, d.nworld, known, [self._scratch, d.x])
 
     @property
     def holders(self) -> dict:
-        """What of it `state.StateArrays` takes."""
+        """Objects with the arrays that `state.StateArrays` copies."""
         return {"condensed": self.remembered, "step": self}
 
 
