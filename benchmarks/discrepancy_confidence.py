@@ -20,7 +20,7 @@ from records import read_json, write_json
 
 from biotac_mj.discrepancy.recordings.confidence import NAMED, farthest
 from biotac_mj.discrepancy.recordings.rest import LIKELY
-from biotac_mj.quality.confidence import BESIDE, WEIGHTS, probability
+from biotac_mj.quality.confidence import PER_CANDIDATE, WEIGHTS, probability
 
 __all__ = ["authors_left_out", "fit"]
 
@@ -88,7 +88,7 @@ def _logistic(cases, signs):
         return None
     right = np.array([c["right"] is not None for c in cases], float)
     weight = np.array([NATURAL if c["right"] == "natural" else 1.0 for c in cases])
-    beside = BESIDE * np.log1p([c["beside"] for c in cases])
+    beside = PER_CANDIDATE * np.log1p([c["beside"] for c in cases])
     x = np.array([[c["features"].get(name, 0.0) for name in signs] for c in cases]).reshape(len(cases), -1)
     middle, spread = x.mean(0), np.maximum(x.std(0), 0.1)
     A = np.column_stack([np.ones(len(cases)), np.clip((x - middle) / spread, -OUT, OUT)])

@@ -59,7 +59,7 @@ def test_a_design_is_the_same_after_its_text(name):
     assert len(design.channels) == design.nelectrode + 4 and design.slots >= 2 * (design.nelectrode + 3)
 
 
-@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("name", [n for n in DESIGNS if read_design(n).nelectrode])
 def test_the_mirror_turns_z_of_every_electrode(name):
     design = read_design(name)
     place = design.in_biotac_frame(np.array(design.electrodes_mm))
@@ -81,7 +81,7 @@ def test_what_cannot_be_simulated_is_said():
             Design("mine", "my pad", **changes)
     with pytest.raises(ValueError, match="a design has no 'colour'"):
         read_design(json.dumps({"name": "a", "title": "b", "colour": "red"}))
-    with pytest.raises(FileNotFoundError, match="pass one of biotac, biotac_sp, or a folder"):
+    with pytest.raises(FileNotFoundError, match="pass one of biotac, biotac_sp,.* or a folder"):
         read_design("nowhere")
     assert BIOTAC.nelectrode + 5 == read_design("biotac_sp").nelectrode
 
