@@ -72,7 +72,7 @@ def test_every_input_against_differences(names, law, exact, element, liquid):
     given = inputs_of(13, liquid) | {"pos": pos, "quat": quat.clone(), "rest_nodes": torch.tensor(skin.rest)}
     given = {name: value.requires_grad_() for name, value in (given | constants(names)).items()}
     pressed = press(skin, dt=DT, **given)
-    assert pressed.counts.slipped and pressed.counts.parted and not pressed.counts.lost
+    assert pressed.counts.slipped and pressed.counts.separated and not pressed.counts.lost
     loss_of(pressed).backward()
     draw = np.random.default_rng(1)
     ways = {name: draw.normal(size=value.shape) for name, value in given.items()}

@@ -73,7 +73,9 @@ def check(model, data, given, exact, seed=5, **steps):
                 for s in (1, -1)
             )
         slope, wanted = (value.grad * way).sum().item(), (ahead - back) / (2 * step)
-        print(f"{name}: {abs(slope / wanted - 1):.0e}, amiss {rolled.amiss[0]:.0e}")  # for the lab book: -rP
+        print(
+            f"{name}: {abs(slope / wanted - 1):.0e}, amiss {rolled.mismatch[0]:.0e}"
+        )  # for the lab book: -rP
         assert slope == pytest.approx(wanted, rel=exact), name
     return rolled
 
@@ -132,7 +134,7 @@ def test_an_arm_that_presses_and_slides():
 
 @pytest.mark.slow
 def test_a_free_ball_pushed_along():
-    """It comes to roll at 7 rad/s. What acts on it is the skin's wrench where it comes: `amiss`."""
+    """It comes to roll at 7 rad/s. What acts on it is the skin's wrench where it comes: `mismatch`."""
     model, data, _ = scene(FREE, [])
     speed = torch.zeros(6, dtype=torch.float64)
     speed[2] = -0.08
@@ -143,7 +145,7 @@ def test_a_free_ball_pushed_along():
     given = {"qpos": start, "qvel": speed, "qfrc_applied": push}
     rolled = check(model, data, given, 1e-4, qfrc_applied=1e-5)
     assert rolled.qvel[:, 3:].norm(dim=1).max() > 5.0
-    assert rolled.amiss[0] < 1e-6
+    assert rolled.mismatch[0] < 1e-6
 
 
 @pytest.mark.slow

@@ -73,7 +73,7 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
         number = np.floor((recording.time - recording.time[0]) / block + 1e-9)
         cut |= set(np.flatnonzero(np.diff(number)) + 1)
     edge = [0, *sorted(int(k) for k in cut), n]
-    said = {"source": recording.source, "frame": recording.frame, "rate": recording.rate_source}
+    description = {"source": recording.source, "frame": recording.frame, "rate": recording.rate_source}
     out = []
     for a, b in zip(edge, edge[1:]):
         rows = slice(a, b)
@@ -84,7 +84,7 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
                 "recorded",
                 "train",
                 0,
-                {**said, "rows": [a, b], "notes": [*recording.notes, *found.notes]},
+                {**description, "rows": [a, b], "notes": [*recording.notes, *found.notes]},
                 recording.time[rows],
                 contact_pos=None if recording.contact_pos is None else recording.contact_pos[rows],
                 indenter_pos=_whole(recording.object_pos, rows),

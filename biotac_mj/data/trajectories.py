@@ -69,8 +69,8 @@ def export_mujoco(
             np.savez_compressed(building / f"{data.id[i]}.npz", **arrays)
             about = {"id": str(data.id[i]), "model": file, "object": thing, "kind": str(data.kind[i])}
             index.append(about | {"split": str(data.split[i]), "rows": len(rows)})
-        said = {"state": STATE.name, "counts": counts, "versions": data.versions, "interactions": index}
-        (building / "index.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+        about_set = {"state": STATE.name, "counts": counts, "versions": data.versions, "interactions": index}
+        (building / "index.json").write_text(json.dumps(about_set, indent=1) + "\n", encoding="utf-8")
     return out
 
 

@@ -102,7 +102,7 @@ def press(
         that parallel worlds lack.
     """
     if together is not None:
-        _refuse_together(skin, together, rest_nodes, smoothing)
+        _refuse_parallel(skin, together, rest_nodes, smoothing)
     pos, quat = real_tensor("pos", pos).cpu(), real_tensor("quat", quat).cpu()
     if (core_pos is None) != (core_quat is None):
         raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
@@ -133,7 +133,7 @@ def press(
     _refuse_smoothing(skin, smoothing)
     memory = {name: parameters.pop(name, None) for name in ("prony", "mullins", "hysteresis")}
     given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
-    rest = _rest_of(skin, rest_nodes, nworld)
+    rest = _rest_positions(skin, rest_nodes, nworld)
     times = _times_of(skin, dt, pos.shape[1])
     constants = _constants_of(skin, memory, nworld)
     made = [numbers_of(skin, {name: v[w] for name, v in given.items()}, rest[w]) for w in range(nworld)]
@@ -228,7 +228,7 @@ def _matrix(quat):
     return torch.stack(matrix_entries(*unit.unbind(-1)), -1).reshape(*quat.shape[:-1], 3, 3)
 
 
-def _rest_of(skin, nodes, nworld):
+def _rest_positions(skin, nodes, nworld):
     """Rest positions (nvert, 3) of each world, None if they are the skin's."""
     if nodes is None:
         return [None] * nworld
@@ -248,7 +248,7 @@ def _rest_of(skin, nodes, nworld):
     return list(nodes)
 
 
-def _refuse_together(skin, device, rest_nodes, smoothing):
+def _refuse_parallel(skin, device, rest_nodes, smoothing):
     """Raises ValueError for features that parallel worlds lack, or a missing device."""
     missing = "is not there for worlds that go together: leave `together` out"
     if skin.model.has_liquid:
@@ -357,12 +357,12 @@ class _Press(torch.autograd.Function):
         if rest is not None:
             core_area = torch.zeros(skin.surfaces[1]) if core_area is None else core_area
             shape = (t.numpy()[None] for t in (rest, area, core_area))
-        ahead = Inputs(
+        tangents = Inputs(
             pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.T[:, None])), *shape,
             None if constants is None else constants.numpy()[None],
         )  # fmt: skip
         with skin.lock, skin.stream():
-            out = push_forward(skin, context.trajectory, ahead)
+            out = push_forward(skin, context.trajectory, tangents)
         return tuple(skin.tensor(a[0]) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod

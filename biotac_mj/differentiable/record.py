@@ -27,7 +27,7 @@ class Changes:
     """Number of kinks of a step's force, where a gradient is one-sided, or jumps.
 
     Attributes:
-      touched, parted: samples that began, ended contact. slipped, stuck: began, ended slip.
+      touched, separated: samples that began, ended contact. slipped, stuck: began, ended slip.
       yielded: friction elements of the rubber's points that began or ended slip. softened: points that began
         or ended to exceed their largest energy.
       sharp: samples in contact with an edge that is not rounded (`touching.at_sharp_edges`): the step may
@@ -37,7 +37,7 @@ class Changes:
     """
 
     touched: int = 0
-    parted: int = 0
+    separated: int = 0
     slipped: int = 0
     stuck: int = 0
     lost: int = 0
@@ -194,7 +194,7 @@ def advance(
         now, then = slips[torch.isin(slips, both)], before.slips[torch.isin(before.slips, both)]
         of_worlds |= {
             "touched": touches[~stay],
-            "parted": before.touches[~stayed],
+            "separated": before.touches[~stayed],
             "slipped": now[~torch.isin(now, before.slips)],
             "stuck": then[~torch.isin(then, slips)],
         }

@@ -143,7 +143,7 @@ def push_forward(
         x = [own + vert[i][:, None] for i, own in enumerate(x)]
     skin.begin_solves()
 
-    def ahead(record, t):
+    def push_step(record, t):
         step, wrench = LinearStep(skin, record), []
         for i in range(k):
             given = {name: value[i] for name, value in numbers.items()} | {"x_last": x[i]}
@@ -166,10 +166,10 @@ def push_forward(
 
     begin = none
     if trajectory.rest:
-        ahead(trajectory.rest, None)
+        push_step(trajectory.rest, None)
         begin = torch.stack(pressure)
     for t, record in enumerate(steps):
-        wrench = ahead(record, t)
+        wrench = push_step(record, t)
         out.append((torch.stack(x), wrench, torch.stack(pressure) - begin))
     nodes, wrench, pressures = (torch.stack(parts, 1) for parts in zip(*out))
     found = nodes.permute(0, 3, 1, 2, 4), wrench.permute(0, 3, 1, 2, 4), pressures.mT

@@ -195,7 +195,7 @@ def _in_frame(point, pos, mat):
 
 
 @wp.kernel(module=f"{__name__}.behind", enable_backward=False)
-def _look_behind(
+def _leaves_other_side(
     # In:
     geom: wp.array(dtype=int),
     geoms: Geoms,
@@ -226,5 +226,5 @@ def at_sharp_edges(geoms: Geoms, at: Touching) -> torch.Tensor:
         arrays = (at.local, vec3), (at.area.sqrt(), real)
         local, spacing = (wp.from_torch(a.contiguous(), dtype=kind) for a, kind in arrays)
         inputs = [wp.from_torch(at.kind.int(), dtype=wp.int32), geoms, local, spacing]
-        wp.launch(_look_behind, len(sharp), inputs, [wp.from_torch(sharp)], device=geoms.size.device)
+        wp.launch(_leaves_other_side, len(sharp), inputs, [wp.from_torch(sharp)], device=geoms.size.device)
     return sharp > 0

@@ -25,7 +25,7 @@ __all__ = ["Estimate", "contact_patch", "draw_skin", "estimate"]
 
 _UNTOUCHED = 0.05  # [N]
 # thresholds of a drift note: number of rows, correlation with TDC, and counts above noise and a light touch
-_ROWS, _GOES_WITH, _FEW_COUNTS = 20, 0.9, 20
+_ROWS, _CORRELATED, _FEW_COUNTS = 20, 0.9, 20
 
 
 class Estimate(typing.NamedTuple):
@@ -104,12 +104,12 @@ def contact_patch(
         )
     geometry = load_skin(skin)
     row = row % len(counts)
-    field, contact, is_force, share = estimate(counts, rest, geometry, weights)
+    field, contact, is_force, fraction = estimate(counts, rest, geometry, weights)
     outer = np.unique(geometry.outer_face)
     place = geometry.vert[outer]
     area = _node_area(geometry, outer)
-    patch = contact > share * contact.max(1, keepdims=True)
-    centre = contact_centre(contact, place, share)
+    patch = contact > fraction * contact.max(1, keepdims=True)
+    centre = contact_centre(contact, place, fraction)
     table = {
         "schema": "biotac_mj.learning.contact_patch/1",
         "weights": "trained on synthetic data",
@@ -124,8 +124,8 @@ def contact_patch(
     out.mkdir(parents=True, exist_ok=True)
     with replacing(out / "contact.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(table))
-    said = None if recorded is None or np.isnan(recorded[row]) else float(recorded[row])
-    one = {"row": row, "notes": table["notes"], "recorded": said} | {
+    force_here = None if recorded is None or np.isnan(recorded[row]) else float(recorded[row])
+    one = {"row": row, "notes": table["notes"], "recorded": force_here} | {
         k: table[name][row]
         for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))
     }
@@ -161,7 +161,7 @@ def _drift(tdc, change, force):
     if len(tdc) < _ROWS or not np.ptp(tdc) or not np.ptp(level):
         return []
     drift = abs(np.polyfit(tdc, level, 1)[0]) * np.ptp(tdc)
-    if abs(np.corrcoef(tdc, level)[0, 1]) < _GOES_WITH or drift < _FEW_COUNTS:
+    if abs(np.corrcoef(tdc, level)[0, 1]) < _CORRELATED or drift < _FEW_COUNTS:
         return []
     return [
         f"electrodes drift with TDC, by about {drift:.0f} counts, as a sensor does that warms up, and this "

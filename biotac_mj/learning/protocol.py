@@ -101,6 +101,6 @@ def conformal_width(error: np.ndarray, owner: ArrayLike, alpha: float = 0.1) -> 
     out = np.empty(error.shape[1])
     for e in range(error.shape[1]):
         order = np.argsort(error[:, e])
-        reached = np.searchsorted(np.cumsum(weight[order]), 1 - alpha - 1e-12)
-        out[e] = error[order[reached], e] if reached < len(order) else np.inf
+        rank = np.searchsorted(np.cumsum(weight[order]), 1 - alpha - 1e-12)
+        out[e] = error[order[rank], e] if rank < len(order) else np.inf
     return out

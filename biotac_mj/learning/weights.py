@@ -228,23 +228,23 @@ def _kind(meta):
 
 
 def _directions(meta):
-    said = meta.get("direction")
-    return _AT_POINTS.get(_kind(meta), ()) if said == "points" else (said,)
+    stated = meta.get("direction")
+    return _AT_POINTS.get(_kind(meta), ()) if stated == "points" else (stated,)
 
 
 def _refuse_other(meta, path, geometry, direction):
-    said = meta.get("direction")
+    stated = meta.get("direction")
     if meta.get("format") != FORMAT or direction not in _directions(meta):
         raise ValueError(
-            f"{path} holds no {direction} model of {FORMAT}: it says {meta.get('format')}, {said}, "
+            f"{path} holds no {direction} model of {FORMAT}: it says {meta.get('format')}, {stated}, "
             f"{_kind(meta)}"
         )
-    check_entries(f"the description of {path}", meta, _DESCRIPTION | _DESCRIPTION_OF[said])
+    check_entries(f"the description of {path}", meta, _DESCRIPTION | _DESCRIPTION_OF[stated])
     if meta["channels"] != list(ELECTRODES):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
         )
-    if said == "points":  # they fit any skin of the shape, which is checked on first use
+    if stated == "points":  # they fit any skin of the shape, which is checked on first use
         if not meta["config"].get("logarithm"):
             raise ValueError(
                 f"{path} was trained on counts and serves no sensor: train with logarithm true in the config"

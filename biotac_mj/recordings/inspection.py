@@ -132,12 +132,12 @@ def _repeated(recording, wrong):
 
 
 def _units(recording):
-    said = {}
+    units = {}
     for name in CHANNELS:
         if getattr(recording, name) is not None:
-            said.setdefault(recording.unit(name), []).append(name)
-    out = [f"units: {'; '.join(f'{unit}: ' + ', '.join(names) for unit, names in said.items())}"]
-    if "tared counts without sign" in said and not _dead(recording):
+            units.setdefault(recording.unit(name), []).append(name)
+    out = [f"units: {'; '.join(f'{unit}: ' + ', '.join(names) for unit, names in units.items())}"]
+    if "tared counts without sign" in units and not _dead(recording):
         out.append(
             "the sign is lost: values are never negative and rest near zero; use energies, not waveforms"
         )

@@ -238,7 +238,7 @@ class Recording:
         return dataclasses.replace(self, **taken)
 
     def _which(self, which):
-        said, n = f"rows of {self.name} are {short_repr(which)}", len(self)
+        text, n = f"rows of {self.name} are {short_repr(which)}", len(self)
         if isinstance(which, slice):
             try:
                 which = np.arange(n)[which]
@@ -251,9 +251,9 @@ class Recording:
         if which.dtype == bool and which.shape == (n,):
             which = np.flatnonzero(which)
         if which.ndim != 1 or which.dtype.kind not in "iu":
-            raise ValueError(f"{said}: give a slice, numbers (k,) of rows, or ({n},) bool")
+            raise ValueError(f"{text}: give a slice, numbers (k,) of rows, or ({n},) bool")
         if not len(which) or which.min() < -n or which.max() >= n:
-            raise ValueError(f"{said}: give at least one of its {n} rows, and none else")
+            raise ValueError(f"{text}: give at least one of its {n} rows, and none else")
         return which
 
 

@@ -39,8 +39,8 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
     force = force_on_object(read.pop("contact_force"))
     read["pac"] = read["pac"][:, -FIELDS["pac"].width :]
     flat = {name: value if value.shape[1] > 1 else value[:, 0] for name, value in read.items()}
-    said = {"name": "simulated", "source": "simulated", "frame": "BioTac", "force": force} | about
-    return Recording(time, **flat, **said)
+    fields = {"name": "simulated", "source": "simulated", "frame": "BioTac", "force": force} | about
+    return Recording(time, **flat, **fields)
 
 
 def force_on_object(contact_force: np.ndarray) -> np.ndarray:

@@ -201,8 +201,8 @@ def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:
     mujoco.mj_forward(model, data)
     core = model.body(handle.body).id
     own = np.flatnonzero(model.geom_bodyid == core)
-    seen = (model.geom_rgba[:, 3] > 0) | (model.geom_matid >= 0)  # replaced geoms are neither
-    hand = (model.body_rootid == model.body_rootid[core])[model.geom_bodyid] & seen
+    visible = (model.geom_rgba[:, 3] > 0) | (model.geom_matid >= 0)  # replaced geoms are neither
+    hand = (model.body_rootid == model.body_rootid[core])[model.geom_bodyid] & visible
     hand[own] = False
     pairs = ((a, b) for a in own for b in np.flatnonzero(hand))
     return min((mujoco.mj_geomDistance(model, data, a, b, 0.05, None) for a, b in pairs), default=0.05)

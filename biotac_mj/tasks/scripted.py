@@ -173,7 +173,7 @@ class Hold(Scripted):
 
     task, calibration = "hold", "grip"
     # grip without load [N]; factor on the required grip, and margin [N]; gain
-    least, share, spare, gain = (1.0, 1.5, 0.35, 1.5)
+    least, factor, margin, gain = (1.0, 1.5, 0.35, 1.5)
 
     def wait(self, observation: dict) -> np.ndarray:
         return np.zeros(1)
@@ -187,7 +187,7 @@ class Hold(Scripted):
         grip, load = estimate[:, 0].mean(), max(0.0, estimate[:, 1].sum())
         needed = load / (2 * _FRICTION)
         self.slipping = needed > 0.85 * max(grip, 0.1)
-        error = max(self.least, self.share * needed + self.spare) - grip
+        error = max(self.least, self.factor * needed + self.margin) - grip
         return np.clip((self.gain if error > 0 else 0.7) * error, -0.15, 1.0) + 0.3 * self.slipping
 
 
@@ -195,7 +195,7 @@ class Lift(Hold):
     """Like `Hold`; raises after gripping, slowly while the load grows."""
 
     task = "lift"
-    least, share, spare, gain = 0.35, 1.3, 0.15, 0.7  # the load comes slowly here
+    least, factor, margin, gain = 0.35, 1.3, 0.15, 0.7  # the load comes slowly here
     goal = 0.0315  # [m] of the gripper
 
     def wait(self, observation: dict) -> np.ndarray:

@@ -18,8 +18,8 @@ __all__ = ["AWAY", "FORCE", "PLACE", "TILT", "Belief", "Posterior", "Touch", "be
 # Standard deviations over sensors, and of the residual of a press: maximum likelihood for 80 presses of 4
 # synthetic sensors (docs/lab/differentiable.md, A contact from electrodes), unless another source is given
 _GAIN = 0.42  # of each electrode
-_NEAR, _NEAR_MEAN, _REACH = 0.22, 0.1, 4e-3  # cross-talk of neighbours, and its range [m]
-_SHARE = 0.63  # of the mean of all
+_CROSS, _CROSS_MEAN, _REACH = 0.22, 0.1, 4e-3  # cross-talk of neighbours, and its range [m]
+_COMMON_MODE = 0.63  # of the mean of all
 _SHIFT, _EACH = 0.55, 0.75  # [mm] of the electrodes' positions, in common and each
 _FLOOR = 0.85  # of ln of the residual film
 _FILL = 0.75  # [ul]
@@ -30,7 +30,7 @@ TILT = 0.18  # [rad] of a press from the normal, in each of two directions: unif
 # times 1.6,
 # intervals need less widening
 _OFF, _LEVEL = 0.68, 0.126
-_ALIKE = 0.4  # correlation of both between neighbours
+_CORRELATION = 0.4  # correlation of both between neighbours
 _ABSOLUTE, _COMMON = 0.006, 0.007  # residual of ln Z: of each, common to all
 _KILOPASCAL = 0.2  # residual of the pressure
 # CHOSEN, of ln of the force and of the centre [m]: the most likely value for forces, 0.11, excludes outliers
@@ -74,7 +74,7 @@ class Belief:
 def believe(n: int) -> Belief:
     """Prior of a sensor with n electrodes."""
     parts = (
-        (n, 0, _GAIN), (1, _NEAR_MEAN, _NEAR), (1, 0, _SHARE), (2, 0, _SHIFT), (2 * n, 0, _EACH),
+        (n, 0, _GAIN), (1, _CROSS_MEAN, _CROSS), (1, 0, _COMMON_MODE), (2, 0, _SHIFT), (2 * n, 0, _EACH),
         (1, 0, _FLOOR), (1, 0, _FILL), (1, _PRESSURE_MEAN, _PRESSURE),
     )  # fmt: skip
     mean, spread = (np.repeat([p[k] for p in parts], [p[0] for p in parts]).astype(float) for k in (1, 2))
@@ -109,7 +109,10 @@ class Posterior:
         parts[:, :n, n], parts[:, :n, n + 1] = own @ (near - np.eye(n)), own.mean(1)[:, None]
         parts[:, :, n + 2], parts[:, :, n + 3] = along, across
         parts[:, :, -3], parts[:, :, -2], parts[:, n, -1] = floor, presses.by_press[among, 2], signal[:, n]
-        level, alike = (own**2).mean(1)[:, None, None], _ALIKE * near + (1 - _ALIKE) * np.eye(n)
+        level, alike = (
+            (own**2).mean(1)[:, None, None],
+            _CORRELATION * near + (1 - _CORRELATION) * np.eye(n),
+        )
         noise = np.zeros((len(signal), n + 1, n + 1))
         noise[:, :n, :n] = (_OFF**2 * own[:, :, None] * own[:, None] + _LEVEL**2 * level) * alike
         noise[:, :n, :n] += _ABSOLUTE**2 * np.eye(n) + _COMMON**2

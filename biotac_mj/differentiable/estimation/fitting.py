@@ -156,17 +156,17 @@ class _Search:
         with skin.lock:
             trajectory = follow(skin, steps.pos[None], steps.mat[None], skin.friction, skin.own)
             still = {name: np.zeros((5, 1)) for name in skin.own}
-            ahead = push_forward(skin, trajectory, Inputs(pose, np.zeros((5, 1, 1)), still))
+            tangents = push_forward(skin, trajectory, Inputs(pose, np.zeros((5, 1, 1)), still))
         record, rest, n = trajectory.steps[-1], trajectory.rest, presses.geometry.nvert
         lies = rest.x[:n, 0].numpy() if rest else presses.geometry.vert
         before = np.log(self._film.impedance(lies))
-        value, slopes = slopes_of_film(self._film, record.x[:n, 0].numpy(), ahead.nodes[:, 0, -1, :n])
+        value, slopes = slopes_of_film(self._film, record.x[:n, 0].numpy(), tangents.nodes[:, 0, -1, :n])
         pressure = float(record.pressure - (rest.pressure if rest else 0.0))
         read = np.append(value - before, 1e-3 * pressure)
-        read_by = np.column_stack([slopes, 1e-3 * ahead.pressure[:, 0, -1]])
+        read_by = np.column_stack([slopes, 1e-3 * tangents.pressure[:, 0, -1]])
         wrench = record.wrench[0, 0]
         outcome = functools.partial(outcome_of, middle=torch.from_numpy(presses.middle(record.touches)))
-        by = torch.autograd.functional.jacobian(outcome, wrench).numpy() @ ahead.wrench[:, 0, -1, 0].T
+        by = torch.autograd.functional.jacobian(outcome, wrench).numpy() @ tangents.wrench[:, 0, -1, 0].T
         used = slice(len(self._signal))
         missed = (read[used] - self._signal) / self._noise[used]
         scale = max(1.0, missed @ missed / len(missed))

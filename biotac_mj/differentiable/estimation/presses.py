@@ -206,7 +206,7 @@ class Presses:
             for j, around in enumerate(capsule.around):
                 with self.skin.lock:
                     trajectory, steps = self.simulate(along, around)
-                    ahead = push_forward(self.skin, trajectory, self._tangents(steps, around))
+                    tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
                 rest = trajectory.rest
                 lies = rest.x[:n, 0].numpy() if rest else self.geometry.vert
                 films = films or _Films(self.geometry, lies)
@@ -214,20 +214,20 @@ class Presses:
                 for k, end in enumerate(steps.ends[1:], start=1):
                     record, here = trajectory.steps[end], (i, j, k)
                     try:
-                        read = films.read(record.x[:n, 0].numpy(), ahead.nodes[:, 0, end, :n])
+                        read = films.read(record.x[:n, 0].numpy(), tangents.nodes[:, 0, end, :n])
                     except NoFilmError:  # deeper than the film allows: use the deepest valid one
                         read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
                     for name, value in zip(widths, read):
                         table[name][here][..., :-1] = value
                     table["signal"][here][-1] = 1e-3 * (float(record.pressure) - begin)
-                    table["by_press"][here][:, -1] = 1e-3 * ahead.pressure[:, 0, end]
+                    table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
                     wrench, middle = record.wrench[0, 0], torch.from_numpy(self.middle(record.touches))
                     slopes = torch.autograd.functional.jacobian(
                         functools.partial(outcome_of, middle=middle), wrench
                     )
                     table["outcome"][here] = outcome_of(wrench, middle).numpy()
                     table["outcome"][here][0] -= np.log(_FRACTIONS[k])
-                    table["outcome_by"][here] = ahead.wrench[:, 0, end, 0] @ slopes.numpy().T
+                    table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
         for name in ("outcome", "outcome_by"):
             table[name][:, :, 0] = table[name][:, :, 1]
         return table

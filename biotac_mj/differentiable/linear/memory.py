@@ -198,7 +198,7 @@ class LinearMemory:
 
     # --- backwards ---
 
-    def _felt(self, after):
+    def _stress_cotangents(self, after):
         """Cotangents of the second Piola-Kirchhoff stress, of the first, and of eta, from those of the
         memory."""
         sigma = _symmetric(after.last + np.tensordot(self._step_weight, after.overstress, 1))
@@ -207,7 +207,7 @@ class LinearMemory:
 
     def pull_deformation(self, after: Memory) -> np.ndarray:
         """(n, 3, 3) cotangents of the deformation gradients from those of the new memory."""
-        sigma, tau, eta = self._felt(after)
+        sigma, tau, eta = self._stress_cotangents(after)
         out = self._eta[:, None, None] * self._derivative(tau)
         if not self._linear:
             out -= _t(self._inverse) @ sigma @ self._S
@@ -229,7 +229,7 @@ class LinearMemory:
     def pull(self, after: Memory, balance: np.ndarray) -> tuple[Memory, np.ndarray, dict]:
         """Cotangents of the old memory, of the memory's constants (c,), and, by name, of mu and lam (those
         that `LinearStep` lacks), from those of the new memory and from the balance."""
-        _, tau, eta = self._felt(after)
+        _, tau, eta = self._stress_cotangents(after)
         force = -self._volume[:, None, None] * self._gradient_of(balance)
         stiff, before = 1 + self._gain, self.before
         past = _symmetric(force if self._linear else _t(self._F) @ force)

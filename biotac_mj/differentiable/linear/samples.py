@@ -25,7 +25,7 @@ _OUTPUTS = 6  # force, anchor
 
 
 @wp.kernel(module=f"{__name__}.adjoint", enable_backward=True)
-def _feel(
+def _sample_outputs(
     # In:
     stick_ratio: real,
     width: real,
@@ -121,9 +121,9 @@ def differentiate_samples(
         constants, device = [stick_ratio, smoothing, which, geoms, met], geoms.size.device
         # forward and backward launches as a tape would do them, whose bookkeeping takes longer than the
         # launches
-        wp.launch(_feel, felt.shape, [*constants, *inputs], ends[:1], device=device)
+        wp.launch(_sample_outputs, felt.shape, [*constants, *inputs], ends[:1], device=device)
         wp.launch(
-            _feel, felt.shape, [*constants, *inputs], ends[:1], device=device, adjoint=True,
+            _sample_outputs, felt.shape, [*constants, *inputs], ends[:1], device=device, adjoint=True,
             adj_inputs=[stick_ratio, smoothing, None, geoms, None, *grads], adj_outputs=ends[1:],
         )  # fmt: skip
     return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes)

@@ -94,12 +94,12 @@ class Bodies:
         data = self.data
         return data.qpos.copy(), data.qvel.copy(), data.act.copy(), data.sensordata.copy()
 
-    def _apart(self, one, other):
+    def _difference(self, one, other):
         out = np.empty(self.nv)
         mujoco.mj_differentiatePos(self.model, out, 1.0, other[0], one[0])
         return np.concatenate([out, *(a - b for a, b in zip(one[1:], other[1:]))])
 
-    def amiss(self, start: Start, wrenches: list, qvel: np.ndarray) -> float:
+    def mismatch(self, start: Start, wrenches: list, qvel: np.ndarray) -> float:
         """Largest difference between the velocities (nv,) after a step and those that given wrenches produce
         [m/s, rad/s]."""
         self._step(start, wrenches, {})
@@ -117,7 +117,7 @@ class Bodies:
                 for sign in (_EPS, -_EPS):
                     self._step(start, wrenches, {name: sign * unit})
                     ends.append(self._end())
-                columns.append(self._apart(*ends) / (2 * _EPS))
+                columns.append(self._difference(*ends) / (2 * _EPS))
             rows = self.ny + self.model.nsensordata
             out[name] = np.array(columns).T if columns else np.zeros((rows, 0))
         self._put(start, {})
@@ -147,7 +147,7 @@ class Bodies:
             BioTac frame, by the name of the variable; "after" are velocities at the end of the step.
         """
 
-        def seen(qvel, moved, one):
+        def geom_poses(qvel, moved, one):
             data = self.data
             self._put(start, {name: value for name, value in moved.items() if name not in ("qvel", "after")})
             data.qvel[:] = qvel
@@ -166,7 +166,7 @@ class Bodies:
                 columns, ngeom = [], len(one.touching.geoms)
                 for unit in np.eye(self.sizes.get(name, self.nv)):
                     (p1, m1), (p0, m0) = (
-                        seen(
+                        geom_poses(
                             speed + sign * weight[name] * unit if name in weight else speed,
                             {name: sign * unit},
                             one,

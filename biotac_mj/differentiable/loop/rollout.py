@@ -37,8 +37,8 @@ class Rolled:
       wrench: of each, (ngroup, 6) of the skin on each body that may touch it, `Handle.linear_model`'s bodies:
         torque about the frame's origin, in its frame [N, N m].
       pressure: of each, of the liquid above rest [Pa].
-      lost: per world, number of steps in which bodies and skins did not agree. amiss: per world, the largest
-        difference between a velocity and MuJoCo's result for these wrenches [m/s, rad/s], which the gradient
+      lost: per world, number of steps in which bodies and skins did not agree. mismatch: per world, the
+        largest difference between a velocity and MuJoCo's result for these wrenches [m/s, rad/s], which the gradient
         ignores.
       readings: of each BioTac, as in its model.
     """
@@ -51,7 +51,7 @@ class Rolled:
     wrench: dict
     pressure: dict
     lost: list
-    amiss: list
+    mismatch: list
     readings: dict
 
     def electrodes(self, name: str = "biotac_", step: int = -1) -> torch.Tensor:
@@ -101,8 +101,8 @@ def rollout(
 
     Not differentiated: rounding, noise and time-dependent effects in the readings; heat and PAC; the skin's
     state in `data`, a constant; constants of the skins and of the model; the limit of a skin's energy, which
-    `amiss` shows; for a skin at rest reached by geoms that move more than 0.5 mm per step, the point of first
-    contact. Callbacks, other plugins and sleep are ignored.
+    `mismatch` shows; for a skin at rest reached by geoms that move more than 0.5 mm per step, the point of
+    first contact. Callbacks, other plugins and sleep are ignored.
 
     Spinning bodies are stepped slightly differently from `mj_step`, whose wrenches contain a term of
     stiffness times rotation times displacement that has no gradient: 0.2 % of the spin of a ball that starts
@@ -175,7 +175,7 @@ def rollout(
     skins, per = runs[0].skins, [out[i::3] for i in (4, 5, 6)]
     each = [{s.name: value for s, value in zip(skins, one)} for one in per]
     readings = {s.name: s.instance.setup.skin.readings for s in skins}
-    return Rolled(*out[:4], *each, [r.lost for r in runs], [r.amiss for r in runs], readings)
+    return Rolled(*out[:4], *each, [r.lost for r in runs], [r.mismatch for r in runs], readings)
 
 
 class _Run:
@@ -195,7 +195,7 @@ class _Run:
         for skin in self.skins:
             refuse_beyond(skin.stepper.model)
         self.bodies = Bodies(model, [s.instance for s in self.skins])
-        self.lost, self.amiss = 0, 0.0
+        self.lost, self.mismatch = 0, 0.0
 
     def step(self, given):
         """Runs all steps; returns their results."""
@@ -218,7 +218,7 @@ class _Run:
             self.kept.append(kept)
             wrenches = [k.wrench for k in kept]
             self.qvel.append(data.qvel.copy())
-            self.amiss = max(self.amiss, self.bodies.amiss(self.starts[-1], wrenches, data.qvel))
+            self.mismatch = max(self.mismatch, self.bodies.mismatch(self.starts[-1], wrenches, data.qvel))
             self.lost += any(s.instance.setup.parts(s.instance.state)[0][1] != 1.0 for s in self.skins)
             row = [data.qpos.copy(), data.qvel.copy(), data.act.copy(), data.sensordata.copy()]
             for s, k in zip(self.skins, kept):

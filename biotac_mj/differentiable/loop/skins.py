@@ -20,11 +20,11 @@ from ..record import Record, advance, hold_pressure
 from ..skin import Skin
 from ..sweep import no_memory, pull_pressure
 
-__all__ = ["Cotangent", "Kept", "LoopSkin", "Pulled"]
+__all__ = ["Cotangent", "SavedStep", "LoopSkin", "Pulled"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
+class SavedStep:
     """Saved data of a skin at the end of a step.
 
     Attributes:
@@ -142,7 +142,7 @@ class LoopSkin:
         """The skin's segment of the plugin's current state."""
         return self.instance.setup.parts(self.instance.state)[2]
 
-    def keep(self, before: np.ndarray) -> Kept:
+    def keep(self, before: np.ndarray) -> SavedStep:
         """Data after a step from a state (nstate,)."""
         head, models, now, _ = self.instance.setup.parts(self.instance.state)
         ends, begun, whole = self.stepper.came_to(now), None, False
@@ -154,7 +154,7 @@ class LoopSkin:
             begun = begun and tuple(a.copy() for a in begun)
         idle = head[STARTED] == OUT_OF_REACH
         wrench, gamma = models[:, :6].copy(), self.instance.step_gamma
-        return Kept(self.stepper.used(now), wrench, bool(idle), resting, gamma, begun, whole)
+        return SavedStep(self.stepper.used(now), wrench, bool(idle), resting, gamma, begun, whole)
 
     def nodes(self, state: SavedState) -> np.ndarray:
         """(nvert, 3) [m]."""
@@ -166,7 +166,7 @@ class LoopSkin:
 
     # --- backwards ---
 
-    def record(self, before: SavedState, kept: Kept, dt: float) -> Record:
+    def record(self, before: SavedState, kept: SavedStep, dt: float) -> Record:
         """Solves a step of dt [s] again."""
         skin, geoms = self.skin, self.skin.geoms
         data = skin.data
@@ -187,7 +187,7 @@ class LoopSkin:
         geoms.set_pose(*ends)
         return advance(skin, geoms, None, dt, skin.constants)
 
-    def linear(self, before: SavedState, kept: Kept, dt: float) -> "LinearLoopStep":
+    def linear(self, before: SavedState, kept: SavedStep, dt: float) -> "LinearLoopStep":
         """Linearised step of dt [s] from a state."""
         return LinearLoopStep(self.skin, self.record(before, kept, dt), kept)
 
@@ -195,7 +195,7 @@ class LoopSkin:
 class LinearLoopStep:
     """A linearised step between states of the MuJoCo plugin."""
 
-    def __init__(self, skin: Skin, record: Record, kept: Kept):
+    def __init__(self, skin: Skin, record: Record, kept: SavedStep):
         self.skin, self.kept, self.record, self.step = skin, kept, record, LinearStep(skin, record)
 
     def pull(self, after: Cotangent, wrench: np.ndarray) -> Pulled:

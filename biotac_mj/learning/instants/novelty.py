@@ -12,7 +12,7 @@ from .linear import principal_components, ridge
 
 __all__ = ["NoveltyDetector", "StuckDetector", "compressed"]
 
-_NEAR, _ALIKE = 5, 10  # nearest neighbours for the distance, and for the expected PDC
+_NEIGHBOURS, _SIMILAR = 5, 10  # nearest neighbours for the distance, and for the expected PDC
 _MOST = 8000  # most reference rows
 # scale above which a change counts by its ratio instead of its size: ln Z, and counts of PDC (chosen on
 # synthetic touches; docs/lab/learning.md)
@@ -114,12 +114,12 @@ class NoveltyDetector:
         chosen = np.random.default_rng(seed).permutation(len(x))[:_MOST]
         rows, owner = (x[chosen] - mean) @ axes / spread, np.unique(owner[chosen], return_inverse=True)[1]
         # rows of one trajectory are similar, so distances to other trajectories represent new data
-        count = min(len(rows), _ALIKE + np.bincount(owner).max())
+        count = min(len(rows), _SIMILAR + np.bincount(owner).max())
         distance, who = cKDTree(rows).query(rows, count)
         distance = np.where(owner[who] == owner[:, None], np.inf, distance)
-        order = np.argsort(distance, 1, kind="stable")[:, :_ALIKE]
+        order = np.argsort(distance, 1, kind="stable")[:, :_SIMILAR]
         distance, who = (np.take_along_axis(value, order, 1) for value in (distance, who))
-        near = distance[:, :_NEAR]
+        near = distance[:, :_NEIGHBOURS]
         there = np.isfinite(near)
         apart = np.where(there, near, 0).sum(1) / np.maximum(there.sum(1), 1)
         apart = np.maximum(apart, np.linalg.norm(_COUNT / spread))
@@ -134,9 +134,9 @@ class NoveltyDetector:
     def __call__(self, x: np.ndarray, pdc: np.ndarray | None = None) -> np.ndarray:
         """(n,) distances of rows (n, k) from the nearest reference rows, relative to these rows' own spacing.
         pdc: (n,) changes [counts]; a deviation from similar rows' PDC increases the distance."""
-        which = np.arange(1, min(_ALIKE, len(self.rows)) + 1)
+        which = np.arange(1, min(_SIMILAR, len(self.rows)) + 1)
         distance, who = self._tree.query((x - self.mean) @ self.axes / self.spread, which)
-        strange = distance[:, :_NEAR].mean(1) / self.apart[who[:, :_NEAR]].mean(1)
+        strange = distance[:, :_NEIGHBOURS].mean(1) / self.apart[who[:, :_NEIGHBOURS]].mean(1)
         if pdc is None:
             return strange
         return np.hypot(strange, _off(_squeezed(pdc), self.pdc[who], distance) / self.off)

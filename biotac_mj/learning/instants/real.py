@@ -67,9 +67,9 @@ def evaluate_recording(
     ntrain = int(fraction * n)
     saturated = ((counts <= 0) | (counts >= FULL_SCALE)).mean(0)
     notes += [
-        f"e{i + 1} reads 0 or 4095 in {100 * share:.1f} % of the rows: its impedance is not known there"
-        for i, share in enumerate(saturated)
-        if share > 0.001
+        f"e{i + 1} reads 0 or 4095 in {100 * saturation:.1f} % of the rows: its impedance is not known there"
+        for i, saturation in enumerate(saturated)
+        if saturation > 0.001
     ]
     steps = int(np.clip(_EPOCHS * ntrain // _BATCH, *_STEPS)) if network else 0
     with tqdm(total=2 * steps, desc="evaluate: codes", disable=not progress or None, leave=False) as bar:
@@ -249,8 +249,8 @@ def _transferred(known, counts, force, ntrain, touches):
     labelled[:ntrain] = label(force[:ntrain], touch, touches)
     y = transfer_force(known_counts, known.force, counts, labelled, touch)
     rows = np.flatnonzero(np.isfinite(labelled).all(1))
-    said = f"transferred: {known.name} and {len(np.unique(touch[rows]))} labelled touches, {len(rows)} rows"
-    return _errors(y[ntrain:], force[ntrain:]), [*notes, said]
+    note = f"transferred: {known.name} and {len(np.unique(touch[rows]))} labelled touches, {len(rows)} rows"
+    return _errors(y[ntrain:], force[ntrain:]), [*notes, note]
 
 
 def _errors(predicted, truth):

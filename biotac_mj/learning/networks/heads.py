@@ -134,8 +134,8 @@ def averages(
         average = torch.zeros_like(value)
         for k in range(1, int(position.max()) + 1):
             row = (position == k).nonzero()[:, 0]
-            share = 1 - torch.exp(-(time[row] - time[row - 1]) / t)
-            average[row] = average[row - 1] + share.view(-1, *[1] * (value.ndim - 1)) * (
+            weight = 1 - torch.exp(-(time[row] - time[row - 1]) / t)
+            average[row] = average[row - 1] + weight.view(-1, *[1] * (value.ndim - 1)) * (
                 value[row] - average[row - 1]
             )
         out.append(value - average)

@@ -170,8 +170,8 @@ def patch_of_push(push: np.ndarray, force: np.ndarray) -> float:
     Args:
       push: (n, nouter) indentation of nodes. force: (n, nouter) contact force.
     """
-    shares = np.arange(0.1, 0.96, 0.05)
-    return float(max(shares, key=lambda share: np.nanmean(patch_overlap(push, force, share))))
+    fractions = np.arange(0.1, 0.96, 0.05)
+    return float(max(fractions, key=lambda fraction: np.nanmean(patch_overlap(push, force, fraction))))
 
 
 @torch.no_grad()

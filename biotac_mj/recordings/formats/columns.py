@@ -203,11 +203,11 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
         )
     for (i, _), row in zip(split, cells):
         if names and not any(map(_is_number, row)) and any(row):
-            said = ", ".join(word[:12] for word in row[:3] if word) + (", ..." if len(row) > 3 else "")
+            words = ", ".join(word[:12] for word in row[:3] if word) + (", ..." if len(row) > 3 else "")
             if all(map(_BARE_HEX.fullmatch, row)):
                 raise Unfit(f"{path}, line {i}: {_remedy(row[0])}")
             raise Unfit(
-                f"{path}, line {i}: no number in it ({said}): remove all lines but one of the header, such "
+                f"{path}, line {i}: no number in it ({words}): remove all lines but one of the header, such "
                 "as a row of units; a clock's unit is part of its name, as in time_ms"
             )
         if len(row) != width:
