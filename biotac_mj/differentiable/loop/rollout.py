@@ -38,8 +38,8 @@ class Rolled:
         torque about the frame's origin, in its frame [N, N m].
       pressure: of each, of the liquid above rest [Pa].
       lost: per world, number of steps in which bodies and skins did not agree. mismatch: per world, the
-        largest difference between a velocity and MuJoCo's result for these wrenches [m/s, rad/s], which the gradient
-        ignores.
+        largest difference between a velocity and MuJoCo's result for these wrenches [m/s, rad/s], which the
+        gradient ignores.
       readings: of each BioTac, as in its model.
     """
 
