@@ -46,7 +46,7 @@ class Mount:
         """(w, x, y, z) of the BioTac frame in the link's: its tip is -x, its pad -y.
 
         Raises:
-          ValueError: tip and pad are not at right angles.
+          ValueError: tip and pad are not orthogonal.
         """
         x, y = (
             -as_numbers(f"{what} of link {short_repr(self.body)}", getattr(self, what))
@@ -64,7 +64,7 @@ class Mount:
 
 
 def write_mounts(path: pathlib.Path | str, mounts: dict[str, Mount]) -> None:
-    """{finger: Mount} as YAML, which `attach_to_hand(mount=path)` reads."""
+    """Writes {finger: Mount} as YAML for `attach_to_hand(mount=path)`."""
     import yaml
 
     document = {

@@ -135,8 +135,8 @@ class LiquidConduction:
         return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in self._layers])
 
     def gap(self, vert_xpos: np.ndarray, rest: bool = False) -> np.ndarray:
-        """(n,) length of each column up to the inner skin [m]; negative below the core. A column that meets
-        no skin takes its nearest node's height, or nan at `rest`."""
+        """(n,) length of each column up to the inner skin [m]; negative below the core. A column without skin
+        above it has its nearest node's height, or nan at `rest`."""
         column, face = self._pair
         corner = np.asarray(vert_xpos, float)[self.geometry.inner_face]
         a, ab, ac = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -161,8 +161,8 @@ class LiquidConduction:
         return gap
 
     def _pairs_within(self, columns):
-        """Pairs (column, inner face) that may meet: the face is over the column at rest, give or take what
-        the skin may slide."""
+        """Pairs (column, inner face) that may meet: at rest the distance between them is within the range of
+        sliding."""
         centre = self.geometry.vert[self.geometry.inner_face].mean(1)
         tree = cKDTree(centre)
         lists = tree.query_ball_point(self.core_point[columns] + 1.2e-3 * self.normal[columns], 2.6e-3)
@@ -177,7 +177,8 @@ class LiquidConduction:
         return column[within], face[within]
 
     def _set_unknowns(self, disc):
-        """Nodes of one disc share an unknown, the first for e1, e2, ...; those of X1, X2, ... have none."""
+        """Nodes of one disc share an unknown, first those of e1, e2, ...; nodes of X1, X2, ... are
+        grounded."""
         n = len(disc)
         self._unknown = np.full(len(self._layers) * n, -1)
         bottom = np.where((disc >= 0) & (disc < self._n), disc, -1)

@@ -79,11 +79,11 @@ def capsule_of(geometry: SkinGeometry) -> Capsule:
 
 
 def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
-    """(7,) of a press: ln of the force [N], the contact's centre [m], the force's direction.
+    """(7,) outcome of a press: ln of the force [N], the contact's centre [m], the force's direction.
 
     Args:
-      wrench: (6,) of the skin on the geom. middle: (3,) of the samples that touch, on the resting skin [m],
-        beside which the centre is on the force's line.
+      wrench: (6,) of the skin on the geom. middle: (3,) mean of the samples in contact, on the skin at rest
+        [m]; the centre is its projection on the line of force.
     """
     force, torque = wrench[:3], wrench[3:]
     along = force / force.norm()

@@ -27,18 +27,18 @@ def fit_gains(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def fit_mixing(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """Matrix (19, k) that predicted changes of counts (n, k) are multiplied with to become measured ones
-    (n, 19): gains, cross-talk and common coupling of a sensor, and of k > 19 what the further columns add.
+    """Matrix (19, k) from predicted changes of counts (n, k) to measured ones (n, 19): gains, cross-talk and
+    common coupling of a sensor, and, for k > 19, coefficients of the further columns.
 
-    A ridge regression towards gains (Hoerl and Kennard, 1970). Penalty, and whether the gains are one for all
-    electrodes or one for each, are those with which touches that are left out, one after another, are
-    predicted best. Fewer than three touches give the common gain alone.
+    Ridge regression towards gains (Hoerl and Kennard, 1970). Leave-one-touch-out cross-validation selects the
+    penalty, and whether the gains are common or one per electrode. Fewer than three touches give the common
+    gain only.
 
     Args:
-      predicted: (n, k), k at least 19, the first 19 of the electrodes. owner: (n,) touch of each row.
+      predicted: (n, k), k at least 19, the first 19 are the electrodes. owner: (n,) touch of each row.
 
     Raises:
-      ValueError: shapes that differ, or no rows.
+      ValueError: incompatible shapes, or no rows.
     """
     x, y, owner = np.asarray(predicted, float), np.asarray(measured, float), np.asarray(owner)
     if len(x) != len(y) or len(owner) != len(y) or not len(y) or x.shape[1] < y.shape[1]:
@@ -89,17 +89,17 @@ def evaluate_new_sensor(
     device: torch.device | str = "cpu",
     sensor: pathlib.Path | str | None = None,
 ) -> dict:
-    """Median RMS error [counts] on touches of a sensor that the model has not seen, after gains or a mixing
-    were fitted to k of its touches; beside no change, and the simulated film treated alike.
+    """Median RMS error [counts] on touches of an unseen sensor, after gains or a mixing were fitted to k of
+    its touches; with no change, and the simulated film with the same fits, as baselines.
 
     Args:
       path: labelled set of that sensor. weights: forward model. out: JSON. draws: random choices of the k
-        touches, averaged. Every model is judged on the same touches, those that were not chosen.
-      sensor: YAML that gets a sensor for `attach(effects=)`: its rest counts, and the mixing of the film's
-        that all touches give.
+        touches, averaged. Every model is evaluated on the same other touches.
+      sensor: YAML file for `attach(effects=)` with the sensor's rest counts, and the mixing of the film
+        fitted to all touches.
 
     Returns:
-      "median_rms_counts": {model: {k: error}}, with 0 touches as the model is.
+      "median_rms_counts": {model: {k: error}}; for k = 0 the model is unchanged.
 
     Raises:
       ValueError: fewer than 10 labelled touches.
@@ -164,7 +164,7 @@ def evaluate_new_sensor(
 
 
 def _log_changes(model, arrays):
-    """(n, 19) of all rows; a window begins with each interaction, at rest."""
+    """(n, 19) d ln Z of all rows; a window starts at rest with each interaction."""
     position = torch.arange(len(arrays.owner), device=arrays.device) - arrays.first
     out = torch.zeros(len(position), NELECTRODE, device=arrays.device)
     average = torch.zeros(len(arrays.objects), *model.memory, device=arrays.device) if model.window else None
