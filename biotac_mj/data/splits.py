@@ -37,9 +37,9 @@ def assign(count: int, seed: int = 0, fractions: tuple = FRACTIONS) -> np.ndarra
             f"fractions {fractions.tolist()} must be three numbers that add up to 1: train, validation, test"
         )
     bound = np.rint(np.cumsum(fractions) * count).astype(int)
-    part = np.searchsorted(bound, np.arange(count), side="right")
+    subset = np.searchsorted(bound, np.arange(count), side="right")
     # not scikit-learn's ShuffleSplit: published numbers and saved models refer to these splits by seed
-    return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(part)]
+    return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(subset)]
 
 
 def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIONS) -> Split:
@@ -53,11 +53,11 @@ def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIO
     Raises:
       ValueError: an empty part, or fractions that do not sum to 1.
     """
-    part = np.empty(len(data), "<U10")
+    subset = np.empty(len(data), "<U10")
     for k, flag in enumerate((False, True)):
         mine = np.flatnonzero(data.labelled == flag)
-        part[mine] = assign(len(mine), [seed, k], fractions)
-    return Split(*(np.flatnonzero(part == name) for name in ("train", "validation", "test"))).check()
+        subset[mine] = assign(len(mine), [seed, k], fractions)
+    return Split(*(np.flatnonzero(subset == name) for name in ("train", "validation", "test"))).check()
 
 
 def split_by_object(
@@ -75,9 +75,9 @@ def split_by_object(
         if name not in known:
             raise ValueError(f"the set has no object {name!r}: it has {', '.join(known)}")
     test = np.isin(data.object, unseen)
-    part = np.empty(len(data), "<U10")
-    part[test] = "test"
+    subset = np.empty(len(data), "<U10")
+    subset[test] = "test"
     for k, flag in enumerate((False, True)):
         mine = np.flatnonzero(~test & (data.labelled == flag))
-        part[mine] = assign(len(mine), [seed, k], (1 - validation, validation, 0.0))
-    return Split(*(np.flatnonzero(part == name) for name in ("train", "validation", "test"))).check()
+        subset[mine] = assign(len(mine), [seed, k], (1 - validation, validation, 0.0))
+    return Split(*(np.flatnonzero(subset == name) for name in ("train", "validation", "test"))).check()

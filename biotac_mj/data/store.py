@@ -130,11 +130,11 @@ def write_shard(
             group["outer_node"] = outer
 
 
-def _write_column(steps, name, parts, length):
+def _write_column(steps, name, pieces, length):
     shape, kind, unit = COLUMNS[name]
     if name == "displacement":
-        parts = [_integers(part) for part in parts]
-    value = np.concatenate([np.asarray(part) for part in parts]).astype(kind)
+        pieces = [_integers(piece) for piece in pieces]
+    value = np.concatenate([np.asarray(piece) for piece in pieces]).astype(kind)
     wide = value.ndim > 1 and value[0].size > 64
     chunks = (int(min(length.max(), len(value))), *value.shape[1:]) if wide else True
     steps.create_dataset(
@@ -162,8 +162,8 @@ class Column:
       name; shape (nstep, ...); dtype of the result of indexing.
     """
 
-    def __init__(self, name: str, parts: list, shape: tuple, offsets: np.ndarray):
-        self.name, self._parts, self._offsets = name, parts, offsets
+    def __init__(self, name: str, pieces: list, shape: tuple, offsets: np.ndarray):
+        self.name, self._pieces, self._offsets = name, pieces, offsets
         self.shape = shape
         self.dtype = (
             np.dtype("f4")
@@ -186,18 +186,18 @@ class Column:
         return out[0] if scalar else out
 
     def _read(self, k, rows):
-        part = self._parts[k]
-        if part is None:
+        piece = self._pieces[k]
+        if piece is None:
             return np.full((len(rows), *self.shape[1:]), np.nan, self.dtype)
         low, high = int(rows.min()), int(rows.max()) + 1
-        path = part.file.filename
+        path = piece.file.filename
         with reading(path, "readable shard", _REMEDY):
             if high - low == len(rows):  # contiguous
-                value = part[low:high]
+                value = piece[low:high]
                 value = value if (np.diff(rows) > 0).all() else value[rows - low]
             else:
                 ordered, inverse = np.unique(rows, return_inverse=True)
-                value = np.concatenate([part[a:b] for a, b in _runs(ordered)])[inverse]
+                value = np.concatenate([piece[a:b] for a, b in _runs(ordered)])[inverse]
             if self.name not in MAY_LACK:
                 check_arrays(path, {self.name: value}, {self.name: Array((None,) * value.ndim)}, _AGAIN)
         return value * np.float32(DISPLACEMENT_SCALE) if self.name == "displacement" else value
@@ -337,9 +337,9 @@ class TactileSet:
         """
         if name not in self.columns:
             raise ValueError(f"{self.path} has no column {name!r}: it has {', '.join(self.columns)}")
-        parts = [f["step"].get(name) for f in self._files]
-        shape = next(p for p in parts if p is not None).shape[1:]
-        return Column(name, parts, (self.nstep, *shape), self._offsets[:-1])
+        pieces = [f["step"].get(name) for f in self._files]
+        shape = next(p for p in pieces if p is not None).shape[1:]
+        return Column(name, pieces, (self.nstep, *shape), self._offsets[:-1])
 
     def vert_xpos(self, index: int | slice | np.ndarray) -> np.ndarray:
         """(..., nvert, 3) float32 positions of the nodes at time steps [m]."""

@@ -179,12 +179,12 @@ def advance(
     step(skin.model, data, geoms, dt)
     x = wp.to_torch(data.x).clone()
     _put_poses(geoms, poses)  # the step overwrites the last poses
-    seen = find_touching(outer, skin.sample_weights, struct, x, x_last, anchors)
-    sharp = seen.sample[at_sharp_edges(struct, seen)]
+    touching = find_touching(outer, skin.sample_weights, struct, x, x_last, anchors)
+    sharp = touching.sample[at_sharp_edges(struct, touching)]
     geoms.advance()
-    slips = (rows(outer.trial_anchor)[seen.sample] != seen.stick).any(1)
-    slips &= rows(struct.friction)[seen.geom] > 0 if geoms.count else slips
-    touches, slips = seen.sample, seen.sample[slips]
+    slips = (rows(outer.trial_anchor)[touching.sample] != touching.stick).any(1)
+    slips &= rows(struct.friction)[touching.geom] > 0 if geoms.count else slips
+    touches, slips = touching.sample, touching.sample[slips]
     yields, loads = _kink_branches(skin, geoms, begun, before, bool((x != x_last).any()))
     counts = {"lost": torch.as_tensor(~data.converged | (data.worlds.increment.numpy() > 0)).long()}
     of_worlds = {"sharp": sharp}

@@ -89,23 +89,23 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
         given["pos"] = _plain((middle + (along.max() - TIP - middle @ tip) * tip).round(5))
     if "replaces" not in given:
         reach = [((_points(model, data, [g]) - here.xpos) @ frame @ tip).max() for g in geoms]
-        goes = np.array(reach) > np.dot(given["pos"], tip) - CLAMP
-        given["replaces"], given["shown"] = _fingertip(model, geoms, goes)
+        replaced = np.array(reach) > np.dot(given["pos"], tip) - CLAMP
+        given["replaces"], given["shown"] = _fingertip(model, geoms, replaced)
     mount = Mount(link.name, **given)
     _ = mount.quat  # raises for invalid directions
     return mount
 
 
-def _fingertip(model, geoms, goes):
+def _fingertip(model, geoms, replaced):
     """`Mount.replaces` and `.shown`: names of the replaced geoms, and of hidden ones that remain instead of a
     replaced visual one. (None, ()), which is all of the link, if none remains or a replaced one has no
     name."""
     names = np.array([model.geom(g).name for g in geoms])
-    if goes.all() or not names[goes].all():
+    if replaced.all() or not names[replaced].all():
         return None, ()
     hidden = model.geom_group[geoms] >= SHOWN
-    shown = ~goes & hidden & (names != "") & (goes & ~hidden).any()
-    return tuple(names[goes].tolist()), tuple(names[shown].tolist())
+    shown = ~replaced & hidden & (names != "") & (replaced & ~hidden).any()
+    return tuple(names[replaced].tolist()), tuple(names[shown].tolist())
 
 
 def _longest_axis(points):
@@ -117,8 +117,8 @@ def _longest_axis(points):
     moments, own = np.linalg.eigh(trimesh.PointCloud(points).convex_hull.moment_inertia)  # smallest: length
     if moments[1] > _SLENDER * moments[0] and np.abs(own[:, 0]).max() < _OBLIQUE:
         axes = own[:, :1].T.round(9)
-    ways = np.concatenate([axes, -axes])
-    return ways[(points @ ways.T).max(0).argmax()]
+    directions = np.concatenate([axes, -axes])
+    return directions[(points @ directions.T).max(0).argmax()]
 
 
 def _plain(vector):
@@ -334,8 +334,8 @@ def mount_verb(args: argparse.Namespace) -> None:
 def _account(spec, mount):
     """Lines on the pose of a BioTac, the replaced geoms and the remaining ones."""
     link = find_link(spec, mount.body)
-    goes = fixed_geoms(link, mount.replaces)
-    names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in goes]
+    replaced = fixed_geoms(link, mount.replaces)
+    names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in replaced]
     yield f"{mount.body}: at {mount.pos} m, tip {mount.tip}, pad {mount.pad}"
     yield f"  stands for {', '.join(names) or 'nothing'}: not drawn, touches nothing"
     if mount.replaces is not None:
@@ -358,13 +358,13 @@ def _write_picture(path, rows):
             axis.imshow(view)
             axis.set(title=title, xticks=[], yticks=[])
         line[0].set_ylabel(body)
-    ways = (
+    directions = (
         ("r", "x: drawn before the tip, points into the link"),
         ("g", "y: to the nail, away from the pad"),
         ("b", "z: across"),
     )
     shown = [Patch(color=_REPLACED, label="what it stands for"), Patch(color=SKIN, label="skin")]
-    shown += [Line2D([], [], color=color, lw=3, label=label) for color, label in ways]
+    shown += [Line2D([], [], color=color, lw=3, label=label) for color, label in directions]
     figure.legend(handles=shown, loc="outside lower center", ncols=3, frameon=False)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format=picture_kind(path))

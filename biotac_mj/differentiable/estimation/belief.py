@@ -73,11 +73,11 @@ class Belief:
 
 def believe(n: int) -> Belief:
     """Prior of a sensor with n electrodes."""
-    parts = (
+    design = (
         (n, 0, _GAIN), (1, _CROSS_MEAN, _CROSS), (1, 0, _COMMON_MODE), (2, 0, _SHIFT), (2 * n, 0, _EACH),
         (1, 0, _FLOOR), (1, 0, _FILL), (1, _PRESSURE_MEAN, _PRESSURE),
     )  # fmt: skip
-    mean, spread = (np.repeat([p[k] for p in parts], [p[0] for p in parts]).astype(float) for k in (1, 2))
+    mean, spread = (np.repeat([p[k] for p in design], [p[0] for p in design]).astype(float) for k in (1, 2))
     return Belief(mean, np.diag(spread**2), _MODULUS_MEAN, _MODULUS**2)
 
 
@@ -102,13 +102,13 @@ class Posterior:
         signal, tilts = presses.signal[among], np.swapaxes(presses.by_press[among, :2], 1, 2)
         own, near = signal[:, :n], _nearness(geometry)
         floor, along, across = np.moveaxis(presses.by_sensor[among], 1, 0)
-        parts = np.zeros((len(signal), n + 1, len(belief.mean)))
+        design = np.zeros((len(signal), n + 1, len(belief.mean)))
         i = np.arange(n)
         for first, value in ((0, own), (n + 4, along[:, :n]), (2 * n + 4, across[:, :n])):
-            parts[:, i, first + i] = value
-        parts[:, :n, n], parts[:, :n, n + 1] = own @ (near - np.eye(n)), own.mean(1)[:, None]
-        parts[:, :, n + 2], parts[:, :, n + 3] = along, across
-        parts[:, :, -3], parts[:, :, -2], parts[:, n, -1] = floor, presses.by_press[among, 2], signal[:, n]
+            design[:, i, first + i] = value
+        design[:, :n, n], design[:, :n, n + 1] = own @ (near - np.eye(n)), own.mean(1)[:, None]
+        design[:, :, n + 2], design[:, :, n + 3] = along, across
+        design[:, :, -3], design[:, :, -2], design[:, n, -1] = floor, presses.by_press[among, 2], signal[:, n]
         level, alike = (
             (own**2).mean(1)[:, None, None],
             _CORRELATION * near + (1 - _CORRELATION) * np.eye(n),
@@ -119,10 +119,10 @@ class Posterior:
         noise[:, n, n] = _KILOPASCAL**2
         noise += TILT**2 * tilts @ np.swapaxes(tilts, 1, 2)
         self._n = n
-        self.parts, self.noise, self.signal = parts[:, used], noise[:, used, used], signal[:, used]
-        covariance = self.parts @ belief.covariance @ np.swapaxes(self.parts, 1, 2) + self.noise
+        self.design, self.noise, self.signal = design[:, used], noise[:, used, used], signal[:, used]
+        covariance = self.design @ belief.covariance @ np.swapaxes(self.design, 1, 2) + self.noise
         self._inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-        self._expected = self.signal + self.parts @ belief.mean
+        self._expected = self.signal + self.design @ belief.mean
         self._scale = np.log(np.diagonal(self._inverse, axis1=1, axis2=2)).sum(1) + presses.weight[among]
         self._tilt = TILT**2 * self._inverse @ tilts[:, used]
         turned = presses.outcome_by[among]
@@ -182,9 +182,9 @@ def learn(presses: Presses, geometry: SkinGeometry, touches: Sequence[Touch]) ->
             best = np.argsort(-likely)[:_LIKELY]
             p = np.exp(likely[best] - likely[best[0]])
             p /= p.sum()
-            parts = posterior.parts[best]
-            pull = np.swapaxes(np.linalg.solve(posterior.noise[best], parts), 1, 2)
-            precision += np.einsum("n,nij->ij", p, pull @ parts)
+            design = posterior.design[best]
+            pull = np.swapaxes(np.linalg.solve(posterior.noise[best], design), 1, 2)
+            precision += np.einsum("n,nij->ij", p, pull @ design)
             weighted += np.einsum("n,nij,nj->i", p, pull, touch.signal - posterior.signal[best])
             force = force[best] + belief.force
             about = p @ force

@@ -81,18 +81,18 @@ class Pulled:
         anchor: torch.Tensor,
         memory: typing.Any | None,
     ):
-        self.parts = [pose, pose_last, x, pressure, anchor]
+        self.cotangents = [pose, pose_last, x, pressure, anchor]
         if memory is not None:
-            self.parts += [getattr(memory, f.name) for f in dataclasses.fields(memory)]
+            self.cotangents += [getattr(memory, f.name) for f in dataclasses.fields(memory)]
 
     @property
     def pose(self) -> np.ndarray:
-        return self.parts[0].numpy().ravel()
+        return self.cotangents[0].numpy().ravel()
 
     def plus(self, others: Iterable["Pulled"], weights: Iterable[float]) -> "Pulled":
         """Adds weighted others."""
         for other, weight in zip(others, weights):
-            self.parts = [a + weight * b for a, b in zip(self.parts, other.parts)]
+            self.cotangents = [a + weight * b for a, b in zip(self.cotangents, other.cotangents)]
         return self
 
 
@@ -212,7 +212,7 @@ class LinearLoopStep:
 
     def before(self, pulled: Pulled) -> Cotangent:
         """Cotangent of the state at the start of the step."""
-        _, last, x, pressure, anchors, *memory = pulled.parts
+        _, last, x, pressure, anchors, *memory = pulled.cotangents
         return Cotangent(x, pressure, last, anchors, Memory(*memory) if memory else None)
 
 

@@ -114,18 +114,18 @@ def _kinds(candidates):
     return kinds
 
 
-def _features(log_z, force, part, candidate):
-    """Features of all rows, fitted on the rows of `part`. tau is relative to the length of `part`."""
+def _features(log_z, force, fit_rows, candidate):
+    """Features of all rows, fitted on the `fit_rows`. tau is relative to the length of `fit_rows`."""
     n = len(log_z)
     rise = None
     if candidate.warm_up:
-        tau = candidate.warm_up * part.stop
+        tau = candidate.warm_up * fit_rows.stop
         rise = 1 - np.exp(-np.arange(n) / tau)
         if candidate.shared:
-            log_z = log_z - (shared_gain(log_z[part], force[part], tau) * rise)[:, None]
+            log_z = log_z - (shared_gain(log_z[fit_rows], force[fit_rows], tau) * rise)[:, None]
     if candidate.raw:
         log_z = counts_from_log_impedance(log_z) / 1000
-    terms = Terms.fit(log_z[part], candidate.products, candidate.common, candidate.waves)(log_z)
+    terms = Terms.fit(log_z[fit_rows], candidate.products, candidate.common, candidate.waves)(log_z)
     columns = [terms, *(causal_average(terms[:, : log_z.shape[1]], tau) for tau in candidate.window)]
     if rise is not None and not candidate.shared:
         columns.append(rise[:, None])
@@ -240,24 +240,24 @@ def _best(candidates, error):
     return dict(zip(kept, weight / weight.sum()))
 
 
-def _mean_of(best, log_z, force, part):
-    """(n, 3): weighted mean of each component's candidates, fitted on the rows of `part`."""
+def _mean_of(best, log_z, force, fit_rows):
+    """(n, 3): weighted mean of each component's candidates, fitted on the `fit_rows`."""
     out = np.zeros((len(log_z), 3))
     for c in dict.fromkeys(c for chosen in best for c in chosen):  # in a fixed order
-        x = _features(log_z, force, part, c)
-        w, b = ridge(x[part], force[part], c.strength)
+        x = _features(log_z, force, fit_rows, c)
+        w, b = ridge(x[fit_rows], force[fit_rows], c.strength)
         out += (x @ w + b) * [chosen.get(c, 0.0) for chosen in best]
     return out
 
 
-def _network(log_z, target, part, seed, members=6, epochs=8, width=64, batch=256):
-    """(n, 3): mean prediction of `target` by small networks on ln Z, trained on the rows of `part`. Inputs
+def _network(log_z, target, fit_rows, seed, members=6, epochs=8, width=64, batch=256):
+    """(n, 3): mean prediction of `target` by small networks on ln Z, trained on the `fit_rows`. Inputs
     are augmented by noise and a common gain, for robustness to drift."""
     import torch
 
     from ..training.fitting import TrainingOptions, train
 
-    mean, scale = log_z[part].mean(0), np.maximum(log_z[part].std(0), 1e-3)
+    mean, scale = log_z[fit_rows].mean(0), np.maximum(log_z[fit_rows].std(0), 1e-3)
     size = np.maximum(target.std(0), 1e-6)
     x = torch.tensor((log_z - mean) / scale, dtype=torch.float32)
     y = torch.tensor(target / size, dtype=torch.float32)

@@ -115,16 +115,16 @@ class NoveltyDetector:
         rows, owner = (x[chosen] - mean) @ axes / spread, np.unique(owner[chosen], return_inverse=True)[1]
         # rows of one trajectory are similar, so distances to other trajectories represent new data
         count = min(len(rows), _SIMILAR + np.bincount(owner).max())
-        distance, who = cKDTree(rows).query(rows, count)
-        distance = np.where(owner[who] == owner[:, None], np.inf, distance)
+        distance, neighbour = cKDTree(rows).query(rows, count)
+        distance = np.where(owner[neighbour] == owner[:, None], np.inf, distance)
         order = np.argsort(distance, 1, kind="stable")[:, :_SIMILAR]
-        distance, who = (np.take_along_axis(value, order, 1) for value in (distance, who))
+        distance, neighbour = (np.take_along_axis(value, order, 1) for value in (distance, neighbour))
         near = distance[:, :_NEIGHBOURS]
         there = np.isfinite(near)
         apart = np.where(there, near, 0).sum(1) / np.maximum(there.sum(1), 1)
         apart = np.maximum(apart, np.linalg.norm(_COUNT / spread))
         pdc = np.zeros(0) if pdc is None else _squeezed(pdc[chosen])
-        off = np.quantile(_off(pdc, pdc[who], distance), _USUAL) if len(pdc) else 1.0
+        off = np.quantile(_off(pdc, pdc[neighbour], distance), _USUAL) if len(pdc) else 1.0
         return cls(mean, axes, spread, rows, apart, pdc, np.array(max(off, _LEAST)))
 
     @functools.cached_property
@@ -135,11 +135,11 @@ class NoveltyDetector:
         """(n,) distances of rows (n, k) from the nearest reference rows, relative to these rows' own spacing.
         pdc: (n,) changes [counts]; a deviation from similar rows' PDC increases the distance."""
         which = np.arange(1, min(_SIMILAR, len(self.rows)) + 1)
-        distance, who = self._tree.query((x - self.mean) @ self.axes / self.spread, which)
-        strange = distance[:, :_NEIGHBOURS].mean(1) / self.apart[who[:, :_NEIGHBOURS]].mean(1)
+        distance, neighbour = self._tree.query((x - self.mean) @ self.axes / self.spread, which)
+        strange = distance[:, :_NEIGHBOURS].mean(1) / self.apart[neighbour[:, :_NEIGHBOURS]].mean(1)
         if pdc is None:
             return strange
-        return np.hypot(strange, _off(_squeezed(pdc), self.pdc[who], distance) / self.off)
+        return np.hypot(strange, _off(_squeezed(pdc), self.pdc[neighbour], distance) / self.off)
 
 
 def _squeezed(pdc):

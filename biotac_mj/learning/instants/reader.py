@@ -143,10 +143,10 @@ class Reader:
 
     def _novelty(self, x, pdc):
         """(n,) novelty of rows, without that of their baseline."""
-        seen = compressed(x - self.tensors["centre"])
+        features = compressed(x - self.tensors["centre"])
         if pdc is None or "pressed.usual" not in self.tensors:
-            return self._novelty_detector["rows"](seen) / self.tensors["rows.usual"]
-        return self._novelty_detector["rows"](seen, pdc) / self.tensors["pressed.usual"]
+            return self._novelty_detector["rows"](features) / self.tensors["rows.usual"]
+        return self._novelty_detector["rows"](features, pdc) / self.tensors["pressed.usual"]
 
     def save(self, path: pathlib.Path | str) -> None:
         """Writes a safetensors file."""
@@ -228,13 +228,13 @@ def fit_reader(
     moving = StuckDetector.fit(x[fit | aside], fit[fit | aside])
     tensors |= {f"moving.{f.name}": getattr(moving, f.name) for f in dataclasses.fields(StuckDetector)}
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
-    seen, pressed = compressed(x - tensors["centre"]), data.pdc is not None
+    features, pressed = compressed(x - tensors["centre"]), data.pdc is not None
     known = {
-        "rows": NoveltyDetector.fit(seen[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)
+        "rows": NoveltyDetector.fit(features[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)
     }
-    usual = {"rows": np.quantile(known["rows"](seen[aside]), 0.95)}
+    usual = {"rows": np.quantile(known["rows"](features[aside]), 0.95)}
     if pressed:
-        usual["pressed"] = np.quantile(known["rows"](seen[aside], data.pdc[aside]), 0.95)
+        usual["pressed"] = np.quantile(known["rows"](features[aside], data.pdc[aside]), 0.95)
     if data.tared:  # one baseline per trajectory
         first = np.isin(np.arange(len(x)), np.unique(data.owner, return_index=True)[1])
         rest = log_impedance(data.tare)

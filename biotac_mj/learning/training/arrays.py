@@ -91,24 +91,24 @@ class Arrays:
     def at_points(self, points: "SkinPoints") -> "Arrays":
         """The set with displacements at the points."""
         matrix = SparseMatrix(points.reading(self.geometry)).to(self.device)
-        parts = [matrix(u.float().transpose(0, 1).contiguous()) for u in self.field.split(512)]
-        return dataclasses.replace(self, field=torch.cat([u.transpose(0, 1).half() for u in parts]))
+        shifted = [matrix(u.float().transpose(0, 1).contiguous()) for u in self.field.split(512)]
+        return dataclasses.replace(self, field=torch.cat([u.transpose(0, 1).half() for u in shifted]))
 
 
 def join(sets: list[Arrays]) -> Arrays:
     """Several sets as one, with the geometry of the first; their fields have the same shape. Contact forces
     are dropped if the outer nodes differ."""
-    shift, parts = 0, []
+    shift, shifted = 0, []
     for a in sets:
-        begin = sum(len(p.owner) for p in parts)
-        parts.append(dataclasses.replace(a, owner=a.owner + shift, first=a.first + begin))
+        begin = sum(len(p.owner) for p in shifted)
+        shifted.append(dataclasses.replace(a, owner=a.owner + shift, first=a.first + begin))
         shift += len(a.objects)
     tensors = ["field", "owner", "first", "time", "counts", "tare", "simulated"]
     if len({a.force.shape[1] for a in sets}) == 1:
         tensors.append("force")
-    whole = {k: torch.cat([getattr(p, k) for p in parts]) for k in tensors}
-    whole |= {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("objects", "labelled")}
-    return dataclasses.replace(parts[0], **whole)
+    whole = {k: torch.cat([getattr(p, k) for p in shifted]) for k in tensors}
+    whole |= {k: np.concatenate([getattr(p, k) for p in shifted]) for k in ("objects", "labelled")}
+    return dataclasses.replace(shifted[0], **whole)
 
 
 def check_columns(data: "TactileSet") -> None:
