@@ -599,7 +599,7 @@ def test_what_is_wrong_is_said_of_recordings_in_other_units():
     time = np.arange(len(counts)) / RATE
     for unit, value in (("tared counts", counts - counts[0]), ("counts", counts)):
         said = findings(Recording(time, value, units={"electrodes": unit}))
-        assert sum("e4 stands still" in line for line in said) == 1, said
+        assert sum("e4 is constant" in line for line in said) == 1, said
     volts = counts / 1000
     volts[:, 9] = 1.0
     said = findings(Recording(time, volts, units={"electrodes": "volts"}))
