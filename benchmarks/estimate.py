@@ -230,7 +230,7 @@ def binds(presses: list, estimator: Estimator, draws: int = 10) -> dict:
             left = rng.multivariate_normal(
                 np.zeros(20), posterior.noise[i] - tilts.T @ tilts, check_valid="ignore"
             )
-            signal = posterior.signal[i] + posterior.parts[i] @ own + tilt @ tilts + left
+            signal = posterior.signal[i] + posterior.design[i] @ own + tilt @ tilts + left
             truth = table.outcome[i] + tilt @ turned + own[-2] * table.outcome_by[i, 2]
             truth[0] += rng.normal(known.force, np.sqrt(known.force_variance))
             likely, outcome = posterior(signal)
