@@ -73,7 +73,7 @@ class PlainRecording:
         if len(e) < MIN_ROWS:
             raise ValueError(
                 f"{len(e)} rows are too few to fit on one part and check on another: "
-                f"record at least {MIN_ROWS}"
+                f"record at least {MIN_ROWS} of this {self.design.title}"
             )
         check_counts(e, self.name)
         for label, width in (("force", 3), ("tdc", None)):
