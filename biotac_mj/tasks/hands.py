@@ -154,7 +154,6 @@ def attach_to_hand(
       settings, keywords: as for `biotac_mj.attach`, for every finger (each has its own noise seed).
 
     Returns:
-    Returns:
       {finger: Handle}, in the order of `fingers`; of a batch {finger: prefix}, for `biotac_mj.batch.attach`.
 
     Raises:
