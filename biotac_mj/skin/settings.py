@@ -59,8 +59,8 @@ def read_settings(
 
 
 def read_material(choice: Material | dict | str | pathlib.Path | None) -> Material:
-    """The Material of a preset's name, a dict of its fields, JSON text or file (as `biotac calibrate`
-    writes), a Material, or None (the default).
+    """The Material of a preset's name, a dict of its fields, JSON text or file (as
+    `biotac lab calibrate` writes), a Material, or None (the default).
 
     Raises:
       ValueError: `choice` is none of these.
