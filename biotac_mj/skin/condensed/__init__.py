@@ -6,7 +6,7 @@ at rest, g the gradient of its volume at rest, s >= 1 and c <= 1 corrections, fi
 (`correction`). The liquid's pressure follows in closed form from p = -K (g.u + q) / V0, with q what the exact
 volume of the deformed cavity adds to its linear part. What is left is the contact law f = F(u) over the
 candidates, tens of coordinates, solved by Newton's method with a search along the step (a semi-smooth Newton
-method; the contact law is that of the full skin, `contact.touch_face`).
+method; the contact law is that of the full skin, `contact.touch_faces`).
 
 A block of threads has a skin, which goes its own way through Newton's method without waiting for others; on
 the CPU one thread does the same. `step` is what others use of it, for many worlds or one (`skin`); `way`

@@ -235,9 +235,12 @@ def block_rank(own: int) -> wp.vec2i:
     for (int o = t; o < n * m; o += threads) a[(long long)(o / m) * width + n + o % m] = panel[o / m][o % m];
     __syncthreads();
 #else
-    // eight pivots are found at a time, and what is right of and below them is changed by all eight at once
+    // eight pivots are found at a time; what is right of and below them is changed by all eight at once, two
+    // rows together
+    typedef float eight __attribute__((vector_size(32), aligned(4)));
     for (int first = 0; first < n; first += 8) {{
         const int next = first + 8 < n ? first + 8 : n;
+        const bool whole = next - first == 8;
         for (int j = first; j < next; ++j) {{
             float* row = a + (long long)j * width;
             int p = n;
@@ -254,13 +257,19 @@ def block_rank(own: int) -> wp.vec2i:
                 other[k] = v;
             }}
             const float inverse = 1.0f / row[j];
+            eight right = {{0.0f}};
+            for (int k = j + 1; k < next; ++k) right[k - first] = row[k];
             for (int i = j + 1; i < n; ++i) {{
                 float* mine = a + (long long)i * width;
-                mine[j] *= inverse;
-                for (int k = j + 1; k < next; ++k) mine[k] -= mine[j] * row[k];
+                const float f = inverse * mine[j];
+                if (whole)
+                    *(eight*)(mine + first) -= f * right;
+                else
+                    for (int k = j + 1; k < next; ++k) mine[k] -= f * row[k];
+                mine[j] = f;  // after that: of what has just been stored in part a load would wait
             }}
         }}
-        const float* __restrict b = a + (long long)first * width;
+        const float* b = a + (long long)first * width;
         for (int j = first + 1; j < next; ++j) {{
             float* mine = a + (long long)j * width;
             for (int r = first; r < j; ++r) {{
@@ -269,28 +278,32 @@ def block_rank(own: int) -> wp.vec2i:
                 for (int k = next; k < width; ++k) mine[k] -= f * row[k];
             }}
         }}
-        if (next == n) break;
-        for (int i = next; i < n; i += 2) {{  // two rows at a time, for each value of b that is loaded
-            float* __restrict even = a + (long long)i * width;
-            float* __restrict odd = even + width;
-            const float f0 = even[first], f1 = even[first + 1], f2 = even[first + 2], f3 = even[first + 3];
-            const float f4 = even[first + 4], f5 = even[first + 5], f6 = even[first + 6];
-            const float f7 = even[first + 7];
-            if (i + 1 == n) {{
-                for (int k = next; k < width; ++k)
-                    even[k] -= (f0 * b[k] + f1 * b[width + k] + f2 * b[2 * width + k] + f3 * b[3 * width + k])
-                        + (f4 * b[4 * width + k] + f5 * b[5 * width + k] + f6 * b[6 * width + k]
-                        + f7 * b[7 * width + k]);
-                break;
+        for (int i = next; i < n; i += 2) {{
+            float* one = a + (long long)i * width;
+            float* other = i + 1 < n ? one + width : one;
+            eight f[8], g[8];
+            for (int l = 0; l < 8; ++l)
+                f[l] = one[first + l] + (eight){{}}, g[l] = other[first + l] + (eight){{}};
+            int k = next;
+            for (; k + 8 <= width; k += 8) {{
+                eight u = *(eight*)(one + k), v = *(eight*)(other + k);
+                #pragma unroll
+                for (int l = 0; l < 8; ++l) {{
+                    const eight c = *(const eight*)(b + (long long)l * width + k);
+                    u -= f[l] * c;
+                    v -= g[l] * c;
+                }}
+                *(eight*)(other + k) = v;
+                *(eight*)(one + k) = u;
             }}
-            const float g0 = odd[first], g1 = odd[first + 1], g2 = odd[first + 2], g3 = odd[first + 3];
-            const float g4 = odd[first + 4], g5 = odd[first + 5], g6 = odd[first + 6], g7 = odd[first + 7];
-            for (int k = next; k < width; ++k) {{
-                const float b0 = b[k], b1 = b[width + k], b2 = b[2 * width + k], b3 = b[3 * width + k];
-                const float b4 = b[4 * width + k], b5 = b[5 * width + k], b6 = b[6 * width + k];
-                const float b7 = b[7 * width + k];
-                even[k] -= (f0 * b0 + f1 * b1 + f2 * b2 + f3 * b3) + (f4 * b4 + f5 * b5 + f6 * b6 + f7 * b7);
-                odd[k] -= (g0 * b0 + g1 * b1 + g2 * b2 + g3 * b3) + (g4 * b4 + g5 * b5 + g6 * b6 + g7 * b7);
+            for (; k < width; ++k) {{
+                float u = one[k], v = other[k];
+                for (int l = 0; l < 8; ++l) {{
+                    u -= f[l][0] * b[(long long)l * width + k];
+                    v -= g[l][0] * b[(long long)l * width + k];
+                }}
+                other[k] = v;
+                one[k] = u;
             }}
         }}
     }}
@@ -300,13 +313,13 @@ def block_rank(own: int) -> wp.vec2i:
     for (int k = n; k < width; ++k)
         for (int i = n - 1; i >= 0; --i) {{
             float* row = a + (long long)i * width;
-            float part[8] = {{row[k]}};
+            eight part = {{row[k]}};
             int j = i + 1;
-            for (; j + 8 <= n; j += 8)
-                for (int b = 0; b < 8; ++b) part[b] -= row[j + b] * x[j + b];
-            for (; j < n; ++j) part[0] -= row[j] * x[j];
-            for (int b = 1; b < 8; ++b) part[0] += part[b];
-            row[k] = part[0] / (i == n - 1 ? last : row[i]);
+            for (; j + 8 <= n; j += 8) part -= *(eight*)(row + j) * *(eight*)(x + j);
+            float sum = 0.0f;
+            for (; j < n; ++j) sum -= row[j] * x[j];
+            for (int b = 0; b < 8; ++b) sum += part[b];
+            row[k] = sum / (i == n - 1 ? last : row[i]);
             x[i] = row[k];
         }}
 #endif

@@ -11,7 +11,7 @@ from .correction import softening_of, swelling_of
 from .lanes import block_max, block_sum, dot_columns, eliminate, sum_rows, sync
 from .states import Linear
 from .structs import Constants, F, G, Remembered, Scratch
-from .system import coordinate_at, entry_of, fill_contact, gather_blocks
+from .system import fill_contact, gather_blocks
 
 __all__ = ["conclude", "correct", "place_nodes", "recall"]
 
@@ -230,22 +230,7 @@ def find_tangents(
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
-            if threads == 1:
-                fill_contact(w, outer, inner, nnode, nin, wide, 1.0, 1, l, c, s)
-            for m in range(t, wp.where(threads == 1, 0, equations * equations), threads):
-                i = m / equations
-                j = m % equations
-                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
-                value = wp.where(i == j, 1.0, 0.0)
-                if i < 3 * outer:
-                    for b in range(3):
-                        ci = s.coordinate[w, coordinate_at(w, i - i % 3 + b, outer, nnode, s)]
-                        value += s.block[w, i / 3, 0][i % 3, b] * entry_of(ci, cj, l, c)
-                else:
-                    place = coordinate_at(w, i, outer, nnode, s)
-                    held = float(s.stiff[w, place - 3 * nnode])
-                    value += held * entry_of(s.coordinate[w, place], cj, l, c)
-                s.matrix[w, i * wide + j] = value
+            fill_contact(w, t, threads, outer, inner, nnode, nin, wide, 1.0, 1, l, c, s)
             for k in range(t, outer, threads):
                 part = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
                 D = part * widen(s.block[w, k, 0])

@@ -206,10 +206,10 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
     s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)
     s.load = wp.zeros((nworld, n), dtype=float)
-    sums = 0 if model.device.is_cuda else max(n, 3 * len(model.free), 3 * touched)
-    s.sum = wp.zeros((nworld, sums), dtype=float)
+    sums = 0 if model.device.is_cuda else max(n, 3 * len(model.free))
+    s.sum = wp.zeros((nworld, max(sums, 3 * touched)), dtype=float)
     s.between = wp.empty((nworld, 0 if model.device.is_cuda else 3 * touched * n), dtype=float)
-    s.swollen = wp.zeros((nworld, 3 * touched), dtype=float)
+    s.held = wp.zeros((nworld, 3 * touched), dtype=float)
     s.stiff = wp.zeros((nworld, core_nodes), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))
     ring = model.ring.shape[1]

@@ -101,7 +101,7 @@ class Scratch:
     coordinate: wp.array2d(dtype=int)
     loaded: wp.array2d(dtype=int)  # contact coordinates with a force, and it, of a product
     load: wp.array2d(dtype=float)
-    sum: wp.array2d(dtype=float)  # by one thread, of `lanes.sum_rows`, or of what the equations are pushed by
+    sum: wp.array2d(dtype=float)  # how pressure pushes the equations; sums of `lanes.sum_rows`
     vector: wp.array3d(dtype=real)
     on: wp.array2d(dtype=int)  # which touch
     stiff: wp.array2d(dtype=real)  # stiffness of inner coordinates, lumped [N/m]
@@ -113,7 +113,7 @@ class Scratch:
     matrix: wp.array2d(dtype=float)
     column: wp.array2d(dtype=int)  # contact coordinates of the equations
     between: wp.array2d(dtype=float)  # by one thread, compliance of candidates at what touches
-    swollen: wp.array2d(dtype=float)  # of what touches, how it is held against the liquid's pressure
+    held: wp.array2d(dtype=float)  # of the equations, how they are held against the liquid's pressure
     solve: Solve
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]
     mat: wp.array2d(dtype=mat33)

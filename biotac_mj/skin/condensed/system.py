@@ -24,7 +24,6 @@ from .structs import DF, DU, TRY, Constants, F, G, Scratch
 __all__ = [
     "coordinate_at",
     "count_contacts",
-    "entry_of",
     "fill_contact",
     "gather_blocks",
     "gather_load",
@@ -145,15 +144,6 @@ def gather_blocks(
                     total += touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
             s.block[w, k, m % most] = narrow(total)
     sync()
-    for k in range(t, room, threads):
-        p = s.node[w, s.touched[w, k]]
-        held = wp.vec3()
-        for e in range(c.ring_start[p], c.ring_start[p + 1]):
-            q = 3 * c.ring[e]
-            give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
-            held += s.block[w, k, e - c.ring_start[p]] * give
-        for a in range(3):
-            s.swollen[w, 3 * k + a] = held[a]
     nsample = c.sample.shape[0]
     most = s.core_block.shape[2]
     for m in range(t, wp.min(inner, s.touched.shape[1] - room) * most, threads):
@@ -198,48 +188,20 @@ def coordinate_at(w: int, k: int, outer: int, nnode: int, s: Scratch):
 
 
 @wp.func
-def entry_of(a: int, b: int, l: Linear, c: Constants):
-    """Entry of W between contact coordinates a and b."""
-    push = l.bulk_stiffness * l.swell * l.scale * c.give_at[a] * c.give_at[b]
-    return float(l.scale) * c.compliance[a, b] - float(push)
-
-
-@wp.func
-def fill_contact(
-    w: int,
-    outer: int,
-    inner: int,
-    nnode: int,
-    nin: int,
-    wide: int,
-    soft: float,
-    lumped: int,
-    l: Linear,
-    c: Constants,
-    s: Scratch,
-):
-    """1 + D W over what touches, D being softer by a factor, row by row, for one thread. lumped: whether D is
-    diagonal, its blocks being the first of each node."""
+def _fill_by_rows(
+    w: int, outer: int, inner: int, nnode: int, nin: int, wide: int, soft: float, lumped: int, scale: float,
+    c: Constants, s: Scratch,
+):  # fmt: skip
+    """The matrix of `fill_contact` by one thread."""
     n = 3 * outer + inner
-    scale = soft * float(l.scale)
-    pressed = float(l.bulk_stiffness * l.swell * l.scale)
-    for j in range(n):
-        at = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
-        s.column[w, j] = at
-        s.sum[w, j] = pressed * float(c.give_at[at])
     gather_rows(c.compliance, w, 3 * nnode + nin, s.coordinate, n, s.column, s.between)
     for k in range(outer):
-        p = s.node[w, s.touched[w, k]]
-        held = wp.vec3(s.swollen[w, 3 * k], s.swollen[w, 3 * k + 1], s.swollen[w, 3 * k + 2])
-        if lumped == 1:
-            q = 3 * p
-            give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
-            held = s.block[w, k, 0] * give
         for a in range(3):
-            begin_row(s.matrix, w, n, wide, 3 * k + a, soft * held[a], s.sum)
+            begin_row(s.matrix, w, n, wide, 3 * k + a, soft * s.held[w, 3 * k + a], s.sum)
         if lumped == 1:
             fill_rows(s.matrix, w, n, wide, 3 * k, scale * s.block[w, k, 0], s.between, 3 * s.touched[w, k])
         else:
+            p = s.node[w, s.touched[w, k]]
             for e in range(c.ring_start[p], c.ring_start[p + 1]):
                 block = s.block[w, k, e - c.ring_start[p]]
                 if wp.ddot(block, block) > 0.0:
@@ -247,20 +209,13 @@ def fill_contact(
                     fill_rows(s.matrix, w, n, wide, 3 * k, scale * block, s.between, row)
     for k in range(inner):
         i = 3 * outer + k
-        place = coordinate_at(w, i, outer, nnode, s) - 3 * nnode
-        p = s.core_node[w, place]
-        first = 3 * c.node.shape[0]
-        push = float(0.0)
+        begin_row(s.matrix, w, n, wide, i, soft * s.held[w, i], s.sum)
+        place = coordinate_at(w, i, outer, nnode, s)
         if lumped == 1:
-            stiff = float(s.stiff[w, place])
-            push = stiff * float(c.give_at[first + p])
-            begin_row(s.matrix, w, n, wide, i, soft * push, s.sum)
-            fill_row(s.matrix, w, n, wide, i, scale * stiff, s.between, 3 * nnode + place)
+            stiff = scale * float(s.stiff[w, place - 3 * nnode])
+            fill_row(s.matrix, w, n, wide, i, stiff, s.between, place)
         else:
-            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
-                one = s.core_block[w, k, e - c.inner_ring_start[p]]
-                push += one * float(c.give_at[first + c.inner_ring[e]])
-            begin_row(s.matrix, w, n, wide, i, soft * push, s.sum)
+            p = s.core_node[w, place - 3 * nnode]
             for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
                 one = s.core_block[w, k, e - c.inner_ring_start[p]]
                 if one != 0.0:
@@ -268,6 +223,79 @@ def fill_contact(
                     fill_row(s.matrix, w, n, wide, i, scale * one, s.between, row)
     for i in range(n):
         s.matrix[w, i * wide + i] = s.matrix[w, i * wide + i] + 1.0
+
+
+@wp.func
+def fill_contact(
+    w: int, t: int, threads: int, outer: int, inner: int, nnode: int, nin: int, wide: int, soft: float,
+    lumped: int, l: Linear, c: Constants, s: Scratch,
+):  # fmt: skip
+    """1 + D W over what touches, in rows of length `wide`, D being softer by a factor. lumped: whether D is
+    diagonal, its blocks being the first of each node."""
+    n = 3 * outer + inner
+    scale = soft * float(l.scale)
+    pressed = float(l.bulk_stiffness * l.swell * l.scale)
+    for i in range(t, n, threads):
+        place = coordinate_at(w, i, outer, nnode, s)
+        at = s.coordinate[w, place]
+        s.column[w, i] = at
+        s.sum[w, i] = pressed * float(c.give_at[at])
+        held = float(0.0)  # against the liquid's pressure
+        if i < 3 * outer and lumped == 1:
+            q = at - i % 3
+            give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
+            held = wp.dot(s.block[w, i / 3, 0][i % 3], give)
+        elif i < 3 * outer:
+            p = s.node[w, s.touched[w, i / 3]]
+            for e in range(c.ring_start[p], c.ring_start[p + 1]):
+                q = 3 * c.ring[e]
+                give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
+                held += wp.dot(s.block[w, i / 3, e - c.ring_start[p]][i % 3], give)
+        elif lumped == 1:
+            held = float(s.stiff[w, place - 3 * nnode]) * float(c.give_at[at])
+        else:
+            p = s.core_node[w, place - 3 * nnode]
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                one = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
+                held += one * float(c.give_at[3 * c.node.shape[0] + c.inner_ring[e]])
+        s.held[w, i] = held
+    sync()
+    if threads == 1:
+        _fill_by_rows(w, outer, inner, nnode, nin, wide, soft, lumped, scale, c, s)
+        return
+    for m in range(t, outer * n, threads):
+        k = m / n
+        j = m % n
+        at = s.column[w, j]
+        p = s.node[w, s.touched[w, k]]
+        begin = c.ring_start[p]
+        end = c.ring_start[p + 1]
+        if lumped == 1:
+            end = begin + 1
+        total = wp.vec3()
+        for e in range(begin, end):
+            q = 3 * wp.where(lumped == 1, p, c.ring[e])
+            v = wp.vec3(c.compliance[q, at], c.compliance[q + 1, at], c.compliance[q + 2, at])
+            total += s.block[w, k, e - begin] * v
+        for a in range(3):
+            i = 3 * k + a
+            value = scale * total[a] - soft * s.held[w, i] * s.sum[w, j]
+            s.matrix[w, i * wide + j] = value + wp.where(i == j, 1.0, 0.0)
+    for m in range(t, inner * n, threads):
+        i = 3 * outer + m / n
+        j = m % n
+        at = s.column[w, j]
+        value = float(0.0)
+        if lumped == 1:
+            stiff = float(s.stiff[w, coordinate_at(w, i, outer, nnode, s) - 3 * nnode])
+            value = stiff * c.compliance[s.column[w, i], at]
+        else:
+            p = s.column[w, i] - 3 * c.node.shape[0]
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                one = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
+                value += one * c.compliance[3 * c.node.shape[0] + c.inner_ring[e], at]
+        value = scale * value - soft * s.held[w, i] * s.sum[w, j]
+        s.matrix[w, i * wide + j] = value + wp.where(i == j, 1.0, 0.0)
 
 
 @wp.func
@@ -334,74 +362,44 @@ def solve_system(
     sync()
     if equations > 0:
         soft = float(softer)
-        scale = float(l.scale)
-        pressed = float(l.bulk_stiffness * l.swell * l.scale)
-        first = int(0)  # column of a row that a thread of many forms
-        if threads == 1:
-            fill_contact(w, outer, inner, nnode, nin, wide, soft, 0, l, c, s)
-            first = equations
-        count = wide - first
+        fill_contact(w, t, threads, outer, inner, nnode, nin, wide, soft, 0, l, c, s)
+        count = wide - equations  # what follows: motions of bodies, and the right-hand side
         for m in range(t, outer * count, threads):
             k = m / count
-            j = first + m % count
+            j = m % count
             p = s.node[w, s.touched[w, k]]
             total = wp.vec3()
-            cj = int(0)
-            if j < equations:
-                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
             for e in range(c.ring_start[p], c.ring_start[p + 1]):
-                q = c.ring[e]
                 v = wp.vec3()
-                near = s.place[w, q]
-                if j < equations:
-                    for a in range(3):
-                        v[a] = c.compliance[3 * q + a, cj]
-                elif near >= 0 and j < wide - 1:
-                    first_of_body = s.bodies.column[s.group[w, near], w] + equations
-                    if equations <= first_of_body and first_of_body <= j and j < first_of_body + 6:
-                        v = -wp.vec3(rigid_column(j - first_of_body, s.arm[w, near]))
+                near = s.place[w, c.ring[e]]
+                if near >= 0 and j < count - 1:
+                    body = s.bodies.column[s.group[w, near], w]
+                    if body >= 0 and body <= j and j < body + 6:
+                        v = -wp.vec3(rigid_column(j - body, s.arm[w, near]))
                 elif near >= 0:
                     for a in range(3):
                         v[a] = float(s.vector[w, DU, 3 * near + a])
                 total += s.block[w, k, e - c.ring_start[p]] * v
-            push = float(0.0)
-            if j < equations:
-                total = scale * total
-                push = pressed * float(c.give_at[cj])
             for a in range(3):
-                i = 3 * k + a
                 value = total[a]
-                if j < equations or j == wide - 1:
-                    value = soft * (value - s.swollen[w, i] * push)
-                if j == wide - 1:
+                if j == count - 1:
                     at = 3 * s.touched[w, k] + a
-                    value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
-                elif j == i:
-                    value += 1.0
-                s.matrix[w, i * wide + j] = value
+                    value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * value
+                s.matrix[w, (3 * k + a) * wide + equations + j] = value
         for m in range(t, inner * count, threads):
-            k = 3 * outer + m / count
-            j = first + m % count
-            at = coordinate_at(w, k, outer, nnode, s)
-            p = s.core_node[w, at - 3 * nnode]
-            cj = int(0)
-            if j < equations:
-                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+            i = 3 * outer + m / count
+            j = m % count
             value = float(0.0)
-            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
-                q = c.inner_ring[e]
-                one = float(0.0)
-                if j < equations:
-                    one = entry_of(3 * c.node.shape[0] + q, cj, l, c)
-                elif j == wide - 1 and s.core_place[w, q] >= 0:
-                    one = float(s.vector[w, DU, 3 * nnode + s.core_place[w, q]])
-                value += s.core_block[w, k - 3 * outer, e - c.inner_ring_start[p]] * one
-            value = soft * value
-            if j == wide - 1:
-                value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
-            elif j == k:
-                value += 1.0
-            s.matrix[w, k * wide + j] = value
+            if j == count - 1:
+                at = coordinate_at(w, i, outer, nnode, s)
+                p = s.core_node[w, at - 3 * nnode]
+                for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                    near = s.core_place[w, c.inner_ring[e]]
+                    if near >= 0:
+                        one = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
+                        value += one * float(s.vector[w, DU, 3 * nnode + near])
+                value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * value
+            s.matrix[w, i * wide + equations + j] = value
         _fill_bodies(w, t, threads, outer, equations, wide, soft, s)
         if eliminate(s.matrix, w, wide - 1, 1) == 0:
             return 0, equations

@@ -176,146 +176,184 @@ def add_samples(
 ) -> real: ...
 
 
-@functools.cache
-def _sample_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
-    """`touch_sample` for `contact_kernels`."""
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return 0;
+#else
+    return 1;
+#endif
+""")
+def one_thread() -> int:
+    """1 on the CPU, where a block is one thread, else 0: known to the compiler."""
+    ...
 
-    # inline: on the CPU a call copies all that Geoms and Contact hold, which takes as long as a sample does
-    @wp.func(inline=True)
-    def touch_sample(
-        i: int,
+
+@functools.cache
+def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
+    """`touch_samples` for `contact_kernels`."""
+
+    # The loop over samples is in here: on the CPU a call copies all that Geoms and Contact hold, which takes
+    # as long as a sample does
+    @wp.func
+    def touch_samples(
+        f: int,
+        begin: int,
+        end: int,
         w: int,
-        b: vec3,
-        t: wp.vec3i,
-        x0: vec3,
-        x1: vec3,
-        x2: vec3,
-        area: real,
         geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
         c: Contact,
         friction_mode: int,
         near: wp.int64,
     ):
-        """Contact of sample i with a set of geoms. b: barycentric coordinates; area: of the sample [m^2].
+        """Contact of the samples begin to end - 1 of face f with a set of geoms.
 
-        Returns geom (-1: none), geom of the adhesive bond, least distance [m], force [N], tangent [N/m],
-        anchor in the geom's frame, and barycentric coordinates at which the force acts."""
-        k = c.stiffness[w] * area
-        p = b[0] * x0 + b[1] * x1 + b[2] * x2
-        touched = int(-1)
-        clearance = real(1.0)
-        gap = real(0.0)
-        if wp.static(has_law):
-            gap = c.laws.reach[w]
-        width = real(0.0)
-        if wp.static(smooth):
-            width = c.laws.smoothing[w]
-            gap = width
-        normal = vec3()
-        local = vec3()
-        at = b
-        weight = real(1.0)
+        Returns whether they touch, their least clearance [m]; of the last one force [N], tangent [N/m] and
+        barycentric coordinates at which the force acts; and on the CPU the sum over all."""
+        t = c.face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        nsample = c.sample.shape[0]
         radius = face_radius(x1 - x0, x2 - x0)
-        for g in range(geoms.count):
-            if not has(near, g):
-                continue
-            y = place_on(geoms, g, w, p)
-            if wp.static(shapes == SKINS):
-                dn = distance_to(geoms, g, w, p)
-                clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3]), radius))
-            elif wp.static(shapes == MESHES):
-                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                least = lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3])
-                clearance = wp.min(clearance, touch_bound(geoms, g, y, least, radius))
-            else:
-                dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
-                clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3], radius))
-            met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0, wp.static(int(shapes != SOLIDS)))
-            if met.gap < gap:
-                gap = met.gap
-                touched = g
-                normal = met.normal
-                at = met.at
-                weight = met.weight
-                local = y
+        touching = int(0)
+        clearance = real(1.0)
+        total = FaceSum()
         force = vec3()
         K = mat33()
-        stick = local
-        bond = touched
-        if touched >= 0:
-            k = k * weight
-            area = area * weight
-            mu = geoms.friction[touched, w]
-            slope_factor = real(1.0)  # of the slip force over the normal force: exponent of its power law
-            fn = -k * gap
+        at = vec3()
+        for s in range(begin, end):
+            i = f * nsample + s
+            b = c.sample[s]
+            area = c.area[f] / real(nsample)
+            k = c.stiffness[w] * area
+            p = b[0] * x0 + b[1] * x1 + b[2] * x2
+            touched = int(-1)
+            gap = real(0.0)
             if wp.static(has_law):
-                joined = real(2.0) * c.laws.work[w] * area  # peak force times range
-                work = joined
-                bond = int(-1)
-                if c.anchor_geom[i, w] == touched:
-                    work = real(2.0) * c.laws.separation[w] * area
-                    bond = touched
-                peak = real(0.0)
-                if c.laws.reach[w] > real(0.0):
-                    peak = work / c.laws.reach[w]
-                    joined = joined / c.laws.reach[w]
-                if k * gap <= joined:
-                    bond = touched
-                traction = normal_traction(k, peak, c.laws.reach[w], gap)
-                fn = traction[0]
-                K = traction[1] * wp.outer(normal, normal)
-                if c.laws.exponent[w] != real(0.0):
-                    pressure = real(0.0)
-                    for n in range(3):
-                        pressure += b[n] * c.laws.node_normal_force[t[n], w] / c.laws.node_area[t[n]]
-                    if pressure > real(_LEAST_PRESSURE) * c.laws.pressure[w]:
-                        slope_factor = real(1.0) - c.laws.exponent[w]
-                    pressure = wp.max(pressure, real(_LEAST_PRESSURE) * c.laws.pressure[w])
-                    mu = mu * wp.pow(pressure / c.laws.pressure[w], -c.laws.exponent[w])
-            else:
-                K = k * wp.outer(normal, normal)
+                gap = c.laws.reach[w]
+            width = real(0.0)
             if wp.static(smooth):
-                if width > real(0.0):
-                    push = smooth_traction(k, width, gap)
-                    fn = push[0]
-                    K = push[1] * wp.outer(normal, normal)
-            if wp.static(shapes != SOLIDS):
-                if (
-                    geoms.kind[touched] == 7
-                ):  # the normal of a smooth surface turns as the skin moves along it
-                    K = K - fn * mesh_curvature(geoms.grids, geoms.grid[touched], local)
-            force = fn * normal
-            if friction_mode == RECORDED and mu > real(0.0):
-                c.bound[i, w] = wp.max(mu * fn, real(0.0))
-            if mu > real(0.0) and (fn > real(0.0) or friction_mode == LAGGED):
-                if c.anchor_geom[i, w] == touched:
-                    stick = c.anchor[i, w]
-                else:
-                    # new contact: slip counts from the sample's position on the geom at the start of the step
-                    last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
-                    stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
+                width = c.laws.smoothing[w]
+                gap = width
+            normal = vec3()
+            local = vec3()
+            at = b
+            weight = real(1.0)
+            for g in range(geoms.count):
+                if not has(near, g):
+                    continue
+                y = place_on(geoms, g, w, p)
                 if wp.static(shapes == SKINS):
-                    stick = carried_anchor(geoms, touched, w, stick)
-                most = mu * fn
-                if friction_mode == LAGGED:
-                    most = c.bound[i, w]
-                if width > real(0.0):
-                    ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, k * c.stick_ratio, width)
-                    force = force + ft
-                    K = K + Kt
+                    dn = distance_to(geoms, g, w, p)
+                    clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3]), radius))
+                elif wp.static(shapes == MESHES):
+                    dn = distance(
+                        geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y
+                    )
+                    least = lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3])
+                    clearance = wp.min(clearance, touch_bound(geoms, g, y, least, radius))
                 else:
-                    start = stick
-                    ft, Kt, stick = stick_or_slip(local, start, normal, most, k * c.stick_ratio)
-                    force = force + ft
-                    if friction_mode == CONSISTENT and wp.length_sq(stick - start) > real(0.0):  # it slips
-                        Kt = Kt + slope_factor * mu / most * wp.outer(ft, K * normal)
-                    K = K + Kt
-            R = geoms.mat[touched, w]
-            force = R * force
-            K = R * K * wp.transpose(R)
-        return touched, bond, clearance, force, K, stick, at
+                    dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
+                    clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3], radius))
+                met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0, wp.static(int(shapes != SOLIDS)))
+                if met.gap < gap:
+                    gap = met.gap
+                    touched = g
+                    normal = met.normal
+                    at = met.at
+                    weight = met.weight
+                    local = y
+            force = vec3()
+            K = mat33()
+            stick = local
+            bond = touched
+            if touched >= 0:
+                k = k * weight
+                area = area * weight
+                mu = geoms.friction[touched, w]
+                slope_factor = real(1.0)  # of the slip force over the normal force: exponent of its power law
+                fn = -k * gap
+                if wp.static(has_law):
+                    joined = real(2.0) * c.laws.work[w] * area  # peak force times range
+                    work = joined
+                    bond = int(-1)
+                    if c.anchor_geom[i, w] == touched:
+                        work = real(2.0) * c.laws.separation[w] * area
+                        bond = touched
+                    peak = real(0.0)
+                    if c.laws.reach[w] > real(0.0):
+                        peak = work / c.laws.reach[w]
+                        joined = joined / c.laws.reach[w]
+                    if k * gap <= joined:
+                        bond = touched
+                    traction = normal_traction(k, peak, c.laws.reach[w], gap)
+                    fn = traction[0]
+                    K = traction[1] * wp.outer(normal, normal)
+                    if c.laws.exponent[w] != real(0.0):
+                        pressure = real(0.0)
+                        for n in range(3):
+                            pressure += b[n] * c.laws.node_normal_force[t[n], w] / c.laws.node_area[t[n]]
+                        if pressure > real(_LEAST_PRESSURE) * c.laws.pressure[w]:
+                            slope_factor = real(1.0) - c.laws.exponent[w]
+                        pressure = wp.max(pressure, real(_LEAST_PRESSURE) * c.laws.pressure[w])
+                        mu = mu * wp.pow(pressure / c.laws.pressure[w], -c.laws.exponent[w])
+                else:
+                    K = k * wp.outer(normal, normal)
+                if wp.static(smooth):
+                    if width > real(0.0):
+                        push = smooth_traction(k, width, gap)
+                        fn = push[0]
+                        K = push[1] * wp.outer(normal, normal)
+                if wp.static(shapes != SOLIDS):
+                    if (
+                        geoms.kind[touched] == 7
+                    ):  # the normal of a smooth surface turns as the skin moves along it
+                        K = K - fn * mesh_curvature(geoms.grids, geoms.grid[touched], local)
+                force = fn * normal
+                if friction_mode == RECORDED and mu > real(0.0):
+                    c.bound[i, w] = wp.max(mu * fn, real(0.0))
+                if mu > real(0.0) and (fn > real(0.0) or friction_mode == LAGGED):
+                    if c.anchor_geom[i, w] == touched:
+                        stick = c.anchor[i, w]
+                    else:
+                        # new contact: slip counts from where the sample was on the geom when the step began
+                        last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
+                        stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
+                    if wp.static(shapes == SKINS):
+                        stick = carried_anchor(geoms, touched, w, stick)
+                    most = mu * fn
+                    if friction_mode == LAGGED:
+                        most = c.bound[i, w]
+                    if width > real(0.0):
+                        ft, Kt, stick = smooth_stick_or_slip(
+                            local, stick, normal, most, k * c.stick_ratio, width
+                        )
+                        force = force + ft
+                        K = K + Kt
+                    else:
+                        start = stick
+                        ft, Kt, stick = stick_or_slip(local, start, normal, most, k * c.stick_ratio)
+                        force = force + ft
+                        if friction_mode == CONSISTENT and wp.length_sq(stick - start) > real(
+                            0.0
+                        ):  # it slips
+                            Kt = Kt + slope_factor * mu / most * wp.outer(ft, K * normal)
+                        K = K + Kt
+                R = geoms.mat[touched, w]
+                force = R * force
+                K = R * K * wp.transpose(R)
+            c.trial_geom[i, w] = touched
+            c.bond[i, w] = bond
+            if touched >= 0:
+                touching = 1
+                c.trial_anchor[i, w] = stick
+                c.sample_force[i, w] = force
+                if one_thread() == 1:
+                    total = with_sample(total, at, force, K)
+        return touching, clearance, force, K, at, total
 
-    return touch_sample
+    return touch_samples
 
 
 @functools.cache
@@ -328,7 +366,7 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
     """
     law = "lawful" if has_law else "smooth" if smooth else "coulomb"
     module = f"{__name__}.{law}_{shapes}"
-    touch_sample = _sample_function(has_law, smooth, shapes)
+    touch_samples = _samples_function(has_law, smooth, shapes)
 
     @wp.func
     def touch_face(
@@ -340,30 +378,10 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         friction_mode: int,
         near: wp.int64,
     ):
-        """Evaluates face f; returns a lower bound of its clearance [m], -1 where it touches."""
-        nsample = c.sample.shape[0]
-        t = c.face[f]
-        x0 = x[t[0], w]
-        x1 = x[t[1], w]
-        x2 = x[t[2], w]
-        clearance = real(1.0)
-        touching = int(0)
-        total = FaceSum()
-        area = c.area[f] / real(nsample)
-        for s in range(nsample):
-            i = f * nsample + s
-            b = c.sample[s]
-            touched, bond, gap, force, K, stick, at = touch_sample(
-                i, w, b, t, x0, x1, x2, area, geoms, c, friction_mode, near
-            )
-            clearance = wp.min(clearance, gap)
-            c.trial_geom[i, w] = touched
-            c.bond[i, w] = bond
-            if touched >= 0:
-                touching = 1
-                c.trial_anchor[i, w] = stick
-                c.sample_force[i, w] = force
-                total = with_sample(total, at, force, K)
+        """Evaluates face f on the CPU; returns a lower bound of its clearance [m], -1 where it touches."""
+        touching, clearance, _force, _K, _at, total = touch_samples(
+            f, 0, c.sample.shape[0], w, geoms, x, c, friction_mode, near
+        )
         write_face(f, w, touching, total, c)
         if touching == 1:  # evaluated again, for any range of adhesion
             clearance = real(-1.0)
@@ -383,49 +401,30 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         friction_mode: int,
     ):
         """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block
-        of `BLOCK` threads with one sample each, or by a single thread."""
+        with one sample for each thread, or on the CPU by a single thread."""
+        if one_thread() == 1:
+            for n in range(count):
+                f = listed[w, n]
+                _clearance = touch_face(f, w, geoms, x, c, friction_mode, near[w, f])
+            return
         nsample = c.sample.shape[0]
-        parallel_faces = int(1)
-        first = int(0)
-        last = nsample
-        if threads > 1:
-            parallel_faces = threads // nsample
-            first = t % nsample
-            last = first + 1
-        for begin in range(0, count, parallel_faces):
-            at = begin + t // nsample
-            f = int(-1)
-            if at < count and t < parallel_faces * nsample:
-                f = listed[w, at]
+        parallel_faces = threads // nsample
+        s = t % nsample
+        for first in range(0, count, parallel_faces):
+            k = first + t // nsample
+            mine = int(-1)
             touching = int(0)
             force = vec3()
             K = mat33()
-            push = vec3()
-            total = FaceSum()
-            for s in range(first, wp.where(f >= 0, last, first)):
-                i = f * nsample + s
-                v = c.face[f]
-                area = c.area[f] / real(nsample)
-                touched, bond, _gap, force, K, stick, push = touch_sample(
-                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], area, geoms, c, friction_mode,
-                    near[w, f],
-                )  # fmt: skip
-                c.trial_geom[i, w] = touched
-                c.bond[i, w] = bond
-                if touched >= 0:
-                    touching = 1
-                    c.trial_anchor[i, w] = stick
-                    c.sample_force[i, w] = force
-                    if threads == 1:
-                        total = with_sample(total, push, force, K)
-            if threads == 1:
-                write_face(f, w, touching, total, c)
-            else:
-                clearance = add_samples(
-                    f, w, real(-touching), force, K, push, nsample, c.corner, c.block
-                )  # fmt: skip
-                if f >= 0 and first == 0:
-                    c.touching[f, w] = int(-clearance)
+            at = vec3()
+            if k < count and t < parallel_faces * nsample:
+                mine = listed[w, k]
+                touching, _least, force, K, at, _total = touch_samples(
+                    mine, s, s + 1, w, geoms, x, c, friction_mode, near[w, mine]
+                )
+            clearance = add_samples(mine, w, real(-touching), force, K, at, nsample, c.corner, c.block)
+            if mine >= 0 and s == 0:
+                c.touching[mine, w] = int(-clearance)
 
     @wp.kernel(module=module, enable_backward=False)
     def by_face(
@@ -475,26 +474,18 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
             if at < count and thread < parallel_faces * nsample:
                 f = cache.near[at] // x.shape[1]
                 w = cache.near[at] % x.shape[1]
-                i = f * nsample + s
                 t = contact.face[f]
-                area = contact.area[f] / real(nsample)
-                touched, bond, clearance, force, K, stick, push = touch_sample(
-                    i, w, contact.sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], area, geoms, contact,
-                    friction_mode[w], ALL,
-                )  # fmt: skip
-                contact.trial_geom[i, w] = touched
-                contact.bond[i, w] = bond
-                if touched >= 0:
+                touching, clearance, force, K, push, _total = touch_samples(
+                    f, s, s + 1, w, geoms, x, contact, friction_mode[w], ALL
+                )
+                if touching == 1:
                     clearance = real(-1.0)  # evaluated again, for any range of adhesion
-                    contact.trial_anchor[i, w] = stick
-                    contact.sample_force[i, w] = force
             clearance = add_samples(f, w, clearance, force, K, push, nsample, contact.corner, contact.block)
             if f >= 0 and s == 0:
                 contact.touching[f, w] = wp.where(clearance > real(-1.0), 0, 1)
                 store_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
     return types.SimpleNamespace(
-        touch_sample=touch_sample,
         touch_faces=touch_faces,
         by_face=by_face,
         by_sample=by_sample,
