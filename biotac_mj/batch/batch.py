@@ -373,17 +373,9 @@ class Batch(Skins):
         known = [self._addresses, acting, self._on_solid]
         self._launch(kernels.write_force, (self.nworld, 6), known, [d.sensordata])
 
-    def apply_wrenches(self, d: "mjw.Data") -> None:
-        """Adds what acts on bodies and core to xfrc_applied, and takes it from its rows."""
-        from . import loads  # here, as mujoco_warp is: `make` does without
-
-        where = [self._core, self._body, self._acting, d.xpos, d.xmat, d.xipos]
-        self._launch(loads.apply_wrenches, self.nworld, where, [d.xfrc_applied])
-        self._launch(loads.clear_rows, self._row.shape, [self._row], [d.efc.force])
-
     def find_touches(self) -> None:
         """Parts what acts among the geoms."""
-        from . import loads
+        from . import loads  # here, as mujoco_warp is: `make` does without
 
         skin, outer, model = self.skin, self.skin.data.outer, self.skin.model
         samples = [len(model.sample), model.outer.face, self._group, outer.kept, outer.anchor_geom]
@@ -402,7 +394,7 @@ class Batch(Skins):
         self._launch(loads.add_touch, (len(sensor), self.nworld), known, [d.sensordata])
 
     def list_touches(self, m: "mjw.Model", d: "mjw.Data", row: int, listed: list) -> None:
-        """Adds its touches to the contacts, with rows from `row` on."""
+        """Adds its touches to the contacts, with rows from `row` on, and clears its own rows."""
         from mujoco_warp import ConeType
 
         from . import loads
@@ -411,6 +403,7 @@ class Batch(Skins):
         pyramidal = m.opt.cone == ConeType.PYRAMIDAL
         known = [self._core, self._core_geom, self._geom, pyramidal, row, d.xpos, d.xmat, pos, normal, wrench]
         self._launch(loads.list_touches, (self.ngeom, self.nworld), known, listed)
+        self._launch(loads.clear_rows, self._row.shape, [self._row], listed[-1:])
 
     def meet(self, others: list["Batch"]) -> None:
         """Shares what skins do to each other between two that both move bodies."""

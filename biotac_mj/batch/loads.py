@@ -32,35 +32,6 @@ _TINY = wp.constant(wp.float64(1e-12))  # [N]
 
 
 @wp.kernel
-def apply_wrenches(
-    # In:
-    core: int,
-    body: wp.array(dtype=int),
-    acting: wp.array2d(dtype=vec6),
-    xpos: wp.array2d(dtype=wp.vec3),
-    xmat: wp.array2d(dtype=wp.mat33),
-    xipos: wp.array2d(dtype=wp.vec3),
-    # In and out:
-    applied: wp.array2d(dtype=wp.spatial_vector),
-):
-    """Adds what a skin does to its bodies, and these to its core, to xfrc_applied [world, body]."""
-    w = wp.tid()
-    turn = widen(xmat[w, core])
-    total = vec6()
-    for g in range(body.shape[0] + 1):
-        b = core
-        one = -total
-        if g < body.shape[0]:
-            b = body[g]
-            one = acting[g, w]
-            total += one
-        force = turn * wp.spatial_top(one)
-        torque = turn * wp.spatial_bottom(one)
-        torque += wp.cross(double(xpos[w, core]) - double(xipos[w, b]), force)
-        applied[w, b] = applied[w, b] + wp.spatial_vector(wp.vec3(force), wp.vec3(torque))
-
-
-@wp.kernel
 def clear_rows(
     # In:
     row: wp.array2d(dtype=int),
@@ -73,41 +44,6 @@ def clear_rows(
     if first >= 0:
         for i in range(6):
             force[w, first + i] = 0.0
-
-
-@wp.kernel
-def write_wrench_sensors(
-    # In:
-    sensor: wp.array(dtype=int),
-    sensor_type: wp.array(dtype=int),
-    sensor_objid: wp.array(dtype=int),
-    sensor_adr: wp.array(dtype=int),
-    sensor_cutoff: wp.array(dtype=float),
-    site_bodyid: wp.array(dtype=int),
-    body_rootid: wp.array(dtype=int),
-    site_xpos: wp.array2d(dtype=wp.vec3),
-    site_xmat: wp.array2d(dtype=wp.mat33),
-    com: wp.array2d(dtype=wp.vec3),
-    internal: wp.array2d(dtype=wp.spatial_vector),
-    # Out:
-    sensordata_out: wp.array2d(dtype=float),
-):
-    """<force> and <torque> by cfrc_int."""
-    k, w = wp.tid()
-    i = sensor[k]
-    site = sensor_objid[i]
-    b = site_bodyid[site]
-    inside = internal[w, b]  # torque first
-    value = wp.spatial_bottom(inside)
-    if sensor_type[i] == _TORQUE:
-        lever = site_xpos[w, site] - com[w, body_rootid[b]]
-        value = wp.spatial_top(inside) - wp.cross(lever, value)
-    value = wp.transpose(site_xmat[w, site]) * value
-    for a in range(3):
-        v = value[a]
-        if sensor_cutoff[i] > 0.0:
-            v = wp.clamp(v, -sensor_cutoff[i], sensor_cutoff[i])
-        sensordata_out[w, sensor_adr[i] + a] = v
 
 
 @wp.kernel
@@ -351,16 +287,22 @@ class Loads:
     def __init__(self, m: "mjw.Model", d: "mjw.Data", batches: list):
         kind, late = m.sensor_type.numpy(), m.sensor_delay.numpy().max(axis=0, initial=0.0) > 0.0
 
-        def those(kinds):
+        def those(*kinds):
             return wp.array(np.flatnonzero(np.isin(kind, kinds) & ~late).astype(np.int32), dtype=int)
 
         with wp.ScopedDevice(d.qpos.device):
-            self._wrench, self._touch, self._contact = map(those, ((_FORCE, _TORQUE), (_TOUCH,), (_CONTACT,)))
+            self._touch, none = those(_TOUCH), those()
             cores = np.zeros(m.nbody, np.int32)
             cores[[batch._core for batch in batches]] = 1
             self._is_core = wp.array(cores, dtype=int)
-            self._applied, self._rows = wp.empty_like(d.xfrc_applied), wp.empty_like(d.efc.force)
-            if len(self._contact):
+            self._again = again = copy.copy(m)  # with those sensors alone which feel what is listed
+            again.callback = type(m.callback)()
+            again.sensor_acc_adr, again.sensor_contact_acc_adr = those(_FORCE, _TORQUE), those(_CONTACT)
+            again.sensor_touch_adr = again.sensor_tendonactfrc_adr = again.sensor_limitfrc_adr = none
+            again.sensor_stage_acc_adr = none
+            self._forces = bool(m.opt.run_rne_postconstraint or m.sensor_rne_postconstraint)
+            self._lists = self._forces or bool(len(again.sensor_contact_acc_adr))
+            if self._lists:
                 self._prepare_contacts(d, batches)
 
     def _prepare_contacts(self, d, batches):
@@ -376,45 +318,36 @@ class Loads:
             setattr(self._mujocos, name, given)
             setattr(self._listed, name, array)
             setattr(self._data.contact, name, array)
-        self._data.efc.force = wp.zeros((d.nworld, rows), dtype=float)
+        for name in ("force", "type", "id"):  # what is read of rows; those of touches have no type
+            given = getattr(d.efc, name)
+            setattr(self._data.efc, name, wp.zeros((d.nworld, rows), dtype=given.dtype))
         self._data.nacon = wp.zeros(1, dtype=int)
         self._data.naconmax, self._data.njmax = room, rows
 
     def write(self, m: "mjw.Model", d: "mjw.Data", batches: list) -> None:
         """Writes them, when each `Batch` has found what acts; of those that move bodies. Launches only."""
-        import mujoco_warp as mjw
-
-        if m.opt.run_rne_postconstraint or m.sensor_rne_postconstraint:
-            wp.copy(self._applied, d.xfrc_applied)
-            wp.copy(self._rows, d.efc.force)
-            for batch in batches:
-                batch.apply_wrenches(d)
-            mjw.rne_postconstraint(m, d)
-            wp.copy(d.xfrc_applied, self._applied)
-            wp.copy(d.efc.force, self._rows)
-            sensors = [self._wrench, m.sensor_type, m.sensor_objid, m.sensor_adr, m.sensor_cutoff]
-            frames = [m.site_bodyid, m.body_rootid, d.site_xpos, d.site_xmat, d.subtree_com, d.cfrc_int]
-            shape = len(self._wrench), d.nworld
-            wp.launch(write_wrench_sensors, shape, [*sensors, *frames], [d.sensordata], device=d.qpos.device)
-        if len(self._touch) or len(self._contact):
+        if len(self._touch) or self._lists:
             for batch in batches:
                 batch.find_touches()
         if len(self._touch):
             for batch in batches:
                 batch.add_touch(m, d, self._touch, self._is_core)
-        if len(self._contact):
-            self._write_contacts(m, d, batches)
+        if self._lists:
+            self._write_again(m, d, batches)
 
-    def _write_contacts(self, m, d, batches):
-        """<contact> by mujoco_warp's own kernels, of its contacts and the skins' touches."""
-        from mujoco_warp._src.sensor import _eval_sensor_contact
+    def _write_again(self, m, d, batches):
+        """What mujoco_warp's own functions make of its contacts and the skins' touches."""
+        from mujoco_warp._src.sensor import sensor_acc
+        from mujoco_warp._src.smooth import rne_postconstraint
 
-        inputs = [self._mujocos, d.nacon]
-        listed = [self._listed, self._data.nacon]
-        wp.launch(copy_contacts, d.naconmax, inputs, listed, device=d.qpos.device)
-        wp.copy(self._data.efc.force[:, : d.njmax], d.efc.force)
+        listed, device = [self._listed, self._data.nacon], d.qpos.device
+        wp.launch(copy_contacts, d.naconmax, [self._mujocos, d.nacon], listed, device=device)
+        for name in ("force", "type", "id"):
+            wp.copy(getattr(self._data.efc, name)[:, : d.njmax], getattr(d.efc, name))
         row = d.njmax
         for batch in batches:
             batch.list_touches(m, d, row, [*listed, self._data.efc.force])
             row += _PYRAMID * batch.ngeom
-        _eval_sensor_contact(m, self._data, self._contact)
+        if self._forces:
+            rne_postconstraint(m, self._data)
+        sensor_acc(self._again, self._data, skip_rne_postconstraint=True)
