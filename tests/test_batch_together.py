@@ -112,7 +112,6 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
             values = values.get(name, np.zeros((1, n, 6)))
             setattr(r, name, wp.array(values, dtype=wp.spatial_vectord))
         r.left, r.store, r.most = (wp.full((1, n), x, dtype=wp.float64) for x in (1e-4, 1e-4, 1e-3))
-        r.trial = wp.zeros((1, n), dtype=int)
         r.push, r.settled = wp.ones((1, n), dtype=wp.float64), wp.ones(n, dtype=int)
         wrench = np.zeros((1, n, 6))
         wrench[0, :, 0] = 5.0, 0.05, 0.05  # [N]: 5 mJ and 0.05 mJ of 0.1
@@ -123,7 +122,7 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
         gains, going, every = Marks(n), Marks(n), wp.ones(n, dtype=int)
         model_before = model.tangent0.numpy()[0, 1]
         # one that gives too much only now, as another pushes less, is withheld too
-        wp.launch(energy.withhold, n, [every, model, pushes, r], [going.struct])
+        wp.launch(energy.restrain, n, [every, model, pushes, r], [going.struct])
         assert r.push.numpy().tolist() == [[0, 1, 0]] and going.world.numpy().tolist() == [1, 0, 1]
         r.push.fill_(1.0)
         wp.launch(energy.find_gain, n, [every, model, pushes, r], [gains.struct])

@@ -5,45 +5,13 @@ import numpy as np
 import pytest
 
 from biotac_mj.coupling.implicit.rules import (
-    affordable,
     beta_of,
     gamma_of,
     in_store,
     lacking,
     poorly_corrected,
     spared,
-    withheld_further,
 )
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_a_skin_pays_for_no_more_than_it_has(seed):
-    """The work that a share of the push does is a parabola; the largest share that is paid for is sought."""
-    rng = np.random.default_rng(seed)
-    none, full = -rng.random(), rng.random() + 1
-    bend = rng.uniform(0, full - none)  # forces that grow with the push
-    store = rng.uniform(0, full)
-    share = affordable(store, none, full, bend)
-
-    def work(p):
-        return none + p * (full - none - bend) + p * p * bend
-
-    assert 0 < share < 1 and work(share) <= store + 1e-12
-    assert work(share + 1e-3) > store - 1e-9
-
-
-def test_a_skin_without_energy_gives_none():
-    assert affordable(-1.0, 0.1, 1.0, 0.0) == 0.0  # others give energy already
-    assert affordable(5.0, 0.0, 1.0, 0.0) == pytest.approx(1.0, abs=1e-3)
-
-
-def test_after_too_much_less_is_given():
-    """Were the work linear in the push, nine tenths of what the store has room for."""
-    assert withheld_further(0.8, 1.0, 0.2, 1.8) == pytest.approx(0.9 * 0.8 * 0.5)
-    assert withheld_further(0.8, 0.1, 0.2, 1.8) == 0.0  # no push gives too much already
-    assert withheld_further(0.8, -1.0, -0.2, 1.8) == pytest.approx(
-        0.9 * 0.8 * 0.1
-    )  # a debt is an empty store
 
 
 def test_what_bodies_did_is_put_into_the_store():

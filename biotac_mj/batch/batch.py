@@ -71,13 +71,13 @@ class Batch(Skins):
             for name in ("here", "start", "", "asked", "free", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
-            for name in ("straight", "travel", "drift", "moved", "full_wrench", "full_motion"):
+            for name in ("straight", "travel", "drift", "moved"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            for name in ("trial", "placed", "open"):
+            for name in ("placed", "open"):
                 setattr(r, name, wp.zeros(self.groups, dtype=int))
             for name in ("inside", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
-            numbers = "gamma", "horizon", "square", "frequency", "left", "store", "most", "without"
+            numbers = "gamma", "horizon", "square", "frequency", "left", "store", "most"
             for name in numbers:
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.float64))
             self._step = wp.full(self.groups, self.dt, dtype=wp.float64)
@@ -302,18 +302,10 @@ class Batch(Skins):
         out = [self._greedy, damped.struct]
         self._settle(energy.find_energy, taking_part, [self._last], [self._solid], out)
 
-    def restrain(self, taking_part: Marks, going: Marks) -> None:
-        """Takes the push on bodies that have not the energy for it, after `find_energy`, and marks their
-        worlds."""
-        self._settle(energy.restrain, taking_part, outputs=[going.struct])
-
-    def scale_push(self) -> None:
-        """Gives these as much push as they have energy for, after `evaluate` without any."""
-        self._settle(energy.scale_push)
-
-    def withhold(self, going: Marks, still_going: Marks) -> None:
-        """Takes it again where it still is too much, as `restrain`."""
-        self._settle(energy.withhold, going, outputs=[still_going.struct])
+    def restrain(self, worlds: Marks, going: Marks) -> None:
+        """Takes the push on bodies that have not the energy for it, after `find_energy` and `evaluate`, and
+        marks their worlds."""
+        self._settle(energy.restrain, worlds, outputs=[going.struct])
 
     def find_gain(self, taking_part: Marks, gains: Marks) -> None:
         """Marks worlds where withholding all does not help, after `evaluate`."""

@@ -190,20 +190,18 @@ class Hook:
             batch.find_energy(self._taking_part, self._next)
 
     def _restrain(self, m, d, moving):
-        """Withholds push in the worlds that are going."""
+        """Withholds push in the worlds that are going: also on bodies that get too much only now that others
+        get none."""
 
         def withhold():
             self._accelerate(m, d, moving)
-            self._choose(moving, lambda batch, found: batch.withhold(self._going, found))
+            self._choose(moving, lambda batch, found: batch.restrain(self._going, found))
 
         def withdraw():
             for batch in moving:
                 batch.withdraw(d, self._going.world)
             self._accelerate(m, d, moving)
 
-        self._accelerate(m, d, moving)
-        for batch in moving:
-            batch.scale_push()
         wp.capture_while(self._going.any, withhold)
         self._choose(moving, lambda batch, found: batch.find_gain(self._taking_part, found))
         wp.capture_if(self._going.any, withdraw)

@@ -4,7 +4,7 @@ once with one thread each, made after the `rounds`."""
 
 import warp as wp
 
-from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, lacking, spared, withheld_further
+from ...coupling.implicit.rules import EULER, in_store, lacking, spared
 from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
@@ -18,9 +18,7 @@ __all__ = [
     "find_gain",
     "pass_by",
     "restrain",
-    "scale_push",
     "withdraw",
-    "withhold",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -28,12 +26,9 @@ wp.set_module_options({"enable_backward": False})
 real = wp.float64
 vec6 = wp.spatial_vectord
 
-_in_store, _lacking, _spared, _affordable, _withheld_further = (
-    wp.func(rule) for rule in (in_store, lacking, spared, affordable, withheld_further)
-)
+_in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))
 mat66 = wp.spatial_matrixd
 
-_TRIALS = wp.constant(TRIALS)
 # of the most that a skin holds: accelerations are of single precision
 _ROUNDING = wp.constant(wp.float64(1e-3))
 
@@ -86,15 +81,6 @@ def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, s
     return not both[0] <= both[1]
 
 
-@wp.func
-def limit(r: Rounds, g: int, w: int, gets: real, both: wp.vec2d):
-    """Energy that a body may get, with its part of what others leave it [J]."""
-    part = real(0.0)
-    if both[0] > real(0.0):
-        part = _lacking(r.store[g, w], gets) * both[1] / both[0]
-    return wp.max(r.store[g, w], real(0.0)) + part
-
-
 @wp.kernel
 def find_energy(
     # In:
@@ -122,8 +108,6 @@ def find_energy(
         before = wp.dot(last.wrench0[g, w], jump)
         now = wp.dot(acts, jump)
         pushes = force_of(acts)
-        r.full_wrench[g, w] = acts
-        r.full_motion[g, w] = r.travel[g, w]
         # a solve that lost its way knows little of the force that was there before it
         most = most_energy(r, wp.max(force_of(last.wrench0[g, w]), pushes), solid, w)
         store = _in_store(r.left[g, w], before, now, most)
@@ -142,7 +126,7 @@ def find_energy(
 @wp.kernel
 def restrain(
     # In:
-    taking_part: wp.array(dtype=int),
+    worlds: wp.array(dtype=int),
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     # In and out:
@@ -152,65 +136,13 @@ def restrain(
     """Takes the push on bodies that would get more energy than they have, and marks their worlds. What
     remains without it is the skin's tangent about the present pose: a damper."""
     w = wp.tid()
-    if taking_part[w] == 1 and overdraws(r, model, wrench, w, real(0.0)):
-        for g in range(r.pos.shape[0]):
-            if not _lacking(r.store[g, w], given(r, model, wrench, g, w)) == real(0.0):
-                r.push[g, w] = real(0.0)
-        mark(going, w)
-
-
-@wp.kernel
-def scale_push(
-    # In:
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
-    # In and out:
-    r: Rounds,
-):
-    """As much push as there is energy for, on bodies without any: what acts, and how bodies move, is linear
-    in it while no other contact changes."""
-    w = wp.tid()
-    both = draws(r, model, wrench, w, real(0.0))
-    for g in range(r.pos.shape[0]):
-        if r.push[g, w] == real(1.0):
-            continue
-        # of the work: without push, with all of it, and half of the curve between them
-        none = given(r, model, wrench, g, w)
-        full = wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
-        change = r.full_wrench[g, w] - acting(r, model, wrench, g, w)
-        bend = wp.dot(change, r.full_motion[g, w] - r.travel[g, w])
-        r.push[g, w] = _affordable(limit(r, g, w, none, both), none, full, bend)
-        r.without[g, w] = none
-        r.trial[g, w] = 0
-
-
-@wp.kernel
-def withhold(
-    # In:
-    going: wp.array(dtype=int),
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
-    # In and out:
-    r: Rounds,
-    still_going: MarkedWorlds,
-):
-    """Withholds more where a share of the push still gives too much, at last all: also of a body that gets
-    too much only now that others get less."""
-    w = wp.tid()
-    if going[w] == 0 or not overdraws(r, model, wrench, w, real(0.0)):
+    if worlds[w] == 0 or not overdraws(r, model, wrench, w, real(0.0)):
         return
-    both = draws(r, model, wrench, w, real(0.0))
     for g in range(r.pos.shape[0]):
         gets = given(r, model, wrench, g, w)
-        if r.push[g, w] == real(0.0) or _lacking(r.store[g, w], gets) == real(0.0):
-            continue
-        mark(still_going, w)
-        if r.push[g, w] < real(1.0) and r.trial[g, w] < _TRIALS - 1:
-            most = limit(r, g, w, gets, both)
-            r.push[g, w] = _withheld_further(r.push[g, w], most, r.without[g, w], gets)
-            r.trial[g, w] = r.trial[g, w] + 1
-        else:
+        if r.push[g, w] > real(0.0) and not _lacking(r.store[g, w], gets) == real(0.0):
             r.push[g, w] = real(0.0)
+            mark(going, w)
 
 
 @wp.kernel

@@ -83,12 +83,7 @@ class Rounds:
     inside: wp.array(dtype=int)  # and one of them into the skin
     open: wp.array2d(dtype=int)  # what was put in so is not yet known
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
-    push: wp.array2d(dtype=real)  # of the wrench at the present pose that acts: below 1 where not paid for
-    trial: wp.array2d(dtype=int)  # of shares of the push
-    without: wp.array2d(dtype=real)  # [J] work without any push
-    # with all of the push: wrenches that act, and motions of the bodies
-    full_wrench: wp.array2d(dtype=vec6)
-    full_motion: wp.array2d(dtype=vec6)
+    push: wp.array2d(dtype=real)  # 1 where the wrench at the present pose acts, 0 where it is withheld
     left: wp.array2d(dtype=real)  # [J] energy that the last step left a body in the skin at most
     store: wp.array2d(dtype=real)  # [J] and with what was put into it since
     most: wp.array2d(dtype=real)  # [J] that the skin can hold of it

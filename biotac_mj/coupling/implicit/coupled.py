@@ -12,14 +12,11 @@ from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import (
     EULER,
-    TRIALS,
-    affordable,
     beta_of,
     in_store,
     lacking,
     share_that_pushes,
     spared,
-    withheld_further,
 )
 
 __all__ = ["TELEPORT", "Coupled", "size"]
@@ -29,7 +26,6 @@ __all__ = ["TELEPORT", "Coupled", "size"]
 _MOST = 0.9
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
-_TINY = np.finfo(float).tiny
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
 
@@ -69,7 +65,8 @@ class Coupled:
         skins at once.
       touching: numbers of the bodies that the skin holds: it has a stiffness against them.
       may_act: whether another solve is worth its cost: not after one that found no balance, which took long.
-      push: (n,) fractions of the wrenches at the present pose that act, see `World._restrain`.
+      push: (n,) 1 where the wrenches at the present pose act, 0 where they are withheld, see
+        `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
       compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
@@ -99,7 +96,6 @@ class Coupled:
         self.use_gamma(instance.gamma(self.tangent.any(axis=(1, 2))))
         self.drifted = self.predicted_wrench = None
         self._account = None  # the `_Energy` of the present model and accelerations
-        self._trial = np.zeros(len(self.push), int)  # of shares of the push
         self.written, self.settled, self.forced = False, True, None
         self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
@@ -291,47 +287,14 @@ class Coupled:
         lacks, spare = self._energy().draws()
         return lacks.sum() > spare.sum()
 
-    def release_greedy(self) -> bool:
-        """Takes the push on bodies that would get more than they have; returns whether there are any."""
-        if not self.overdraws():
-            return False
-        energy = self._energy()
-        self._full = energy.acting, self.travel
-        self.push = np.where(energy.draws()[0] > 0.0, 0.0, 1.0)
-        self._account = None
-        return True
-
-    def scale_push(self) -> None:
-        """As much of the push as there is energy for, of bodies without any."""
-        self._without, energy = self._energy().given, self._energy()
-        (force, motion), limit = self._full, self._limit()
-        change, further = force - energy.acting, motion - self.travel
-        for g in np.flatnonzero(self.push == 0.0):
-            work = float(force[g] @ motion[g]), float(change[g] @ further[g])
-            self.push[g] = affordable(limit[g], self._without[g], *work)
-        self._account = None
-
-    def withhold(self) -> bool:
-        """Withholds more of the push where a share of it still gives too much, at last all: also of a body
-        that gets too much only now that others get less. Returns whether it does."""
+    def restrain(self) -> bool:
+        """Takes the push on bodies that would get more than they have; returns whether there are any. Such a
+        body is leaving: force and motion point the same way."""
         greedy = (self._energy().draws()[0] > 0.0) & (self.push > 0.0)
         if not (self.overdraws() and greedy.any()):
             return False
-        limit, given = self._limit(), self._energy().given
-        for g in np.flatnonzero(greedy):
-            if self.push[g] < 1.0 and self._trial[g] < TRIALS - 1:
-                self.push[g] = withheld_further(self.push[g], limit[g], self._without[g], given[g])
-                self._trial[g] += 1
-            else:
-                self.push[g] = 0.0
-        self._account = None
+        self.push, self._account = np.where(greedy, 0.0, self.push), None
         return True
-
-    def _limit(self):
-        """(n,) energy that each body may get, with its part of what others leave it [J]."""
-        energy = self._energy()
-        lacks, spare = energy.draws()
-        return np.maximum(energy.store, 0.0) + lacks * (spare.sum() / max(lacks.sum(), _TINY))
 
     def _energy(self):
         if self._account is None:

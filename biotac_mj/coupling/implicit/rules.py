@@ -10,8 +10,6 @@ __all__ = [
     "LOSS_FREQUENCY",
     "PATIENCE",
     "TOLERANCE",
-    "TRIALS",
-    "affordable",
     "beta_of",
     "gamma_of",
     "in_store",
@@ -20,7 +18,6 @@ __all__ = [
     "share_that_pushes",
     "spared",
     "stayed",
-    "withheld_further",
 ]
 
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which a skin is not solved again: a
@@ -30,9 +27,6 @@ MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from th
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
 EULER = 1.5  # gamma of backward Euler's member of the family of steps
 LOSS_FREQUENCY = 50.0  # [Hz] at which the rubber has its loss factor
-TRIALS = 4  # to find how much of its push a skin can pay for
-_BISECTIONS = 12  # of that share
-_CAUTION = 0.9
 _UNKNOWN = math.inf  # [J] of energy
 
 
@@ -84,27 +78,6 @@ def spared(left: Any, store: Any, given: Any) -> Any:
     if growth > type(store)(0.0) and growth < type(store)(_UNKNOWN):
         return growth
     return type(store)(0.0)
-
-
-def affordable(store: Any, none: Any, full: Any, bend: Any) -> Any:
-    """Share of a skin's push on a body that there is the energy for. none, full: work of what acts without
-    any push, with all of it; bend: half of the curve between them: forces and ways are linear in the push
-    while no other contact changes; all [J]."""
-    low = type(store)(0.0)
-    high = type(store)(1.0)
-    for _ in range(_BISECTIONS):
-        p = type(store)(0.5) * (low + high)
-        if none + p * (full - none - bend) + p * p * bend > max(store, type(store)(0.0)):
-            high = p
-        else:
-            low = p
-    return low
-
-
-def withheld_further(push: Any, store: Any, none: Any, given: Any) -> Any:
-    """A smaller share of the push, after one that gave too much; none where even no push gives too much."""
-    room = (max(store, type(store)(0.0)) - none) / (given - none)
-    return type(store)(_CAUTION) * max(room, type(store)(0.0)) * push
 
 
 def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> Any:

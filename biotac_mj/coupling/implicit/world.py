@@ -329,7 +329,7 @@ class World:
         return self._find_balance(skins, outside)
 
     def _restrain(self, skins, outside):
-        """Withholds so much of the push on each body that this gets no more energy than it has put in.
+        """Withholds the push on bodies that would get more energy than they have put in.
 
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
@@ -337,17 +337,9 @@ class World:
         """
         self._group.predict_wrenches()
         by_rows = all(skin.forced is None for skin in skins)
-        greedy = [skin for skin in skins if by_rows and skin.release_greedy()]
-        if greedy:
+        while [skin for skin in skins if by_rows and skin.restrain()]:
             self._group.evaluate(self._accelerations(skins, outside))
             self._group.predict_wrenches()
-            for skin in greedy:
-                skin.scale_push()
-            going = True
-            while going:
-                self._group.evaluate(self._accelerations(skins, outside))
-                self._group.predict_wrenches()
-                going = [skin for skin in skins if skin.withhold()]
         if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
