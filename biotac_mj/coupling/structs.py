@@ -277,12 +277,6 @@ class DataView(_View):
         )
         return out
 
-    def kinetic_energy(self, velocity: np.ndarray) -> float:
-        """Of all bodies where they are, at velocities (nv,) [J]."""
-        momentum, velocity = np.empty(self.model.nv), np.ascontiguousarray(velocity)
-        LIBRARY.mj_mulM(self.model.address, self.address, momentum.ctypes.data, velocity.ctypes.data)
-        return 0.5 * float(momentum @ velocity)
-
     def acceleration(self) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
         rows as they are now.

@@ -283,7 +283,8 @@ def conclude(
     for g in range(r.pos.shape[0]):
         r.frequency[g, w] = _frequency(power, g, w)
         gets = given(r, model, wrench, g, w)
-        left = r.store[g, w] - gets  # what is withheld is in the skin all the same
+        # what is withheld is in the skin all the same; a damper, which is all that acts then, keeps nothing
+        left = r.store[g, w] - wp.where(r.push[g, w] > real(0.0), gets, wp.max(gets, real(0.0)))
         if passed > real(0.0):
             left += passed * _lacking(r.store[g, w], gets) / both[0]
             left -= passed * _spared(r.left[g, w], r.store[g, w], gets) / both[1]

@@ -194,11 +194,11 @@ class Coupled:
             self.written = True
         return self.correction + self._push()
 
-    def force(self, wrench: np.ndarray, fraction: float) -> None:
-        """Lets wrenches (n, 6) act in place of model and rows: what they would do with a share of the
-        push."""
+    def force(self, wrench: np.ndarray, push: float) -> None:
+        """Lets wrenches (n, 6) act in place of model and rows; push: 1 where these are the skin's, 0 where
+        they are none."""
         self.forced, self._account = wrench, None
-        self.push = np.full(len(wrench), fraction)
+        self.push = np.full(len(wrench), push)
         self.touching, self.written, self.settled = np.zeros(0, int), False, False
 
     def hold(self) -> None:
@@ -211,13 +211,10 @@ class Coupled:
         if self.forced is not None:
             self.forced, self.touching, self._account = None, _touching(self.tangent), None
 
-    def equations(self, fraction: float) -> tuple[np.ndarray, np.ndarray]:
-        """Wrenches (n, 6) without acceleration, with a share of the push, and how they fall as the bodies
-        move on (n, 6, 6)."""
-        before, self.push = self.push, np.full(len(self.push), fraction)
-        wrench = self._push()
-        self.push = before
-        return wrench, self.tangent
+    def equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Wrenches (n, 6) without acceleration, and how they fall as the bodies move on (n, 6, 6)."""
+        self.push = np.ones(len(self.push))
+        return self._push(), self.tangent
 
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
@@ -276,11 +273,6 @@ class Coupled:
     def turning(self) -> float:
         """How far its bodies turn in the step at most [rad]."""
         return np.abs(self.travel[:, 3:]).max(initial=0.0)
-
-    @property
-    def store(self) -> float:
-        """The energy that the skin has to give to bodies that it pushes [J]."""
-        return float(np.maximum(self._energy().store, 0.0)[self.push > 0.0].sum())
 
     def overdraws(self) -> bool:
         """Whether what acts gives bodies more energy on their way than they have in the skin."""
@@ -353,7 +345,8 @@ class Coupled:
         lacks, spare = energy.draws()
         all_lack, all_spare = lacks.sum(), spare.sum()
         passed = min(all_lack, all_spare)  # from some to others
-        left = energy.store - given
+        # a damper, which is all that acts without push, keeps nothing
+        left = energy.store - np.where(self.push > 0.0, given, np.maximum(given, 0.0))
         if passed > 0.0:
             left = left + passed * (lacks / all_lack - spare / all_spare)
         left = np.minimum(left, energy.most)

@@ -307,7 +307,7 @@ class World:
         acceleration = self._accelerations(skins, outside)
         off = self._group.evaluate(acceleration)
         if self._rows_are_open(skins):
-            next(self._solve_group(skins, outside, (1.0,)))
+            self._solve_group(skins, outside)
             off = max(skin.off for skin in skins)
             for skin in skins:
                 skin.settled = True  # unless it turns out otherwise
@@ -345,34 +345,25 @@ class World:
 
     def _act_by_force(self, skins, outside):
         """Where MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too
-        little of what the passive forces push, or too much: even the damper without any push gives energy.
-        Then forces act, without rows, and none where others turn these into a gain."""
-        for fraction in self._solve_group(skins, outside, (1.0, 0.0)):
-            if not self._gain(skins):
-                for skin in skins:
-                    skin.settled = fraction == 1.0 and skin.off < self.tolerance
-                return
-        self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
+        little of what the passive forces push, or too much. Then forces act, without rows, and none where
+        others turn these into a gain."""
+        self._solve_group(skins, outside)
+        gains = self._gain(skins)
+        if gains:
+            self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
+        for skin in skins:
+            skin.settled = not gains and skin.off < self.tolerance
 
     def _gain(self, skins):
-        """Whether bodies gain more than the skins have. Where one turns by a radian in a step under forces,
-        its way tells little of their work: then speeds count, against those that are and those without."""
-        if any(skin.overdraws() for skin in skins):
-            return True
-        if all(skin.forced is None or skin.turning < _FAR for skin in skins):
-            return False
-        return self._kinetic(skins) > self._kinetic_without + sum(skin.store for skin in skins)
+        """Whether bodies gain more than they have in the skins. Where one turns by a radian in a step under
+        forces, its way does not tell their work."""
+        return any(skin.overdraws() or (skin.forced is not None and skin.turning >= _FAR) for skin in skins)
 
-    def _kinetic(self, skins):
-        """Energy of the bodies at the end of the step [J]."""
-        return self.data.kinetic_energy(self.data.qvel + skins[0].instance.horizon * skins[0].acceleration)
-
-    def _solve_group(self, skins, outside, fractions):
+    def _solve_group(self, skins, outside):
         """Solves the models and the bodies' inertia together, with what other constraints do without the
-        skins; lets what is found act as forces, for one share of the push after another, which it yields."""
-        parts = [[skin.equations(fraction) for skin in skins] for fraction in fractions]
+        skins; lets what is found act as forces."""
+        wrench, tangent = zip(*(skin.equations() for skin in skins))
         self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
-        self._kinetic_without = max(self._kinetic(skins), self.data.kinetic_energy(self.data.qvel))
         jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
         response = self.data.moved_by(jacobian)
         if self._damped:
@@ -380,18 +371,15 @@ class World:
         squares = np.repeat(np.concatenate([skin.square for skin in skins]), 6)
         compliance = squares[:, None] * (response @ jacobian.T)
         moved = np.concatenate([skin.moved for skin in skins])
-        for fraction, own in zip(fractions, parts):
-            wrench, tangent = (np.concatenate(each) for each in zip(*own))
-            stiffness = block_diag(*tangent)
-            left = wrench.ravel() - stiffness @ moved.ravel()
-            wrench = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
-            ends = np.cumsum([len(skin.wrench0) for skin in skins])[:-1]
-            self._force(skins, outside, np.split(wrench, ends), fraction)
-            yield fraction
+        stiffness = block_diag(*np.concatenate(tangent))
+        left = np.concatenate(wrench).ravel() - stiffness @ moved.ravel()
+        found = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
+        ends = np.cumsum([len(skin.wrench0) for skin in skins])[:-1]
+        self._force(skins, outside, np.split(found, ends), 1.0)
 
-    def _force(self, skins, outside, wrenches, fraction):
+    def _force(self, skins, outside, wrenches, push):
         for skin, wrench in zip(skins, wrenches):
-            skin.force(wrench, fraction)
+            skin.force(wrench, push)
         self._group.evaluate(self._accelerations(skins, outside))
 
     def _accelerations(self, skins, outside):
