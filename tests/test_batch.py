@@ -451,9 +451,7 @@ def thrown(speeds, spins, mass, timestep, steps, neighbours=0, **settings):
     yield 0.5 * (weight * d.qvel.numpy().astype(float) ** 2).sum(axis=1), mjm, d, velocity
 
 
-@pytest.mark.parametrize(
-    "middle, fastest", [(0.15, 0.25), (0.15, 0.4), (0.3, 0.5), (0.15, 0.6), (0.3, 0.6)]
-)
+@pytest.mark.parametrize("middle, fastest", [(0.15, 0.25), (0.15, 0.4), (0.3, 0.5), (0.15, 0.6), (0.3, 0.6)])
 def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest):
     speeds, timestep, steps = [0.05, middle, fastest], 2e-3, 14
     rounds = []

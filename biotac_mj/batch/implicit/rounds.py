@@ -134,10 +134,9 @@ def wrenches(
             _turns(r.drift[g, w]),
         )
         total = model.wrench0[g, w] + model.tangent0[g, w] * motion
-        push = r.push[g, w]
-        if push < real(1.0):
+        if r.push[g, w] == real(0.0):
             # against the drift itself: the way from here to the pose is another one where bodies turn far
-            total = push * total - (real(1.0) - push) * (model.tangent0[g, w] * r.drift[g, w])
+            total = -(model.tangent0[g, w] * r.drift[g, w])
     wrench_out[g, w] = total
 
 

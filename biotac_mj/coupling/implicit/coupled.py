@@ -221,12 +221,10 @@ class Coupled:
         if self.drifted is None:  # ways are measured as the rows measure them, also where bodies turn
             start = *self.pose, self.here[0], self.drift[:, 3:]
             self.drifted = self.after(-displacement_at_once(*self.pose0, *start))
-        wrench = self.drifted
-        if (self.push == 1.0).all():
-            return wrench
+        if (self.push > 0.0).all():
+            return self.drifted
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
-        push = self.push[:, None]
-        return push * wrench - (1.0 - push) * self._by_tangent(self.drift)
+        return np.where(self.push[:, None] > 0.0, self.drifted, -self._by_tangent(self.drift))
 
     def acting(self) -> np.ndarray:
         """Wrenches (n, 6) that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
