@@ -72,14 +72,10 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     assert_told(rows)
 
 
-LEFT = pytest.mark.xfail(strict=True, reason="MuJoCo's constraint solver leaves 1e-7 N in a step")
-
-
 @pytest.mark.parametrize(
     "integrator, tier, speed",
     [
         pytest.param("Euler", "full", 2.22, marks=pytest.mark.slow),
-        pytest.param("implicit", "condensed", 2.22, marks=LEFT),
         ("implicit", "condensed", 2.3),
     ],
 )
