@@ -18,6 +18,10 @@ from test_batch import ball_spec, shell
 
 from biotac_mj import batch, mjx
 
+# docs/lab/limits.md, Neighbours: the cause is not known
+ON_CUDA = pytest.mark.xfail(
+    jax.default_backend() == "gpu", reason="a bouncing world differs by 1e-5 on CUDA", strict=True
+)
 SPEED = jnp.array([0.0, 0.2, 0.6])  # [m/s] of a ball of 5 g towards the pad, in three worlds
 REMEMBERS = {
     "tier": "condensed",
@@ -65,6 +69,7 @@ def assert_same(first, second):
         np.testing.assert_array_equal(a, b, err_msg=name)
 
 
+@ON_CUDA
 def test_a_scan_gives_what_a_batch_gives(model):
     end, (qpos, sensordata) = jax.jit(jax.vmap(rolled(model, 100)))(worlds(model))
     mjd = mujoco.MjData(model.mjm)
@@ -122,6 +127,7 @@ def test_worlds_are_reset_by_jax(model):
     assert not np.array_equal(again.qpos[1], end.qpos[1])
 
 
+@ON_CUDA
 def test_models_and_nested_worlds_go_through_jax(model):
     flat = jax.jit(jax.vmap(mjx.step, in_axes=(None, 0)))(model, worlds(model))
     twice = jax.tree.map(lambda x: jnp.stack([x, x[::-1]]), worlds(model))
