@@ -8,6 +8,7 @@ import pytest
 from blocks import four_nodes
 
 import biotac_mj
+from biotac_mj.coupling.config import OWN
 from biotac_mj.plugin import engine
 from biotac_mj.tasks.hands import Mount
 
@@ -143,6 +144,33 @@ def test_who_is_not_to_meet_does_not(how):
             geom.contype = geom.conaffinity = 0
     data = press(spec.compile(), [0, 0, -1.5e-3])
     assert not pushes(data, fingers).any()
+
+
+def test_domes_on_flat_backings_meet():
+    """Their skins are open where the backing closes them."""
+    spec = spec_of()
+    fingers = pads(spec, design="biotac_sp")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = spec.compile()
+    low, high = pushes(press(model, [0, 0, 3.2e-3]), fingers)
+    assert 0.5 < high[2] < 1
+    assert low == pytest.approx(-high, abs=1e-9)
+
+
+def test_a_body_with_the_mask_of_biotacs_is_none():
+    """roll_ball has such a ball, which meets BioTacs and not what carries them."""
+    spec = mujoco.MjSpec()
+    ball = spec.worldbody.add_body(name="ball", mocap=True)
+    ball.add_geom(name="ball", size=[0.006, 0, 0], contype=2 | OWN, conaffinity=2 | OWN)
+    finger = biotac_mj.attach(spec, body="world", quat=UP, skin="coarse", tier="condensed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = spec.compile()
+    data = mujoco.MjData(model)
+    data.mocap_pos[0] = -0.01, 0, PAD + 5e-3
+    mujoco.mj_step(model, data)
+    assert np.linalg.norm(finger.read(data, "contact_force")[:3]) > 0.3
 
 
 def test_a_read_only_finger_leaves_the_force_to_the_other():

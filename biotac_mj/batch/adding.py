@@ -75,7 +75,8 @@ def _couple_earlier(spec, core):
     own = _mover(core)
     for geom in spec.geoms:
         body, prefix = geom.parent, geom.name.removesuffix("core")
-        if not geom.contype & OWN or geom.name != body.name or body.name == core.name:
+        is_core = geom.contype & OWN and geom.type == mujoco.mjtGeom.mjGEOM_MESH and geom.name == body.name
+        if not is_core or body.name == core.name:
             continue
         met = {e.name2 for e in spec.equalities if e.name.startswith(f"{prefix}couple")}
         if own.name not in met and _mover(body).name != own.name:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from ..geometry.rigid import cross, matrix, rotation
-from ..geometry.solid import bounds_solid, convex_hull, ground
+from ..geometry.solid import bounds_solid, close_rim, convex_hull, ground
 from .config import OWN, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
@@ -210,13 +210,14 @@ def _select(model, core, names):
     pairs = np.stack([model.pair_geom1, model.pair_geom2])  # that MuJoCo collides whatever the masks are
     of_core = model.geom_bodyid[pairs] == core
     meets[pairs[of_core[::-1]]] = True
+    biotacs = {model.geom_bodyid[i] for i in np.flatnonzero(model.geom_contype & OWN) if _is_core(model, i)}
     out = []
     for i in np.flatnonzero(meets):
         body = model.geom_bodyid[i]
         if weld[body] == own:
             continue
         # solid parts of another BioTac meet those of this one; its core stands for the skin around it
-        if model.geom_contype[i] & OWN and not _has_skin(model, core, i):
+        if model.geom_contype[i] & OWN and body in biotacs and not _has_skin(model, core, i):
             continue
         if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own):
             continue
@@ -253,8 +254,17 @@ def _has_skin(model, core, geom):
     """Whether a geom is the core of another BioTac that meets the skin of BioTac `core`, as both meet all
     that collides."""
     own = model.geom_contype[model.geom_bodyid == core]
+    return _is_core(model, geom) and bool((own & OWN).any())
+
+
+def _is_core(model, geom):
+    """Whether a geom is the core of a BioTac that meets others; bodies of a user may have its mask."""
     name, body = model.name("geom", geom), model.geom_bodyid[geom]
-    return bool(model.geom_contype[geom] & OWN) and name == model.name("body", body) and (own & OWN).any()
+    return (
+        bool(model.geom_contype[geom] & OWN)
+        and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+        and name == model.name("body", body)
+    )
 
 
 def _is_met(model, core):
@@ -333,6 +343,7 @@ def _skin_of(model, geom):
         return None
     vert, face = (_part(model, shown[0], part, "skin") for part in ("vert", "face"))
     vert = (vert - model.geom_pos[geom]) @ matrix(model.geom_quat[geom])
+    face = close_rim(face)  # a dome's is on its backing
     return (vert, face) if bounds_solid(vert, face) else None
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["bounds_solid", "convex_hull", "fills_hull", "ground", "spread_points"]
+__all__ = ["bounds_solid", "close_rim", "convex_hull", "fills_hull", "ground", "spread_points"]
 
 
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
@@ -19,6 +19,21 @@ def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
     corner = vert[face] - vert.mean(axis=0)
     volume = np.linalg.det(corner)
     return bool(volume.sum() > 1e-6 * np.abs(volume).sum() and np.array_equal(there, back))
+
+
+def close_rim(face: np.ndarray) -> np.ndarray:
+    """Faces (m, 3) of a surface with a fan over its rim, where it has one."""
+    if not len(face):
+        return face
+    edges = np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]).astype(np.int64)
+    there, back = (edges @ [face.max() + 1, 1][::step] for step in (1, -1))
+    rim = edges[~np.isin(there, back)]
+    if not len(rim):
+        return face
+    first = rim[0, 0]
+    rim = rim[(rim != first).all(axis=1)]
+    fan = np.column_stack([rim[:, ::-1], np.full(len(rim), first)])
+    return np.concatenate([face, fan.astype(face.dtype)])
 
 
 def convex_hull(vert: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -10,6 +10,7 @@ import warp as wp
 
 from ...cache import digest
 from ...geometry.skin_geometry import SkinGeometry
+from ...geometry.solid import close_rim
 from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ...skin.bodies import BodyMotion
 from ...skin.contact.meshes import DistanceGrid
@@ -433,7 +434,7 @@ def geom_set(
     Args:
       geometry: of that skin. nworld: number of worlds. device: Warp device.
     """
-    node, face = np.unique(geometry.outer_face, return_inverse=True)
+    node, face = np.unique(close_rim(geometry.outer_face), return_inverse=True)
     own = geometry.vert[node], face.reshape(-1, 3).astype(np.int32)
     return GeomSet(
         [g.type for g in geoms],
