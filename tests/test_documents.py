@@ -140,6 +140,16 @@ def test_every_block_runs_or_is_named():
         assert any(n == name and text.startswith(begin) for n, text in found), (name, begin, why)
 
 
+def test_what_prints_shows_what_it_prints():
+    """Known before a page runs: an output that is not written after its block."""
+    for page in PAGES:
+        for language, line, text, written in blocks(page.read_text()):
+            if language != "sh" and page.name not in NEEDS and not left_out(page, text):
+                assert written or "print(" not in text, (
+                    f"{page.name}:{line} prints, and no output stands there"
+                )
+
+
 def test_commands_of_all_blocks_are_understood():
     """Verbs, options and choices of every line that calls biotac, comments left out."""
     shown = [line for page in PAGES for line in commands(page.read_text())]
