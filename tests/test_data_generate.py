@@ -57,6 +57,16 @@ def small(tmp_path_factory):
     return out, generate(out, SMALL, workers=0, progress=False)
 
 
+@pytest.mark.parametrize("name", ["geom:sphere:3mm", "geom:box:2mm,4mm,2mm"])
+def test_objects_of_ones_own_touch_with_their_tip(name, skin):
+    ahead = make_object(name).vert[:, 1].max()
+    assert ahead > 1.9e-3
+    for motion in plan_motions(skin, name, [[1, k] for k in range(3)], 8):
+        tip = motion.pos[0] + ahead * motion.mat[0][:, 1]
+        nearest = [np.linalg.norm(skin.vert - x, axis=1).min() for x in (tip, motion.pos[0])]
+        assert nearest[0] < 2.5e-3 < 0.5e-3 + ahead < 0.6e-3 + nearest[1]
+
+
 def test_names_are_those_of_the_help():
     assert tuple(cli.OBJECTS) == OBJECTS and len(OBJECTS) == 17 and OBJECTS[:8] == INDENTERS
     assert tuple(cli.INTERACTIONS) == KINDS

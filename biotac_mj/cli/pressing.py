@@ -67,7 +67,7 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--timestep",
-        type=quantity("time", _LONGEST_STEP),
+        type=quantity("time", _LONGEST_STEP, 0.0),
         default="4ms",
         metavar="TIME",
         help="of MuJoCo; the sensor reads a frame every 10 ms",

@@ -32,7 +32,11 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         help="further interactions with only the synthetic sensor's counts",
     )
     verb.add_argument(
-        "--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches"
+        "--objects",
+        nargs="+",
+        default=list(OBJECTS),
+        metavar="NAME",
+        help=f"what touches: {', '.join(OBJECTS)}, geom:TYPE:SIZE[,SIZE...] or mesh:FILE",
     )
     verb.add_argument(
         "--kinds",

@@ -109,12 +109,14 @@ def _is_recording(path):
     """Whether a file is a recording: no HDF5, one of `biotac recording import`, or one of somebody else's."""
     import h5py
 
+    from ..reading import reading
+
     if os.path.isdir(path):
         return os.path.isfile(os.path.join(path, "metadata.yaml"))  # a bag of ROS 2
     if not os.path.isfile(path):
         return False  # what reads it says so
     if not h5py.is_hdf5(path):
         return True
-    with h5py.File(path) as file:
+    with reading(path, "recording", "copy it again"), h5py.File(path) as file:
         schema = str(file.attrs.get("schema", ""))
         return not schema or schema.startswith("biotac_mj.recording")

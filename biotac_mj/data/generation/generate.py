@@ -21,7 +21,7 @@ from ...sensor.materials import check_choices, read_thermal
 from ...sensor.signals import read_signal
 from ...sensor.vibration import read_texture
 from ...skin.settings import plain, read_dict, read_settings
-from ..objects import OBJECTS
+from ..objects import OBJECTS, make_object
 from ..store import TactileSet, shard_path
 from .plan import KINDS
 from .vary import check_vary
@@ -154,12 +154,10 @@ class GenerateOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if self.tier not in ("full", "condensed"):
             raise ValueError(f"unknown tier {self.tier!r}: choose full or condensed")
-        unknown = [name for name in self.objects if name not in OBJECTS]
-        if unknown or not self.objects:
-            raise ValueError(
-                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: "
-                f"choose from {', '.join(OBJECTS)}"
-            )
+        if not self.objects:
+            raise ValueError(f"unknown object list: it is empty: choose from {', '.join(OBJECTS)}")
+        for name in self.objects:
+            make_object(name)  # raises where there is none of that name
         unknown = [name for name in self.kinds if name not in KINDS]
         if unknown or not self.kinds:
             raise ValueError(f"unknown kind of interaction {unknown}: choose from {', '.join(KINDS)}")

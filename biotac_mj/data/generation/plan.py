@@ -11,6 +11,7 @@ from ...geometry.rigid import matrix, quaternion_from_y, rotation
 from ...geometry.skin_geometry import SkinGeometry
 from ...press.approach import nearest_point
 from ...sensor.core_surface import CoreSurface
+from ..objects import OBJECTS, make_object
 from .clearance import Placed, first_touch, surface_samples
 
 __all__ = ["Motion", "plan_motions", "sensing_faces"]
@@ -40,7 +41,7 @@ class Motion:
 
     Attributes:
       kind: of KINDS. parameters: as stored, JSON types.
-      pos: (n, 3) tip of the object [m]. mat: (n, 3, 3) its orientation.
+      pos: (n, 3) of the object's frame [m]. mat: (n, 3, 3) its orientation.
     """
 
     kind: str
@@ -103,6 +104,8 @@ def plan_motions(
 class _Planner:
     def __init__(self, geometry, name, steps, kinds, device):
         self.geometry, self.name, self.steps, self.device = geometry, name, steps, device
+        # [m] of the foremost point ahead of the object's frame; OBJECTS have it at the origin
+        self.tip = 0.0 if name in OBJECTS else make_object(name).vert[:, 1].max()
         self.kinds = list(kinds)
         probability = np.array([_PROBABILITY[KINDS.index(kind)] for kind in self.kinds])
         self.probability = probability / probability.sum()
@@ -117,6 +120,7 @@ class _Planner:
         """A Motion or None for each seed."""
         drawn = [self._draw(np.random.default_rng(seed)) for seed in seeds]
         point, direction, mat = (np.array([d[key] for d in drawn]) for key in ("point", "direction", "mat"))
+        point = point - self.tip * direction  # of the object's frame, when its tip is at the skin
         placed = Placed(self.name, len(drawn), self.device)
         travel = first_touch(placed, self.skin, point - _BACK * direction, mat, direction)
         start = point + (travel - _BACK)[:, None] * direction
