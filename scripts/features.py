@@ -305,7 +305,7 @@ _READINGS = (
 # How `mj_step` and `mujoco_warp.step` find the force of a skin and the motion of bodies together.
 _COUPLING = (
     ("`status` tells how the step went: tier, steps without a balance, rounds, share of the bodies' way, "
-     "share of the push that was withheld", "attach, condensed, batch; generate keeps `converged`"),
+     "whether push on a body was withheld", "attach, condensed, batch; generate keeps `converged`"),
     ("Two-way, skin and bodies are solved in rounds until they agree. A skin that cannot be solved where the "
      "bodies go is solved on the way there. Core, nail and clamp are solid. No blow gives back more energy "
      "than it put in", "attach, condensed, batch"),

@@ -285,7 +285,7 @@ def test_room_for_more_bodies_must_be_there():
         (FEM | dict(options={"skin": {"fill_volume": 1e-3}}), r"fill_volume 0.001 .*: take less than 1.75"),
         (
             FEM | dict(skin="coarse", options={"skin": {"rest_pressure": 1e7}}),
-            r"no balance .* of rest_pressure 1e\+07: .*; take less",
+            r"no equilibrium .* of rest_pressure 1e\+07: .*; take less",
         ),
         (
             FEM | dict(liquid=True, options={"skin": {"liquid": False}}),
