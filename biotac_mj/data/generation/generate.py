@@ -157,7 +157,10 @@ class GenerateOptions:
         if not self.objects:
             raise ValueError(f"unknown object list: it is empty: choose from {', '.join(OBJECTS)}")
         for name in self.objects:
-            make_object(name)  # raises where there is none of that name
+            try:
+                make_object(name)
+            except (ValueError, FileNotFoundError) as error:
+                raise ValueError(f"objects: {error}") from None
         unknown = [name for name in self.kinds if name not in KINDS]
         if unknown or not self.kinds:
             raise ValueError(f"unknown kind of interaction {unknown}: choose from {', '.join(KINDS)}")
