@@ -131,7 +131,7 @@ def test_a_damped_ball_settles_along_the_static_curve(integrator):
     depth, force = [], []
     for _ in range(40):
         mujoco.mj_step(model, data)
-        ball_in_finger = data.plugin_state[5 + 42 : 5 + 45]  # of the linear model
+        ball_in_finger = data.plugin_state[3 + 42 : 3 + 45]  # of the linear model
         depth.append(TOP + RADIUS + ball_in_finger[1])
         force.append(handle.read(data, "contact_force")[1])
     depth, force = np.array(depth), np.array(force)
@@ -445,11 +445,11 @@ def test_an_unconverged_step_keeps_the_last_state_and_is_counted():
     status = handle.read(data, "status")
     assert status[0] == 0 and status[1] == failed + 2 and status[3] > 3e-4
     # what acts is its linear model where the ball is now, deeper along +y of the BioTac
-    tangent = good[5 + 6 : 5 + 42].reshape(6, 6)
+    tangent = good[3 + 6 : 3 + 42].reshape(6, 6)
     acting = force + tangent @ [0, 2.2e-3, 0, 0, 0, 0]
     np.testing.assert_allclose(handle.read(data, "contact_force"), acting, rtol=1e-3, atol=1e-6)
     assert np.array_equal(
-        data.plugin_state[5 + 66 :], good[5 + 66 :]
+        data.plugin_state[3 + 68 :], good[3 + 68 :]
     )  # all but the counters and the pose of the one touching body
     data.mocap_pos[0, 2] += 2.2e-3
     mujoco.mj_step(model, data, 3)
