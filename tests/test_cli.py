@@ -59,7 +59,7 @@ def test_without_a_verb_the_help_says_which_there_are(capsys, monkeypatch):
 
 def test_help_says_each_default(capsys):
     """0 and 1 too, which equal False and True."""
-    for verb, text in (("lab estimate", "untouched (default: 1)"), ("press", "noise (default: 0)")):
+    for verb, text in (("lab estimate", "sensor at rest (default: 1)"), ("press", "noise (default: 0)")):
         with pytest.raises(SystemExit):
             cli.main([*verb.split(), "--help"])
         assert text in " ".join(capsys.readouterr().out.split())

@@ -402,7 +402,11 @@ def test_disabled_equalities_are_refused_two_way(model):
     biotac_mj.plugin.clear_errors()
 
 
-@pytest.mark.parametrize("coupling, limit", [("one-way", 150), ("two-way", 640)])
+# an account and a step of its own for each body cost 110 calls a step
+_OLD_LIMIT = pytest.param("two-way", 640, marks=pytest.mark.xfail(reason="accounts of bodies", strict=True))
+
+
+@pytest.mark.parametrize("coupling, limit", [("one-way", 150), ("two-way", 800), _OLD_LIMIT])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
     """Calls of Python functions in a step whose skin costs nothing: 128 and 535, which take 0.1 ms and 0.5 ms
     (docs/lab/coupling.md), on whatever machine."""
