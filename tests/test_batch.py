@@ -475,7 +475,13 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
         np.testing.assert_allclose(d.qvel.numpy()[w, :3], data.qvel[:3], atol=0.03 * v[1])
 
 
-@pytest.mark.parametrize("speed", [0.45, 0.5, 0.6])
+# withheld push leaves a damper, which holds back a ball that leaves: docs/lab/limits.md, Hard contact
+_DAMPED = pytest.param(
+    0.5, marks=pytest.mark.xfail(mujoco.__version__ >= "4", reason="3 % of the peak pulls", strict=True)
+)
+
+
+@pytest.mark.parametrize("speed", [0.45, _DAMPED, 0.6])
 def test_a_step_without_a_balance_pulls_no_ball(speed):
     """Of 100 g, in `mj_step` and in a batch, whose solves are cut off as it leaves skin that lay on the
     core."""
