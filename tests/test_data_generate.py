@@ -57,7 +57,7 @@ def small(tmp_path_factory):
     return out, generate(out, SMALL, workers=0, progress=False)
 
 
-@pytest.mark.parametrize("name", ["geom:sphere:3mm", "geom:box:2mm,4mm,2mm"])
+@pytest.mark.parametrize("name", ["geom:sphere:6mm", "geom:capsule:2mm,6mm"])
 def test_objects_of_ones_own_touch_with_their_tip(name, skin):
     ahead = make_object(name).vert[:, 1].max()
     assert ahead > 1.9e-3
