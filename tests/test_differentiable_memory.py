@@ -92,9 +92,9 @@ def sides_of(skin, step):
     outer, at = skin.data.outer, step.touching
     slipping = at.sample[(outer.trial_anchor.numpy()[at.sample, 0] != at.stick.numpy()).any(1)]
     memory = step.memory
-    bears = memory._W > 1e-9 * memory._W.max()  # what bears nothing is always on a kink
+    bears = memory.energy > 1e-9 * memory.energy.max()  # what bears nothing is always on a kink
     samples = [np.isin(np.arange(len(outer.trial_geom)), some) for some in (at.sample.numpy(), slipping)]
-    return np.concatenate([memory._slips.ravel(), memory._loads[bears], *samples])
+    return np.concatenate([memory.slips.ravel(), memory.loads[bears], *samples])
 
 
 @pytest.mark.parametrize("element, law", first(["linear", "quadratic"], ["neo_hookean", "corotational"]))
@@ -108,7 +108,7 @@ def test_one_step_to_rounding(element, law):
     record, step = balanced(skin, steps[8])
     before, free = step.memory.before, skin.model.free_mask.numpy()[:, None]
     sides = sides_of(skin, step)
-    assert 0.1 < (before.worst < step.memory._W).mean() < 0.9 and step.memory._slips.any()
+    assert 0.1 < (before.worst < step.memory.energy).mean() < 0.9 and step.memory.slips.any()
     draw = np.random.default_rng(5)
 
     def like(value, size):
@@ -259,7 +259,7 @@ def test_kinks_of_rubber_are_counted():
     for record in steps:
         restore(skin, record)
         there = LinearMemory(skin, record)
-        sides.append((there._slips.ravel(), there._loads))
+        sides.append((there.slips.ravel(), there.loads))
     changed = [[int((a != b).sum()) for a, b in zip(*pair)] for pair in zip(sides, sides[1:])]
     found = [[record.changes[0].yielded, record.changes[0].softened] for record in steps[1:]]
     assert found == changed
