@@ -1,14 +1,16 @@
-"""The package's structure: no module imports itself by way of others, and every folder imports only what the
-table of docs/design.md allows."""
+"""The package's structure: no module imports itself by way of others, every folder imports only what LAYERS
+allows, and the pages about the code name what is there."""
 
 import ast
 import collections
 import pathlib
+import re
 
 import pytest
 from imports import circles, imports, modules
 
-# What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
+REPO = pathlib.Path(__file__).parent.parent
+# What each folder may import, itself aside; a dotted name is that module alone.
 LAYERS = {
     "arguments": "quiet files units",
     "cache": "files",
@@ -55,6 +57,8 @@ LAYERS = {
     "biotac_mj": "lazy plugin",
 }
 ABOVE_ALL = {"cli", "__main__"}
+# what the walk's rows name of other files and of MuJoCo
+OTHERS = set("mjData plugin_state SkinData GeomSet condensed py".split())
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +88,26 @@ def test_folders_import_only_what_lies_below_them(graph):
             if _folder(other) not in {folder, *allowed} and other.removeprefix("biotac_mj.") not in allowed:
                 wrong[folder].add(f"{name} imports {other}")
     assert not wrong, "\n".join(line for lines in wrong.values() for line in sorted(lines))
+
+
+def test_design_has_a_row_for_every_folder_and_module():
+    text = (REPO / "docs" / "design.md").read_text()
+    rows = {name.strip("/") for row in re.findall(r"^\| .*?\|", text, re.M)
+            for name in re.findall(r"`biotac_mj/([\w./]+)`", row)}  # fmt: skip
+    there = {path.name for path in (REPO / "biotac_mj").iterdir() if path.name != "__pycache__"}
+    assert rows == {name for name in there if not name.startswith(("__main__", "py."))}
+
+
+def test_the_walk_names_at_most_12_files_and_what_is_in_them():
+    text = (REPO / "docs" / "concepts" / "step.md").read_text()
+    rows = re.findall(r"^\| (\d+) \| \[`(.+?)`\]\((.+?)\) \| (.+?) \|$", text, re.M)
+    assert [int(row[0]) for row in rows] == list(range(1, len(rows) + 1)) and 8 <= len(rows) <= 12
+    for _, name, link, about in rows:
+        path = (REPO / "docs" / "concepts" / link).resolve()
+        assert path == REPO / "biotac_mj" / name and path.is_file(), name
+        defined = {node.name for node in ast.walk(ast.parse(path.read_text())) if hasattr(node, "name")}
+        said = {part for word in re.findall(r"`([A-Za-z_][\w.]*)`", about) for part in word.split(".")}
+        assert said - OTHERS <= defined, f"{name} has no {', '.join(said - OTHERS - defined)}"
 
 
 def test_no_bar_is_drawn_where_no_terminal_is():
