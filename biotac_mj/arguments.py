@@ -109,8 +109,15 @@ def real(low: float = -math.inf, high: float = math.inf) -> Callable[[str], floa
     return _number(float, "a finite number", low, high)
 
 
-def quantity(kind: str, most: float = math.inf, least: float = -math.inf) -> Callable[[str], float]:
-    """A length, angle, time or speed (`units.UNITS`) in SI: a number with a unit, or a plain number of SI."""
+def quantity(
+    kind: str, most: float = math.inf, least: float = -math.inf, plain: float = math.inf
+) -> Callable[[str], float]:
+    """A length, angle, time or speed (`units.UNITS`) in SI: a number with a unit, or a plain number of SI.
+
+    Args:
+      most, least: limits, in SI. plain: limit of a number without a unit, which the usual unit may be missing
+        from.
+    """
     usual, factor = list(UNITS[kind].items())[1]
 
     def read(text):
@@ -122,6 +129,11 @@ def quantity(kind: str, most: float = math.inf, least: float = -math.inf) -> Cal
             limits = f"{least / factor:.4g} to {most / factor:.4g} {usual}"
             raise argparse.ArgumentTypeError(
                 f"{text!r} is {value:g} {SI[kind]}: {question(value, most, kind)}{limits} can be given"
+            )
+        if abs(value) > plain and not text.strip()[-1].isalpha():
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is {value:g} {SI[kind]}: {question(value, plain, kind)}write {value:g}{SI[kind]} "
+                "if not"
             )
         return value
 

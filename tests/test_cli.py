@@ -103,6 +103,28 @@ def test_units_mean_the_same_on_the_command_line_and_in_python():
             PressOptions(**wrong)
 
 
+@pytest.mark.parametrize(
+    "words, value, said",
+    [
+        ("press --hold 20", None, "'20' is 20 s: did you mean 20ms? write 20s if not"),
+        ("press --hold 2e5", None, "'2e5' is 200000 s: write 200000s if not"),
+        ("press --hold 20s", 20.0, None),
+        ("press --hold 0.5", 0.5, None),
+        ("view --seconds 500ms", 0.5, None),
+        ("view --seconds 300", None, "'300' is 300 s: did you mean 300ms? 0 to 6e+04 ms can be given"),
+        ("data import log.txt --out set --block 10s", 10.0, None),
+    ],
+)
+def test_a_plain_time_that_is_too_long_is_asked_about(words, value, said, capsys):
+    try:
+        args = cli.parser().parse_args(words.split())
+    except SystemExit:
+        assert said in " ".join(capsys.readouterr().err.split())
+    else:
+        option = next(word[2:] for word in words.split() if word in ("--hold", "--seconds", "--block"))
+        assert said is None and getattr(args, option) == value
+
+
 def test_help_is_light():
     code = (
         "import sys; from biotac_mj.cli import parser; parser(); "

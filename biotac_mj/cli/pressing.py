@@ -11,6 +11,7 @@ from .names import INDENTER_HELP, LOCATION_HELP, TASKS
 __all__ = ["add_design", "add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
 
 _LONGEST_STEP = 0.1  # [s] quasi-static presses use longer internal steps
+_LONG_HOLD = 5.0  # [s] a longer one is more likely of milliseconds, and needs its unit
 
 
 def add_press(verbs: argparse._SubParsersAction) -> None:
@@ -60,7 +61,7 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--hold",
-        type=quantity("time"),
+        type=quantity("time", plain=_LONG_HOLD),
         default="20ms",
         metavar="TIME",
         help="rest at the end of press and slide",
@@ -218,7 +219,13 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
         metavar="FILE",
         help="write a picture of the ball lying on the pad instead of opening a window",
     )
-    verb.add_argument("--seconds", type=real(0, 60), default=0.3, help="how long to simulate before --render")
+    verb.add_argument(
+        "--seconds",
+        type=quantity("time", 60.0, 0.0),
+        default="300ms",
+        metavar="TIME",
+        help="how long to simulate before --render",
+    )
     verb.add_argument(
         "--hand",
         metavar="FILE",

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import SEED, add_ray, check_device, output_folder, real, whole
+from ..arguments import SEED, add_ray, check_device, output_folder, quantity, real, whole
 from .common import add_sensor, add_skin, add_verb
 from .names import INTERACTIONS, OBJECTS
 
@@ -114,8 +114,8 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--force", metavar="FILE", help="forces row by row, text of 3 columns [N]")
     verb.add_argument(
         "--block",
-        type=real(1e-3, 1e9),
-        metavar="S",
+        type=quantity("time", 1e9, 1e-3),
+        metavar="TIME",
         help="split into interactions of this length (and at gaps of half a second)",
     )
     verb.add_argument(

@@ -15,7 +15,16 @@ from ..geometry.rigid import matrix
 from ..sensor.colors import FULL_CHANGE, change_map
 from .record import PressRecord
 
-__all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "unroll", "write_picture"]
+__all__ = [
+    "draw_electrodes",
+    "draw_force",
+    "draw_map",
+    "draw_surface",
+    "draw_traces",
+    "table",
+    "unroll",
+    "write_picture",
+]
 
 _CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
 _HARD = np.array([0.75, 0.75, 0.78])
@@ -33,7 +42,6 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
     """Draws the unrolled core, tip on the left, E1..E6 below: electrodes with numbers and changes, in the
     colours of all pictures, over contours of the skin's displacement."""
     geometry = record.geometry
-    change = record.electrode_change[step]
     outer = np.unique(geometry.outer_face)
     outer = outer[np.abs(np.arctan2(geometry.vert[outer, 2], -geometry.vert[outer, 1])) < 2.0]
     moved = 1e3 * np.linalg.norm(record.vert_xpos[step, outer] - geometry.vert[outer], axis=1)
@@ -41,7 +49,14 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
         place = unroll(geometry.vert[outer])
         lines = axes.tricontour(*place.T, moved, levels=6, colors="0.6", linewidths=0.8, zorder=1)
         axes.clabel(lines, fmt="%g", fontsize=7, zorder=1)
-    place, scale = unroll(geometry.electrode_pos), dict(vmin=-FULL_CHANGE, vmax=FULL_CHANGE)
+    draw_map(axes, geometry.electrode_pos, record.electrode_change[step])
+    axes.set_title(f"{axes.get_title()}; lines: how far the skin moved [mm]")
+
+
+def draw_map(axes: Axes, electrode_pos: np.ndarray, change: np.ndarray) -> None:
+    """Draws electrodes at their places (nelectrode, 3) [m] on the unrolled core with their changes
+    (nelectrode,) from the reference counts, tip on the left, E1..E6 below."""
+    place, scale = unroll(electrode_pos), dict(vmin=-FULL_CHANGE, vmax=FULL_CHANGE)
     dots = axes.scatter(*place.T, c=change, cmap=change_map(), **scale, s=480, edgecolors="0.3", zorder=2)
     for i, (x, y) in enumerate(place):
         ink = "white" if abs(change[i]) > 0.6 * FULL_CHANGE else "black"
@@ -56,7 +71,7 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
         aspect="equal",
         xlabel="along the finger, tip on the left [mm]",
         ylabel="around the core [mm]",
-        title="Electrodes E1..E19; lines: how far the skin moved [mm]",
+        title=f"Electrodes E1..E{len(change)}",
     )
     axes.margins(0.12)
 

@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Callable
 
-from ..arguments import output_file, real, whole
+from ..arguments import output_file, quantity, real, whole
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -64,7 +64,12 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         metavar="NAME",
         help="of --serial's lines, as time e1 ... e19 pdc (default: a header line, or e1..e19)",
     )
-    v.add_argument("--seconds", type=real(0.01, 1e6), help="duration (default: 10, or that of the protocol)")
+    v.add_argument(
+        "--seconds",
+        type=quantity("time", 1e6, 0.01),
+        metavar="TIME",
+        help="duration (default: 10s, or that of the protocol)",
+    )
     v.add_argument(
         "--protocol",
         type=output_file(),

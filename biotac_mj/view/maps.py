@@ -14,7 +14,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["Maps"]
 
 _SCALE = 6.0  # [pixel / mm]
-_HEIGHT, _BAR = 180, 260  # height of the strip, width of the colour scale [pixel]
+_HEIGHT, _BAR = 180, 260  # height of the strip, largest width of the colour scale [pixel]
 
 
 class Maps:
@@ -56,14 +56,14 @@ class Maps:
         return whole
 
     def _draw_scale(self, draw, width, bottom):
-        left, half = (width - _BAR) / 2, _BAR / 2
-        for x in range(_BAR):
+        less, more = f"-{FULL_CHANGE:.0f} counts, less liquid", f"+{FULL_CHANGE:.0f}, more"
+        room = max(draw.textlength(text, self._font) for text in (less, more)) + 12
+        bar = min(_BAR, int(width - 2 * room))
+        left, half = (width - bar) / 2, bar / 2
+        for x in range(bar):
             color = electrode_colors(np.array([(x / half - 1) * FULL_CHANGE]))[0, :3]
             draw.line([left + x, bottom - 20, left + x, bottom - 10], tuple((255 * color).astype(int)))
-        for x, anchor, text in (
-            (left - 6, "rm", f"-{FULL_CHANGE:.0f} counts, less liquid"),
-            (left + _BAR + 6, "lm", f"+{FULL_CHANGE:.0f}, more"),
-        ):
+        for x, anchor, text in ((left - 6, "rm", less), (left + bar + 6, "lm", more)):
             draw.text((x, bottom - 15), text, "black", self._font, anchor=anchor)
 
     @staticmethod

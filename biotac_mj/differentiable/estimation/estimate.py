@@ -105,7 +105,7 @@ class Estimator:
 
     Args:
       geometry: of the skin. indenter: as in `biotac press --indenter`, one geom or mesh.
-      material, options: of the skin; force scales with its modulus.
+      material, options: of the skin; force scales with its modulus. progress: whether to show bars.
 
     Raises:
       ValueError: as for `Skin`.
@@ -117,8 +117,9 @@ class Estimator:
         indenter: str = "sphere_7mm",
         material: str | Material = "default",
         options: SkinOptions | None = None,
+        progress: bool = False,
     ):
-        self.geometry, self.indenter = geometry, indenter
+        self.geometry, self.indenter, self.progress = geometry, indenter, progress
         _, shape = steps_of(plan_indentation(indenter, slide=0.0, samples=4, skin=geometry))
         self.skin = Skin(geometry, material, options, **shape, precision=_PRECISION)
         self._last = None
@@ -126,7 +127,7 @@ class Estimator:
     @functools.cached_property
     def presses(self) -> Presses:
         """Presses all over the skin; simulated on first use, or read from disk."""
-        return Presses(self.skin, self.geometry, self.indenter)
+        return Presses(self.skin, self.geometry, self.indenter, self.progress)
 
     def learn(self, touches: Sequence[Touch]) -> Belief:
         """Belief about the sensor after known touches, see `belief.learn`."""
@@ -154,7 +155,7 @@ class Estimator:
         signal = change if pdc is None else np.append(change, pressure_change(*pdc))
         film = FilmConduction(self.geometry, **(film or {}))
         noise = noise_of(np.asarray(rest, float), rows)[: len(signal)]
-        found = fit(self.presses, film, signal, noise)
+        found = fit(self.presses, film, signal, noise, self.progress)
         spread = np.sqrt(np.diag(found.covariance))
         wide_force, wide = OWN_WIDE
         size = float(np.exp(found.outcome[0]))

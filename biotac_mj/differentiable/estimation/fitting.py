@@ -9,6 +9,7 @@ import functools
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from ...calibration.forward import Steps
 from ...sensor.channels import electrode_noise, log_impedance, pressure_from_counts
@@ -59,14 +60,18 @@ def noise_of(rest: np.ndarray, rows: int) -> np.ndarray:
     return np.append(electrode_noise(rest) * slope, count) * np.sqrt(1 + 1 / rows)
 
 
-def fit(presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.ndarray) -> Fit:
+def fit(
+    presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.ndarray, progress: bool = False
+) -> Fit:
     """Fits presses to a signal (nelectrode + 1,), or (nelectrode,) without pressure, with that noise.
 
     Raises:
       ValueError: no starting press can be simulated.
     """
-    searches = (_Search(presses, film, signal, noise, start) for start in _starts(presses, signal, noise))
-    found = [press for press in (search.run() for search in searches) if press is not None]
+    starts = _starts(presses, signal, noise)
+    with tqdm(desc="estimate: fit", unit="press", disable=not progress or None, leave=False) as bar:
+        searches = (_Search(presses, film, signal, noise, start, bar) for start in starts)
+        found = [press for press in (search.run() for search in searches) if press is not None]
     if not found:
         raise ValueError("no press near what was read can be simulated: choose a row under less load")
     # several presses may fit: they are weighted by their likelihood
@@ -108,10 +113,10 @@ def _starts(presses, signal, noise):
 class _Search:
     """Search from one press of the table."""
 
-    def __init__(self, presses, film, signal, noise, start):
+    def __init__(self, presses, film, signal, noise, start, bar):
         self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
         self._steps = presses.path(*presses.at[start])
-        self._axes = frame_of(self._steps, presses.at[start, 1])
+        self._axes, self._bar = frame_of(self._steps, presses.at[start, 1]), bar
 
     def run(self) -> _Press | None:
         """Levenberg-Marquardt iterations. The scale of the noise is estimated with the press, so the prior
@@ -143,6 +148,7 @@ class _Search:
 
     def _simulate(self, at):
         """Simulates a press moved by the first three coordinates [mm] and tilted by the others [rad]."""
+        self._bar.update()
         skin, presses, start = self._presses.skin, self._presses, self._steps.pos[0]
         turn = Rotation.from_rotvec(at[3:] @ self._axes).as_matrix()
         pos = start + (self._steps.pos - start) @ turn.T + 1e-3 * at[:3]

@@ -6,12 +6,14 @@ interpolated by splines."""
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 import torch
 import warp as wp
 from scipy.interpolate import RegularGridInterpolator
 from torch.autograd import forward_ad
+from tqdm import tqdm
 
 from ...cache import cached
 from ...calibration import plan_indentation
@@ -136,6 +138,7 @@ class Presses:
 
     Args:
       skin: with one geom. geometry: of it. indenter: the geom, as in `biotac press --indenter`.
+      progress: whether to show a bar while the table is made.
 
     Attributes:
       at: (n, 3) along [m] and around [rad] the capsule, fraction of the deepest press there.
@@ -148,8 +151,8 @@ class Presses:
         position.
     """
 
-    def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str):
-        self.skin, self.geometry, self._indenter = skin, geometry, indenter
+    def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str, progress: bool = False):
+        self.skin, self.geometry, self._indenter, self._progress = skin, geometry, indenter, progress
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
         self._capsule = capsule = capsule_of(geometry)
         axes = capsule.along, capsule.around, _FRACTIONS
@@ -202,32 +205,33 @@ class Presses:
         }  # fmt: skip
         table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
         films, n = None, len(self.geometry.vert)
-        for i, along in enumerate(capsule.along):
-            for j, around in enumerate(capsule.around):
-                with self.skin.lock:
-                    trajectory, steps = self.simulate(along, around)
-                    tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
-                rest = trajectory.rest
-                lies = rest.x[:n, 0].numpy() if rest else self.geometry.vert
-                films = films or _Films(self.geometry, lies)
-                begin = float(rest.pressure) if rest else 0.0
-                for k, end in enumerate(steps.ends[1:], start=1):
-                    record, here = trajectory.steps[end], (i, j, k)
-                    try:
-                        read = films.read(record.x[:n, 0].numpy(), tangents.nodes[:, 0, end, :n])
-                    except NoFilmError:  # deeper than the film allows: use the deepest valid one
-                        read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
-                    for name, value in zip(widths, read):
-                        table[name][here][..., :-1] = value
-                    table["signal"][here][-1] = 1e-3 * (float(record.pressure) - begin)
-                    table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
-                    wrench, middle = record.wrench[0, 0], torch.from_numpy(self.middle(record.touches))
-                    slopes = torch.autograd.functional.jacobian(
-                        functools.partial(outcome_of, middle=middle), wrench
-                    )
-                    table["outcome"][here] = outcome_of(wrench, middle).numpy()
-                    table["outcome"][here][0] -= np.log(_FRACTIONS[k])
-                    table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
+        places = list(itertools.product(enumerate(capsule.along), enumerate(capsule.around)))
+        silent = not self._progress or None
+        for (i, along), (j, around) in tqdm(places, "estimate: table, once", unit="press", disable=silent):
+            with self.skin.lock:
+                trajectory, steps = self.simulate(along, around)
+                tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
+            rest = trajectory.rest
+            lies = rest.x[:n, 0].numpy() if rest else self.geometry.vert
+            films = films or _Films(self.geometry, lies)
+            begin = float(rest.pressure) if rest else 0.0
+            for k, end in enumerate(steps.ends[1:], start=1):
+                record, here = trajectory.steps[end], (i, j, k)
+                try:
+                    read = films.read(record.x[:n, 0].numpy(), tangents.nodes[:, 0, end, :n])
+                except NoFilmError:  # deeper than the film allows: use the deepest valid one
+                    read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
+                for name, value in zip(widths, read):
+                    table[name][here][..., :-1] = value
+                table["signal"][here][-1] = 1e-3 * (float(record.pressure) - begin)
+                table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
+                wrench, middle = record.wrench[0, 0], torch.from_numpy(self.middle(record.touches))
+                slopes = torch.autograd.functional.jacobian(
+                    functools.partial(outcome_of, middle=middle), wrench
+                )
+                table["outcome"][here] = outcome_of(wrench, middle).numpy()
+                table["outcome"][here][0] -= np.log(_FRACTIONS[k])
+                table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
         for name in ("outcome", "outcome_by"):
             table[name][:, :, 0] = table[name][:, :, 1]
         return table

@@ -49,7 +49,7 @@ def estimate_verb(args: argparse.Namespace) -> None:
     pressed = settings_of(args.file, recording)
     simulated = pressed is not None and _is_the_simulated_one(args, pressed)
     skin, indenter, settings, film = _inverted(args, pressed, designed(counts))
-    estimator = Estimator(load_skin(skin), indenter, settings.material, settings.options)
+    estimator = Estimator(load_skin(skin), indenter, settings.material, settings.options, not args.quiet)
     belief = estimator.learn(_touches(args)) if args.known else None
     pdc = _pdc(recording)
     pdc_rest = None if pdc is None or len(counts) <= args.rest else pdc[: args.rest].mean()
