@@ -206,8 +206,8 @@ class Presses:
         table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
         films, n = None, len(self.geometry.vert)
         places = list(itertools.product(enumerate(capsule.along), enumerate(capsule.around)))
-        silent = not self._progress or None
-        for (i, along), (j, around) in tqdm(places, "estimate: table, once", unit="press", disable=silent):
+        shown = self._progress
+        for (i, along), (j, around) in tqdm(places, "table, once", unit="press", disable=not shown or None):
             with self.skin.lock:
                 trajectory, steps = self.simulate(along, around)
                 tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
