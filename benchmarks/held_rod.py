@@ -1,6 +1,7 @@
 """The fast setting against the full tier: a rod that a Shadow Hand holds and rolls, step by step.
 
-    MENAGERIE_ROOT=DIR python benchmarks/held_rod.py [--json OUT] [--decisions 20] [--from 8] [--seed 1]
+    MENAGERIE_ROOT=DIR python benchmarks/held_rod.py [--json OUT] [--decisions 28] [--from 8] [--seed 1]
+        [--skin coarse]
 
 `RollRod` (tasks/batched) is stepped with one world and random actions. The rod's poses on each fingertip are
 recorded: where the batch solved the skin. Then they are replayed on a BioTac that stands still, one way, by
@@ -8,6 +9,7 @@ the condensed and by the full tier, and compared from decision --from on, in whi
 
   force_rel     RMS over steps of the difference of the force, over the RMS of the full tier's
   counts_rms    RMS over steps and electrodes of the difference of their counts
+  electrodes, pdc, pac  slope of the full tier's changes over those of the condensed tier
   batch_rel     as force_rel, of what acted in the batch against the condensed tier's replay
 
 A row of the JSON is a finger. Steps are of 4 ms, ten a decision."""
@@ -66,29 +68,46 @@ def record(hand: pathlib.Path, decisions: int, seed: int) -> tuple[dict, tuple]:
     return out, tuple(geoms.size.numpy()[0][:2])
 
 
-def replay(pos: np.ndarray, mat: np.ndarray, friction: float, size: tuple, tier: str) -> tuple:
-    """Forces (n, 3) [N] and counts (n, 19) of a BioTac on which a capsule goes along."""
+def replay(
+    pos: np.ndarray, mat: np.ndarray, friction: float, size: tuple, tier: str, skin: str = "coarse"
+) -> tuple:
+    """Forces (n, 3) [N] and {channel: counts (n, k)} of a BioTac on which a capsule goes along."""
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep=".004" gravity="0 0 0"/><worldbody><body name="finger"/>'
         f'<body name="rod" mocap="true"><geom name="rod" type="capsule" size="{size[0]} {size[1]}"/></body>'
         "</worldbody></mujoco>"
     )
     handle = biotac_mj.attach(
-        spec, body="finger", tier=tier, skin="coarse", geoms=["rod"], friction=friction, coupling="one-way"
+        spec, body="finger", tier=tier, skin=skin, geoms=["rod"], friction=friction, coupling="one-way"
     )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     core = data.body(handle.body)
     frame, origin = core.xmat.reshape(3, 3).copy(), core.xpos.copy()
-    force, counts = [], []
+    force, counts = [], {name: [] for name in ("electrodes", "pdc", "pac")}
     for p, R in zip(pos, mat):
         data.mocap_pos[0] = origin + frame @ p
         mujoco.mju_mat2Quat(data.mocap_quat[0], (frame @ R).ravel())
         mujoco.mj_step(model, data)
         force.append(handle.read(data, "contact_force")[:3])
-        counts.append(handle.read(data, "electrodes"))
-    return np.array(force), np.array(counts)
+        for name, rows in counts.items():
+            rows.append(handle.read(data, name))
+    return np.array(force), {name: np.array(rows) for name, rows in counts.items()}
+
+
+def changes(counts: dict, begin: int) -> dict:
+    """{channel: (n, k)} from row `begin` on, as changes from the first rows, in which nothing touches; of PAC
+    from its mean."""
+    return {
+        name: rows[begin:] - (rows[begin:].mean() if name == "pac" else rows[:5].mean(0))
+        for name, rows in counts.items()
+    }
+
+
+def slope(first: np.ndarray, second: np.ndarray) -> float:
+    """Of `second` over `first`, through zero, by least squares."""
+    return float((first * second).sum() / (first**2).sum())
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -97,6 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--decisions", type=int, default=28, help="in all, of ten steps")
     parser.add_argument("--from", type=int, default=8, dest="first", help="decision from which is compared")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--skin", default="coarse", help="of the full tier")
     options = parser.parse_args(arguments)
     warnings.simplefilter("ignore")
     root = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
@@ -105,17 +125,21 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for name, (pos, mat, acted, friction) in seen.items():
         (fast, fast_counts), (full, full_counts) = (
-            replay(pos, mat, friction, size, tier) for tier in ("condensed", "full")
+            replay(pos, mat, friction, size, *kind) for kind in (("condensed",), ("full", options.skin))
         )
         begin = STEPS * options.first
         fast, full, acted = fast[begin:], full[begin:], acted[begin:]
+        fast_changes, full_changes = (changes(counts, begin) for counts in (fast_counts, full_counts))
         rms = float(np.sqrt((full**2).sum(axis=1).mean()))
         row = {
             "finger": name,
             "steps": len(full),
             "force_n": rms,
             "force_rel": float(np.sqrt(((fast - full) ** 2).sum(axis=1).mean())) / rms,
-            "counts_rms": float(np.sqrt(((fast_counts - full_counts)[begin:] ** 2).mean())),
+            "counts_rms": float(
+                np.sqrt(((fast_counts["electrodes"] - full_counts["electrodes"])[begin:] ** 2).mean())
+            ),
+            **{name: slope(fast_changes[name], full_changes[name]) for name in fast_changes},
             "batch_rel": float(np.sqrt(((fast + acted) ** 2).sum(axis=1).mean())) / rms,
         }
         rows.append(row)

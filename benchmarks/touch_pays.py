@@ -12,7 +12,7 @@ learned electrodes in a batch of their own. Success is that of one more episode 
 that no policy has seen, without exploration; its interval is Wilson's, of 95 %.
 
 --transfer N: the same policies, side by side in N worlds each, with the default skin in the full tier, on
-random sensors with three effects that learning did not have (UNSEEN)."""
+other random sensors with another gain of PDC and three effects that learning did not have (UNSEEN)."""
 
 import argparse
 import functools
@@ -27,8 +27,8 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 __all__ = ["UNSEEN", "draw", "main", "table", "transfer"]
 
-UNSEEN = {"dead": 1.0, "crosstalk": 1.0, "pdc_gain": 1.0}
-OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": UNSEEN}
+UNSEEN = ("dead", "crosstalk", "relax")
+OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": (*UNSEEN, "pdc_gain")}
 
 
 def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict]:
@@ -38,7 +38,7 @@ def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict
     Args:
       paths: of the policies. worlds: of each. own: further keywords of `make`.
     """
-    from biotac_mj.tasks.batched.playing import acting, env_of, play
+    from biotac_mj.tasks.batched.playing import HELD_OUT, acting, env_of, play
     from biotac_mj.tasks.batched.policy import read_card
 
     found, cards = [], {path: read_card(path) for path in sorted(paths)}
@@ -47,7 +47,8 @@ def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict
         if not some:
             continue
         signal = "learned" if learned else "electrodes"
-        env = env_of(cards[some[0]], worlds * len(some), observe=signal, **OTHER | own)
+        more = {"seed": HELD_OUT, **OTHER, **own}
+        env = env_of(cards[some[0]], worlds * len(some), observe=signal, **more)
         acts = []
         for i, path in enumerate(some):
             own_worlds = slice(i * worlds, (i + 1) * worlds)

@@ -31,7 +31,7 @@ from biotac_mj.tasks.batched.playing import find_policy
 from biotac_mj.tasks.batched.policy import Policy, load_policy, read_card, save_policy
 from biotac_mj.tasks.batched.ppo import Learner, Lessons, Numbers
 from biotac_mj.tasks.batched.roll_rod import Settings, rolled
-from biotac_mj.tasks.batched.training import train
+from biotac_mj.tasks.batched.training import of_runs, train
 from biotac_mj.view.offscreen import find_gl
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
@@ -136,6 +136,41 @@ def test_an_observation_has_the_last_decisions():
         assert not torch.equal(now[0], before[0])
     with pytest.raises(ValueError, match="history"):
         make("follow_edge", 1, device="cpu", history=0)
+
+
+def test_every_episode_has_gains_of_its_own():
+    """What counts change by is felt times a factor of each finger's electrodes, one of PDC, one of PAC."""
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1, decisions=2)
+    env = make("follow_edge", 3, observe="electrodes+pac", settings=settings, device="cpu", model_error=0.1)
+
+    def felt():
+        """(3, 42) of changes of 100 counts in all channels."""
+        env.step(torch.zeros(3, 4))
+        env._sensed[:, env._touch._place] = env.rest_counts + 100.0
+        env._sense(~env._everyone)
+        return env.observe()["touch"]
+
+    seen = felt()
+    for part in seen.split([19, 1, 22], dim=1):
+        assert torch.allclose(part, part[:, :1].expand_as(part), rtol=1e-5)
+        assert len(part[:, 0].unique()) == 3
+    assert 0.02 < seen[:, [0, 19, 20]].std() < 0.3 and abs(seen.mean() - 1) < 0.2
+    env.reset()
+    assert not torch.isclose(felt(), seen).any()  # another episode
+    env.model_error = 0.0
+    env.reset()
+    assert torch.allclose(felt(), torch.ones(3, 42), atol=1e-5)
+    with pytest.raises(ValueError, match="model_error"):
+        make("follow_edge", 1, device="cpu", model_error=-0.1)
+
+
+def test_sensors_in_learning_have_their_own_gain_of_pdc():
+    env = of_runs("follow_edge", [("electrodes", 0)], 4, "cpu")
+    acquired = next(iter(env.batches.values())).senses.acquisition
+    first = acquired.state.numpy()[:, acquired.place.pdc_gain].copy()
+    assert len(np.unique(first)) == 4 and 0.02 < first.std() < 0.5 and env.model_error > 0
+    env.reset()
+    assert (acquired.state.numpy()[:, acquired.place.pdc_gain] != first).all()  # of another sensor
 
 
 def test_libraries_get_what_they_ask_for():
@@ -275,7 +310,7 @@ def test_learning_goes_on_where_it_was_stopped(tmp_path, capsys):
         picture = tmp_path / "task.gif"
         assert main(["play", "follow_edge", "--policy", str(path), "--render", str(picture)]) == 0
         with Image.open(picture) as film:
-            assert film.n_frames == 12 and film.size == (480, 360)  # four episodes
+            assert film.n_frames == 12 and film.size == (480, 540)  # four episodes
 
 
 def test_what_only_a_task_has_is_refused_elsewhere(capsys):

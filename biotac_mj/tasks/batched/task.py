@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ...fields import as_whole
+from ...fields import as_real, as_whole
 from ...view.offscreen import stage
 from .bank import Bank
 from .touch import Touch, check_observe
@@ -67,12 +67,14 @@ class BatchTask(abc.ABC):
         projections in place of the film's.
       history: decisions of which "body" and "touch" have what was sensed, the last one first; an episode that
         is younger repeats its first.
+      model_error: deviation of the factors by which counts change more or less than the skins of this tier
+        say, drawn in each episode: of a finger's electrodes, of its PDC, of its PAC.
       settings: the task's numbers; None takes the class's own.
       biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`. Skins are coarse and condensed where
         nothing else is said.
 
     Attributes:
-      num_envs, num_actions, max_episode_length, device, observes, history, biotac.
+      num_envs, num_actions, max_episode_length, device, observes, history, model_error, biotac.
       model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}. prefixes: {finger: of its names}.
       good: (k,) worlds whose states were kept, where episodes begin with them.
       episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
@@ -94,6 +96,7 @@ class BatchTask(abc.ABC):
         observe: str = "electrodes",
         settings: TaskSettings | None = None,
         history: int = 1,
+        model_error: float = 0.0,
         **biotac: object,
     ):
         import mujoco_warp as mjw
@@ -102,6 +105,7 @@ class BatchTask(abc.ABC):
 
         self.num_envs, self.observes = as_whole("num_envs", num_envs, 1), check_observe(observe)
         self.history = as_whole("history", history, 1)
+        self.model_error = as_real("model_error", model_error, 0.0)
         self.cfg = s = self.settings if settings is None else settings
         where = wp.get_device(device)
         self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
@@ -375,7 +379,7 @@ class BatchTask(abc.ABC):
         """What is sensed after a decision goes before what was sensed earlier; in worlds (num_envs,) of bool
         that begin there is nothing earlier."""
         touched = (self._age > 0)[:, None, None]
-        changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
+        changes = torch.where(touched, self._touch.changes, 0.0)
         now = [torch.cat(self._sense_body(), dim=1), changes]
         first = [one[:, None].expand(-1, self.history, *one.shape[1:]) for one in now]
         if self._past is None:
@@ -398,6 +402,7 @@ class BatchTask(abc.ABC):
         if not which.any():
             return
         self.episode_length_buf[which] = 0
+        self._touch.draw_gains(which, self.model_error, self._draw)
         if self._bank:
             worlds = which.nonzero()[:, 0]
             self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])

@@ -59,11 +59,25 @@ class Touch:
         self._seeds = [_as_int64(a.seed) for a in acquired]
         self._noise = [wp.to_torch(a.state)[:, a.place.pdc_noise] for a in acquired]
         self.tare = torch.zeros(self.channels.shape, device=sensordata.device)
+        self._gain = torch.ones_like(self.tare)
 
     @property
     def channels(self) -> torch.Tensor:
         """(nworld, nfinger, k) counts of electrodes, PDC and PAC."""
         return self._sensed[:, self._place]
+
+    @property
+    def changes(self) -> torch.Tensor:
+        """(nworld, nfinger, k) of the channels from `tare`, times what `draw_gains` has drawn."""
+        return (self.channels - self.tare) * self._gain
+
+    def draw_gains(self, which: torch.Tensor, deviation: float, draw: torch.Generator) -> None:
+        """Draws factors 1 +- deviation on the changes in worlds (nworld,) of bool: of each finger one for its
+        electrodes, one for PDC and one for PAC."""
+        gain = torch.randn(*self.tare.shape[:2], len(_CHANNELS), generator=draw, device=draw.device)
+        split = torch.tensor(self._split, device=draw.device)
+        gain = (1 + deviation * gain).repeat_interleave(split, dim=2)
+        self._gain = gain.where(which[:, None, None], self._gain)
 
     def observe(self, choice: str, changes: torch.Tensor) -> torch.Tensor:
         """(nworld, h, n) of a choice of OBSERVE, from the `channels` as changes from those at rest, (nworld,

@@ -6,7 +6,8 @@ batch.
 Each learns in its own share of the worlds. Every half minute the folder gets `TASK-OBSERVE-SEED.safetensors`,
 the policy with a card of what it saw and how it does, and a file beside it from which `--resume` goes on; so
 it may be stopped at any time. When the minutes are over each policy plays its worlds once more, from
-beginnings that none has seen, without exploration: that is the success on its card. Needs the extras
+beginnings that none has seen, without exploration and without the error of the model that they learned with
+(`BatchTask.model_error`): that is the success on its card. Needs the extras
 `batch` and `learning`; on a GPU some minutes, on a CPU a day."""
 
 import argparse
@@ -30,7 +31,9 @@ from .task import BatchTask
 __all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
 
 # what sensors have in learning besides the spread of real ones (`sensor="random"`)
-RANDOMISED = ("gain", "warmup", "drift")
+RANDOMISED = ("gain", "pdc_gain", "warmup", "drift")
+# of coarse skins in the condensed tier against the full one and the default skin (docs/lab/tasks.md)
+_MODEL_ERROR = 0.1
 _KEEP = 30.0  # [s] between files
 _STRAY = 0.3  # deviation of actions from the teacher's while he acts: he shows the way back too
 _HISTORY = 12  # decisions that a policy sees: noise of the encoders is new in each
@@ -206,6 +209,7 @@ def train(
             print(f"{told}{', taught' if learns else ''}, {rates}", flush=True)
     for run in learners:
         run.keep(out, task, about)
+    env.model_error = 0.0
     ends = play(env, [(run.worlds, run.act) for run in learners])
     return [run.keep(out, task, about | end) for run, end in zip(learners, ends, strict=True)]
 
@@ -232,7 +236,7 @@ def _about(env):
     device = wp.get_device(env.device)
     packages = versions()
     made = {"settings": dataclasses.asdict(env.cfg), "biotac": env.biotac, "worlds": env.num_envs}
-    made |= {"history": env.history}
+    made |= {"history": env.history, "model_error": env.model_error}
     return {"data": "synthetic", **made, "device": device.name, "versions": packages}
 
 
@@ -293,6 +297,7 @@ def of_runs(
         sensor="random",
         randomise=list(RANDOMISED),
         history=_HISTORY,
+        model_error=_MODEL_ERROR,
         **own,
     )
 
