@@ -275,8 +275,7 @@ _READINGS = (
      "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
     ("electrodes from a network", '`signal=` "latent_projection" (every BioTac skin), "learned" (the default '
      "skin), or a file of `biotac learn train`",
-     "attach, condensed, batch, tasks, press and generate (`--signal`); diagnose: by physics alone; no heat "
-     "or vibration in `attach`"),
+     "attach, condensed, batch, tasks, press and generate (`--signal`); diagnose: by physics alone"),
     ("place and force from electrodes by Lin, Fishel and Loeb's formula",
      "`sensor.WeightedElectrodes` of counts of any path",
      'tasks (`observe="estimated"`); force of other designs than the BioTac after `fitted`'),

@@ -201,7 +201,23 @@ def test_pointnets_weights_know_no_way_back(tmp_path, points):
         load_inverse(path, skin)
 
 
-def test_errors_name_the_network_as_it_was_asked_for():
-    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
-    with pytest.raises(ValueError, match="signal 'latent_projection' knows no heat"):
-        biotac_mj.attach(spec, site="tip", skin="coarse", signal=NAME, thermal={})
+def test_a_sensor_with_a_network_feels_heat():
+    """A cold finger on steel: the liquid and with it all electrodes cool, which moves their counts."""
+    counts = {}
+    for thermal in (None, {"ball": "steel"}):
+        spec = mujoco.MjSpec.from_string(
+            """<mujoco><option timestep="0.01"/><worldbody><site name="tip"/>
+            <body pos="-0.008 -0.0108 0" mocap="true">
+            <geom name="ball" type="sphere" size="0.0035"/></body></worldbody></mujoco>"""
+        )
+        handle = biotac_mj.attach(
+            spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", signal=NAME,
+            readings={"noise": False}, thermal=thermal,
+        )  # fmt: skip
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        for _ in range(150):
+            mujoco.mj_step(model, data)
+        counts[bool(thermal)] = handle.read(data, "tdc")[-1], handle.read(data, "electrodes").mean()
+    assert counts[True][0] != counts[False][0]
+    assert abs(counts[True][1] - counts[False][1]) > 0

@@ -21,7 +21,7 @@ from biotac_mj.data import TactileSet  # noqa: E402
 from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.patch import contact_patch  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
-from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
+from biotac_mj.learning.serve import LearnedBatchFilm, NetworkFilm  # noqa: E402
 from biotac_mj.learning.shipping import ship  # noqa: E402
 from biotac_mj.learning.training import experiment, fitting  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
@@ -35,6 +35,7 @@ from biotac_mj.learning.training.local import Features, train_head  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
+from biotac_mj.sensor.readings import PhysicsReadings  # noqa: E402
 
 SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
 
@@ -337,13 +338,13 @@ def test_a_window_remembers_in_the_state_and_settles(tmp_path):
     about = {"nvert": skin.nvert, "model": "random"}
     file = tmp_path / "w.safetensors"
     save_forward(file, [member], Pod(skin.nvert, 4), config, {"kind": "local", "window": True}, skin, about)
-    readings = NetworkReadings(skin, weights=file, noise=False, sensor="2")
+    readings = PhysicsReadings(skin, film=NetworkFilm(skin, file), noise=False, sensor="2")
     assert readings.nstate == Acquisition().nstate + 1 + 2 * 19 * FilmFeatures.count
     state = np.zeros(readings.nstate)
     readings.reset(state)
     moved = skin.vert + dent(skin, [-9e-3, -7e-3, 0], 0.3e-3, 2e-3, 0)
     u = torch.tensor(1e3 * (moved - skin.vert)[None], dtype=torch.float32)
-    steady = readings.model.counts(u, REST_COUNTS["2"])[0].numpy()
+    steady = readings.film.model.counts(u, REST_COUNTS["2"])[0].numpy()
     trace = []
     for k in range(400):
         readings.advance(state, 0.01 * k, 0.01, moved, 0.0)
@@ -362,7 +363,7 @@ def test_a_batch_gives_what_single_sensors_give(weights):
     film = LearnedBatchFilm(skin, 3, "cpu", weights=weights, sensor="2")
     x = wp.array(np.ascontiguousarray((skin.vert + u).transpose(1, 0, 2)), dtype=wp.vec3d)
     film.solve_film(x, wp.array(np.array([1, 0, 1], np.int32), dtype=int))
-    one = NetworkReadings(skin, weights=weights, sensor="2", noise=False)
+    one = NetworkFilm(skin, weights)
     got = film.impedance.numpy()
     np.testing.assert_allclose(got[1], film.rest)
     average = torch.zeros(3, *one.model.memory) if one.model.window else None

@@ -179,7 +179,7 @@ _steppers = {"fem": "biotac_mj.coupling.steppers.fem:FemStepper"}
 _tiers = {"condensed": "biotac_mj.coupling.steppers.condensed:CondensedStepper"}  # instead of "fem"
 _readings = {
     "biotac": "biotac_mj.coupling.sensing.counts:SensorReadings",
-    "learned": "biotac_mj.learning.serve:LearnedReadings",
+    "learned": "biotac_mj.coupling.sensing.counts:LearnedReadings",
     "none": _NoReadings,
 }
 
@@ -202,18 +202,10 @@ def _named(config):
     return f"signal {config.options.get('readings', {}).get('weights') or 'learned'!r}"
 
 
-def _factory(table, name, named=None):
+def _factory(table, name):
     if isinstance(table[name], str):
         module, attribute = table[name].split(":")
-        try:
-            return getattr(importlib.import_module(module), attribute)
-        except ModuleNotFoundError as error:
-            if error.name not in ("torch", "safetensors"):
-                raise
-            raise ModuleNotFoundError(
-                f"{named or repr(name)} needs {error.name}: pip install 'biotac-mj[learning]'",
-                name=error.name,
-            ) from None
+        return getattr(importlib.import_module(module), attribute)
     return table[name]
 
 
@@ -253,7 +245,14 @@ def make_readings(
         do not know.
     """
     check_names(config)
-    readings = _factory(_readings, config.readings, _named(config))(config, geometry)
+    try:
+        readings = _factory(_readings, config.readings)(config, geometry)
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "safetensors"):
+            raise
+        raise ModuleNotFoundError(
+            f"{_named(config)} needs {error.name}: pip install 'biotac-mj[learning]'", name=error.name
+        ) from None
     if config.thermal is not None:
         if not hasattr(readings, "feel_heat"):
             raise ValueError(f"{_named(config)} knows no heat: leave thermal out")

@@ -7,10 +7,7 @@ import typing
 import numpy as np
 import torch
 
-from ..effects.sensors import take_sensor
-from ..sensor.acquisition import Acquisition
 from ..sensor.presets import Sensor, read_sensor
-from ..sensor.readings import check_settings
 from .weights import find_weights, load_forward, window_of
 
 if typing.TYPE_CHECKING:
@@ -19,151 +16,52 @@ if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
     from .predictor import ForwardModel
 
-__all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkFilm", "NetworkReadings"]
+__all__ = ["LearnedBatchFilm", "NetworkFilm"]
 
 
 class NetworkFilm:
-    """Replacement of `sensor.film.FilmConduction` for stored motions: a network without memory.
-
-    Args:
-      geometry, weights: as for `NetworkReadings`.
-
-    Attributes:
-      geometry: the skin. rest: (n,) impedance at rest [ohm].
-
-    Raises:
-      ValueError: a network with a window.
-    """
-
-    def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
-        path = find_weights(weights)
-        self.geometry, self._model = geometry, load_forward(path, geometry)
-        if self._model.window:
-            raise ValueError(f"{path} has a window, which remembers: stored motions need a network without")
-        self.rest = read_sensor(None, design=geometry.design).impedance
-
-    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
-        """(n,) [ohm] for nodes (nvert, 3) [m]."""
-        u = torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)
-        return self.rest * np.exp(self._model.log_change(u[None])[0][0].double().numpy())
-
-
-class NetworkReadings:
-    """Counts of all channels: electrodes from a network, the others like `sensor.readings.PhysicsReadings`.
-    The caller owns the state.
+    """Electrodes from a network, in the place of `sensor.film.FilmConduction`.
 
     Args:
       geometry: the skin.
       weights: file, or a name of `weights.SHIPPED`; None is "forward" (all are trained on synthetic data).
-      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
-        baseline of `sensor`.
 
     Attributes:
-      nstate: length of the state: the acquisition's, the time of the last film, and the network's window.
+      geometry: the skin. rest: (n,) impedance at rest [ohm].
+      nstate: length of the state of a network with a window: the time of its last step, and its averages; 0
+        without.
     """
 
-    def __init__(
-        self,
-        geometry: "SkinGeometry",
-        weights: pathlib.Path | str | None = None,
-        seed: int = 0,
-        noise: bool = True,
-        sensor: str | dict | Sensor | None = None,
-        film_every_step: bool = False,
-        temperature: float | None = None,
-    ):
-        design = geometry.design
-        sensor = read_sensor(sensor, seed, design)
-        self.acquisition = Acquisition(seed, noise, film_every_step, sensor, sensor.impedance, design=design)
-        self.temperature = temperature
-        self._weights, self._geometry = find_weights(weights), geometry
-        self._rest = sensor.impedance
+    def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
+        self._weights, self.geometry = find_weights(weights), geometry
         self._memory = window_of(self._weights, geometry)
-        self.nstate = self.acquisition.nstate + 1 + int(np.prod(self._memory))
+        size = int(np.prod(self._memory))
+        self.nstate = 1 + size if size else 0
+        self.rest = read_sensor(None, design=geometry.design).impedance
 
     @functools.cached_property
     def model(self) -> "ForwardModel":
-        return load_forward(self._weights, self._geometry)
+        return load_forward(self._weights, self.geometry)
 
-    def _parts(self, state):
-        n = self.acquisition.nstate
-        return state[:n], state[n : n + 1], state[n + 1 :]
+    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
+        """(n,) [ohm] for nodes (nvert, 3) [m]; of a network with a window, of a skin that stays there."""
+        return self.rest * np.exp(self.model.log_change(self._change(vert_xpos))[0][0].double().numpy())
 
-    def reset(
-        self, state: np.ndarray, pressure: float = 0.0, time: float = 0.0, sensor: Sensor | None = None
-    ) -> None:
-        """Writes the skin at rest into state (nstate,); from now on the sensor is `sensor`."""
-        counts, last, memory = self._parts(state)
-        acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)
-        acquisition.reset(counts, self._rest, pressure, self.temperature, time)
-        last[:], memory[:] = time, 0
+    def follow(self, state: np.ndarray, time: float, vert_xpos: np.ndarray) -> np.ndarray:
+        """Likewise at `time` [s] of a motion, for a network with a window; updates its state (nstate,), which
+        is (time, 0, ...) for a skin that was at rest."""
+        before = torch.as_tensor(state[1:].reshape(1, *self._memory), dtype=torch.float32)
+        change, after = self.model.log_change(self._change(vert_xpos), before, time - state[0])
+        state[0], state[1:] = time, after.numpy().ravel()
+        return self.rest * np.exp(change[0].double().numpy())
 
-    def advance(
-        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
-    ) -> None:
-        """Samples (time, time + dt]; arguments and errors as `PhysicsReadings.advance`."""
-        acquisition, last, memory = self._parts(state)
-        impedance = None
-        if self.acquisition.needs_impedance(acquisition, time, dt):
-            vert_xpos = np.asarray(vert_xpos, float)
-            if vert_xpos.shape != self._geometry.vert.shape:
-                raise ValueError(
-                    f"vert_xpos has shape {vert_xpos.shape}: this network reads {self._geometry.vert.shape}"
-                )
-            u = torch.as_tensor(1e3 * (vert_xpos - self._geometry.vert), dtype=torch.float32)[None]
-            before = (
-                torch.as_tensor(memory.reshape(1, *self._memory), dtype=torch.float32)
-                if memory.size
-                else None
+    def _change(self, vert_xpos):
+        vert_xpos = np.asarray(vert_xpos, float)
+        if vert_xpos.shape != self.geometry.vert.shape:
+            raise ValueError(
+                f"vert_xpos has shape {vert_xpos.shape}: this network reads {self.geometry.vert.shape}"
             )
-            change, after = self.model.log_change(u, before, time + dt - last[0])
-            impedance = self._rest * np.exp(change[0].double().numpy())
-        self.acquisition.advance(acquisition, time, dt, impedance, pressure, self.temperature)
-        if impedance is not None:
-            last[0] = time + dt
-            if memory.size:
-                memory[:] = after.numpy().ravel()
-
-    def readings(self, state: np.ndarray) -> dict:
-        """dict of counts, as `PhysicsReadings.readings`."""
-        return self.acquisition.readings(self._parts(state)[0])
-
-
-class LearnedReadings:
-    """`NetworkReadings` with the coupling's `Readings` protocol; `config.options["readings"]` are its
-    settings."""
-
-    def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
-        if "film" in config.options:
-            raise ValueError("a network replaces the film: leave options['film'] out")
-        settings = check_settings(
-            config.options.get("readings", {}), more={"weights": str | None}, design=geometry.design
-        )
-        self._settings, self._config, self._design = settings, config, geometry.design
-        sensor, settings, _ = take_sensor(settings, config.own_seed(), geometry.design)
-        self._network = NetworkReadings(geometry, seed=config.seed, sensor=sensor, **settings)
-        self.nstate = self._network.nstate
-
-    @functools.cached_property
-    def rest(self) -> dict:
-        state = np.zeros(self.nstate)
-        self._network.reset(state)
-        return self._network.readings(state)
-
-    def reset(self, state: np.ndarray) -> None:
-        self._network.reset(state)
-
-    def draw(self, state: np.ndarray, seed: int) -> Sensor:
-        """Resets to a randomly drawn sensor, if the settings are random."""
-        sensor = take_sensor(self._settings, self._config.own_seed(seed), self._design)[0]
-        self._network.reset(state, sensor=sensor)
-        return sensor
-
-    def advance(
-        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
-    ) -> dict:
-        self._network.advance(state, time, dt, vert_xpos, pressure)
-        return self._network.readings(state)
+        return torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)[None]
 
 
 class LearnedBatchFilm:
@@ -173,8 +71,8 @@ class LearnedBatchFilm:
     launches are not Warp's.
 
     Args:
-      geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: time
-        between two solves, for the window [s].
+      geometry, weights: as for `NetworkFilm`. sensor: whose rest it reads. nworld: worlds. device: Warp
+        device. dt: time between two solves, for the window [s].
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;

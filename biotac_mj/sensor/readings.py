@@ -43,7 +43,8 @@ class PhysicsReadings:
       bodies: material of each body that may touch. The sensor then has a heat model (`sensor.heat`), which
         changes TDC, TAC and, through the liquid's temperature, all electrodes. None: no heat model.
       cold: the sensor is switched on at the reset: it starts at ambient temperature and warms up.
-      film: a FilmConduction to share between sensors of the same geometry; None builds one.
+      film: a FilmConduction to share between sensors of the same geometry, or `learning.serve.NetworkFilm`;
+        None builds one.
       vibration: of one sensor on the CPU, for PAC's response to taps, stick-slip and `textures` of the
         bodies; None: PAC has only the pressure of whole steps.
 
@@ -93,7 +94,8 @@ class PhysicsReadings:
         if self._heat is not None:
             self._warm = slice(self._warm.start, self._warm.start + self._heat.nstate)
         self._vibration, self._bodies, self._textures = vibration, bodies, textures or []
-        self.nstate = self._warm.stop + (0 if vibration is None else vibration.nstate)
+        self._shaken = slice(self._warm.stop, self._warm.stop + (vibration.nstate if vibration else 0))
+        self.nstate = self._shaken.stop + self.film.nstate
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
     def reset(
@@ -120,7 +122,9 @@ class PhysicsReadings:
             state[self._warm] = begin
             temperature, liquid = begin[THERMISTOR], begin[ABOVE]
         if self._vibration is not None:
-            state[self._warm.stop :] = self._vibration.rest(textures or self._textures)
+            state[self._shaken] = self._vibration.rest(textures or self._textures)
+        if self.film.nstate:
+            state[self._shaken.stop], state[self._shaken.stop + 1 :] = time, 0.0
         acquisition.reset(self._counts(state), impedance, pressure, temperature, time, liquid)
 
     def _counts(self, state):
@@ -153,22 +157,26 @@ class PhysicsReadings:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
         """
         counts, temperature, liquid = self._counts(state), None, 0.0
+        memory = state[self._shaken.stop :].copy()
         heat = self._advance_heat(state, dt, area, force)
         if heat is not None:
             temperature, liquid = heat[THERMISTOR], heat[ABOVE]
         if impedance is None and self.acquisition.needs_impedance(counts, time, dt):
-            # without contact the film need not be solved again
-            still = np.array_equal(vert_xpos, self._rest_vert)
             with contextlib.suppress(
                 NoFilmError
             ):  # the film of a skin after a hard hit: electrodes hold, as in batches
-                impedance = self._rest if still else self.film.impedance(vert_xpos)
+                if self.film.nstate:
+                    impedance = self.film.follow(memory, time + dt, vert_xpos)
+                else:  # without contact the film need not be solved again
+                    still = np.array_equal(vert_xpos, self._rest_vert)
+                    impedance = self._rest if still else self.film.impedance(vert_xpos)
         moved, shaken = self._vibrate(state, time, dt, shaking)
         self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken, liquid)
         if heat is not None:
             state[self._warm] = heat
         if moved is not None:
-            state[self._warm.stop :] = moved
+            state[self._shaken] = moved
+        state[self._shaken.stop :] = memory
 
     def _advance_heat(self, state, dt, area, force):
         """The heat's state after the step, None without heat."""
@@ -188,7 +196,7 @@ class PhysicsReadings:
             return None, None
         v = self._vibration
         own = v.state.numpy()[0]
-        own[:] = state[self._warm.stop :]
+        own[:] = state[self._shaken]
         v.time.numpy()[0] = time
         for i, array in enumerate((v.drive, v.gain, v.slip, v.area)):
             array.numpy()[0] = 0.0 if shaking is None else shaking[i]

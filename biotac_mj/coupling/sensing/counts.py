@@ -1,6 +1,7 @@
 """The sensor as the coupling sees it: counts of every channel from the deformed skin."""
 
 import functools
+import typing
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +24,10 @@ from ..stepper import Geom, SkinResult
 from ..steppers.fem import FemStepper, rest_geometry
 from .vibration import Shaking
 
-__all__ = ["SensorReadings", "film_of", "materials_of", "textures_of"]
+if typing.TYPE_CHECKING:
+    from ...learning.serve import NetworkFilm
+
+__all__ = ["LearnedReadings", "SensorReadings", "film_of", "materials_of", "textures_of"]
 
 
 class SensorReadings:
@@ -35,9 +39,11 @@ class SensorReadings:
     The film, with its factorisations, is made at the first reset and shared by all sensors of one geometry.
     """
 
+    _more = {"cold": bool}
+
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
-        settings = check_settings(config.options.get("readings", {}), {"cold": bool}, design=geometry.design)
+        settings = check_settings(config.options.get("readings", {}), self._more, design=geometry.design)
         self._film = film_of(config, geometry)
         self.sensor, self._options, _ = take_sensor(settings, config.own_seed(), geometry.design)
         self._bodies: list[Material] | None = None
@@ -78,7 +84,8 @@ class SensorReadings:
         sound = self._shaking and Vibration(self._shaking.modes, self._textures, seed=self._seed)
         more = {"film": film, "bodies": self._bodies, "vibration": sound, "sensor": self.sensor}
         more["textures"] = self._textures
-        return PhysicsReadings(geometry, seed=self._seed, **more, **self._options)
+        options = {name: value for name, value in self._options.items() if name != "weights"}
+        return PhysicsReadings(geometry, seed=self._seed, **more, **options)
 
     @functools.cached_property
     def rest(self) -> dict:
@@ -111,6 +118,26 @@ class SensorReadings:
     ) -> dict:
         self._physics.advance(state, time, dt, vert_xpos, pressure, area, force, shaking)
         return self._physics.readings(state)
+
+
+class LearnedReadings(SensorReadings):
+    """`SensorReadings` with a network in the place of the film, of `options["readings"]["weights"]`."""
+
+    _more = {**SensorReadings._more, "weights": str | None}
+
+    def __init__(self, config: Config, geometry: SkinGeometry):
+        from ...learning.serve import NetworkFilm
+
+        if "film" in config.options:
+            raise ValueError("a network replaces the film: leave options['film'] out")
+        super().__init__(config, geometry)
+        self._network = NetworkFilm(geometry, self._options.get("weights"))
+        self.nstate += self._network.nstate
+
+    @property
+    def film(self) -> "NetworkFilm":
+        """The network, which reads displacements from the unfilled skin."""
+        return self._network
 
 
 def film_of(config: Config, geometry: SkinGeometry | None = None) -> dict:

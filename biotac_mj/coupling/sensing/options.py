@@ -72,12 +72,13 @@ class ReadingsOptions:
         return self.options() | ({} if self.signal == "physics" else {"signal": self.signal})
 
     def readings(self, geometry: SkinGeometry, seed: int = 0) -> object:
-        """For stored motions of one skin: `PhysicsReadings` or `learning.serve.NetworkReadings`."""
+        """`PhysicsReadings`, for stored motions of one skin."""
+        from ...sensor.readings import PhysicsReadings
+
         sensor, options, _ = take_sensor(self.options(), seed, geometry.design)
-        if self.signal == "physics":
-            from ...sensor.readings import PhysicsReadings
+        film, weights = None, options.pop("weights", None)
+        if self.signal != "physics":
+            from ...learning.serve import NetworkFilm
 
-            return PhysicsReadings(geometry, seed=seed, sensor=sensor, **options)
-        from ...learning.serve import NetworkReadings
-
-        return NetworkReadings(geometry, seed=seed, sensor=sensor, **options)
+            film = NetworkFilm(geometry, weights)
+        return PhysicsReadings(geometry, seed=seed, sensor=sensor, film=film, **options)

@@ -212,7 +212,9 @@ def prepare_worker(
     else:
         from ...learning.serve import NetworkFilm
 
-        _here["film"] = NetworkFilm(rest, weights)
+        film = _here["film"] = NetworkFilm(rest, weights)
+        if film.nstate:
+            raise ValueError(f"{signal} has a window, which remembers: stored motions need a network without")
 
 
 def read_in_worker(

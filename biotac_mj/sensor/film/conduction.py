@@ -79,8 +79,7 @@ class NoFilmError(ValueError):
 
 
 class FilmConduction:
-    """Impedances of the sensing electrodes from the deformed skin. Constant after construction, without
-    state.
+    """Impedances of the sensing electrodes from the deformed skin. Constant after construction.
 
     Args:
       geometry: the skin, its core and its electrodes.
@@ -103,6 +102,7 @@ class FilmConduction:
       ValueError: a parameter out of range, or an electrode that the film does not cover.
     """
 
+    nstate = 0  # conduction has no memory
     _power = 1.0  # exponent of the conductance over thickness
 
     def __init__(
