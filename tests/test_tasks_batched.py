@@ -157,18 +157,22 @@ def test_every_episode_has_gains_of_its_own():
     assert 0.02 < seen[:, [0, 19, 20]].std() < 0.3 and abs(seen.mean() - 1) < 0.2
     env.reset()
     assert not torch.isclose(felt(), seen).any()  # another episode
-    env.model_error = 0.0
+    env.model_error = (0.0, 0.1, 0.0)
     env.reset()
-    assert torch.allclose(felt(), torch.ones(3, 42), atol=1e-5)
-    with pytest.raises(ValueError, match="model_error"):
-        make("follow_edge", 1, device="cpu", model_error=-0.1)
+    electrodes, pdc, pac = felt().split([19, 1, 22], dim=1)
+    for part in (electrodes, pac):
+        assert torch.allclose(part, torch.ones_like(part), atol=1e-5)
+    assert len(pdc.unique()) == 3
+    for wrong in (-0.1, (0.1, 0.1), "much"):
+        with pytest.raises(ValueError, match="model_error"):
+            make("follow_edge", 1, device="cpu", model_error=wrong)
 
 
 def test_sensors_in_learning_have_their_own_gain_of_pdc():
     env = of_runs("follow_edge", [("electrodes", 0)], 4, "cpu")
     acquired = next(iter(env.batches.values())).senses.acquisition
     first = acquired.state.numpy()[:, acquired.place.pdc_gain].copy()
-    assert len(np.unique(first)) == 4 and 0.02 < first.std() < 0.5 and env.model_error > 0
+    assert len(np.unique(first)) == 4 and 0.02 < first.std() < 0.5 and min(env.model_error) > 0
     env.reset()
     assert (acquired.state.numpy()[:, acquired.place.pdc_gain] != first).all()  # of another sensor
 

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from ...fields import as_real, as_whole
+from ...fields import as_whole
 from ...view.offscreen import stage
 from .bank import Bank
-from .touch import Touch, check_observe
+from .touch import Touch, as_deviations, check_observe
 
 __all__ = ["BatchTask", "TaskSettings"]
 
@@ -67,8 +67,8 @@ class BatchTask(abc.ABC):
         projections in place of the film's.
       history: decisions of which "body" and "touch" have what was sensed, the last one first; an episode that
         is younger repeats its first.
-      model_error: deviation of the factors by which counts change more or less than the skins of this tier
-        say, drawn in each episode: of a finger's electrodes, of its PDC, of its PAC.
+      model_error: deviations of the factors by which counts change more or less than the skins of this tier
+        say, drawn in each episode: of a finger's electrodes, of its PDC, of its PAC; or one for all.
       settings: the task's numbers; None takes the class's own.
       biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`. Skins are coarse and condensed where
         nothing else is said.
@@ -96,7 +96,7 @@ class BatchTask(abc.ABC):
         observe: str = "electrodes",
         settings: TaskSettings | None = None,
         history: int = 1,
-        model_error: float = 0.0,
+        model_error: float | tuple[float, float, float] = 0.0,
         **biotac: object,
     ):
         import mujoco_warp as mjw
@@ -105,7 +105,7 @@ class BatchTask(abc.ABC):
 
         self.num_envs, self.observes = as_whole("num_envs", num_envs, 1), check_observe(observe)
         self.history = as_whole("history", history, 1)
-        self.model_error = as_real("model_error", model_error, 0.0)
+        self.model_error = as_deviations(model_error)
         self.cfg = s = self.settings if settings is None else settings
         where = wp.get_device(device)
         self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ...fields import as_numbers
 from ...geometry import load_skin
 from ...sensor.weighted import WeightedElectrodes
 from ...short_repr import short_repr
@@ -15,7 +16,7 @@ from ...short_repr import short_repr
 if typing.TYPE_CHECKING:
     from ...batch import Batch
 
-__all__ = ["OBSERVE", "Touch", "check_observe"]
+__all__ = ["OBSERVE", "Touch", "as_deviations", "check_observe"]
 
 OBSERVE = ("none", "binary", "force", "electrodes", "electrodes+pac", "learned")
 _CHANNELS = ("electrodes", "pdc", "pac")
@@ -32,6 +33,18 @@ def check_observe(value: object) -> str:
     if not isinstance(value, str) or value not in OBSERVE:
         raise ValueError(f"observe is {short_repr(value)}: choose one of {', '.join(OBSERVE)}")
     return value
+
+
+def as_deviations(value: object) -> tuple[float, ...]:
+    """Deviations for electrodes, PDC and PAC, of one number or three.
+
+    Raises:
+      ValueError: others.
+    """
+    given = as_numbers("model_error", value)
+    if given.shape not in ((), (3,)) or not (np.isfinite(given).all() and (given >= 0).all()):
+        raise ValueError(f"model_error is {short_repr(value)}: give a number of 0 or more, or three of them")
+    return tuple(np.broadcast_to(given, 3).tolist())
 
 
 class Touch:
@@ -71,11 +84,11 @@ class Touch:
         """(nworld, nfinger, k) of the channels from `tare`, times what `draw_gains` has drawn."""
         return (self.channels - self.tare) * self._gain
 
-    def draw_gains(self, which: torch.Tensor, deviation: float, draw: torch.Generator) -> None:
+    def draw_gains(self, which: torch.Tensor, deviation: tuple[float, ...], draw: torch.Generator) -> None:
         """Draws factors 1 +- deviation on the changes in worlds (nworld,) of bool: of each finger one for its
         electrodes, one for PDC and one for PAC."""
-        gain = torch.randn(*self.tare.shape[:2], len(_CHANNELS), generator=draw, device=draw.device)
-        split = torch.tensor(self._split, device=draw.device)
+        gain = torch.randn(*self.tare.shape[:2], len(deviation), generator=draw, device=draw.device)
+        deviation, split = (torch.tensor(x, device=draw.device) for x in (deviation, self._split))
         gain = (1 + deviation * gain).repeat_interleave(split, dim=2)
         self._gain = gain.where(which[:, None, None], self._gain)
 
