@@ -218,6 +218,12 @@ class Batch(Skins):
         clearance.measure(geoms, laws, skin.data.rest_vert)
         self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
 
+    def look_ahead(self, m: "mjw.Model", taking_part: Marks) -> None:
+        """Marks worlds that this skin cannot leave alone, after `evaluate`."""
+        r = self._of_step
+        self.place_geoms(r.pos, r.mat, m.geom_pos, m.geom_quat)
+        self.rest.look_ahead(taking_part)
+
     def find_compliance(self, m: "mjw.Model", d: "mjw.Data", going: wp.array, inertia: wp.array) -> None:
         """Finds how the bodies give way in worlds that are going (nworld,), after mujoco_warp's constraint
         solver; inertia: see `Integrator`. Launches only."""

@@ -94,7 +94,8 @@ class Hook:
     def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._passive:
             self._passive(m, d)
-        if self._corrected != [b for b in self.batches if b.moving]:
+        first = self._corrected != [b for b in self.batches if b.moving]
+        if first:
             self._take_memory(m, d)
         batches = [b for b in self.batches if b.active]
         self._taking_part.clear()
@@ -106,7 +107,9 @@ class Hook:
         if moving:
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
-                wp.capture_if(self._taking_part.any, lambda: self._find_balance(m, d, moving))
+                if first:  # all is run once, which takes the memory that a capture must find
+                    self._taking_part.fill()
+                wp.capture_if(self._taking_part.any, lambda: self._look_ahead(m, d, moving, first))
             self._fork.run(*(functools.partial(batch.pass_by, self._taking_part) for batch in moving))
             self._act(m, d, moving)
         self._fork.run(*(batch.end_step for batch in batches))
@@ -136,16 +139,28 @@ class Hook:
         for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):
             batch.take_part(m, self._slope.correction, int(first), rows, int(row))
 
-    def _find_balance(self, m, d, moving):
-        """Models of the skins that hold where they lead, and that give no energy which is not there.
-
-        A world is going until its skins are settled. From then on no launch changes it."""
+    def _look_ahead(self, m, d, moving, whole):
+        """Where the bodies go under the models of the last step; and, in worlds whose skins act or are
+        touched there, the balance. whole: in all worlds."""
         going, taking_part = self._going, self._taking_part
         going.copy(taking_part)
         _begin_dynamics(m, d)
         if self._integrator.differs:
             self._integrator.take_matrices(m, d)
         self._accelerate(m, d, moving, first=True)
+        taking_part.clear()
+        self._fork.run(*(functools.partial(batch.look_ahead, m, taking_part) for batch in moving))
+        if whole:
+            taking_part.fill()
+        self._fork.run(*(functools.partial(batch.rest.leave, taking_part) for batch in moving))
+        wp.capture_if(taking_part.any, lambda: self._find_balance(m, d, moving))
+
+    def _find_balance(self, m, d, moving):
+        """Models of the skins that hold where they lead, and that give no energy which is not there.
+
+        A world is going until its skins are settled. From then on no launch changes it."""
+        going, taking_part = self._going, self._taking_part
+        going.copy(taking_part)
         self._find_compliance(m, d, moving)
         self._solve(moving, lambda batch: batch.solve_first(m, d))
         self._choose(moving, lambda batch, found: batch.compare(found))

@@ -7,7 +7,7 @@ import warp as wp
 from ..coupling.implicit.rules import PATIENCE, stayed
 from ..coupling.steppers.fem import CLEAR
 from ..geometry.rigid_warp import is_finite
-from ..skin.contact.broadphase import ALL, contact_range, sample_clearance
+from ..skin.contact.broadphase import ALL, contact_range, face_clearance, sample_clearance
 from ..skin.contact.faces import Laws
 from ..skin.contact.penetration import core_clearance
 from ..skin.contact.posed import Geoms, bound_to, place_on
@@ -110,8 +110,8 @@ def measure_clearance(
     # In and out:
     clearance: wp.array(dtype=wp.vec2d),
 ):
-    """Clearance of the geoms from the skin, where that is less than the margin, and from the core, where they
-    overlap: `ProximityQuery` of one world. A thread for each face, then for each point of the core."""
+    """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core: as
+    `ProximityQuery` of one world. A thread for each face, then for each point of the core."""
     f, w = wp.tid()
     if close[w] == 0 or clearance[w][0] < contact_range(laws, w):  # one that touches is not to be measured
         return
@@ -122,15 +122,17 @@ def measure_clearance(
         least = sample_clearance(
             x[t[0], own], x[t[1], own], x[t[2], own], sample, w, geoms, ALL, margin, contact_range(laws, w)
         )
-        if least < margin:
+        if least >= margin:
+            least = wp.max(least, face_clearance(x[t[0], own], x[t[1], own], x[t[2], own], w, geoms, ALL))
+        if least < clearance[w][0]:
             wp.atomic_min(clearance, w, wp.vec2d(least, real(wp.inf)))
     else:
-        least = real(0.0)
+        least = clearance[w][1]
         for g in range(geoms.count):
             pos = geoms.pos[g, w]
             mat = geoms.mat[g, w]
             least = wp.min(least, core_clearance(f - face.shape[0], geoms, g, pos, mat, core, core_vert))
-        if least < real(0.0):
+        if least < clearance[w][1]:
             wp.atomic_min(clearance, w, wp.vec2d(real(wp.inf), least))
 
 
@@ -255,8 +257,8 @@ class Clearance:
     Attributes:
       ball: centre and radius [m] of a ball around the skin at rest.
       close: (nworld,) wp.array int, 1 where a geom is so close to the ball that its distance is needed.
-      found: (nworld,) wp.array vec2d, clearance from the skin where less than the margin, and from the core
-        where less than 0; else infinite [m]. Where the skin is touched it is that of any touch.
+      found: (nworld,) wp.array vec2d, clearance from the skin, beyond the margin a bound of it, and from the
+        core [m]; infinite where no geom is close. Where the skin is touched it is that of any touch.
     """
 
     def __init__(self, model: SkinModel, nworld: int):
@@ -288,9 +290,11 @@ class Release:
       near: (nworld,) wp.array int, how near geoms are: AFAR, NEAR or TOUCHING.
       stays: (nworld,) wp.array int, steps in a row in which the skin has stayed where it was.
       undeformed: (nworld,) wp.array int, 1 where the skin has its form at rest.
+      at_rest: (nworld,) wp.array int, 1 where the solve put it to rest.
       reset, gone: (nworld,) wp.array bool, whose nodes and contacts are to be those of rest after this solve;
         those of them that are in balance so.
       any: (1,) wp.array int, 1 where any is.
+      own: (nworld,) wp.array vec4d, `constants_of` the skins as they were made.
     """
 
     def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet):
@@ -299,13 +303,13 @@ class Release:
         n = data.nworld
         with wp.ScopedDevice(model.device):
             allocate("release", self, {"world": n})
-            self.near, self.undeformed, self._at_rest = (wp.zeros(n, dtype=int) for _ in range(3))
+            self.near, self.undeformed, self.at_rest = (wp.zeros(n, dtype=int) for _ in range(3))
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
-            self._own = wp.zeros(n, dtype=vec4)
+            self.own = wp.zeros(n, dtype=vec4)
         self._clearance = Clearance(model, n)
         self._filled = int(bool(model.options.fill_volume or model.options.rest_pressure or data.rests))
-        self._launch(keep_constants, n, [data.worlds], [self._own])
+        self._launch(keep_constants, n, [data.worlds], [self.own])
 
     def begin(self) -> None:
         """Before a solve: takes worlds out of it that nothing is near to. Launches only."""
@@ -313,7 +317,7 @@ class Release:
             return
         m, d, geoms, laws = self._model, self._data, self._geoms.struct, self._data.laws.struct
         near, clearance = self.near, self._clearance
-        known = [*clearance.ball, self._filled, geoms, laws, self._own, d.worlds]
+        known = [*clearance.ball, self._filled, geoms, laws, self.own, d.worlds]
         self._launch(begin_search, d.nworld, known, [near, clearance.close, clearance.found])
         clearance.measure(geoms, laws, d.rest_vert)
         found = [m.options.max_core_depth, laws, clearance.found, self.undeformed]
@@ -324,12 +328,12 @@ class Release:
         if not self.possible:
             return
         self.any.zero_()
-        outputs = [self._data.worlds, self.gone, self._at_rest, self._anew, self.reset, self.any]
+        outputs = [self._data.worlds, self.gone, self.at_rest, self._anew, self.reset, self.any]
         self._launch(give_up, self._data.nworld, [self.near, self.stays], outputs)
 
     def count(self, awake: wp.array) -> None:
         """Ends a step; awake: (nworld,) 1 where the skin took part in it. Launches only."""
-        known, outputs = [awake, self._at_rest, self._data.worlds], [self.stays, self.undeformed]
+        known, outputs = [awake, self.at_rest, self._data.worlds], [self.stays, self.undeformed]
         self._launch(count_stays, self._data.nworld, known, outputs)
 
     def _launch(self, kernel, dim, inputs, outputs):

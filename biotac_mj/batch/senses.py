@@ -104,6 +104,13 @@ def reset_rows(
 
 
 @wp.kernel
+def forget_films(mask: wp.array(dtype=bool), known_out: wp.array(dtype=int)):
+    w = wp.tid()
+    if mask[w]:
+        known_out[w] = 0
+
+
+@wp.kernel
 def find_changed(
     # In:
     due: wp.array(dtype=int),
@@ -231,6 +238,7 @@ class Senses:
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest; may draw other sensors."""
         self.acquisition.reset(mask)
+        wp.launch(forget_films, self._known.shape, [mask], [self._known], device=self._known.device)
         for rest, state in self._rests:
             inputs = [mask, self.acquisition.row, rest]
             wp.launch(reset_rows, state.shape, inputs, [state], device=state.device)

@@ -305,6 +305,7 @@ def pass_by(taking_part: wp.array(dtype=int), area: real, r: Rounds):
     if taking_part[w] == 1:
         return
     r.passed[w] = 1
+    r.rounds[w] = 1
     for g in range(r.pos.shape[0]):
         r.left[g, w] = real(0.0)
         if r.surface.shape[0] > 0:
