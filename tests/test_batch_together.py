@@ -19,10 +19,10 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from test_batch import ball_spec, make, read, shell
 
 from biotac_mj import batch as batches
-from biotac_mj.batch import kernels
 from biotac_mj.batch.batch import Batch
-from biotac_mj.batch.implicit import energy, integrator, rounds
-from biotac_mj.batch.marks import Marks
+from biotac_mj.batch.implicit import integrator
+from biotac_mj.coupling.implicit import energy, rounds
+from biotac_mj.coupling.implicit.marks import Marks
 
 SKINS, NV, WORLDS, H2 = 3, 8, 16, 1.6e-5
 
@@ -56,7 +56,7 @@ def corrected(steps):
         own, models = [], []
         for k in range(SKINS):
             own.append(wp.array(np.ascontiguousarray(jacobian[None, :, k]), dtype=wp.spatial_vectord))
-            models.append(kernels.Model())
+            models.append(rounds.Model())
             tangent = np.ascontiguousarray(stiffness[None, :, k])
             models[k].tangent0 = wp.array(tangent, dtype=wp.spatial_matrixd)
             models[k].wrench0 = wp.zeros((1, WORLDS), dtype=wp.spatial_vectord)
@@ -100,32 +100,28 @@ def test_a_skin_that_does_not_act_lacks_nothing():
 def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
     n = 3
     with wp.ScopedDevice("cpu"):
-        r, model = rounds.Rounds(), kernels.Model()
-        r.pos = r.here_pos = wp.zeros((1, n), dtype=wp.vec3d)
+        r, model = rounds.make_rounds(1, n), rounds.Model()
         r.here_mat = wp.array(np.tile(np.eye(3), (1, n, 1, 1)), dtype=wp.mat33d)
         ways = np.zeros((1, n, 6))
         ways[0, :, 0] = 1e-3, 1e-3, 1e-3  # [m]
         missing = np.zeros((1, n, 6))
         missing[0, 2, 0] = np.nan  # accelerations that are no number, of bodies that were sound
-        for name in ("straight", "travel", "moved", "amiss"):
-            values = {"straight": ways, "travel": ways + missing, "moved": missing}
-            values = values.get(name, np.zeros((1, n, 6)))
-            setattr(r, name, wp.array(values, dtype=wp.spatial_vectord))
+        r.straight.assign(ways)
+        r.travel.assign(ways + missing)
         r.left, r.store, r.most = (wp.full((1, n), x, dtype=wp.float64) for x in (1e-4, 1e-4, 1e-3))
-        r.push, r.settled = wp.ones((1, n), dtype=wp.float64), wp.ones(n, dtype=int)
         wrench = np.zeros((1, n, 6))
         wrench[0, :, 0] = 5.0, 0.05, 0.05  # [N]: 5 mJ and 0.05 mJ of 0.1
-        pushes = wp.array(wrench, dtype=wp.spatial_vectord)
+        r.acting.assign(wrench + missing)
         model.wrench0 = wp.array(wrench, dtype=wp.spatial_vectord)
         model.tangent0 = wp.array(np.tile(np.eye(6), (1, n, 1, 1)), dtype=wp.spatial_matrixd)
         correction = wp.array(wrench, dtype=wp.spatial_vectord)
         gains, going, every = Marks(n), Marks(n), wp.ones(n, dtype=int)
         model_before = model.tangent0.numpy()[0, 1]
         # one that gives too much only now, as another pushes less, is withheld too
-        wp.launch(energy.restrain, n, [every, model, pushes, r], [going.struct])
+        wp.launch(energy.restrain, n, [every, r, going.struct])
         assert r.push.numpy().tolist() == [[0, 1, 0]] and going.world.numpy().tolist() == [1, 0, 1]
         r.push.fill_(1.0)
-        wp.launch(energy.find_gain, n, [every, model, pushes, r], [gains.struct])
+        wp.launch(energy.find_gain, n, [every, 1e-3, r, gains.struct])
         assert gains.world.numpy().tolist() == [1, 0, 1] and gains.any.numpy()[0] == 1
         start = wp.array(np.full((n, 4), np.nan), dtype=float)
         wp.launch(energy.withdraw, n, [gains.world, model, r, correction, start])

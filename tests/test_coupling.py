@@ -165,7 +165,7 @@ def test_what_a_correction_lacks_is_in_the_account_of_energy(monkeypatch):
     seen, conclude = [], coupled.Coupled.conclude
 
     def watch(self, *how):
-        seen.append(self.acting().ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
+        seen.append(self.arrays.acting.ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
         conclude(self, *how)
 
     monkeypatch.setattr(coupled.Coupled, "conclude", watch)
@@ -392,22 +392,23 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
     seen, conclude = [], coupled.Coupled.conclude
 
     def watch(self, *how):
-        J, drift = self.jacobian, self.horizon[:, None] * (self.jacobian @ self.data.qvel)
-        moved = self.square[:, None] * (J @ self.acceleration)
-        target = displace(*self.pose, moved, self.here[0], drift[:, 3:])
+        J, a = self.jacobian, self.arrays
+        drift = a.horizon[:, None] * (J @ self.data.qvel)
+        moved = a.square[:, None] * (J @ self.acceleration)
+        target = displace(a.start_pos, a.start_mat, moved, a.here_pos, drift[:, 3:])
+        way = displacement_at_once(a.pos0, a.mat0, a.start_pos, a.start_mat, a.here_pos, drift[:, 3:])
+        wrench = a.wrench0 + np.einsum("nij,nj->ni", a.tangent0, way)
         wanted = (
-            (moved, self.moved),
-            (target[0], self.target[0]),
-            (
-                self.after(-displacement_at_once(*self.pose0, *self.pose, self.here[0], drift[:, 3:])),
-                self.drifted,
-            ),
-            (self.after(displacement(*target, *self.pose0)), self.predicted_wrench),
+            (moved, a.moved),
+            (target[0], a.pos),
+            (target[1], a.mat),
+            (wrench, a.wrench),
+            (wrench - np.einsum("nij,nj->ni", a.tangent0, moved) + self.excess, a.acting),
         )
         for one, other in wanted:
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-15)
         assert self.off == pytest.approx(coupled.size(displacement(*target, *self.asked)), abs=1e-15)
-        seen.append(np.abs(self.drifted).max())
+        seen.append(np.abs(a.wrench).max())
         conclude(self, *how)
 
     monkeypatch.setattr(coupled.Coupled, "conclude", watch)

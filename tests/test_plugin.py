@@ -402,14 +402,10 @@ def test_disabled_equalities_are_refused_two_way(model):
     biotac_mj.plugin.clear_errors()
 
 
-# an account and a step of its own for each body cost 110 calls a step
-_OLD_LIMIT = pytest.param("two-way", 640, marks=pytest.mark.xfail(reason="accounts of bodies", strict=True))
-
-
-@pytest.mark.parametrize("coupling, limit", [("one-way", 150), ("two-way", 800), _OLD_LIMIT])
+@pytest.mark.parametrize("coupling, limit", [("one-way", 150), ("two-way", 560)])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
-    """Calls of Python functions in a step whose skin costs nothing: 128 and 535, which take 0.1 ms and 0.5 ms
-    (docs/lab/coupling.md), on whatever machine."""
+    """Calls of Python functions in a step whose skin costs nothing, 128 and 503 (docs/lab/coupling.md), on
+    whatever machine."""
     ball = (
         '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" '
         'size=".01" mass=".1"/></body>'

@@ -11,6 +11,7 @@ import warp as wp
 
 from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_two_way
 from ..coupling.handle import SENSORS
+from ..coupling.implicit import energy, rounds
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.sensing.counts import film_of
 from ..coupling.settings import SensorSettings, SettingKeywords, Settings
@@ -42,7 +43,7 @@ from . import kernels, release, rest, skin_kernels
 from .ahead import kernels_of_step, launched_by
 from .batch import Batch
 from .hook import Hook
-from .implicit import dynamics, energy, integrator, rounds
+from .implicit import dynamics, integrator
 from .senses import Senses, draws
 from .skin import BatchSkin
 from .skins import PoseBatch

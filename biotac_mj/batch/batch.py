@@ -8,15 +8,16 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.implicit import energy, rounds
+from ..coupling.implicit.marks import Marks
 from ..coupling.implicit.rules import LOSS_FREQUENCY
 from ..coupling.loads import core_geom
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from . import kernels, solid
-from .implicit import dynamics, energy, integrator, rounds
+from .implicit import compliance, dynamics, integrator
 from .implicit.compliance import Response
-from .marks import Marks
 from .release import Clearance
 from .senses import Senses
 from .skin import BatchSkin
@@ -28,6 +29,8 @@ if typing.TYPE_CHECKING:
 
 
 __all__ = ["Batch"]
+
+_ROUNDING = 1e-3  # of the most energy that a skin holds: accelerations are of single precision
 
 
 class Batch(Skins):
@@ -66,20 +69,7 @@ class Batch(Skins):
             self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
             kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.spatial_vectord)
             self._touches = [wp.zeros((len(touching.geom), self.nworld), dtype=kind) for kind in kinds]
-            self._of_step = r = rounds.Rounds()
-            r.limit = limit
-            for name in ("here", "start", "", "asked", "free", "end"):
-                for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
-                    setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
-            for name in ("straight", "travel", "drift", "moved"):
-                setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            for name in ("placed", "open"):
-                setattr(r, name, wp.zeros(self.groups, dtype=int))
-            for name in ("inside", "passed"):
-                setattr(r, name, wp.zeros(self.nworld, dtype=int))
-            numbers = "gamma", "horizon", "square", "frequency", "left", "store", "most"
-            for name in numbers:
-                setattr(r, name, wp.zeros(self.groups, dtype=wp.float64))
+            self._of_step = r = rounds.make_rounds(*self.groups, limit)
             self._step = wp.full(self.groups, self.dt, dtype=wp.float64)
             self._power = wp.zeros((self.nworld, 6 * skin.ngroup), dtype=wp.vec2d)
             self._greedy = wp.zeros(self.nworld, dtype=int)
@@ -102,7 +92,7 @@ class Batch(Skins):
     def lasting(self) -> tuple[list[wp.array], list[wp.array]]:
         last, first = super().lasting()
         r = self._of_step
-        return [*last, r.end_pos, r.end_mat, r.left, r.frequency, r.open, r.passed], first
+        return [*last, r.end_pos, r.end_mat, r.left, r.frequency, r.passed], first
 
     def predict(self, m: "mjw.Model", d: "mjw.Data", taking_part: Marks) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
@@ -116,8 +106,7 @@ class Batch(Skins):
         self._launch(dynamics.relative_jacobians, self._jacobian.shape, turning, [self._jacobian])
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, taking_part)
         if self.moving:
-            inertial = int(self.skin.inertial)
-            by = [self.dt, self._delay, inertial, self.model]
+            by = [self.dt, 0.0, self._delay, self._solid, self.model]
             self._launch(rounds.choose_gamma, self.groups, by, [r])
             self._find_drift(m, d)
             self._correction_force.zero_()
@@ -143,7 +132,7 @@ class Batch(Skins):
 
     def use_euler(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Makes greedy worlds' step that of backward Euler, after `restrain`. Launches only."""
-        self._launch(rounds.use_euler, self.nworld, [self.dt, self._greedy], [self._of_step])
+        self._launch(rounds.use_euler, self.nworld, [self.dt, 0.0, self._greedy], [self._of_step])
         self._find_drift(m, d)
 
     def add_forces(self, d: "mjw.Data") -> None:
@@ -203,10 +192,9 @@ class Batch(Skins):
 
     def evaluate(self, qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""
-        r, self._qacc = self._of_step, qacc
-        going = [self.dt, r.square, self._jacobian, qacc, r.here_pos, r.start_pos, r.start_mat]
-        found = [r.moved, r.travel, r.pos, r.mat]
-        self._launch(dynamics.follow, self.groups, [*going, r.straight, r.drift], found)
+        self._qacc = qacc
+        known = [self.dt, self._jacobian, qacc]
+        self._launch(dynamics.accelerate, self.groups, known, [self._of_step])
 
     def _look_inside(self, m):
         """Whether bodies that were put somewhere were put into the skin."""
@@ -306,7 +294,7 @@ class Batch(Skins):
         """Finds the energy of skins in worlds that take part, after `evaluate`; marks those in which a step
         of more damping is to be tried."""
         out = [self._greedy, damped.struct]
-        self._settle(energy.find_energy, taking_part, [self._last], [self._solid], out)
+        self._settle(energy.find_energy, taking_part, [self._last, self._solid], out)
 
     def restrain(self, worlds: Marks, going: Marks) -> None:
         """Takes the push on bodies that have not the energy for it, after `find_energy` and `evaluate`, and
@@ -315,7 +303,7 @@ class Batch(Skins):
 
     def find_gain(self, taking_part: Marks, gains: Marks) -> None:
         """Marks worlds where withholding all does not help, after `evaluate`."""
-        self._settle(energy.find_gain, taking_part, outputs=[gains.struct])
+        self._settle(energy.find_gain, taking_part, [_ROUNDING], [gains.struct])
 
     def withdraw(self, d: "mjw.Data", gains: wp.array) -> None:
         """Lets the skins of those worlds not act in this step."""
@@ -325,15 +313,19 @@ class Batch(Skins):
     def add_stiffness(self, stiffness: wp.array) -> None:
         """Adds the skin's to that of all (nworld, nv, nv)."""
         dim = stiffness.shape[:2]
-        self._launch(energy.add_stiffness, dim, [self._jacobian, self.model], [stiffness])
+        self._launch(compliance.add_stiffness, dim, [self._jacobian, self.model], [stiffness])
 
     def conclude(self, taking_part: Marks, stiffness: wp.array) -> None:
         """Settles the account of energy, after `evaluate`; stiffness: of all skins."""
         found, driven = self._response, self._driven
-        self._launch(energy.drive, self._power.shape, [stiffness, found.L, found.response], [driven])
+        self._launch(compliance.drive, self._power.shape, [stiffness, found.L, found.response], [driven])
         known = [stiffness, found.response, driven, self.model]
-        self._launch(energy.add_powers, self._power.shape, known, [self._power])
-        self._settle(energy.conclude, taking_part, how=[self.skin.reason, self._power])
+        self._launch(compliance.add_powers, self._power.shape, known, [self._power])
+        known, r = [taking_part.world, self._power], self._of_step
+        self._launch(compliance.find_frequencies, self.groups, known, [r.frequency])
+        self._find_wrenches()
+        known = [taking_part.world, self.skin.reason, r]
+        self._launch(energy.conclude, self.nworld, known, [r.left])
 
     def finish(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
@@ -419,10 +411,9 @@ class Batch(Skins):
         known = [taking_part.world, self._solid.area]
         self._launch(energy.pass_by, self.nworld, known, [self._of_step])
 
-    def _settle(self, kernel, worlds=None, last=(), how=(), outputs=()):
+    def _settle(self, kernel, worlds, known=(), outputs=()):
         self._find_wrenches()
-        inputs = [*([worlds.world] if worlds else []), self.model, *last, self._wrench, *how]
-        self._launch(kernel, self.nworld, inputs, [self._of_step, *outputs])
+        self._launch(kernel, self.nworld, [worlds.world, *known], [self._of_step, *outputs])
 
     def _find_wrenches(self):
         self._launch(rounds.wrenches, self.groups, [self.model, self._of_step], [self._wrench])

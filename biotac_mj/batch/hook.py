@@ -18,13 +18,13 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.implicit.marks import Marks
 from ..skin.program import Fork
 from .ahead import kernels_of_step
 from .batch import Batch
 from .implicit import integrator
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
-from .marks import Marks
 from .memory import Scratch
 from .skin import solve_group
 

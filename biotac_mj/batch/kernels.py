@@ -6,6 +6,7 @@ unless something else is said."""
 
 import warp as wp
 
+from ..coupling.implicit.rounds import Model
 from ..coupling.implicit.rules import share_that_pushes
 from ..geometry.rigid_warp import LEVER, motion
 from ..sensor.acquisition_kernels import Place
@@ -14,7 +15,6 @@ from ..skin.newton.worlds import CONVERGED, NOT_FINITE
 from ..skin.types import double, widen
 
 __all__ = [
-    "Model",
     "accept_models",
     "body_forces",
     "core_pose",
@@ -35,16 +35,6 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 _share_that_pushes = wp.func(share_that_pushes)
-
-
-@wp.struct
-class Model:
-    """Linear models of skins [group, world]: wrench0 - tangent0 (pose - pose0)."""
-
-    wrench0: wp.array2d(dtype=vec6)
-    tangent0: wp.array2d(dtype=mat66)
-    pos0: wp.array2d(dtype=vec3)
-    mat0: wp.array2d(dtype=mat33)
 
 
 @wp.kernel

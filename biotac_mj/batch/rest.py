@@ -8,12 +8,12 @@ world where the bodies go, nothing is solved in that world."""
 
 import warp as wp
 
+from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
+from ..coupling.implicit.rounds import Model
 from ..skin.contact.broadphase import contact_range, motion_bound
 from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
-from .kernels import Model
-from .marks import MarkedWorlds, Marks, mark
 from .release import NEAR, Clearance, constants_of, find_close, margin_of
 from .skin import BatchSkin
 

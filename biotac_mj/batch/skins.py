@@ -6,13 +6,14 @@ import numpy as np
 import warp as wp
 
 from ..coupling.handle import SENSORS, sensor_widths
+from ..coupling.implicit.marks import Marks
+from ..coupling.implicit.rounds import Model
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
 from ..skin.program import compile_ahead, finish_compiling
 from ..skin.state import GUESS, MEMORY, OUTCOME
 from . import kernels
 from .ahead import launched_by
-from .marks import Marks
 from .rest import Rest
 from .senses import Senses
 from .skin import BatchSkin
@@ -32,7 +33,7 @@ class Skins:
     Attributes:
       nworld: number of worlds.
       failed: (nworld,) wp.array int, steps that found no balance since the reset.
-      model: `kernels.Model`, linear models in force: of the skin ON each touching body in the BioTac frame.
+      model: `Model`, linear models in force: of the skin ON each touching body in the BioTac frame.
       began: (nworld,) wp.array int, whether a step was made since the reset.
       rest: `rest.Rest`, which skins take part in the step.
     """
@@ -58,8 +59,8 @@ class Skins:
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
             self._group = wp.array(touching.group.astype(np.int32), dtype=int)
             self._addresses = wp.array(np.array(addresses, np.int32), dtype=int)
-            self.model, self._last = kernels.Model(), kernels.Model()
-            for name, variable in kernels.Model.vars.items():
+            self.model, self._last = Model(), Model()
+            for name, variable in Model.vars.items():
                 for model in (self.model, self._last):
                     setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
             self.failed, self.began = (wp.zeros(self.nworld, dtype=int) for _ in range(2))
@@ -115,7 +116,7 @@ class Skins:
         """The arrays that outlive a step: those with the worlds as their last axis, and those with the worlds
         as their first. A step from the same numbers in them, and the same world of the simulator, gives the
         same."""
-        models = [getattr(self.model, name) for name in kernels.Model.vars]
+        models = [getattr(self.model, name) for name in Model.vars]
         last = [*self.skin.state.of_role(MEMORY, GUESS, OUTCOME), *models, self.failed, self.began]
         last += [*self.rest.lasting, self.skin.release.undeformed]
         return last, self.senses.lasting if self.senses else []
@@ -137,7 +138,7 @@ class Skins:
 
     def keep_models(self) -> None:
         """Keeps the linear models of the last step, before the first `solve_at`. Launches only."""
-        for name in kernels.Model.vars:
+        for name in Model.vars:
             wp.copy(getattr(self._last, name), getattr(self.model, name))
 
     def end_step(self) -> None:

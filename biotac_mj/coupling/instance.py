@@ -5,6 +5,7 @@ from it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads se
 state."""
 
 import dataclasses
+import functools
 import math
 import warnings
 
@@ -15,7 +16,8 @@ from ..geometry.rigid import cross
 from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.metric import Metric
-from .implicit.rules import EULER, LOSS_FREQUENCY, PATIENCE, gamma_of, stayed
+from .implicit.rules import EULER, PATIENCE, stayed
+from .implicit.step_arrays import StepArrays
 from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
 from .solid import solid_wrench
 from .stepper import SkinResult
@@ -107,16 +109,6 @@ class Instance:
         """How far ahead [s] the skin is solved: to the end of the step."""
         return self.model.opt.timestep
 
-    def gamma(self, touches: np.ndarray) -> np.ndarray:
-        """(ngroup,) Newmark's, of the bodies in the step that begins. A skin with inertia steps itself to the
-        end of the step. touches: (ngroup,) whether it held them in the last step."""
-        if self.inertial:
-            return np.full(len(touches), EULER - 0.5 * self.by_stages)
-        step = self.horizon
-        delay = self.setup.config.loss / (2 * np.pi * LOSS_FREQUENCY * step)
-        pace = step * self.setup.parts(self.state)[1][:, FREQUENCY]
-        return np.array([gamma_of(p, delay, t) for p, t in zip(pace.tolist(), touches.tolist())])
-
     @property
     def by_stages(self) -> bool:
         """Whether a step is Runge-Kutta's, of four stages."""
@@ -165,27 +157,26 @@ class Instance:
             models[:, 45:54].reshape(-1, 3, 3),
         )
 
-    def last_energy(self) -> tuple:
-        """Energy (ngroup,) [J] that the last step left to the bodies in the skin at most, and the poses
-        (ngroup, 3), (ngroup, 3, 3) at which it left them; None instead of these before the first step. Where
-        they were out of reach, these are about where they go."""
-        head, models, *_ = self.setup.parts(self.state)
-        ends = (models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)) if head[STARTED] else None
-        return models[:, ENERGY], ends
+    @functools.cached_property
+    def _arrays(self):
+        setup = self.setup
+        how = setup.thickness, setup.surface_energy, self.inertial, setup.config.loss
+        return StepArrays(setup.ngroup, *how)
 
-    @property
-    def was_out_of_reach(self) -> bool:
-        """Whether nothing was in reach of the skin in the last step."""
-        return self.setup.parts(self.state)[0][STARTED] == OUT_OF_REACH
-
-    def most_energy(self, wrench: np.ndarray) -> np.ndarray:
-        """(ngroup,) upper bounds [J] of the energy in a skin that pushes with wrenches (ngroup, 6): its force
-        times the distance to the core."""
-        if self.inertial:
-            return np.full(len(wrench), np.inf)
-        squares = wrench * wrench
-        force = np.sqrt(squares[:, :3].sum(axis=1)) + np.sqrt(squares[:, 3:].sum(axis=1)) / LEVER
-        return force * self.setup.thickness + self.setup.surface_energy
+    def begin_arrays(self, pos: np.ndarray, mat: np.ndarray) -> StepArrays:
+        """The arrays of a coupled step that begins with bodies at (ngroup, 3), (ngroup, 3, 3): the linear
+        model in force is that of the last step."""
+        arrays, (head, models, *_) = self._arrays, self.setup.parts(self.state)
+        arrays.record(self.horizon, 0.5 * self.by_stages)
+        n = len(models)
+        parts = models[:, :6], models[:, 6:42].reshape(n, 6, 6), models[:, 42:45], models[:, 45:54]
+        for name, part in zip(arrays.last, parts):
+            arrays.last[name][:] = getattr(arrays, name)[:] = part.reshape(getattr(arrays, name).shape)
+        arrays.here_pos[:], arrays.here_mat[:] = pos, mat
+        arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(n, 3, 3)
+        arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
+        arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
+        return arrays
 
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
         """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
@@ -298,7 +289,7 @@ class Instance:
         stepper = self.setup.skin.stepper
         if result.load_factor > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
             return dataclasses.replace(result, pose=self._came_to(result.state))
-        if self.last_energy()[1] is None:  # the first step
+        if not self.setup.parts(self.state)[0][STARTED]:  # the first step
             return result
         wrench, tangent, *last = self.last_model()
         state = before.copy()

@@ -1,5 +1,5 @@
 """How the touching bodies of a batch give way to wrenches on them: beta h^2 J H^-1 J', for all worlds at
-once.
+once, and how fast they bounce on the skin.
 
 H is M - h D, with D what the integrator treats implicitly, and the springs that MuJoCo's other constraints
 are where its solver left them."""
@@ -9,13 +9,14 @@ import typing
 import mujoco
 import warp as wp
 
+from ...coupling.implicit.rounds import Model
 from ...skin.condensed.lanes import sync
 from ...skin.program import Launcher
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Factor", "Response", "substitute"]
+__all__ = ["Factor", "Response", "add_powers", "add_stiffness", "drive", "find_frequencies", "substitute"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -161,6 +162,93 @@ def move(
             m += (both * response[w, c, i]) * jacobian[g, w, i]
         for b in range(6):
             compliance_out[groups * g + c / 6, w, b, c % 6] = m[b]
+
+
+@wp.kernel
+def add_stiffness(
+    # In:
+    jacobian: wp.array3d(dtype=vec6),
+    model: Model,
+    # In and out:
+    stiffness: wp.array3d(dtype=real),
+):
+    """Adds a skin's stiffness against the degrees of freedom [world, dof, dof], a row by each thread."""
+    w, i = wp.tid()
+    for g in range(jacobian.shape[0]):
+        held = wp.transpose(model.tangent0[g, w]) * jacobian[g, w, i]
+        if wp.dot(held, held) > real(0.0):
+            for j in range(jacobian.shape[2]):
+                stiffness[w, i, j] = stiffness[w, i, j] + wp.dot(held, jacobian[g, w, j])
+
+
+@wp.kernel
+def drive(
+    # In:
+    stiffness: wp.array3d(dtype=real),
+    L: wp.array3d(dtype=real),
+    response: wp.array3d(dtype=real),
+    # Out:
+    driven_out: wp.array3d(dtype=real),
+):
+    """Accelerations by what all skins do against motions of the degrees of freedom [world, column, dof]."""
+    w, c = wp.tid()
+    for i in range(stiffness.shape[1]):
+        held = real(0.0)
+        for j in range(stiffness.shape[1]):
+            held += stiffness[w, i, j] * response[w, c, j]
+        driven_out[w, c, i] = held
+    substitute(L, w, c, driven_out)
+
+
+@wp.kernel
+def add_powers(
+    # In:
+    stiffness: wp.array3d(dtype=real),
+    response: wp.array3d(dtype=real),
+    driven: wp.array3d(dtype=real),
+    model: Model,
+    # Out:
+    power_out: wp.array2d(dtype=wp.vec2d),
+):
+    """What each wrench on a skin's bodies [world, column] adds to the traces of the second and the fourth
+    power of the modes, see `SkinGroup.frequencies`."""
+    w, c = wp.tid()
+    g = c / 6
+    second = vec6()
+    fourth = vec6()
+    if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
+        for i in range(stiffness.shape[1]):
+            once = real(0.0)
+            twice = real(0.0)
+            for j in range(stiffness.shape[1]):
+                once += stiffness[w, i, j] * response[w, c, j]
+                twice += stiffness[w, i, j] * driven[w, c, j]
+            for b in range(6):
+                second[b] = second[b] + once * response[w, 6 * g + b, i]
+                fourth[b] = fourth[b] + twice * driven[w, 6 * g + b, i]
+    T = model.tangent0[g, w]
+    power_out[w, c] = wp.vec2d((T * second)[c % 6], (T * fourth)[c % 6])
+
+
+@wp.kernel
+def find_frequencies(
+    # In:
+    taking_part: wp.array(dtype=int),
+    power: wp.array2d(dtype=wp.vec2d),
+    # Out:
+    frequency_out: wp.array2d(dtype=real),
+):
+    """As `SkinGroup.frequencies`."""
+    g, w = wp.tid()
+    if taking_part[w] == 0:
+        return
+    total = wp.vec2d()
+    for c in range(6 * g, 6 * g + 6):
+        total += power[w, c]
+    frequency = real(0.0)
+    if total[0] > real(0.0) and total[1] > real(0.0):
+        frequency = wp.sqrt(wp.sqrt(total[1] / total[0]))
+    frequency_out[g, w] = frequency
 
 
 class Factor:

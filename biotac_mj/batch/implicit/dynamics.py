@@ -7,18 +7,19 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
-from ...geometry.rigid_warp import displace_from, is_finite, rotation
+from ...coupling.implicit.rounds import Rounds, follow
+from ...geometry.rigid_warp import is_finite, rotation
 from ...skin.newton.worlds import NOT_FINITE
 from ...skin.types import double, widen
 
 __all__ = [
+    "accelerate",
     "acting_wrenches",
     "add_forces",
     "advance_core",
     "advance_groups",
     "find_drift",
     "find_rows",
-    "follow",
     "relative_jacobians",
     "write_rows",
 ]
@@ -171,40 +172,20 @@ def advance_core(
 
 
 @wp.kernel
-def follow(
+def accelerate(
     # In:
     h: real,
-    square: wp.array2d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
-    here: wp.array2d(dtype=vec3),
-    pos: wp.array2d(dtype=vec3),
-    mat: wp.array2d(dtype=mat33),
-    straight: wp.array2d(dtype=vec6),
-    drift: wp.array2d(dtype=vec6),
-    # Out:
-    moved_out: wp.array2d(dtype=vec6),
-    travel_out: wp.array2d(dtype=vec6),
-    pos_out: wp.array2d(dtype=vec3),
-    mat_out: wp.array2d(dtype=mat33),
+    # In and out:
+    r: Rounds,
 ):
-    """Poses at which the skins are solved: those without acceleration, moved by beta h^2 J a. The travel is
-    that of the mean velocity in the step.
-
-    Bodies turn by both at once: `geometry.rigid.displace` with its spin."""
+    """Where the bodies go with accelerations (nworld, nv), see `rounds.follow`."""
     g, w = wp.tid()
     gain = vec6()
     for i in range(jacobian.shape[2]):
         gain += real(qacc[w, i]) * jacobian[g, w, i]
-    m = square[g, w] * gain
-    moved_out[g, w] = m
-    travel_out[g, w] = straight[g, w] + real(0.5) * h * h * gain
-    spin = wp.spatial_bottom(drift[g, w])
-    both = vec6(m[0], m[1], m[2], m[3] + spin[0], m[4] + spin[1], m[5] + spin[2])
-    p, R = displace_from(here[g, w], pos[g, w], rotation(-spin) * mat[g, w], both)
-    p -= wp.cross(spin, here[g, w])
-    pos_out[g, w] = p
-    mat_out[g, w] = R
+    follow(r, g, w, h, gain)
 
 
 @wp.kernel

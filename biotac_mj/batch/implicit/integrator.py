@@ -11,11 +11,11 @@ import typing
 import mujoco
 import warp as wp
 
+from ...coupling.implicit.rounds import Model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
 from ...skin.condensed.lanes import eliminate, sync
 from ...skin.program import Launcher
-from ..kernels import Model
 from .compliance import Factor, substitute
 
 if typing.TYPE_CHECKING:

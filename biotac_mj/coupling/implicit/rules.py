@@ -9,6 +9,7 @@ __all__ = [
     "EULER",
     "LOSS_FREQUENCY",
     "PATIENCE",
+    "TELEPORT",
     "TOLERANCE",
     "beta_of",
     "gamma_of",
@@ -23,6 +24,8 @@ __all__ = [
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which a skin is not solved again: a
 # solve leaves its bodies open by as much, and over so short a way its linear model errs by 5e-4 of the force
 TOLERANCE = 5e-6
+# [m] a body that was moved further than this, and than it goes by itself in a step, was put there
+TELEPORT = 1e-3
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
 EULER = 1.5  # gamma of backward Euler's member of the family of steps

@@ -27,7 +27,7 @@ from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .group import SkinGroup
 from .integrator import Integrator
-from .rules import EULER, MAX_CORRECTIONS, TOLERANCE, poorly_corrected
+from .rules import MAX_CORRECTIONS, TOLERANCE, poorly_corrected
 
 __all__ = ["ASTRAY", "World"]
 
@@ -222,6 +222,9 @@ class World:
             self._group.evaluate(np.zeros(self.model.nv))
             self._solve_all({skin: skin.finish for skin in skins})
             self._forces(skins, outside)
+            for skin in skins:
+                skin.evaluate(np.zeros(self.model.nv))
+                skin.arrays.find_energy()
         for skin, frequency in zip(skins, self._group.frequencies()):
             skin.conclude(rounds, frequency)
 
@@ -258,7 +261,7 @@ class World:
     def _rows_hold(self, skin):
         """Whether a skin's rows push what its model says."""
         rows = np.abs(_SCALE * skin.excess).max(initial=0.0)
-        return not rows > SOLVED * np.abs(_SCALE * skin.acting()).max(initial=0.0)
+        return not rows > SOLVED * np.abs(_SCALE * skin.arrays.acting).max(initial=0.0)
 
     def _find_balance(self, skins, outside):
         """Finds models of the skins that hold where these lead; returns how many rounds that took.
@@ -319,14 +322,15 @@ class World:
     def _damp(self, skins, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
         how many rounds that took."""
-        self._group.predict_wrenches()
-        greedy = [skin for skin in skins if not skin.euler and skin.overdraws()]
+        greedy = [skin for skin in skins if skin.arrays.find_energy()]
         if not greedy:
             return 0
         for skin in greedy:
-            skin.use_gamma(np.full(len(skin.gamma), EULER))
-        self._group.find_drift()
-        return self._find_balance(skins, outside)
+            skin.use_euler()
+        rounds = self._find_balance(skins, outside)
+        for skin in skins:
+            skin.arrays.find_energy()
+        return rounds
 
     def _restrain(self, skins, outside):
         """Withholds the push on bodies that would get more energy than they have put in.
@@ -335,11 +339,9 @@ class World:
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
         about the present pose: a damper, where MuJoCo's solver finds what its rows push.
         """
-        self._group.predict_wrenches()
         by_rows = all(skin.forced is None for skin in skins)
-        while [skin for skin in skins if by_rows and skin.restrain()]:
+        while [skin for skin in skins if by_rows and skin.arrays.restrain()]:
             self._group.evaluate(self._accelerations(skins, outside))
-            self._group.predict_wrenches()
         if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
@@ -350,20 +352,22 @@ class World:
         self._solve_group(skins, outside)
         gains = self._gain(skins)
         if gains:
-            self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
+            self._force(skins, outside, [np.zeros_like(skin.correction) for skin in skins], 0.0)
         for skin in skins:
             skin.settled = not gains and skin.off < self.tolerance
 
     def _gain(self, skins):
         """Whether bodies gain more than they have in the skins. Where one turns by a radian in a step under
         forces, its way does not tell their work."""
-        return any(skin.overdraws() or (skin.forced is not None and skin.turning >= _FAR) for skin in skins)
+        return any(
+            skin.arrays.gains() or (skin.forced is not None and skin.turning >= _FAR) for skin in skins
+        )
 
     def _solve_group(self, skins, outside):
         """Solves the models and the bodies' inertia together, with what other constraints do without the
         skins; lets what is found act as forces."""
         wrench, tangent = zip(*(skin.equations() for skin in skins))
-        self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
+        self._force(skins, outside, [np.zeros_like(skin.correction) for skin in skins], 0.0)
         jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
         response = self.data.moved_by(jacobian)
         if self._damped:
@@ -374,7 +378,7 @@ class World:
         stiffness = block_diag(*np.concatenate(tangent))
         left = np.concatenate(wrench).ravel() - stiffness @ moved.ravel()
         found = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
-        ends = np.cumsum([len(skin.wrench0) for skin in skins])[:-1]
+        ends = np.cumsum([len(skin.correction) for skin in skins])[:-1]
         self._force(skins, outside, np.split(found, ends), 1.0)
 
     def _force(self, skins, outside, wrenches, push):
@@ -410,7 +414,7 @@ class World:
             np.concatenate([getattr(s, name)[s.touching] for s in skins])
             for name in ("jacobian", "tangent", "correction")
         )
-        largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
+        largest = max(np.abs(_SCALE * s.arrays.wrench0).max(initial=0.0) for s in skins)
         stiffness = np.concatenate([s.square[s.touching] for s in skins])[:, None, None] * tangent
         own = np.concatenate([skin.instance.metric.numbers() for skin in skins])
         for last in range(MAX_CORRECTIONS, -1, -1):
@@ -444,6 +448,6 @@ def _hand_out(wrenches, skins, name):
     """Gives each skin its wrenches (k, 6) on the bodies that it holds as attribute `name`; none on others."""
     begin = 0
     for skin in skins:
-        own, end = np.zeros_like(skin.wrench0), begin + len(skin.touching)
+        own, end = np.zeros_like(skin.correction), begin + len(skin.touching)
         own[skin.touching], begin = wrenches[begin:end], end
         setattr(skin, name, own)

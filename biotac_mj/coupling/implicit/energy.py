@@ -1,16 +1,16 @@
-"""What energy the skins of a batch may give in a step, and what is withheld of their push so that they give
-no more. It is the account of `coupled.py` and `World._restrain` in `coupling/implicit/`, for all worlds at
-once with one thread each, made after the `rounds`."""
+"""What energy skins may give in a step, and what is withheld of their push so that they give no more: one
+thread for each world.
+
+The account is made after the rounds. What acts on a body is linear in the accelerations, as MuJoCo takes it:
+`Rounds.acting`."""
 
 import warp as wp
 
-from ...coupling.implicit.rules import EULER, in_store, lacking, spared
 from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
-from ..kernels import Model
-from ..marks import MarkedWorlds, mark
-from .compliance import substitute
-from .rounds import Rounds, Solid, force_of
+from .marks import MarkedWorlds, mark
+from .rounds import Model, Rounds, Solid, force_of
+from .rules import EULER, in_store, lacking, spared
 
 __all__ = [
     "conclude",
@@ -25,27 +25,18 @@ wp.set_module_options({"enable_backward": False})
 
 real = wp.float64
 vec6 = wp.spatial_vectord
-
-_in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))
 mat66 = wp.spatial_matrixd
 
-# of the most that a skin holds: accelerations are of single precision
-_ROUNDING = wp.constant(wp.float64(1e-3))
+_in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))
 
 
 @wp.func
-def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
-    """What acts on a body, as MuJoCo takes it: linear in the accelerations, from its wrench without them."""
-    return wrench[g, w] - model.tangent0[g, w] * r.moved[g, w] + r.amiss[g, w]
-
-
-@wp.func
-def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
+def given(r: Rounds, g: int, w: int):
     """Work of what acts on a body on its way [J]; not on what was lost before the step."""
     motion = r.straight[g, w]
     if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(motion, motion))):
         return real(0.0)
-    return wp.dot(acting(r, model, wrench, g, w), r.travel[g, w])
+    return wp.dot(r.acting[g, w], r.travel[g, w])
 
 
 @wp.func
@@ -60,13 +51,13 @@ def most_energy(r: Rounds, force: real, solid: Solid, w: int):
 
 
 @wp.func
-def draws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, slack: real):
+def draws(r: Rounds, w: int, slack: real):
     """What the bodies of a skin lack together, and what they may leave to each other [J]. slack: of the most
     that the skin can hold, by which each may get more."""
     lacks = real(0.0)
     spare = real(0.0)
     for g in range(r.pos.shape[0]):
-        gets = given(r, model, wrench, g, w)
+        gets = given(r, g, w)
         spare += _spared(r.left[g, w], r.store[g, w], gets)
         if slack > real(0.0):
             gets -= slack * r.most[g, w]
@@ -75,9 +66,9 @@ def draws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, slack
 
 
 @wp.func
-def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, slack: real):
+def overdraws(r: Rounds, w: int, slack: real):
     """Whether what acts gives bodies more energy than they have, or is no number."""
-    both = draws(r, model, wrench, w, slack)
+    both = draws(r, w, slack)
     return not both[0] <= both[1]
 
 
@@ -85,9 +76,7 @@ def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int, s
 def find_energy(
     # In:
     taking_part: wp.array(dtype=int),
-    model: Model,
     last: Model,
-    wrench: wp.array2d(dtype=vec6),
     solid: Solid,
     # In and out:
     r: Rounds,
@@ -104,7 +93,7 @@ def find_energy(
         return
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
-        acts = acting(r, model, wrench, g, w)
+        acts = r.acting[g, w]
         before = wp.dot(last.wrench0[g, w], jump)
         now = wp.dot(acts, jump)
         pushes = force_of(acts)
@@ -118,7 +107,7 @@ def find_energy(
     least = real(EULER)
     for g in range(r.pos.shape[0]):
         least = wp.min(least, r.gamma[g, w])
-    if least < real(EULER) and overdraws(r, model, wrench, w, real(0.0)):
+    if solid.inertial == 0 and least < real(EULER) and overdraws(r, w, real(0.0)):
         greedy_out[w] = 1
         mark(damped, w)
 
@@ -127,8 +116,6 @@ def find_energy(
 def restrain(
     # In:
     worlds: wp.array(dtype=int),
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
     # In and out:
     r: Rounds,
     going: MarkedWorlds,
@@ -136,10 +123,10 @@ def restrain(
     """Takes the push on bodies that would get more energy than they have, and marks their worlds. What
     remains without it is the skin's tangent about the present pose: a damper."""
     w = wp.tid()
-    if worlds[w] == 0 or not overdraws(r, model, wrench, w, real(0.0)):
+    if worlds[w] == 0 or not overdraws(r, w, real(0.0)):
         return
     for g in range(r.pos.shape[0]):
-        gets = given(r, model, wrench, g, w)
+        gets = given(r, g, w)
         if r.push[g, w] > real(0.0) and not _lacking(r.store[g, w], gets) == real(0.0):
             r.push[g, w] = real(0.0)
             mark(going, w)
@@ -149,15 +136,15 @@ def restrain(
 def find_gain(
     # In:
     taking_part: wp.array(dtype=int),
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
+    slack: real,
     r: Rounds,
     # Out:
     gains: MarkedWorlds,
 ):
-    """Marks worlds where a skin gives more than it has whatever is withheld, or what acts is no number."""
+    """Marks worlds where a skin gives more than it has whatever is withheld, or what acts is no number.
+    slack: of the most that the skin holds, which the engine's rounding may give more."""
     w = wp.tid()
-    if taking_part[w] == 1 and overdraws(r, model, wrench, w, _ROUNDING):
+    if taking_part[w] == 1 and overdraws(r, w, slack):
         mark(gains, w)
 
 
@@ -171,13 +158,13 @@ def withdraw(
     correction: wp.array2d(dtype=vec6),
     warmstart: wp.array2d(dtype=float),
 ):
-    """No skin of such a world acts in this step, as at last in `World._act_by_force`; mujoco_warp's solver
-    begins anew, since what it found may be no number."""
+    """No skin of such a world acts in this step; mujoco_warp's solver begins anew, since what it found may be
+    no number."""
     w = wp.tid()
     if gains[w] == 0:
         return
     for i in range(warmstart.shape[1]):
-        warmstart[w, i] = float(0.0)
+        warmstart[w, i] = 0.0
     r.settled[w] = 0
     for g in range(correction.shape[0]):
         r.push[g, w] = real(0.0)
@@ -187,114 +174,33 @@ def withdraw(
 
 
 @wp.kernel
-def add_stiffness(
-    # In:
-    jacobian: wp.array3d(dtype=vec6),
-    model: Model,
-    # In and out:
-    stiffness: wp.array3d(dtype=real),
-):
-    """Adds a skin's stiffness against the degrees of freedom [world, dof, dof], a row by each thread."""
-    w, i = wp.tid()
-    for g in range(jacobian.shape[0]):
-        held = wp.transpose(model.tangent0[g, w]) * jacobian[g, w, i]
-        if wp.dot(held, held) > real(0.0):
-            for j in range(jacobian.shape[2]):
-                stiffness[w, i, j] = stiffness[w, i, j] + wp.dot(held, jacobian[g, w, j])
-
-
-@wp.kernel
-def drive(
-    # In:
-    stiffness: wp.array3d(dtype=real),
-    L: wp.array3d(dtype=real),
-    response: wp.array3d(dtype=real),
-    # Out:
-    driven_out: wp.array3d(dtype=real),
-):
-    """Accelerations by what all skins do against motions of the degrees of freedom [world, column, dof]."""
-    w, c = wp.tid()
-    for i in range(stiffness.shape[1]):
-        held = real(0.0)
-        for j in range(stiffness.shape[1]):
-            held += stiffness[w, i, j] * response[w, c, j]
-        driven_out[w, c, i] = held
-    substitute(L, w, c, driven_out)
-
-
-@wp.kernel
-def add_powers(
-    # In:
-    stiffness: wp.array3d(dtype=real),
-    response: wp.array3d(dtype=real),
-    driven: wp.array3d(dtype=real),
-    model: Model,
-    # Out:
-    power_out: wp.array2d(dtype=wp.vec2d),
-):
-    """What each wrench on a skin's bodies [world, column] adds to the traces of the second and the fourth
-    power of the modes, see `SkinGroup.frequencies`."""
-    w, c = wp.tid()
-    g = c / 6
-    second = vec6()
-    fourth = vec6()
-    if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
-        for i in range(stiffness.shape[1]):
-            once = real(0.0)
-            twice = real(0.0)
-            for j in range(stiffness.shape[1]):
-                once += stiffness[w, i, j] * response[w, c, j]
-                twice += stiffness[w, i, j] * driven[w, c, j]
-            for b in range(6):
-                second[b] = second[b] + once * response[w, 6 * g + b, i]
-                fourth[b] = fourth[b] + twice * driven[w, 6 * g + b, i]
-    T = model.tangent0[g, w]
-    power_out[w, c] = wp.vec2d((T * second)[c % 6], (T * fourth)[c % 6])
-
-
-@wp.func
-def _frequency(power: wp.array2d(dtype=wp.vec2d), g: int, w: int):
-    """As `SkinGroup.frequencies`."""
-    total = wp.vec2d()
-    for c in range(6 * g, 6 * g + 6):
-        total += power[w, c]
-    if total[0] > real(0.0) and total[1] > real(0.0):
-        return wp.sqrt(wp.sqrt(total[1] / total[0]))
-    return real(0.0)
-
-
-@wp.kernel
 def conclude(
     # In:
     taking_part: wp.array(dtype=int),
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
     reason: wp.array(dtype=int),
-    power: wp.array2d(dtype=wp.vec2d),
-    # In and out:
     r: Rounds,
+    # Out:
+    left_out: wp.array2d(dtype=real),
 ):
-    """Keeps the energy that is left, and how fast bodies bounce."""
+    """Finds the energy that is left to the bodies; left_out may be that of the last step, which it takes the
+    place of."""
     w = wp.tid()
     if taking_part[w] == 0:
         return
-    both = draws(r, model, wrench, w, real(0.0))
+    both = draws(r, w, real(0.0))
     passed = wp.min(both[0], both[1])  # from some bodies to others
     for g in range(r.pos.shape[0]):
-        r.frequency[g, w] = _frequency(power, g, w)
-        gets = given(r, model, wrench, g, w)
+        gets = given(r, g, w)
         # what is withheld is in the skin all the same; a damper, which is all that acts then, keeps nothing
         left = r.store[g, w] - wp.where(r.push[g, w] > real(0.0), gets, wp.max(gets, real(0.0)))
         if passed > real(0.0):
             left += passed * _lacking(r.store[g, w], gets) / both[0]
             left -= passed * _spared(r.left[g, w], r.store[g, w], gets) / both[1]
         left = wp.min(left, r.most[g, w])
-        if r.open[g, w] == 1 or (r.placed[g, w] == 1 and r.inside[w] == 1):
-            # what was put in is not known before a balance is found
-            r.open[g, w] = wp.where(reason[w] == CONVERGED, 0, 1)
-            if r.open[g, w] == 1:
-                left = real(wp.inf)
-        r.left[g, w] = left
+        unknown = wp.isinf(r.left[g, w]) or (r.placed[g, w] == 1 and r.inside[w] == 1)
+        if unknown and reason[w] != CONVERGED:  # what was put in is not known before a balance is found
+            left = real(wp.inf)
+        left_out[g, w] = left
 
 
 @wp.kernel

@@ -1,32 +1,42 @@
-"""Decides how a coupled step goes on: `world.py` and `coupled.py` of `coupling/implicit/` for all worlds at
-once, one thread each. The account of their energy is in `energy`.
+"""The coupled step of skins and bodies, of one world or of all at once: where bodies go, what acts on them,
+and how the rounds go on. The account of energy is in `energy`.
 
 Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
-from ...coupling.implicit.coupled import TELEPORT
-from ...coupling.implicit.rules import EULER, TOLERANCE, beta_of, gamma_of
-from ...geometry.rigid_warp import LEVER, displace_at_once, is_finite, motion, motion_at_once, size_of
+from ...geometry.rigid_warp import (
+    LEVER,
+    displace_at_once,
+    displace_from,
+    is_finite,
+    motion,
+    motion_at_once,
+    rotation,
+    size_of,
+)
 from ...skin.bodies import Bodies
 from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
 from ...skin.newton.worlds import CONVERGED
-from ..kernels import Model
-from ..marks import MarkedWorlds, mark
+from .marks import MarkedWorlds, mark
+from .rules import EULER, TELEPORT, TOLERANCE, beta_of, gamma_of
 
 __all__ = [
+    "Model",
     "Rounds",
     "Solid",
     "ask",
     "begin_rounds",
     "choose_gamma",
+    "follow",
     "force_of",
     "judge",
     "uncoupled_poses",
     "use_euler",
     "look",
     "look_inside",
+    "make_rounds",
     "tell_bodies",
     "wrenches",
 ]
@@ -41,6 +51,16 @@ mat66 = wp.spatial_matrixd
 
 _gamma_of, _beta_of = (wp.func(rule) for rule in (gamma_of, beta_of))
 _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPORT))
+
+
+@wp.struct
+class Model:
+    """Linear models of skins [group, world]: wrench0 - tangent0 (pose - pose0)."""
+
+    wrench0: wp.array2d(dtype=vec6)
+    tangent0: wp.array2d(dtype=mat66)
+    pos0: wp.array2d(dtype=vec3)
+    mat0: wp.array2d(dtype=mat33)
 
 
 @wp.struct
@@ -68,7 +88,9 @@ class Rounds:
     horizon: wp.array2d(dtype=real)  # [s] after which the skin is solved, without acceleration
     square: wp.array2d(dtype=real)  # beta h^2, [m per m/s^2]
     frequency: wp.array2d(dtype=real)  # angular, at which bodies bounce on the skin [rad/s]
-    amiss: wp.array2d(dtype=vec6)  # what the correction for it still lacks: it acts on the bodies too
+    # what passive forces and rows lack of the skin's model or have more than it: it acts on the bodies too
+    amiss: wp.array2d(dtype=vec6)
+    acting: wp.array2d(dtype=vec6)  # what acts on the bodies, linear in the accelerations
     asked_pos: wp.array2d(dtype=vec3)
     asked_mat: wp.array2d(dtype=mat33)
     free_pos: wp.array2d(dtype=vec3)
@@ -81,10 +103,9 @@ class Rounds:
     began: wp.array(dtype=int)  # a step was made since the reset
     placed: wp.array2d(dtype=int)  # a body was put where it is from outside
     inside: wp.array(dtype=int)  # and one of them into the skin
-    open: wp.array2d(dtype=int)  # what was put in so is not yet known
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
     push: wp.array2d(dtype=real)  # 1 where the wrench at the present pose acts, 0 where it is withheld
-    left: wp.array2d(dtype=real)  # [J] energy that the last step left a body in the skin at most
+    left: wp.array2d(dtype=real)  # [J] energy that the last step left a body in the skin at most, or inf
     store: wp.array2d(dtype=real)  # [J] and with what was put into it since
     most: wp.array2d(dtype=real)  # [J] that the skin can hold of it
     surface: wp.array(dtype=real)  # [J/m^2] of adhesion, of length zero without a law
@@ -97,6 +118,21 @@ class Solid:
     thickness: real
     area: real
     inertial: int
+
+
+def make_rounds(groups: int, nworld: int, limit: int = 0) -> Rounds:
+    """Those of `groups` bodies, on Warp's default device; all zero but for what acts: all of the push, and
+    skins that settled in one round."""
+    r = Rounds()
+    for name, variable in Rounds.vars.items():
+        kind = getattr(variable.type, "dtype", None)
+        if kind is not None:
+            shape = (groups, nworld) if variable.type.ndim == 2 else nworld
+            setattr(r, name, wp.zeros(shape, dtype=kind))
+    for array in (r.push, r.settled, r.rounds):
+        array.fill_(1)
+    r.surface, r.limit = wp.zeros(0, dtype=real), limit
+    return r
 
 
 @wp.func
@@ -121,7 +157,8 @@ def wrenches(
     wrench_out: wp.array2d(dtype=vec6),
 ):
     """On each group without acceleration, without what is withheld of the push at the present pose. Ways are
-    measured as the rows do: what acts where the bodies come is what the skin says there."""
+    measured as the rows do: what acts where the bodies come is what the skin says there. Finds `acting`, too,
+    after `follow`."""
     g, w = wp.tid()
     total = vec6()
     if is_finite(r.start_pos[g, w], r.start_mat[g, w]):
@@ -138,34 +175,60 @@ def wrenches(
             # against the drift itself: the way from here to the pose is another one where bodies turn far
             total = -(model.tangent0[g, w] * r.drift[g, w])
     wrench_out[g, w] = total
+    r.acting[g, w] = total - model.tangent0[g, w] * r.moved[g, w] + r.amiss[g, w]
 
 
 @wp.func
-def _set_gamma(r: Rounds, g: int, w: int, step: real, gamma: real):
+def follow(r: Rounds, g: int, w: int, h: real, gain: vec6):
+    """Finds where a body goes with an acceleration `gain` of itself, and where the skin is solved for it:
+    from the pose without acceleration, moved by beta h^2 times that. The travel is that of the mean velocity
+    in the step.
+
+    Bodies turn by both at once: `geometry.rigid.displace` with its spin."""
+    m = r.square[g, w] * gain
+    r.moved[g, w] = m
+    r.travel[g, w] = r.straight[g, w] + real(0.5) * h * h * gain
+    here = r.here_pos[g, w]
+    spin = _turns(r.drift[g, w])
+    both = vec6(m[0], m[1], m[2], m[3] + spin[0], m[4] + spin[1], m[5] + spin[2])
+    p, R = displace_from(here, r.start_pos[g, w], rotation(-spin) * r.start_mat[g, w], both)
+    r.pos[g, w] = p - wp.cross(spin, here)
+    r.mat[g, w] = R
+
+
+@wp.func
+def _set_gamma(r: Rounds, g: int, w: int, step: real, ahead: real, gamma: real):
     r.gamma[g, w] = gamma
-    r.horizon[g, w] = (gamma - real(0.5)) * step
+    r.horizon[g, w] = (gamma - real(0.5) + ahead) * step
     r.square[g, w] = _beta_of(gamma) * step * step
 
 
 @wp.kernel
-def choose_gamma(step: real, delay: real, inertial: int, last: Model, r: Rounds):
-    """Newmark's gamma of the step, as `Instance.gamma`; delay: of the rubber's force, in steps."""
+def choose_gamma(step: real, ahead: real, delay: real, solid: Solid, last: Model, r: Rounds):
+    """Newmark's gamma of the step of each body. A skin with inertia steps itself to the end of the step.
+
+    Args:
+      ahead: by how many steps positions are ahead of those with the velocity after a step: half of one, where
+        they go by the mean velocity. delay: of the rubber's force, in steps.
+    """
     g, w = wp.tid()
-    touches = bool(False)
-    if inertial == 0 and wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0):
-        touches = True
-    _set_gamma(r, g, w, step, _gamma_of(r.frequency[g, w] * step, delay, touches))
+    gamma = real(EULER) - ahead
+    if solid.inertial == 0:
+        touches = wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0)
+        gamma = _gamma_of(r.frequency[g, w] * step, delay, touches)
+    _set_gamma(r, g, w, step, ahead, gamma)
 
 
 @wp.kernel
 def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
+    """What is known of a step before it is made: which bodies were put where they are from outside."""
     w = wp.tid()
     r.inside[w] = 1 - r.began[w]
     for g in range(r.pos.shape[0]):
         r.placed[g, w] = 1 - r.began[w]
         r.push[g, w] = real(1.0)
         if r.began[w] == 0:
-            r.open[g, w] = 0
+            r.left[g, w] = real(0.0)
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.straight[g, w])):
             r.placed[g, w] = 1
@@ -179,13 +242,13 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
 
 
 @wp.kernel
-def use_euler(step: real, greedy: wp.array(dtype=int), r: Rounds):
+def use_euler(step: real, ahead: real, greedy: wp.array(dtype=int), r: Rounds):
     """Makes the step that of backward Euler in greedy worlds, whose skins are to be solved again."""
     w = wp.tid()
     if greedy[w] == 1:
         r.settled[w] = 0
         for g in range(r.gamma.shape[0]):
-            _set_gamma(r, g, w, step, real(EULER))
+            _set_gamma(r, g, w, step, ahead, real(EULER))
 
 
 @wp.kernel

@@ -1,0 +1,144 @@
+"""The coupled step of one skin in one world: the arrays and kernels of `rounds` and `energy` for MuJoCo, seen
+from numpy."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from ...geometry.rigid_warp import motion, size_of
+from ...launches import in_a_row, recorded
+from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
+from . import energy, rounds
+from .marks import Marks
+from .rounds import Model, Rounds, Solid, follow
+from .rules import LOSS_FREQUENCY
+
+__all__ = ["StepArrays"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec6 = wp.spatial_vectord
+
+
+@wp.kernel
+def evaluate(
+    # In:
+    h: real,
+    gain: wp.array2d(dtype=vec6),
+    # In and out:
+    r: Rounds,
+    # Out:
+    off_out: wp.array(dtype=real),
+):
+    """Where bodies go that gain these accelerations (`rounds.follow`), and how far that is at most from where
+    the skin was solved [m]."""
+    w = wp.tid()
+    off = real(0.0)
+    for g in range(r.pos.shape[0]):
+        follow(r, g, w, h, gain[g, w])
+        way = motion(r.pos[g, w], r.mat[g, w], r.asked_pos[g, w], r.asked_mat[g, w])
+        off = wp.max(off, size_of(way))
+    off_out[w] = off
+
+
+class StepArrays:
+    """Arrays (ngroup, ...) of a skin's step, views of what kernels work on; their names are those of `Rounds`
+    and `Model`. A launch takes 1 us, several numpy calls on so few numbers.
+
+    Args:
+      ngroup: number of bodies that can touch. thickness: [m], surface_energy: [J] most of adhesion, inertial:
+        of the skin. loss: of its rubber.
+
+    Attributes:
+      gain: (ngroup, 6) accelerations of the bodies, for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
+      off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
+      last: views by name of the linear model of the last step.
+    """
+
+    def __init__(self, ngroup: int, thickness: float, surface_energy: float, inertial: bool, loss: float):
+        shape = ngroup, 1
+        self._loss, self._key, solid = loss, None, Solid()
+        solid.thickness, solid.area, solid.inertial = thickness, 1.0, int(inertial)
+        self._solid = solid
+        with wp.ScopedDevice("cpu"):
+            self._rounds, self._model, self._last = rounds.make_rounds(*shape), Model(), Model()
+            self._rounds.surface = wp.array([surface_energy], dtype=real)
+            for name, variable in Model.vars.items():
+                for model in (self._model, self._last):
+                    setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
+            self._wrench, self._gain = (wp.zeros(shape, dtype=vec6) for _ in range(2))
+            self._left_out = wp.zeros(shape, dtype=real)
+            self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
+            self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
+        self._one.fill_(1)
+        self.wrench, self.gain, self.left_out = map(_seen, (self._wrench, self._gain, self._left_out))
+        self.off, self._is_greedy, self._is_marked, self._found = (
+            a.numpy() for a in (self._off, self._greedy, self._marks.any, self._reason)
+        )
+        for part, names in ((self._rounds, Rounds.vars), (self._model, Model.vars)):
+            for name in names:
+                array = getattr(part, name)
+                if isinstance(array, wp.array):
+                    setattr(self, name, _seen(array))
+        self.last = {name: _seen(getattr(self._last, name)) for name in Model.vars}
+
+    def record(self, step: float, ahead: float) -> None:
+        """Makes the launches for a time step [s]; ahead: see `rounds.choose_gamma`."""
+        if self._key == (step, ahead):
+            return
+        self._key, r, n = (step, ahead), self._rounds, self.wrench.shape[0]
+        delay = self._loss / (2 * math.pi * LOSS_FREQUENCY * step)
+
+        def row(*launches) -> Callable[[], None]:
+            runs = in_a_row([recorded(kernel, dim, known) for kernel, dim, known in launches])
+            return runs[0] if len(runs) == 1 else lambda: [run() for run in runs]
+
+        forces = rounds.wrenches, (n, 1), [self._model, r, self._wrench]
+        one = [self._one]
+        self.choose_gamma = row(
+            (rounds.choose_gamma, (n, 1), [step, ahead, delay, self._solid, self._last, r])
+        )
+        self.use_euler = row((rounds.use_euler, 1, [step, ahead, *one, r]))
+        self.begin = row((rounds.begin_rounds, 1, [*one, r]))
+        self.find_wrenches = row(forces)
+        self.evaluate = row((evaluate, 1, [step, self._gain, r, self._off]), forces)
+        marks = self._marks.struct
+        self._find_energy = row(
+            (energy.find_energy, 1, [*one, self._last, self._solid, r, self._greedy, marks])
+        )
+        self._restrain = row((energy.restrain, 1, [*one, r, marks]))
+        self._find_gain = row((energy.find_gain, 1, [*one, 0.0, r, marks]))
+        self._conclude = row((energy.conclude, 1, [*one, self._reason, r, self._left_out]))
+
+    def find_energy(self) -> bool:
+        """Makes the account; whether the skin is greedy."""
+        self._find_energy()
+        return bool(self._is_greedy[0])
+
+    def restrain(self) -> bool:
+        """Whether push on a body had to be withheld, which now is."""
+        return self._marked(self._restrain)
+
+    def gains(self) -> bool:
+        """Whether bodies get more energy than they have."""
+        return self._marked(self._find_gain)
+
+    def conclude(self, converged: bool) -> np.ndarray:
+        """(ngroup,) energy that is left to the bodies [J]."""
+        self._found[0] = CONVERGED if converged else NOT_CONVERGED
+        self._conclude()
+        return self.left_out.copy()
+
+    def _marked(self, run):
+        self._is_marked[0] = 0
+        run()
+        return bool(self._is_marked[0])
+
+
+def _seen(array):
+    """A view of what is of the one world in an array [item, world] or [world]."""
+    view = array.numpy()
+    return view[:, 0] if array.ndim == 2 else view
