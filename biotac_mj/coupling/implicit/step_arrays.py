@@ -93,7 +93,8 @@ class StepArrays:
         delay = self._loss / (2 * math.pi * LOSS_FREQUENCY * step)
 
         def row(*launches) -> Callable[[], None]:
-            runs = in_a_row([recorded(kernel, dim, known) for kernel, dim, known in launches])
+            # none over no bodies
+            runs = in_a_row([recorded(kernel, dim, given) for kernel, dim, given in launches if np.prod(dim)])
             return runs[0] if len(runs) == 1 else lambda: [run() for run in runs]
 
         forces = rounds.wrenches, (n, 1), [self._model, r, self._wrench]
