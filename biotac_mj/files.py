@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import io
+import json
 import os
 import pathlib
 import shutil
@@ -17,6 +18,7 @@ from .short_repr import short_repr
 
 if typing.TYPE_CHECKING:
     import h5py
+    from matplotlib.figure import Figure
 
 __all__ = [
     "check_output",
@@ -26,6 +28,8 @@ __all__ = [
     "refuse_inputs",
     "remove_leftovers",
     "replacing",
+    "save_figure",
+    "write_json",
     "write_npz",
 ]
 
@@ -145,6 +149,18 @@ def write_npz(path: pathlib.Path | str, **arrays: np.ndarray) -> None:
     np.savez_compressed(memory, allow_pickle=False, **arrays)
     with replacing(path) as temporary:
         temporary.write_bytes(memory.getbuffer())
+
+
+def write_json(path: pathlib.Path | str, value: object, indent: int | None = 1) -> None:
+    """Writes JSON types to a file."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=indent) + "\n", encoding="utf-8")
+
+
+def save_figure(path: pathlib.Path | str, figure: "Figure", dpi: int = 110, kind: str | None = None) -> None:
+    """Writes a picture of a figure of Matplotlib; kind: its format, None: by the suffix."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, format=kind)
 
 
 def check_output(folder: pathlib.Path | str, *names: str) -> None:

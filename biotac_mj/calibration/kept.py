@@ -2,7 +2,6 @@
 continues. The file is JSON and can only restore the dataclasses named here."""
 
 import dataclasses
-import json
 import pathlib
 from collections.abc import Callable, Iterable
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ..cache import key_of
 from ..fields import check_types
-from ..files import replacing
+from ..files import write_json
 from ..reading import read_json
 from ..skin.contact.law import ContactLaw
 from ..skin.model import SkinOptions
@@ -55,8 +54,7 @@ class Kept:
         if not isinstance(self._parts.get(name), kind):
             self._parts[name] = make()
             content = {"key": self._key, "parts": _plain(self._parts)}
-            with replacing(self._path) as temporary:
-                temporary.write_text(json.dumps(content))
+            write_json(self._path, content, None)
         return self._parts[name]
 
 

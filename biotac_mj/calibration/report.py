@@ -1,12 +1,11 @@
 """Reports of fits and comparisons: tables, JSON and a picture."""
 
 import dataclasses
-import json
 import pathlib
 
 import numpy as np
 
-from ..files import replacing
+from .. import files
 from .fit import Calibration
 
 __all__ = ["calibration_table", "write_json", "write_picture"]
@@ -70,8 +69,7 @@ def plain(value):
 def write_json(content: dict, path: pathlib.Path | str) -> None:
     """Writes a dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite
     become null."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
+    files.write_json(path, plain(content))
 
 
 def write_picture(result: Calibration, path: pathlib.Path | str) -> None:
@@ -97,6 +95,5 @@ def write_picture(result: Calibration, path: pathlib.Path | str) -> None:
     bottom.axhline(0, lw=0.5, color="black")
     bottom.set_ylabel("fitted - measured [N]")
     bottom.set_xlabel("time [s]")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    files.save_figure(path, figure, 120)
     plt.close(figure)

@@ -1,14 +1,13 @@
 """`biotac learn predict inverse`: deformation and contact patch of a BioTac from its electrodes, drawn from
 below like the paper's figure."""
 
-import json
 import pathlib
 import typing
 
 import numpy as np
 import torch
 
-from ..files import replacing
+from ..files import save_figure, write_json
 from ..geometry import load_skin
 from ..recordings import load_one
 from .predictor import PointsModel
@@ -121,9 +120,7 @@ def contact_patch(
         "deepest_mm": (1e3 * np.linalg.norm(field[:, outer], axis=2).max(1)).tolist(),
     }
     out = pathlib.Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    with replacing(out / "contact.json") as temporary:
-        pathlib.Path(temporary).write_text(json.dumps(table))
+    write_json(out / "contact.json", table, None)
     force_here = None if recorded is None or np.isnan(recorded[row]) else float(recorded[row])
     one = {"row": row, "notes": table["notes"], "recorded": force_here} | {
         k: table[name][row]
@@ -255,5 +252,4 @@ def _figure(geometry, outer, field, contact, is_force, centre, counts, tare, one
     force = f"force about {one['force']:.2f} N, " if is_force else ""
     what = f"row {one['row']}: {force}patch {one['area_mm2']:.1f} mm2"
     figure.suptitle(f"{what} (network trained on synthetic data)", fontsize=10)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    save_figure(path, figure, 120)

@@ -1,13 +1,12 @@
 """`biotac learn judge FOLDER`: predictions of `biotac learn train` over all seeds, with the paper's numbers;
 JSON, a table and figures."""
 
-import json
 import pathlib
 
 import numpy as np
 
 from ..fields import check_entries
-from ..files import replacing
+from ..files import save_figure, write_json
 from ..reading import Array, check_arrays, read_json, read_npz
 from ..sensor.channels import NELECTRODE, electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
@@ -60,13 +59,11 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
     for split, found in result["splits"].items():
         found["tests"] = _tests(drawn[split]["errors"], result["default"])
     out = pathlib.Path(out or folder / "evaluation.json")
-    out.parent.mkdir(parents=True, exist_ok=True)
     figures = [out.with_name(f"{out.stem}_{what}.png") for what in ("errors", "traces")]
     draw_errors(result, figures[0])
     _traces(result, drawn, list(result["splits"]), figures[1])
     result["figures"] = [str(path) for path in figures]
-    with replacing(out) as temporary:
-        pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
+    write_json(out, result)
     return result
 
 
@@ -320,8 +317,7 @@ def draw_errors(result: dict, path: pathlib.Path | str) -> None:
         "with. Star: the paper's own, of a real sensor. Dashed: noise of the sensor.",
         fontsize=9,
     )
-    with replacing(pathlib.Path(path)) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(path, figure)
 
 
 def _traces(result, drawn, splits, path):
@@ -347,5 +343,4 @@ def _traces(result, drawn, splits, path):
             axis.set_title(f"{split}: E{e + 1}, {data['object'][mine][0].decode()}", fontsize=9)
             axis.set_xlabel("time [s]"), axis.set_ylabel("change [counts]")
             axis.legend(fontsize=7)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(path, figure)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..coupling.show import OBJECT, SKIN
-from ..files import replacing
+from ..files import save_figure
 from ..geometry.rigid import matrix
 from ..sensor.colors import FULL_CHANGE, change_map
 from .record import PressRecord
@@ -176,8 +176,7 @@ def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndar
         f"{record.parameters.get('indenter', 'indenter')} on a BioTac, skin {record.geometry.name}",
         fontsize=13,
     )
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(path, figure)
 
 
 def table(record: PressRecord, files: tuple | list = ()) -> str:

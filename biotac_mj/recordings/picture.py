@@ -4,7 +4,7 @@ import pathlib
 
 import numpy as np
 
-from ..files import check_output_file, picture_kind, replacing
+from ..files import check_output_file, picture_kind, save_figure
 from ..quality.clock import BUS_RATE
 from ..sensor.channels import NPAC
 from ..sensor.colors import change_map, line_color
@@ -84,8 +84,7 @@ def draw(recording: Recording, path: pathlib.Path | str) -> None:
         axes[-1].set_ylabel(f"PAC\n[({_short(recording, 'pac')})²/Hz]", fontsize=8)
     what = f", {recording.object}" if recording.object else ""
     figure.suptitle(f"{recording.name}{what}: {len(recording)} rows, {recording.rate:.4g} Hz", fontsize=11)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, format=kind)
+    save_figure(path, figure, kind=kind)
 
 
 def _short(recording, name):

@@ -9,16 +9,15 @@ import pathlib
 
 import numpy as np
 
-from ..data.contact import contact_labels
 from ..data.generation.generate import made_already
 from ..data.generation.plan import Motion
 from ..data.generation.readings import read_in_worker, readings_pool
-from ..data.generation.simulate import simulate
+from ..data.generation.simulate import describe, simulate
 from ..data.objects import OBJECTS, make_object
-from ..data.schema import DISPLACEMENT_SCALE, Interaction
+from ..data.schema import Interaction
 from ..data.splits import assign
 from ..data.store import TactileSet, shard_path, write_shard
-from ..files import replacing
+from ..files import write_json
 from ..geometry import load_skin
 from ..geometry.design import BIOTAC, SINGLES, check_nelectrode
 from ..geometry.rigid import quaternion
@@ -174,8 +173,7 @@ def resimulate(
         for _ in run_tasks(work, tasks, out, "resimulate", "step", ray, progress=progress, **needs):
             pass
     report = _report(out, len(tasks), notes)
-    with replacing(out / "resimulate.json") as temporary:
-        pathlib.Path(temporary).write_text(json.dumps(dataclasses.asdict(report), indent=1) + "\n")
+    write_json(out / "resimulate.json", dataclasses.asdict(report))
     return report
 
 
@@ -254,7 +252,6 @@ class _Drive:
         ones = []
         for i, (fields, k, answer) in zip(members, parts):
             touch = self.touches[i]
-            n, read = len(touch.time), answer.result()
             ones.append(
                 Interaction(
                     id=f"{i:06d}",
@@ -264,38 +261,16 @@ class _Drive:
                     seed=self.options.seed,
                     parameters=touch.motion.parameters | {"clock": float(touch.time[0])},
                     time=touch.time,
-                    displacement=fields.displacement[k, :n] * np.float32(DISPLACEMENT_SCALE),
-                    wrench=fields.wrench[k, :n],
-                    contact_force=fields.contact_force[k, :n],
-                    **contact_labels(
-                        self._model.geometry,
-                        fields.displacement[k, :n] * DISPLACEMENT_SCALE,
-                        fields.contact_force[k, :n],
-                        fields.area[k, :n],
-                        self._model.rest.vert - self._model.geometry.vert,
-                    ),
-                    pressure=fields.pressure[k, :n],
-                    impedance=read.impedance,
-                    counts=read.counts,
-                    pac=read.pac,
+                    **fields.columns(self._model, k, answer.result(), len(touch.time)),
                     indenter_pos=touch.motion.pos,
                     indenter_quat=quaternion(touch.motion.mat),
-                    converged=fields.converged[k, :n] & ~read.failed,
                     measured_counts=touch.counts,
                     measured_pac=touch.pac,
                     measured_wrench=touch.wrench,
                 )
             )
-        model = self._model
-        about = self.about | {
-            "skin": self.options.skin,
-            "material": dataclasses.asdict(model.material),
-            "element": model.element,
-            "tier": "full",
-            "liquid": model.has_liquid,
-            "device": str(model.device),
-        }
-        write_shard(folder / path, ones, model.geometry, about)
+        about = self.about | describe(self._model, self.options.skin)
+        write_shard(folder / path, ones, self._model.geometry, about)
         return path
 
 

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
-from ..files import replacing
+from ..files import write_json
 from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
 from ..geometry.design import Design
 from ..geometry.edge_nodes import with_edge_nodes
@@ -169,8 +169,7 @@ def new_design(
         skin = dataclasses.replace(skin, design=design)
     folder.mkdir(parents=True, exist_ok=True)
     skin.save(folder / "default.npz")
-    with replacing(folder / "design.json") as temporary:
-        temporary.write_text(json.dumps(json.loads(design.text), indent=1))
+    write_json(folder / "design.json", json.loads(design.text))
     return design
 
 

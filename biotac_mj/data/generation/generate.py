@@ -11,7 +11,7 @@ import numpy as np
 
 from ...effects.sensors import take_sensor
 from ...fields import check_types, either
-from ...files import replacing
+from ...files import write_json
 from ...geometry import load_skin
 from ...geometry.design import designs
 from ...geometry.indenters import INDENTERS
@@ -295,10 +295,7 @@ def generate(
             devices=len(options.devices),
         )
     if todo:
-        with replacing(out / "generate.json") as temporary:
-            temporary.write_text(
-                json.dumps({**dataclasses.asdict(report), "settings": settings}, indent=1) + "\n"
-            )
+        write_json(out / "generate.json", {**dataclasses.asdict(report), "settings": settings})
     return report
 
 

@@ -7,7 +7,6 @@ cluster each batch is a task.
 import dataclasses
 import gc
 import pathlib
-import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -16,8 +15,7 @@ import numpy as np
 
 from ...geometry.rigid import quaternion
 from ...shards import Task, one_per_gpu, run_tasks
-from ..contact import contact_labels
-from ..schema import DISPLACEMENT_SCALE, Interaction
+from ..schema import Interaction
 from ..splits import assign
 from ..store import write_shard
 from .plan import plan_motions
@@ -132,6 +130,7 @@ class Maker:
         from ...skin.condensed.refusals import refuse
         from ...skin.per_world import NAMES, make_room
         from ...skin.settings import read_settings
+        from .simulate import describe
 
         self.options, self.seconds = options, dict.fromkeys(_STAGES, 0.0)
         clock = time.perf_counter()
@@ -149,15 +148,7 @@ class Maker:
         self.geometry = model.geometry  # with all solved nodes
         if options.tier == "condensed":
             refuse(model.material.extensions, skin, model.has_liquid, model.device.is_cuda)
-        self.attributes = {
-            "settings": settings,
-            "skin": options.skin,
-            "material": dataclasses.asdict(model.material),
-            "element": model.element,
-            "tier": options.tier,
-            "liquid": model.has_liquid,
-            "device": _device_name(model.device),
-        }
+        self.attributes = {"settings": settings, **describe(model, options.skin, options.tier)}
         self.modes = self.few = None
         if options.texture is not None:
             from ...sensor.vibration import Modes
@@ -286,12 +277,6 @@ class Maker:
         say(f"{batch.path}: {len(motions)} worlds, {spent}")
         return running
 
-    def _contact(self, fields, k):
-        """Contact labels of interaction k."""
-        rest = self.model.rest.vert - self.geometry.vert if fields.rest is None else fields.rest[k]
-        moved = fields.displacement[k] * DISPLACEMENT_SCALE
-        return contact_labels(self.geometry, moved, fields.contact_force[k], fields.area[k], rest)
-
     def _free(self):
         """Frees the device memory of the last batch: its data and graphs refer to each other, and torch
         caches memory."""
@@ -318,18 +303,7 @@ class Maker:
                 "converged": np.ones(len(self.time), bool),
             }
             if batch.simulated:
-                fields, read = running.fields, running.reads[k].result()
-                columns |= {
-                    "displacement": fields.displacement[k] * np.float32(DISPLACEMENT_SCALE),
-                    "wrench": fields.wrench[k],
-                    "contact_force": fields.contact_force[k],
-                    **self._contact(fields, k),
-                    "pressure": fields.pressure[k],
-                    "impedance": read.impedance,
-                    "counts": read.counts,
-                    "pac": read.pac,
-                }
-                columns["converged"] &= fields.converged[k] & ~read.failed
+                columns |= running.fields.columns(self.model, k, running.reads[k].result())
             if batch.measured:
                 counts, pac = running.labels[k].result()
                 columns |= {
@@ -358,7 +332,3 @@ class Maker:
             self.geometry if batch.simulated else None,
             self.attributes,
         )
-
-
-def _device_name(device):
-    return device.name if device.is_cuda else platform.processor() or platform.machine()

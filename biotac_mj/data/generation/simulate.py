@@ -1,6 +1,7 @@
 """Simulates the skin under a batch of motions; every interaction is a world."""
 
 import dataclasses
+import platform
 from collections.abc import Callable
 
 import numpy as np
@@ -12,12 +13,13 @@ from ...skin.modes import SkinModes
 from ...skin.per_world import make_worlds
 from ...skin.touched import Touched
 from ...skin.types import real, vec3
+from ..contact import contact_labels
 from ..objects import grid_of, make_object
 from ..schema import DISPLACEMENT_SCALE, nodes_of
 from .clearance import Placed
-from .readings import Touch
+from .readings import Readings, Touch
 
-__all__ = ["Fields", "Scene", "clock", "simulate", "simulate_condensed"]
+__all__ = ["Fields", "Scene", "clock", "describe", "simulate", "simulate_condensed"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -60,6 +62,38 @@ class Fields:
     def vert_xpos(self, vert: np.ndarray, i: int) -> np.ndarray:
         """(n, nvert, 3) stored node positions of interaction i [m]; vert: the skin at rest."""
         return vert + self.displacement[i] * DISPLACEMENT_SCALE
+
+    def columns(self, model: SkinModel, i: int, read: Readings, n: int | None = None) -> dict:
+        """Columns of `schema.Interaction` of the first n time steps of interaction i (None: all): the skin's,
+        and what the sensor read."""
+        rows = slice(n)
+        force = self.contact_force[i, rows]
+        rest = model.rest.vert - model.geometry.vert if self.rest is None else self.rest[i]
+        moved = self.displacement[i, rows] * DISPLACEMENT_SCALE
+        return {
+            "displacement": self.displacement[i, rows] * np.float32(DISPLACEMENT_SCALE),
+            "wrench": self.wrench[i, rows],
+            "contact_force": force,
+            **contact_labels(model.geometry, moved, force, self.area[i, rows], rest),
+            "pressure": self.pressure[i, rows],
+            "impedance": read.impedance,
+            "counts": read.counts,
+            "pac": read.pac,
+            "converged": self.converged[i, rows] & ~read.failed,
+        }
+
+
+def describe(model: SkinModel, skin: str, tier: str = "full") -> dict:
+    """Attributes of a set: the skin's name, tier, and what its model is made of."""
+    device = model.device
+    return {
+        "skin": skin,
+        "material": dataclasses.asdict(model.material),
+        "element": model.element,
+        "tier": tier,
+        "liquid": model.has_liquid,
+        "device": device.name if device.is_cuda else platform.processor() or platform.machine(),
+    }
 
 
 def simulate(

@@ -1,13 +1,12 @@
 """`biotac learn judge` of a recording: reconstruction and force on a real recording, trained on the first 70
 % of the time, tested on the last 30 %."""
 
-import json
 import pathlib
 import time
 
 import numpy as np
 
-from ...files import replacing
+from ...files import save_figure, write_json
 from ...recordings.recording import Recording
 from ...sensor.channels import FULL_SCALE, log_impedance
 from .force import TRIALS, fit_force
@@ -102,12 +101,10 @@ def evaluate_recording(
         result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
     out = pathlib.Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
     picture = out.with_suffix(".png")
     _plot(counts, recording.force, ntrain, traces, predicted, result, picture)
     result["plot"] = str(picture)
-    with replacing(out) as temporary:
-        pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
+    write_json(out, result)
     return result
 
 
@@ -323,5 +320,4 @@ def _plot(counts, force, ntrain, reconstructed, predicted, result, path):
         axis.axvspan(ntrain, len(t), color="C2", alpha=0.08, lw=0)
         axis.legend(loc="upper left", fontsize=7, framealpha=0.8)
     axes[-1].set_xlabel("row")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(path, figure)

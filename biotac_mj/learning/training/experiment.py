@@ -15,7 +15,7 @@ import torch
 
 from ...data import Split, TactileSet, split_by_interaction, split_by_object
 from ...fields import refuse_unknown
-from ...files import replacing, write_npz
+from ...files import write_json, write_npz
 from ...reading import read_json
 from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
@@ -432,5 +432,4 @@ def _write(out, name, arrays, check, rows, both, truth, predictions, report):
     }
     content = {k: v.detach().cpu().numpy() if torch.is_tensor(v) else v for k, v in content.items()}
     write_npz(out / f"{name}.npz", **content)
-    with replacing(out / f"{name}.json") as temporary:
-        pathlib.Path(temporary).write_text(json.dumps(report, indent=1))
+    write_json(out / f"{name}.json", report)

@@ -1,7 +1,6 @@
 """Adaptation to a new sensor with few touches: errors of the film and of a trained model, unadapted and with
 a mixing of their electrodes fitted to the touches."""
 
-import json
 import pathlib
 from collections.abc import Sequence
 
@@ -9,7 +8,7 @@ import numpy as np
 import torch
 
 from ...effects.sensor_file import SensorFile, write_sensor_file
-from ...files import replacing
+from ...files import write_json
 from ...sensor.channels import FULL_SCALE, NELECTRODE, log_impedance
 from ..protocol import interaction_errors
 from ..weights import load_forward
@@ -153,9 +152,7 @@ def evaluate_new_sensor(
         "interactions": len(labelled),
         "median_rms_counts": table,
     }
-    pathlib.Path(out).parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as temporary:
-        temporary.write_text(json.dumps(result, indent=1))
+    write_json(out, result)
     if sensor is not None:
         rest = arrays.counts[arrays.first[rows].unique()].mean(0).tolist()
         own = {"rest": rest, "mixing": fit_mixing(film, truth, owner).tolist()}
