@@ -110,6 +110,20 @@ def test_the_walk_names_at_most_12_files_and_what_is_in_them():
         assert said - OTHERS <= defined, f"{name} has no {', '.join(said - OTHERS - defined)}"
 
 
+def test_names_on_the_pages_about_the_code_exist():
+    """Each word of a name in backticks, and of `Class.name` in a file that has that class."""
+    pages = [REPO / "docs" / "design.md", *(REPO / "docs" / "concepts").glob("*.md")]
+    text = re.sub(r"```.*?```", "", "".join(page.read_text() for page in pages), flags=re.S)
+    sources = [path.read_text() for path in modules().values()]
+    there = set(re.findall(r"\w+", " ".join(sources))) | {"LAYERS", "py"}
+    for name in re.findall(r"`([A-Za-z_][\w.]*)`", text):
+        words = [word for word in name.split(".") if word]
+        own = [source for source in sources if re.search(rf"^class {words[0]}\b", source, re.M)]
+        known = set(re.findall(r"\w+", " ".join(own))) if own else there
+        gone = set(words) - known - ({"md", "npz", "json"} if "." in name else set())
+        assert not gone or name.endswith((".md", ".npz")), f"{name}: {', '.join(gone)} is in no module"
+
+
 def test_no_bar_is_drawn_where_no_terminal_is():
     """tqdm looks itself where `disable` is None."""
     bars = [

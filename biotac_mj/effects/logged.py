@@ -86,10 +86,10 @@ class SharedLevel(Effect):
 
     @abc.abstractmethod
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """Its parameters {name: (value, low, high)}, nan if no interval is known.
+        """The effect's parameters for a trend, {name: (value, low, high)}; nan if no interval is known.
 
         Args:
-          trend: of the mean ln Z. change: of it from start to end. slope, counts: see `pattern`.
+          trend: of the mean ln Z over time. change: of it from start to end. slope, counts: see `pattern`.
         """
 
 

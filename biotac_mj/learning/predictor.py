@@ -118,7 +118,7 @@ class PointsModel(_Served):
 
 
 def _between(matrix, field):
-    """(n, k, 3) of field (n, m, 3) by a SparseMatrix (k, m)."""
+    """Interpolates a field (n, m, 3) to k points, (n, k, 3); matrix: SparseMatrix (k, m) of the weights."""
     return matrix(field.float().transpose(0, 1).contiguous()).transpose(0, 1)
 
 

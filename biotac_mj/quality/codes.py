@@ -31,7 +31,7 @@ _FRACTION = 0.8  # least fraction of overflows among changes of more than half a
 
 
 def coarse(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Finds channels that omit some of the codes which their noise should visit, on a lattice or not."""
+    """Finds channels that skip codes which their noise should reach: every second one, say, or others."""
     if not log.whole:
         return []
     x = log.counts.astype(int)

@@ -28,7 +28,7 @@ def nearest(
     # Out:
     distance_out: wp.array(dtype=real),
 ):
-    """Smallest distance of any point to the geom, at most `far`; a minimum does not depend on the order."""
+    """Smallest distance of any point to the geom, at most `far`. The order of the threads does not matter."""
     i, w = wp.tid()
     y = wp.transpose(geoms.mat[0, w]) * (points[i] - geoms.pos[0, w])
     d = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], y)[3]

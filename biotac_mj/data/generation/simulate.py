@@ -335,7 +335,7 @@ class _Reader:
             self.outer = wp.array(outer.astype(np.int32), dtype=int)
 
     def read(self, data, worlds):
-        """displacement (k, nvert, 3) int16 and contact_force (k, nouter, 3) of worlds (k,)."""
+        """Stored fields of worlds (k,): displacement (k, nvert, 3) int16, contact_force (k, nouter, 3)."""
         m, device = self.model, self.model.device
         displacement = wp.zeros((len(worlds), m.nvert), dtype=wp.vec3s, device=device)
         force = wp.zeros((len(worlds), self.count), dtype=wp.vec3, device=device)

@@ -221,8 +221,8 @@ class ProximityQuery:
         return self._out(pos, mat, lambda at: self.clear(at, mat, margin), _NARROW, margin)
 
     def shallow(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-        """Positions (ngeom, 3) [m] of the geoms after each that is too `deep` in the core is moved out until
-        a skin fits between, along the mean normal of the undeformed faces that it touches."""
+        """Positions (ngeom, 3) [m] of the geoms. Each one that is too `deep` in the core is moved out, along
+        the mean normal of the undeformed faces that it touches, until a skin fits between."""
         return self._out(pos, mat, lambda at: not self.deep(at, mat), _CORE)
 
     def _out(self, pos, mat, free, narrow, margin=0.0):

@@ -403,7 +403,8 @@ def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
         # Out:
         partial_out: wp.array3d(dtype=vec3),
     ):
-        """R' D p of a chunk of faces [2 group + (0, 1), chunk, world]."""
+        """Wrenches R' D p on the bodies from a chunk of faces, by the contact stiffness D and displacements p
+        of the nodes: forces in row 2 group, torques in row 2 group + 1."""
         c, w = wp.tid()
         if on[w] == 0:
             return

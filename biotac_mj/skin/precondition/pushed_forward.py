@@ -119,7 +119,7 @@ def _turn(
 
 
 class PushForward:
-    """The matrices M of all nodes and worlds of one SkinData on the CPU.
+    """Pushes the inverse at rest forward into the deformed shape, by a matrix M at each node, on the CPU.
 
     Args:
       elements: of the skin. x: [nvert, nworld] nodes, a wp.array.
