@@ -226,11 +226,11 @@ class Worker:
             "ties": [list(e.ties) for e in report.effects],
             "confidence": [e.confidence for e in report.effects],
             "closed": report.closed,
-            "nats": report.ranking[0][1] / len(report.selection) if report.ranking else 0.0,
+            "nats": report.tried[0]["evidence_nats"] / len(report.selection) if report.tried else 0.0,
             "trace": report.trace,
             "where": len(report.where),
-            "before": report.before,
-            "after": report.after,
+            "before": report.proof.before,
+            "after": report.proof.after,
             "parameters": [
                 {name: [p.value, p.low, p.high] for name, p in e.parameters.items()} for e in report.effects
             ],

@@ -180,11 +180,10 @@ def judge(case, recording, authors: Authors, protocol=None) -> dict:
     """Diagnoses the recording of one case, by a checkup's protocol if there is one, and scores it."""
     from biotac_mj.discrepancy import diagnose_recording
     from biotac_mj.discrepancy.recordings.confidence import NAMED
-    from biotac_mj.discrepancy.recordings.report import verdict_of
 
     began = time.process_time()
     d = diagnose_recording(recording, protocol=protocol)
-    verdict = verdict_of(d).to_dict()
+    verdict = d.to_dict()
 
     def scored(finding, effect):
         return {name: effect[name] for name in ("id", "ties", "channels", "confidence", "p")} | {

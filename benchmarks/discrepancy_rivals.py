@@ -17,16 +17,57 @@ best, with what modulus, friction, footprint and mesh can mimic taken out. Rival
 
 import numpy as np
 
-__all__ = ["SYSID", "cells", "f1", "rivals"]
+__all__ = ["SYSID", "cells", "f1", "nuisance_space", "rivals", "stacked"]
 
 SYSID = ("depth0", "misalign", "radius", "mount", "rocking", "friction", "latency", "pdc_gain", "force_cross")
 _LEVELS = (0.1, 0.2, 0.4, 0.8, 1.6)  # of realistic sizes, below which sparse regression drops a block
 _MOST = 3
 
 
+# Of the base model's parameters, for differences. Friction is no part of it: what it is off by has a name.
+STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
+STEPS |= {"stands_off": 0.3}
+
+
+def columns(comparison, current, effect, shape, base, chosen):
+    """(rows, free) signatures of an effect about the present model: secants at a realistic size.
+
+    Args:
+      base: (rows of a trajectory,) `Fit.vectors` of the present model, of every trajectory.
+    """
+    from biotac_mj.discrepancy.trajectories.fitting import sizes
+
+    out = []
+    for name, size in sizes(effect):
+        theta = {**effect.default(), **shape}
+        theta[name] = theta[name] + size
+        r = comparison.vectors([*current.effects, (effect, theta)], current.nuisance)
+        out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))
+    return np.stack(out, axis=1)
+
+
+def stacked(comparison: object, vectors: list, chosen: np.ndarray) -> np.ndarray:
+    """(rows,) of the chosen trajectories one after another, each with as many nats as it has rows."""
+    return np.concatenate([vectors[i] * np.sqrt(len(comparison.trajectories[i].time)) for i in chosen])
+
+
+def nuisance_space(comparison: object, current: object, base: list, chosen: np.ndarray) -> np.ndarray:
+    """(rows, up to 7) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
+    A latency of five frames looks like the one frame that a row's electrodes may be late, and more."""
+    out = []
+    for name, by in STEPS.items():
+        if current.nuisance.at_bound(name) or name == "stands_off" and not np.any(comparison.sim.log_rest):
+            continue
+        r = comparison.vectors(current.effects, current.nuisance.moved(**{name: by}))
+        out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))
+    if not out:
+        return np.zeros((stacked(comparison, base, chosen).size, 0))
+    q, r = np.linalg.qr(np.stack(out, axis=1))
+    return q[:, np.abs(np.diag(r)) > 1e-9]
+
+
 def _library(comparison, null, chosen):
     """[(effect, shape, block (rows, free))] of the usable catalogue, and y (rows,), both without nuisance."""
-    from biotac_mj.discrepancy.trajectories.screening import columns, nuisance_space, stacked
     from biotac_mj.effects.catalogue import CATALOGUE
 
     base = null.vectors(comparison)
@@ -127,7 +168,6 @@ def _sysid(comparison, null, chosen):
     from mujoco import minimize
 
     from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-    from biotac_mj.discrepancy.trajectories.screening import stacked
     from biotac_mj.effects.catalogue import CATALOGUE
 
     there = [comparison.trajectories[i] for i in chosen]

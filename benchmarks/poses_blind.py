@@ -21,6 +21,7 @@ import json
 import pathlib
 
 import numpy as np
+from discrepancy_rivals import nuisance_space, stacked
 from records import read_json, write_json
 
 DETECTABLE = 10.0  # nats per trajectory
@@ -141,7 +142,6 @@ def shown(measured, clean, sim):
     """Nats per trajectory that are hidden in recordings beside clean ones: all of it, and without what errors
     of the base model mimic (modulus, footprint, film, tier, ...)."""
     from biotac_mj.discrepancy.trajectories.fitting import fit_effects
-    from biotac_mj.discrepancy.trajectories.screening import nuisance_space, stacked
     from biotac_mj.discrepancy.trajectories.whitening import REPEATABILITY
     from biotac_mj.discrepancy.trajectories.workflow import about_rests
 

@@ -15,14 +15,15 @@ import pathlib
 import numpy as np
 from records import write_json
 
+from biotac_mj.discrepancy.evidence import sign_flip
+from biotac_mj.discrepancy.plates.models import blocks, judge, press_rows
+from biotac_mj.discrepancy.plates.tables import base_response, with_effects
 from biotac_mj.discrepancy.recordings.recording import read_recording
-from biotac_mj.discrepancy.simulated.diagnosis import press_rows
-from biotac_mj.discrepancy.simulated.nested import blocks, compare, judge
-from biotac_mj.discrepancy.simulated.tables import base_response, with_effects
 from biotac_mj.effects.plate import PLATE
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Setup, fit_constants, fit_states
 from biotac_mj.matching.match import HELD_OUT
+from biotac_mj.quality.noise import noise_level
 
 TIP = [6, 7, 8, 9]
 ONE, GAINS = Setup(gains=0.0), Setup()
@@ -52,6 +53,16 @@ def _better(before, after):
     return sum(int((before[b] ** 2).mean() > (after[b] ** 2).mean()) for b in blocks(len(after)))
 
 
+def _compared(smaller, larger, noise):
+    """RMS at the tip and of all electrodes by both models, and the evidence for the larger one."""
+    gain = larger.gain(smaller, noise)
+    out = {"nats": float(gain.sum()), "p": sign_flip(gain)}
+    for where, which in {"tip": TIP, "all": slice(None)}.items():
+        before, after = (float(np.sqrt((one.error[:, which] ** 2).mean())) for one in (smaller, larger))
+        out[where] = {"before": before, "after": after}
+    return out
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--press", nargs=2, action="append", required=True, metavar=("E", "F"))
@@ -72,21 +83,16 @@ def main(argv: list[str] | None = None) -> None:
         rows, aside = press_rows(recording)
         one = judge(base, rows, ONE, judge(base, rows, ONE))
         more = judge(whole, rows, ONE, one)
-        found = {given.mechanism: [compare(one, more, TIP), compare(one, more)]}
+        noise = noise_level(recording.electrodes, recording.repeated)
+        found = {given.mechanism: _compared(one, more, noise)}
         for k, then in enumerate(tried[1:], 1):
             answers = copy.copy(whole)
             answers.changes = response.changes[k : k + 1]
             on_top = judge(answers, rows, Setup(gains=0.0, amount=1.0), more)
-            found[f"{then.id} on top"] = [compare(more, on_top, TIP), compare(more, on_top)]
+            found[f"{then.id} on top"] = _compared(more, on_top, noise)
             print(then.id, [then.value(float(c.amount[0])) for c in on_top.constants], then.unit)
         out[recording.name] = {
-            "first_70": {
-                name: {
-                    where: {"before": c.before, "after": c.after, "p": c.p}
-                    for where, c in zip(("tip", "all"), pair)
-                }
-                for name, pair in found.items()
-            },
+            "first_70": found,
             "locked": locked({"base": base, given.mechanism: whole}, rows, aside),
         }
         print(recording.name, json.dumps(out[recording.name], indent=1))

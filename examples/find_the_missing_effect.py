@@ -85,19 +85,19 @@ def picture(report, truth, path):
 
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1, 2])
-    y = np.arange(len(report.ranking))[::-1]
+    y = np.arange(len(report.tried))[::-1]
     left.barh(
         y,
-        [n for _, n, _ in report.ranking],
-        color=["tab:blue" if i == truth else "0.7" for i, _, _ in report.ranking],
+        [one["evidence_nats"] for one in report.tried],
+        color=["tab:blue" if one["id"] == truth else "0.7" for one in report.tried],
     )
-    left.set_yticks(y, [i for i, _, _ in report.ranking])
+    left.set_yticks(y, [one["id"] for one in report.tried])
     left.set_xlabel("nats per press left out (blue: the truth)")
-    x, sigma = np.arange(report.comparison.width), report.comparison.sigma
-    right.bar(x - 0.2, np.array(report.before["channels"]) / sigma, 0.4, color="0.6", label="as simulated")
+    x, sigma, proof = np.arange(report.comparison.width), report.comparison.sigma, report.proof
+    right.bar(x - 0.2, np.array(proof.before["channels"]) / sigma, 0.4, color="0.6", label="as simulated")
     right.bar(
         x + 0.2,
-        np.array(report.after["channels"]) / sigma,
+        np.array(proof.after["channels"]) / sigma,
         0.4,
         color="tab:blue",
         label="with the effect found",
@@ -129,10 +129,10 @@ def main(argv=None):
     for effect in report.effects:
         for name, size in list(effect.parameters.items())[:3]:
             print(f"  {name} {size}")
+    force, electrodes = report.gap["force"], report.gap["electrodes"]
     print(
-        f"gap closed on presses kept aside: {report.closed:.0%}; force {report.before['force']:.4f} -> "
-        f"{report.after['force']:.4f} N, "
-        f"electrodes {report.before['electrodes']:.2f} -> {report.after['electrodes']:.2f} counts RMS"
+        f"gap closed on presses kept aside: {report.closed:.0%}; force {force.before:.4f} -> "
+        f"{force.after:.4f} N, electrodes {electrodes.before:.2f} -> {electrodes.after:.2f} counts RMS"
     )
     picture(report, truth, args.out)
     return report, truth

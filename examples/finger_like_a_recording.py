@@ -13,7 +13,7 @@ import numpy as np
 
 import biotac_mj
 from biotac_mj.discrepancy import diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
+from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.presets import read_sensor
@@ -48,7 +48,7 @@ def main(electrodes=None, force=None, seconds=30.0, skin="coarse", tier="condens
             electrodes = pathlib.Path(folder) / "synthetic.txt"
             synthetic_recording(electrodes)
         diagnosis = diagnose_recording(read_recording(electrodes, force))
-        print(summary(verdict_of(diagnosis)))
+        print(summary(diagnosis))
         _, _, amended, *_ = write_report(diagnosis, folder)  # sensor_amended.yaml, beside report.html
         spec = mujoco.MjSpec.from_string(HAND)
         biotac_mj.attach(spec, site="fingertip", effects=amended, skin=skin, tier=tier)

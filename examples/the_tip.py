@@ -15,7 +15,7 @@ import pathlib
 import sys
 
 from biotac_mj.discrepancy.recordings.recording import read_recording
-from biotac_mj.discrepancy.simulated.verb import diagnose_with_states
+from biotac_mj.discrepancy.verbs import diagnose_with_states
 
 PRESSES = (
     ("epfl_flat_press/SynImpF1.txt", "epfl_flat_press/ForceData.txt"),

@@ -16,7 +16,7 @@ from imports import modules
 from biotac_mj import cache
 from biotac_mj.cache import Entry, cache_folder, cached, digest
 from biotac_mj.discrepancy import Trajectory
-from biotac_mj.discrepancy.simulated import tables
+from biotac_mj.discrepancy.plates import tables
 from biotac_mj.discrepancy.trajectories.model import simulator
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.skins import load_skin, skin_reference

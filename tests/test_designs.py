@@ -208,7 +208,7 @@ def test_diagnose_names_gains_of_an_sp():
         one.electrodes = np.rint(run.counts + rng.normal(0, 4, run.counts.shape))
         one.force = run.force + rng.normal(0, 0.01, run.force.shape)
     found = diagnose(sim, data, progress=False)
-    assert [f.id for f in found.effects] == ["gain"] and len(found.before["channels"]) == 24 + 3
+    assert [f.id for f in found.effects] == ["gain"] and len(found.proof.before["channels"]) == 24 + 3
     change = np.ptp([one.electrodes for one in data], axis=(0, 1))
     told = {name: value.value for name, value in found.effects[0].parameters.items()}
     moved = [name for name, size in zip(SP.electrodes, change) if size > 200]

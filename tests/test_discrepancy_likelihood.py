@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_discrepancy_workflow import Springs, measured
 
+from biotac_mj.discrepancy.evidence import asked
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.likelihood import kernel, of
 from biotac_mj.discrepancy.trajectories.model.fields import Curve
@@ -86,7 +87,7 @@ def test_data_with_nothing_in_them_show_no_effect(seed):
     """Their surrogates show less than is asked of an effect, and so do they."""
     comparison, null, chosen = compared(seed=seed)
     _, chance = screened(comparison, null, SOME, chosen)
-    assert np.quantile(chance, 1 - SETTINGS.rate) < np.log(SETTINGS.odds) + np.log(len(SOME))
+    assert np.quantile(chance, 1 - SETTINGS.rate) < asked(len(SOME))
     assert not found(comparison, null, SOME, chosen).found
 
 

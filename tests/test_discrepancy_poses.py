@@ -126,7 +126,7 @@ def test_what_cannot_be_used_is_refused(change, message):
 def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch):
     """From the file to what is diagnosed, with the skin, object and repeatability of the command line."""
     from biotac_mj.cli import main
-    from biotac_mj.discrepancy.trajectories import verb
+    from biotac_mj.discrepancy.trajectories import workflow
 
     one = presses()
     columns = {"time": one.time, **{f"e{k + 1}": one.electrodes[:, k] for k in range(19)}, "pdc": one.pdc}
@@ -143,7 +143,7 @@ def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch)
         seen.update(sim=sim, data=data, **settings)
         raise ValueError("enough")
 
-    monkeypatch.setattr(verb, "diagnose", diagnose)
+    monkeypatch.setattr(workflow, "diagnose", diagnose)
     out = ["--out", str(tmp_path / "report"), "--quiet"]
     main(
         ["diagnose", str(path), "--object", "sphere_7mm", "--skin", "fine", "--repeatability", "0.2mm", *out]

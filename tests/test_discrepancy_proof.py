@@ -60,7 +60,7 @@ def test_constants_that_make_it_worse_are_not_taken(late):
 def test_where_nothing_is_named_nothing_else_is_written():
     data = measured([], n=8)
     report = diagnose(Springs(), data, effects=[by_id("latency")], progress=False)
-    assert not report.effects and report.after == report.before
+    assert not report.effects and report.proof.after == report.proof.before
     written = report.apply(Springs())
     assert not written.effects and written.modulus == report.fit.nuisance.modulus
 

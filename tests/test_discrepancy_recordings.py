@@ -20,8 +20,8 @@ from biotac_mj.discrepancy.recordings.detectors.order import slipped
 from biotac_mj.discrepancy.recordings.detectors.process import process
 from biotac_mj.discrepancy.recordings.detectors.trends import sharp, trends
 from biotac_mj.discrepancy.recordings.recording import as_plain
-from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.recordings.session import Session
+from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.plots import overview
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.effects.effect import shifted
@@ -48,7 +48,7 @@ def test_a_few_seconds_of_a_fast_log_are_read():
     counts, force, rng = pressed(seconds=8.57)
     counts[500:] = counts[500:][:, np.r_[1, 0, 2:19]]  # two channels exchanged, so that parts are compared
     found = diagnose_recording(PlainRecording(noisy(counts, rng), force, rate=300.0))
-    assert verdict_of(found).to_dict()["verdict"]
+    assert found.to_dict()["verdict"]
 
 
 def ids(diagnosis):
@@ -146,12 +146,12 @@ def test_what_makes_a_recording_doubtful_is_said(tmp_path):
     write_report(d, tmp_path)
     page = (tmp_path / "report.html").read_text()
     for text in said:
-        assert f"warning: {text}" in summary(verdict_of(d)) and f"<b>Warning:</b> {text}" in page
-        assert any(text in line for line in verdict_of(d).to_dict()["warnings"])
+        assert f"warning: {text}" in summary(d) and f"<b>Warning:</b> {text}" in page
+        assert any(text in line for line in d.to_dict()["warnings"])
     assert read_recording(tmp_path / "e.csv", rate=RATE).warnings == recording.warnings
     # the general form of a recording tells the same
     again = diagnose_recording(load_one(tmp_path / "e.csv").recording)
-    assert verdict_of(again).to_dict() == verdict_of(d).to_dict()
+    assert again.to_dict() == d.to_dict()
     assert again.recording.warnings == recording.warnings
     with pytest.raises(TypeError, match="recording is ndarray: pass a Recording or a PlainRecording"):
         diagnose_recording(e)
@@ -553,7 +553,7 @@ def test_the_report_leads_with_the_largest_gap(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64") == 3 and 'src="curves' not in page  # one file, to be sent
     verdict = json.loads((tmp_path / "verdict.json").read_text())
-    assert verdict == json.loads(json.dumps(verdict_of(d).to_dict()))
+    assert verdict == json.loads(json.dumps(d.to_dict()))
     check_verdict(verdict)
 
 
@@ -569,14 +569,14 @@ def test_parameters_are_those_of_the_simulators_effects():
 
 def test_summary_says_what_it_cannot_know():
     e, rng = unloaded()
-    text = summary(verdict_of(diagnose_recording(PlainRecording(noisy(e, rng)))))
+    text = summary(diagnose_recording(PlainRecording(noisy(e, rng))))
     assert "no force: how late" in text and "not loaded: saturation" in text
 
 
 @pytest.mark.slow  # quick: what a summary says it cannot know
 def test_a_force_too_short_to_tell_touches_from_drift_says_so():
     e, force, rng = pressed(seconds=15)
-    said = summary(verdict_of(diagnose_recording(PlainRecording(noisy(e, rng), force))))
+    said = summary(diagnose_recording(PlainRecording(noisy(e, rng), force)))
     assert re.search(r"too short to tell touches from drift, record \d+ s or more", said)
 
 
@@ -585,7 +585,7 @@ def test_touches_not_separable_from_drift_ask_for_a_recording():
     """A recording as long as it asks for will do; touches as slow as a drift never do."""
 
     def said(counts, force, rng):
-        return summary(verdict_of(diagnose_recording(PlainRecording(noisy(counts, rng), force))))
+        return summary(diagnose_recording(PlainRecording(noisy(counts, rng), force)))
 
     short = said(*pressed(seconds=15))
     assert "too short to tell touches from drift" in short and "not loaded" not in short
@@ -602,9 +602,9 @@ def test_touches_not_separable_from_drift_ask_for_a_recording():
 @pytest.mark.slow
 def test_a_force_without_noise_is_said_to_have_none():
     e, force, rng = pressed()
-    with_noise = summary(verdict_of(diagnose_recording(PlainRecording(noisy(e, rng), force))))
+    with_noise = summary(diagnose_recording(PlainRecording(noisy(e, rng), force)))
     force[: len(force) // 2] = 0
-    without = summary(verdict_of(diagnose_recording(PlainRecording(noisy(e, rng), force))))
+    without = summary(diagnose_recording(PlainRecording(noisy(e, rng), force)))
     last = [
         [x for x in text.splitlines() if x.strip().startswith("force from electrodes")][0].split()
         for text in (with_noise, without)

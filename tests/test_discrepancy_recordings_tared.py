@@ -9,7 +9,7 @@ import yaml
 from logs import RATE, noisy, pressed
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
+from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.recordings.tared import with_baseline
 
@@ -55,7 +55,7 @@ def test_what_a_tared_log_cannot_tell_is_said(tmp_path):
     write_report(d, tmp_path)
     verdict = json.loads((tmp_path / "verdict.json").read_text())
     (line,) = d.recording.not_identifiable
-    assert line in verdict["cannot_be_known"] and line in summary(verdict_of(d))
+    assert line in verdict["cannot_be_known"] and line in summary(d)
     assert "rest" not in yaml.safe_load((tmp_path / "sensor_amended.yaml").read_text())["sensor"]
     assert len(log(tmp_path, np.abs(x - x[0])).not_identifiable) == 2
     assert log(tmp_path, x).not_identifiable == []

@@ -13,9 +13,9 @@ import pytest
 from verdicts import check_verdict, schema
 
 from biotac_mj.discrepancy.report import plots
-from biotac_mj.discrepancy.report.files import Picture, page, write
+from biotac_mj.discrepancy.report.files import page, write_report
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.discrepancy.report.verdict import SCHEMA, VERSION, Estimate, Finding, Gap, Verdict
+from biotac_mj.discrepancy.report.verdict import SCHEMA, VERSION, Estimate, Finding, Gap, Picture, Verdict
 from biotac_mj.effects.effect import Param
 
 HOSTILE = '<script>alert("1")</script>&amp;'
@@ -83,6 +83,14 @@ def everywhere(text):
     )
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Drawn(Verdict):
+    figure: object
+
+    def pictures(self):
+        return [Picture("channels", "gap", self.figure)]
+
+
 class Tags(html.parser.HTMLParser):
     """Tags that are opened, by name, and those that are open at the end."""
 
@@ -117,7 +125,8 @@ def test_every_tag_of_the_page_is_closed():
 
 def test_the_schema_takes_what_is_written(tmp_path):
     figure = plots.channels([plots.Bars("a", "counts", ["e1"], [2.0], [1.0], 0.5)])
-    paths = write(everywhere(HOSTILE), [Picture("channels", "gap", figure)], tmp_path)
+    drawn = Drawn(**vars(everywhere(HOSTILE)), figure=figure)
+    paths = write_report(drawn, tmp_path)
     assert [p.name for p in paths] == ["report.html", "verdict.json", "channels.png"]
     assert "data:image/png;base64" in paths[0].read_text() and 'src="channels' not in paths[0].read_text()
     written = json.loads(paths[1].read_text())

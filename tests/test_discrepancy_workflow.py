@@ -14,11 +14,11 @@ from scipy.integrate import solve_ivp
 from verdicts import check_verdict
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
+from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance, widen
 from biotac_mj.discrepancy.trajectories.levels import astray
-from biotac_mj.discrepancy.trajectories.report import verdict_of, write_report
-from biotac_mj.discrepancy.trajectories.screening import next_experiment
+from biotac_mj.discrepancy.trajectories.remarks import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import STAGES, Run, memory, shifted
@@ -385,8 +385,7 @@ def test_what_trajectories_kept_aside_contradict_has_no_name():
     )
     assert not report.effects and not report.apply(Springs()).effects
     assert report.verdict.startswith("unknown (") and not report.beliefs.decided
-    said = verdict_of(report)
-    assert [e.id for e in said.not_named] == ["relax"] and said.not_named[0].confirmed is False
+    assert [e.id for e in report.not_named] == ["relax"] and report.not_named[0].confirmed is False
 
 
 @pytest.mark.parametrize(
@@ -662,16 +661,16 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, effects,
     assert [e.id for e in report.effects] == [name] and report.closed > 0.8
     parameter, found = next(iter(report.effects[0].parameters.items()))
     assert abs(found.value / size[parameter] - 1) < 0.3
-    assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
-    assert report.ranking[0][0] == name
+    assert np.mean(report.proof.after["mean_square"]) < np.mean(report.proof.before["mean_square"])
+    assert report.tried[0]["id"] == name
     # what a sideways shift does changes its sign from place to place: no cell has a mean
     assert name == "misalign" or any(
         c["condition"] in ("approach", "hold", "unload", "deep", "light") for c in report.where
     )
     amended = report.apply(Springs())
     assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
-    files = write_report(report, Springs(), tmp_path)
-    assert all(f.exists() for f in files) and "kept aside" in summary(verdict_of(report))
+    files = write_report(report, tmp_path)
+    assert all(f.exists() for f in files) and "kept aside" in summary(report)
     check_verdict(json.loads(files[1].read_text()))
     assert load_simulator(tmp_path / "sensor_amended.yaml").effects[0][0].id == name
 

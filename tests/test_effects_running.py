@@ -16,8 +16,8 @@ from blocks import four_nodes
 import biotac_mj
 from biotac_mj import cli
 from biotac_mj.discrepancy import PlainRecording, Simulator, diagnose_recording
-from biotac_mj.discrepancy.recordings.amended import amended_sensor
-from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
+from biotac_mj.discrepancy.recordings.amended import running
+from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
 from biotac_mj.effects.amended import Model, amend
@@ -372,9 +372,9 @@ def test_an_amended_sensor_says_what_it_leaves_out():
     counts = counts_from_impedance(z) + 3 * rng.standard_normal(z.shape)
     counts += 25 * np.sin(2 * np.pi * 31.3 * time)[:, None]
     diagnosis = diagnose_recording(PlainRecording(np.rint(counts)))
-    file, left = amended_sensor(diagnosis)
+    file, left = diagnosis.sensor(), running(diagnosis.session)[1]
     assert "hum" in {f.id for f in diagnosis.findings} and "hum" in left
-    assert "not in sensor_amended.yaml: hum" in summary(verdict_of(diagnosis))
+    assert "not in sensor_amended.yaml: hum" in summary(diagnosis)
     own = file.base["sensor"]
     assert own["warm_up"] * own["warm_share"][4] == pytest.approx(0.0, abs=0.6)
     drift = own["warm_up"] * np.delete(own["warm_share"], 4) * (1 - np.exp(-90 / own["warm_time"]))

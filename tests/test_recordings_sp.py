@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.report import verdict_of
 from biotac_mj.geometry.design import read_design
 from biotac_mj.recordings import load, load_one
 from biotac_mj.recordings.inspection import findings
@@ -81,6 +80,6 @@ def test_diagnose_takes_one_finger_and_says_which_it_is(tmp_path):
     assert not [line for line in second.warnings if "recordings are in" in line]
     assert first.design == second.design == SP
     np.testing.assert_allclose((first.electrodes - second.electrodes).mean(0), 50, atol=2)
-    said = verdict_of(diagnose_recording(second, progress=False))
+    said = diagnose_recording(second, progress=False)
     assert said.data.startswith("BioTac SP (24 electrodes), 400 rows")
     assert said.details["recording"]["design"] == "biotac_sp"

@@ -1,13 +1,37 @@
-"""Tests whose unit is the block of time or the trajectory, never the sample."""
+"""Evidence whose unit is the block of time or the trajectory, never the sample, and what of it is enough."""
 
 import numpy as np
 from scipy.special import stdtr
+from scipy.stats import false_discovery_control
 
 from ..quality.evidence import sign_flip
 
-__all__ = ["max_t", "sign_flip", "signed_root_t"]
+__all__ = ["ODDS", "RATE", "asked", "discoveries", "log_ratio", "max_t", "sign_flip", "signed_root_t"]
+
+RATE = 1 / 21  # of false discoveries
+ODDS = (1 - RATE) / RATE  # how much likelier than all else an explanation has to be
 
 # scipy has no max-T and no test of signed roots
+
+
+def log_ratio(
+    before: np.ndarray, after: np.ndarray, rows: np.ndarray | float, floor: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Log likelihood [nats] that data left out gain from one model to another, by the mean squares of both on
+    so many independent rows, with noise of a mean square `floor` beneath."""
+    return 0.5 * rows * np.log((before + floor) / (after + floor))
+
+
+def asked(count: int) -> float:
+    """Evidence [nats] that makes one of so many candidates likelier than nothing by `ODDS`, where any may be
+    there as well as none."""
+    return float(np.log(ODDS) + np.log(max(count, 1)))
+
+
+def discoveries(p: np.ndarray) -> np.ndarray:
+    """Which of all that was tested, p (tests, ...), is discovered: of these a share of `RATE` may be false
+    (Benjamini and Hochberg 1995)."""
+    return false_discovery_control(np.asarray(p, float), axis=0) <= RATE
 
 
 def signed_root_t(gain: np.ndarray) -> float:

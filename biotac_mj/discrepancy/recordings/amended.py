@@ -8,54 +8,58 @@ from ...geometry.skins import shipped_skin
 from ...recordings.own import rest_of
 from ...recordings.recording import designed
 from ...sensor.channels import FULL_SCALE
-from .search import RecordingDiagnosis
+from .session import Session
 
-__all__ = ["amended_sensor"]
+__all__ = ["amended_sensor", "running"]
 
 _MATERIAL = "calibrated"  # the rubber that real sensors were matched with
 
 
-def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]]:
-    """The recording's sensor and the named effects that a sensor can run with; and ids of those that it
-    cannot: of the logger, of the force beside it, or of the moment.
+def amended_sensor(session: Session) -> SensorFile:
+    """The sensor of a session's recording with the effects found that a sensor can run with.
 
     Rest, noise and the trend that drifts have in common are measured over the whole recording; the trend
     acts only where a warm-up, a loss of liquid or a drift was named.
     """
-    session = diagnosis.session
     r = session.recording
     without, recorded = (rest_of(counts, r.rate, r.force) for counts in (session.filled(), r.electrodes))
-    drifts = any(f.kind.drifts for f in diagnosis.findings)
+    drifts = any(f.kind.drifts for f in session.findings)
     own = recorded if drifts else without
     # what was named is no noise; and no electrode rests where it has never been
     seen = r.electrodes.min(0), r.electrodes.max(0)
     rest, mixing = np.clip(own["rest"], *seen), np.eye(r.electrodes.shape[1])
-    disturbed = any(f.kind.in_noise for f in diagnosis.findings)
+    disturbed = any(f.kind.in_noise for f in session.findings)
     noise = np.minimum(recorded["noise"], without["noise"]) if disturbed else recorded["noise"]
+    for finding in session.findings:
+        if finding.kind.silent:
+            for k in finding.channels:
+                mixing[k, k], rest[k] = 0.0, np.clip(finding.parameters["value"][0], 1.0, FULL_SCALE - 1.0)
     design = designed(r.electrodes)
     sensor = {"like": design.sensor, "rest": rest, "noise": noise}
     if not r.absolute:  # the rest is the one that was assumed
         del sensor["rest"]
     if drifts:  # whatever its cause: by its trend, and each electrode's share of it
         sensor |= {name: own[name] for name in ("warm_up", "warm_time", "warm_share")}
-    effects, left = [], []
-    for finding in diagnosis.findings:
-        if finding.kind.drifts:
-            continue
-        if finding.kind.silent:
-            for k in finding.channels:
-                mixing[k, k], rest[k] = 0.0, np.clip(finding.parameters["value"][0], 1.0, FULL_SCALE - 1.0)
-        else:
-            theta = _theta(finding)
-            if theta is None:
-                left.append(finding.id)
-            else:
-                effects.append((by_id(finding.id).on(design), theta))
     if (mixing != np.eye(len(mixing))).any():
         sensor["mixing"] = mixing
     plain = {k: np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for k, v in sensor.items()}
     base = {"skin": shipped_skin(design), "tier": "full", "material": _MATERIAL, "sensor": plain}
-    return SensorFile(base, effects, {}), left
+    return SensorFile(base, running(session)[0], {})
+
+
+def running(session: Session) -> tuple[list, list[str]]:
+    """[(Effect, theta)] of the effects found that act in a running sensor, beside its rest and its trend; and
+    ids of those that do not: of the logger, of the force beside it, or of the moment."""
+    design, effects, left = designed(session.recording.electrodes), [], []
+    for finding in session.findings:
+        if finding.kind.drifts or finding.kind.silent:
+            continue
+        theta = _theta(finding)
+        if theta is None:
+            left.append(finding.id)
+        else:
+            effects.append((by_id(finding.id).on(design), theta))
+    return effects, left
 
 
 def _theta(finding):

@@ -4,18 +4,17 @@ whole model in counts and newtons, beside the noise floor."""
 import numpy as np
 
 from ...effects.effect import shifted
-from ...quality.check import sample_faults
 from ...quality.noise import noise_level
 from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..report.verdict import Gap, electrode_names
 from .candidates import Candidate
 from .detectors.latency import force_view
-from .faults import as_log
-from .recording import FORCE_MOVED, MIN_ROWS
+from .recording import FORCE_MOVED
 from .session import Session
 
 __all__ = ["prove", "views"]
 
+_FEWEST = 5  # samples
 _TURNS = 0.3  # logarithm of way over range: how a trend goes on that has turned nobody knows
 _NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 
@@ -23,25 +22,24 @@ _NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simu
 def prove(session: Session, finding: Candidate) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
-    without = session.without(finding)
+    taken_out = finding.correct is not None or finding.mask is not None
+    if finding.detector.of_log:
+        finding.verified = True  # what is wrong with a log is told by its own samples
     if finding.delay:
         before, after, floor, unit, name = _force(session, finding)
-    elif finding.mask is not None:
-        by = _held if finding.mask.all(1).any() else _samples
-        before, after, floor, unit, name = by(session, without, finding)
-    elif finding.places or finding.end < _aside_from(session):
-        return  # nothing to take out, or it is over by then
+    elif not taken_out:
+        return
     elif finding.detector.of_log:
-        before, after, floor, unit, name = _again(session, finding)
+        before, after, floor, unit, name = _samples(session, finding)
+    elif finding.places or finding.end < _aside_from(session):
+        return  # it is over by then
     else:
-        before, after, floor, unit, name = _counts(session, without, finding)
+        before, after, floor, unit, name = _counts(session, session.without(finding), finding)
     if not np.isfinite(before):
         return
     finding.gap = Gap(unit, before, after, floor, name)
     if finding.verified is None and np.isfinite(after):
         finding.verified = bool(after < before)
-    if finding.mask is not None:  # it was told in these rows by their own samples
-        finding.verified = True
 
 
 def _aside(session):
@@ -89,58 +87,26 @@ def _counts(session, without, finding):
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
 
 
-def _samples(session, without, finding):
-    """RMS by which masked samples miss what the other electrodes say, against the same of samples that are
-    measurements."""
-    m, aside = _aside(session)
+def _samples(session, finding):
+    """RMS by which the finding's samples miss what the other electrodes say, as they were logged and without
+    it: those that are no measurement against those that are."""
+    m, late = session.model(), ~session.fit
     said = counts_from_log_impedance(m.value - m.alone() + m.mean)
-    time = session.recording.time
-    late = ~session.fit
-    error = np.full(session.counts.shape, np.nan)
+    time, number = session.recording.time[late], session.counts.shape[1]
+    expected = np.full((len(time), number), np.nan)
     for i, k in enumerate(m.used):
-        error[:, k] = without.counts[:, k] - np.interp(time, m.time, said[:, i])
-    mine = finding.mask & late[:, None] & np.isfinite(error)
-    fair = ~session.masked & late[:, None] & np.isfinite(error) & finding.mask.any(0)
+        expected[:, k] = np.interp(time, m.time, said[:, i])
+    own = np.broadcast_to(np.isin(np.arange(number), finding.channels), expected.shape)
+    touched = own if finding.mask is None else finding.mask[late]
+    left = ~session.masked[late] & (own if finding.mask is None else finding.mask.any(0))
+    out = []
+    for counts, which in ((session.without(finding).counts, touched), (session.counts, left)):
+        error = (counts[late] - expected)[which]
+        error = error[np.isfinite(error)]
+        out.append(float(np.sqrt(np.mean(error**2))) if len(error) >= _FEWEST else np.nan)
     floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
-    if mine.sum() < 5 or not fair.any():
-        return np.nan, np.nan, floor, "counts", ""
-    pair = (float(np.sqrt(np.mean(error[rows] ** 2))) for rows in (mine, fair))
-    return *pair, floor, "counts", "RMS of samples against what the others say: those masked, those left"
-
-
-def _held(session, without, finding):
-    """RMS by which held rows miss the line between those that are measurements, and by which these miss the
-    line between their neighbours."""
-    late = np.flatnonzero(~session.fit)
-    x, held = without.counts[late], finding.mask[late].all(1)
-    rows = np.arange(len(late))
-    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
-    own = rows[~held]
-    if held.sum() < 5 or len(own) < 5:
-        return np.nan, np.nan, floor, "counts", ""
-    missed = np.column_stack([np.interp(rows[held], own, c[own]) - c[held] for c in x.T])
-    part = ((own[1:-1] - own[:-2]) / (own[2:] - own[:-2]))[:, None]
-    own_missed = x[own[:-2]] * (1 - part) + x[own[2:]] * part - x[own[1:-1]]
-    text = "RMS of rows against the line between their neighbours: those held, those left"
-    return float(np.sqrt(np.mean(missed**2))), float(np.sqrt(np.mean(own_missed**2))), floor, "counts", text
-
-
-def _again(session, finding):
-    """The finding's last parameter on the part kept aside alone: its distance from none, and from what was
-    found in the whole log."""
-    name = [*finding.parameters][-1]
-    known = finding.kind.params[name]
-    if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
-        return np.nan, np.nan, np.nan, known.unit, ""
-    again = sample_faults(as_log(session.recording, rows=~session.fit)).faults
-    found = [f for f in again if f.id == finding.id and set(f.channels) & set(finding.channels)]
-    if not found:  # it may be over, or too weak in so many rows: they say nothing
-        return np.nan, np.nan, np.nan, known.unit, ""
-    value, late = finding.parameters[name][0], found[0].parameters[name][0]
-    floor = float(np.nanmax(np.abs(np.array(finding.parameters[name][1:]) - value)))
-    finding.verified = True  # whatever its size
-    text = f"{name}: its distance from none, and from what was found in the whole log"
-    return abs(late - known.start), abs(late - value), floor, known.unit, text
+    before, after = out if np.isfinite(out).all() else (np.nan, np.nan)
+    return before, after, floor, "counts", "RMS of samples against what the others say"
 
 
 def _force(session, finding):

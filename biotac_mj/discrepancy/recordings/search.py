@@ -2,68 +2,37 @@
 kept aside."""
 
 import dataclasses
-import math
 
 import numpy as np
 import tqdm
-from scipy.stats import false_discovery_control
 
 from ...quality.check import lost_rows, sample_faults
 from ...quality.confidence import clear
 from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ...recordings.protocol import Protocol
-from ...recordings.recording import REST_LIKE
-from ..report.verdict import Gap
-from .candidates import Candidate
+from ..evidence import discoveries
 from .confidence import NAMED, confidence
 from .connected import part_connected
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
 from .detectors.order import ORDER, exchanged, slipped
+from .diagnosis import RecordingDiagnosis, concluded
 from .faults import as_candidates, as_log
-from .model import LEAST, WINDOW
-from .proof import prove, views
-from .recording import FORCE_MOVED, PlainRecording, as_plain
-from .rest import Rest, rest
-from .segments import memory_of, moved, segment_findings, stretches
+from .proof import prove
+from .recording import PlainRecording, as_plain
+from .segments import moved, segment_findings, stretches
 from .session import Session
 
-__all__ = ["RecordingDiagnosis", "diagnose_recording"]
+__all__ = ["diagnose_recording"]
 
 _MOST = 8  # of trends over time
-_FALSE = 0.05  # of the names of a report
 _LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _LOST = 0.2  # of an electrode's samples, beyond which they tell nothing of its noise
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
-
-
-@dataclasses.dataclass
-class RecordingDiagnosis:
-    """What was found.
-
-    Attributes:
-      recording: with upper bits put back where counts overflowed; locked: share kept aside at the end;
-      verdict: one line; findings: named, the largest gap closed first; rejected: those that the part kept
-      aside contradicts or that are too weak to be named; late: those that begin in the part kept aside;
-      gap: views with before and after; rest: what is left; notes: what the data cannot tell; session: counts
-      without the effects; protocol: of a checkup, None of a plain log.
-    """
-
-    recording: PlainRecording
-    locked: float
-    verdict: str
-    findings: list[Candidate]
-    rejected: list[Candidate]
-    late: list[Candidate]
-    gap: dict[str, Gap]
-    rest: Rest
-    notes: list[str]
-    session: Session
-    protocol: Protocol | None = None
 
 
 def diagnose_recording(
@@ -108,20 +77,7 @@ def diagnose_recording(
         session = _proved(session)
         if protocol is not None:
             _checkup(session, protocol, named)
-        result = RecordingDiagnosis(
-            recording,
-            locked,
-            "",
-            session.findings,
-            session.weak,
-            late,
-            views(session),
-            rest(session),
-            _notes(recording, session, protocol),
-            session,
-            protocol,
-        )
-        result.verdict = _verdict(result)
+        result = concluded(session, locked, late, protocol)
         bar.update()
     return result
 
@@ -225,14 +181,14 @@ def _refined(session, finding, same):
 
 
 def _proved(session):
-    """The session without the findings that the rows kept aside contradict, or that are one too many: of all
-    that was tested, one in twenty of those named may be false (Benjamini and Hochberg 1995)."""
+    """The session without the findings that the rows kept aside contradict, or that are one too many of all
+    that was tested."""
     for finding in session.findings:
         prove(session, finding)
     tested = [*session.findings, *session.weak]
-    q = dict(zip(map(id, tested), false_discovery_control([f.p for f in tested])))
+    enough = discoveries([f.p for f in tested])
     # what is wrong with the log is said whatever else was tested
-    chance = [f for f in session.findings if q[id(f)] > _FALSE and not f.detector.of_log]
+    chance = [f for f, yes in zip(session.findings, enough) if not (yes or f.detector.of_log)]
     contradicted = [f for f in session.findings if f.verified is False or f in chance]
     if contradicted:
         session = session.without(*contradicted)
@@ -257,9 +213,9 @@ def _checkup(session, protocol, named):
         found += [moved(f, rows, r) for f in some if not f.kind.silent and not _told(f, known)]
     isolated = segment_findings(session, protocol, _faulty([*known, *found]))
     found += [f for f in isolated if not any(f.id == k.id and _alike(f, k) for k in known)]
-    q = false_discovery_control([f.p for f in (*session.findings, *found)])[len(session.findings) :]
-    for finding, chance in zip(found, q):
-        if chance > _FALSE or finding.confidence < named or finding.verified is False:
+    enough = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
+    for finding, yes in zip(found, enough):
+        if not yes or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
             continue
         if any(f.id == finding.id and _alike(f, finding) for f in session.findings):
@@ -316,47 +272,6 @@ def _late(session, named):
             found.append(finding)
             whole.accept(finding)
     return found
-
-
-def _notes(recording, session, protocol):
-    loads = "saturation"
-    out = [f"{recording.rate:.1f} Hz: {recording.rate_source}"]
-    if recording.force is None:
-        out.append("no force: how late the electrodes follow it")
-    if recording.tdc is None:
-        out.append("no TDC: whether a warm-up is the liquid's temperature")
-    if not session.model().parted:
-        out.append(
-            f"too short to tell touches from drift, record {math.ceil(LEAST / session.fit.mean())} s or "
-            f"more: slow changes of single electrodes, {loads}"
-        )
-    elif not session.loaded and recording.force is not None and recording.force.std(0).max() > FORCE_MOVED:
-        out.append(
-            "touches could not be told from drift, record some at several places that each change electrodes "
-            f"by tens of counts within {WINDOW[0]:g} s: {loads}"
-        )
-    elif not session.loaded:
-        out.append(f"not loaded: {loads}")
-    out += recording.not_identifiable
-    if recording.absolute and recording.rest_correlation < REST_LIKE:
-        out.append(
-            "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
-        )
-    if protocol is not None and (memory := memory_of(session, protocol)):
-        out.append(memory)
-    return out
-
-
-def _verdict(d):
-    if not (d.findings or d.late or d.rest.significant):
-        return "no significant disagreement"
-    parts = []
-    if d.findings or d.late:
-        names = dict.fromkeys(f.kind.name + f.where for f in (*d.findings, *d.late))
-        parts.append("found: " + "; ".join(names))
-    if d.rest.significant:
-        parts.append(("remainder " if parts else "") + "unknown: " + d.rest.text)
-    return "; ".join(parts)
 
 
 def _taken(finding):

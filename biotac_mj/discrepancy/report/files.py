@@ -1,45 +1,20 @@
-"""The files of a report: report.html (one file, to be sent), verdict.json and figures."""
+"""The files of a report: report.html (one file, to be sent), verdict.json, the amended sensor, figures."""
 
-import base64
-import dataclasses
-import functools
 import importlib.resources
-import io
 import json
 import math
 import pathlib
 from collections.abc import Sequence
 
 from ...effects.effect import STAGES
+from ...effects.sensor_file import write_sensor_file
 from ...files import replacing
 from .text import cell, columns
-from .verdict import Verdict
+from .verdict import Picture, Verdict
 
-__all__ = ["Picture", "page", "write"]
+__all__ = ["AMENDED", "page", "write_report"]
 
-
-@dataclasses.dataclass(frozen=True)
-class Picture:
-    """A figure of a report.
-
-    Attributes:
-      name: of its file, without suffix. section: "curves", "gap", "where", "tried" or "unknown". figure: of
-        matplotlib.
-    """
-
-    name: str
-    section: str
-    figure: object
-
-    @functools.cached_property
-    def png(self) -> bytes:
-        store = io.BytesIO()
-        self.figure.savefig(store, dpi=110, format="png")
-        return store.getvalue()
-
-    @property
-    def data(self) -> str:
-        return base64.b64encode(self.png).decode()
+AMENDED = "sensor_amended.yaml"
 
 
 def page(verdict: Verdict, pictures: Sequence[Picture] = ()) -> str:
@@ -57,17 +32,18 @@ def _percent(share):
     return f"{share:.0%}" if math.isfinite(share) else ""
 
 
-def write(
-    verdict: Verdict, pictures: Sequence[Picture], folder: pathlib.Path | str
-) -> tuple[pathlib.Path, ...]:
-    """Writes report.html, verdict.json and NAME.png of every picture; returns the paths, in this order."""
-    folder = pathlib.Path(folder)
+def write_report(verdict: Verdict, folder: pathlib.Path | str) -> list[pathlib.Path]:
+    """Writes report.html, verdict.json, sensor_amended.yaml if the verdict has a sensor, and NAME.png of each
+    picture; returns the paths, in this order."""
+    folder, pictures, sensor = pathlib.Path(folder), verdict.pictures(), verdict.sensor()
     content = {
         "report.html": page(verdict, pictures).encode(),
         "verdict.json": json.dumps(verdict.to_dict(), indent=1, allow_nan=False).encode(),
-        **{f"{one.name}.png": one.png for one in pictures},
     }
-    for name, data in content.items():
+    drawn = {f"{one.name}.png": one.png for one in pictures}
+    for name, data in (content | drawn).items():
         with replacing(folder / name) as temporary:
             temporary.write_bytes(data)
-    return tuple(folder / name for name in content)
+    if sensor is not None:
+        write_sensor_file(folder / AMENDED, sensor)
+    return [folder / name for name in (*content, *([] if sensor is None else [AMENDED]), *drawn)]

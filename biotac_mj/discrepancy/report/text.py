@@ -9,7 +9,7 @@ __all__ = ["cell", "columns", "summary"]
 
 _NUMBERS = 6  # parameters of an effect that are printed
 _CELLS, _TRIED = 6, 12  # cells and causes that are printed
-_HIDDEN = {"id"}  # columns of tables that are for programs
+_HIDDEN = {"id", "stage", "unit", "attach"}  # columns of tables that are for programs
 
 
 def summary(verdict: Verdict) -> str:

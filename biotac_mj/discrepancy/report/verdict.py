@@ -1,9 +1,12 @@
 """A finding, a verdict, and what verdict.json holds of them (`schema.json`).
 
-Recordings, trajectories and flat plates are diagnosed by three programs. Each maps its results to these
-classes; text (`text.py`), page (`page.py`) and files (`files.py`) are made from them alone."""
+What is found in recordings, in trajectories and in presses of a flat plate is a `Verdict` with what only that
+kind of data has; text (`text.py`), page and files (`files.py`) are made from any of them."""
 
+import base64
 import dataclasses
+import functools
+import io
 import math
 import re
 import typing
@@ -13,8 +16,19 @@ from .plain_values import plain_values
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Effect, Param
+    from ...effects.sensor_file import SensorFile
 
-__all__ = ["SCHEMA", "VERSION", "Estimate", "Finding", "Gap", "Verdict", "electrode_names", "of_electrodes"]
+__all__ = [
+    "SCHEMA",
+    "VERSION",
+    "Estimate",
+    "Finding",
+    "Gap",
+    "Picture",
+    "Verdict",
+    "electrode_names",
+    "of_electrodes",
+]
 
 SCHEMA, VERSION = "biotac_mj.verdict", 3
 _NOISELESS = 2e-6  # counts or newtons: a simulated force has no noise, which is taken for half of that
@@ -210,9 +224,33 @@ class Finding:
         }
 
 
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A figure of a report.
+
+    Attributes:
+      name: of its file, without suffix. section: "curves", "gap", "where", "tried" or "unknown". figure: of
+        matplotlib.
+    """
+
+    name: str
+    section: str
+    figure: object
+
+    @functools.cached_property
+    def png(self) -> bytes:
+        store = io.BytesIO()
+        self.figure.savefig(store, dpi=110, format="png")
+        return store.getvalue()
+
+    @property
+    def data(self) -> str:
+        return base64.b64encode(self.png).decode()
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What a program says of its data.
+    """What is found in some data.
 
     Attributes:
       kind: of the data; name: of this one; data: what it consists of, a line. warnings: lines.
@@ -226,7 +264,7 @@ class Verdict:
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
       notes: what the data cannot tell. next_experiment: what would. next_command: the command that begins it.
       amended: lines on sensor_amended.yaml.
-      details: what only this program knows, as further keys of verdict.json.
+      details: what is known of this kind of data alone, as further keys of verdict.json.
     """
 
     kind: str
@@ -252,6 +290,14 @@ class Verdict:
     next_command: str = ""
     amended: list[str] = dataclasses.field(default_factory=list)
     details: dict = dataclasses.field(default_factory=dict)
+
+    def pictures(self) -> list[Picture]:
+        """Figures of the report."""
+        return []
+
+    def sensor(self) -> "SensorFile | None":
+        """The sensor with what was found, None where there is none to write."""
+        return None
 
     @property
     def leading(self) -> Gap:

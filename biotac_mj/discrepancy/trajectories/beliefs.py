@@ -12,11 +12,11 @@ import numpy as np
 
 from ...effects.catalogue import CATALOGUE, by_id
 from ...files import replacing
+from ..evidence import ODDS
 from .base.nuisance import PRIOR, Nuisance
 from .fitting import SHAPE_PRIOR, sizes
 from .model.sensor_file import load_simulator
 from .model.simulator import Simulator
-from .screening import STEPS
 from .settings import SETTINGS
 from .trajectory import Trajectory, read_trajectories, write_trajectories
 
@@ -25,9 +25,11 @@ if typing.TYPE_CHECKING:
     from .search import Search
     from .whitening import Comparison
 
-__all__ = ["ODDS", "Beliefs", "Explanation", "believed", "pooled", "weights"]
+__all__ = ["Beliefs", "Explanation", "believed", "pooled", "weights"]
 
-ODDS = SETTINGS.odds  # times as likely as all others together: then nothing more is asked
+# of the base model's parameters, for differences
+_STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
+_STEPS |= {"stands_off": 0.3}
 _MOST = 6  # explanations, the likeliest ones
 _SHAPE_STEP = 0.2  # of a shape's logarithm
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
@@ -61,7 +63,7 @@ class Explanation:
     def moves(self) -> Iterator[tuple[float, float, list, Nuisance]]:
         """(step, standard deviation of the prior, effects, nuisance) with one parameter moved by a step."""
         for k, field in enumerate(dataclasses.fields(Nuisance)):
-            step = STEPS.get(field.name, 0.05)
+            step = _STEPS.get(field.name, 0.05)
             yield step, PRIOR[k], self.effects, self.nuisance.moved(**{field.name: step})
         for i, (effect, theta) in enumerate(self.effects):
             steps = [(name, effect.params[name].scale, size, False) for name, size in sizes(effect)]

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .beliefs import ODDS, Beliefs, Explanation
+from ..evidence import ODDS
+from .beliefs import Beliefs, Explanation
 from .contacts import Bounds, Contact, drawn, trajectory_of
 from .whitening import Comparison
 

@@ -5,18 +5,21 @@ import typing
 
 import numpy as np
 
+from ...effects.catalogue import CATALOGUE
 from .base.channels import jumping
 from .base.nuisance import OTHER_MESH
 from .levels import astray
+from .signatures import SEEN
 from .where import phases
 from .whitening import REPEATABILITY
 
 if typing.TYPE_CHECKING:
+    from ..report.verdict import Finding
     from .fitting import Fit
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["jumps", "of_base", "of_data", "scattered", "strays"]
+__all__ = ["jumps", "next_experiment", "of_base", "of_data", "scattered", "strays"]
 
 
 def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, step: list) -> str:
@@ -121,3 +124,40 @@ def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
     if not comparison.has_force:
         notes.append("no force: the rubber's modulus shows in the liquid's pressure alone")
     return notes
+
+
+def next_experiment(effects: "list[Finding]", isolability: dict, unknown: bool, tier: str) -> str:
+    """What to do next, in words.
+
+    Args:
+      effects: Findings, the one that explains most first.
+      isolability: see `isolability`.
+      unknown: whether something is left that no effect explains.
+      tier: of the skin with which the recording was compared.
+    """
+    pairs = [(e, t) for e in effects for t in e.ties]
+    if not pairs:
+        pairs = [(e, next((o for o in e.confusable if o in isolability["ids"]), None)) for e in effects[:1]]
+    out = []
+    if tier == "condensed" and (effects or unknown):
+        out.append("compare again with --tier full: what the condensed skin lacks may be taken for an effect")
+    for effect, other in pairs[:3]:
+        if other is None:
+            continue
+        text = effect.confusable.get(other) or next(
+            (e.confusable.get(effect.id) for e in CATALOGUE if e.id == other), None
+        )
+        ids, own = isolability["ids"], ""
+        if effect.id in ids and other in ids:
+            i, j = ids.index(effect.id), ids.index(other)
+            share = isolability["matrix"][i][j]
+            count = int(np.ceil(SEEN / max(share * isolability["nats"][i], 1e-3)))
+            own = f" (here {share:.0%} of what it does is its own" + (
+                f": about {count} trajectories like these are needed)" if count > 1 else ")"
+            )
+        name = next((e.name for e in CATALOGUE if e.id == other), other)
+        how = text or "vary load, speed and hold together less"
+        out.append(f"to tell {effect.name} from {name}: {how}{own}")
+    if unknown and not effects:
+        out.append("repeat some trajectories unchanged: what does not come again is no effect of the sensor")
+    return "; ".join(out) or "none needed: nothing is tied, and nothing is left"

@@ -7,11 +7,13 @@ import typing
 import numpy as np
 import tqdm
 
+from ..evidence import ODDS, asked
 from .base.channels import narrowed
 from .fitting import Fit, fit_effects, sizes
 from .likelihood import of
 from .model.in_skin import FOLLOWS, remember
 from .settings import SETTINGS
+from .signatures import Signatures
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
@@ -130,17 +132,11 @@ def _other_shapes(comparison, one, current, chosen) -> Candidate:
     return dataclasses.replace(one, fit=best, gain=float(best.score - current.score))
 
 
-def _asked(usable):
-    """Evidence [nats] that makes one of these effects likelier than nothing by the odds that decide, where
-    any may be there as well as none."""
-    return float(np.log(SETTINGS.odds) + np.log(max(len(usable), 1)))
-
-
 def _tied(best, other) -> bool:
     """Whether another Candidate is nearly as likely: within the odds that decide, or within what the laws of
     both may be off by, which evidence has twice."""
     laws = np.hypot(*(max(c.effect.law, SETTINGS.law) for c in (best, other)))
-    return bool(best.gain - other.gain < max(np.log(SETTINGS.odds), 2 * laws * best.gain))
+    return bool(best.gain - other.gain < max(np.log(ODDS), 2 * laws * best.gain))
 
 
 def _shared(comparison, one, search, chosen) -> bool:
@@ -179,7 +175,7 @@ def _without_needless(comparison, search, usable, chosen):
     for one in list(search.found[:-1]):
         rest = [pair for pair in search.fit.effects if pair[0].id != one.effect.id]
         reduced = fit_effects(comparison, rest, chosen, search.fit)
-        if search.fit.score - reduced.score < _asked(usable):
+        if search.fit.score - reduced.score < asked(len(usable)):
             search.found.remove(one)
             search.fit = reduced
             search.fits[frozenset(e.id for e, _ in rest)] = reduced
@@ -236,9 +232,9 @@ def _candidate(comparison, effect, fit, current, chance, usable, chosen):
     gain, theta = fit.score - current.score, fit.effects[-1][1]
     p = float((1 + (chance >= gain).sum()) / (1 + len(chance)))
     # as much again of every further effect: laws of other forms leave something
-    asked = len(fit.effects) * _asked(usable)
-    refused = ["evidence"] if gain < asked else []
-    refused += ["resolution"] if gain >= asked > _beside_alike(comparison, fit, current, gain, chosen) else []
+    least = len(fit.effects) * asked(len(usable))
+    refused = ["evidence"] if gain < least else []
+    refused += ["resolution"] if gain >= least > _beside_alike(comparison, fit, current, gain, chosen) else []
     refused += ["chance"] if p > SETTINGS.rate else []
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
@@ -333,26 +329,17 @@ def screened(
     """By straight lines about a fit: [(evidence of the effect beside it [nats], effect, parameters where a
     fit may start)], best first; and the most evidence (surrogates,) that any of them has of data drawn from
     the model without it."""
-    likelihood = of(comparison, chosen)
-    variance = likelihood.variance(current.amplitude, current.size)
-    flat = current.columns.reshape(len(current.columns), -1)
-    _, _, factor = likelihood.evidence(current.y, current.columns, variance)
-    weighted = np.linalg.solve(factor, flat / variance.ravel())
+    signatures = Signatures(comparison, current, chosen)
     rng = np.random.default_rng(seed)
-    draws = rng.standard_normal((_SURROGATES, len(flat))) @ flat
-    draws += rng.standard_normal(draws.shape) * np.sqrt(variance.ravel())
-    y = np.vstack([current.y.ravel(), draws])  # the data first
-    alone = weighted @ y.T
-    raw = comparison.raw(current.effects, current.nuisance, offsets=current.offsets)
-    base = likelihood.turned(likelihood.stacked(raw))
+    draws = rng.standard_normal((_SURROGATES, len(signatures.known))) @ signatures.known
+    draws += rng.standard_normal(draws.shape)
+    y = signatures.own(np.vstack([current.y.ravel() / signatures.sd, draws]))  # the data first
     best, chance = {}, np.full(_SURROGATES, -np.inf)
     for effect, shape in [(e, s) for one in effects for e in _variants(one) for s in e.grid]:
-        columns = _columns(comparison, likelihood, current, effect, shape, base)
-        flat_columns = columns.reshape(len(columns), -1)
-        own = flat_columns / variance.ravel()
-        cross = weighted @ flat_columns.T
-        precision = np.eye(len(own)) + own @ flat_columns.T - cross.T @ cross
-        pull = own @ y.T - cross.T @ alone
+        prior = [[SETTINGS.wide * effect.params[name].scale / size] for name, size in sizes(effect)]
+        columns = signatures.columns(effect, shape) * np.array(prior)
+        precision = np.eye(len(columns)) + columns @ signatures.own(columns).T
+        pull = columns @ y.T
         weights = np.linalg.solve(precision, pull)
         gain = 0.5 * (pull * weights).sum(0) - 0.5 * np.linalg.slogdet(precision)[1]
         chance = np.maximum(chance, gain[1:])
@@ -365,19 +352,6 @@ def screened(
 def _variants(effect):
     """The effect as it is mostly, and with its rare parameters."""
     return [effect, *([effect.given(list(effect.rare))] if effect.rare else [])]
-
-
-def _columns(comparison, likelihood, current, effect, shape, base):
-    """(free, n, width) what one prior's standard deviation of each free parameter does, by secants."""
-    out = []
-    for name, size in sizes(effect):
-        theta = {**effect.default(), **shape}
-        theta[name] = theta[name] + size
-        effects = [*current.effects, (effect, theta)]
-        moved = comparison.raw(effects, current.nuisance, offsets=current.offsets)
-        change = base - likelihood.turned(likelihood.stacked(moved))
-        out.append(change * (SETTINGS.wide * effect.params[name].scale / size))
-    return np.array(out)
 
 
 def _begin(effect, shape, weights):

@@ -5,6 +5,8 @@ import dataclasses
 import hashlib
 import json
 
+from ..evidence import RATE
+
 __all__ = ["SETTINGS", "Settings"]
 
 
@@ -27,16 +29,11 @@ class Settings:
     own: float = 0.5
     law: float = 0.05
     wide: float = 2.5
-    rate: float = 1 / 21
+    rate: float = RATE
     explained: float = 0.2
     beyond: float = 3.0
     most: int = 3
     refit: int = 6
-
-    @property
-    def odds(self) -> float:
-        """How much likelier than all else an explanation has to be."""
-        return (1 - self.rate) / self.rate
 
     @property
     def hash(self) -> str:

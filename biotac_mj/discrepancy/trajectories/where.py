@@ -4,14 +4,18 @@ import typing
 
 import numpy as np
 
-from ..evidence import max_t
+from ..where import Cells
+from .settings import SETTINGS
 
 if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["channel_groups", "conditions", "depends_on", "phases", "where"]
+__all__ = ["channel_groups", "conditions", "depends_on", "phases", "residual_cells", "where"]
+
+TRENDS = "along finger", "across finger", "clock", "temperature"  # over trajectories
+_FEWEST = 5  # trajectories that know a cell
 
 
 def phases(t: "Trajectory") -> dict:
@@ -48,14 +52,10 @@ def conditions(trajectories: "list[Trajectory]") -> dict:
     for tool in tools if len(tools) > 1 else ():
         out[tool] = [(rows & (t.tool == tool), 1.0) for t, rows in zip(trajectories, touch)]
     place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])
-    trends = {
-        "along finger": place[:, 0],
-        "across finger": place[:, 2],
-        "clock": [t.clock for t in trajectories],
-    }
+    trends = [place[:, 0], place[:, 2], [t.clock for t in trajectories]]
     if all(t.tdc is not None for t in trajectories):
-        trends["temperature"] = [float(t.tdc.mean()) for t in trajectories]
-    for name, values in trends.items():
+        trends.append([float(t.tdc.mean()) for t in trajectories])
+    for name, values in zip(TRENDS, trends):
         spread = np.std(values)
         if spread > 0:
             rows = (
@@ -75,31 +75,32 @@ def channel_groups(comparison: "Comparison") -> dict:
     }
 
 
+def residual_cells(
+    comparison: "Comparison", null: "Fit", chosen: np.ndarray, channels: dict[str, slice]
+) -> Cells:
+    """Of the residuals of the chosen trajectories over noise and resolution; channels: name -> columns."""
+    white = null.posed(comparison)
+    asked = conditions([comparison.trajectories[i] for i in chosen])
+    return Cells.of([white[i] for i in chosen], asked, channels)
+
+
 def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dict]:
     """Cells channel x condition that stand out; family-wise p by sign flips of whole trajectories.
 
     All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times
     that, a trend 0.3 sigma."""
-    white = null.posed(comparison)
-    cells, names, large = [], [], []
-    for condition, parts in conditions([comparison.trajectories[i] for i in chosen]).items():
-        for channel, part in channel_groups(comparison).items():
-            column, size = [], []
-            for i, (rows, weight) in zip(chosen, parts):
-                x = white[i][rows][:, part]
-                column.append(weight * x.mean() * np.sqrt(len(x)) if x.size else np.nan)
-                size += [weight * x.mean()] if x.size else []
-            if len(size) >= 5:
-                trend = any(weight != 1.0 for _, weight in parts)
-                cells.append(column), names.append((channel, condition))
-                large.append(abs(np.mean(size)) > (0.3 if trend else 3 / np.sqrt(len(chosen))))
-    if not cells:
-        return []
-    t, p = max_t(np.array(cells).T)
+    cells = residual_cells(comparison, null, chosen, channel_groups(comparison))
+    t, p = cells.tested(cells.mean * np.sqrt(cells.rows)[:, :, None], _FEWEST)
+    trend = np.array([name in TRENDS for name in cells.conditions])
+    least = np.where(trend, 0.3, 3 / np.sqrt(len(chosen)))
     out = [
-        {"channel": n[0], "condition": n[1], "t": float(a), "p": float(b)}
-        for n, a, b, c in zip(names, t, p, large)
-        if b < 0.05 and c
+        {
+            "channel": cells.channels[k],
+            "condition": cells.conditions[c],
+            "t": float(t[c, k]),
+            "p": float(p[c, k]),
+        }
+        for c, k in np.argwhere((p < SETTINGS.rate) & (np.abs(cells.overall) > least[:, None]))
     ]
     return sorted(out, key=lambda c: -abs(c["t"]))
 

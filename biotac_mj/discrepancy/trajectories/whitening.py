@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ..report.verdict import electrode_names
 from .base.nuisance import KNOWN, Nuisance
 from .model.fields import Fields
 from .model.simulator import Simulator
@@ -80,6 +81,12 @@ class Comparison:
         self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
         self.sigma = np.sqrt((self.sigmas**2).mean(0))
         self._prepare()
+
+    @property
+    def channels(self) -> list[str]:
+        """(width,) names."""
+        more = (["pdc"] if self.has_pdc else []) + (["Fx", "Fy", "Fz"] if self.has_force else [])
+        return electrode_names(range(self.nelectrode)) + more
 
     def _floor(self, measured):
         """(width,) what the base model may be off by in a trajectory (n, width): of electrodes by the largest

@@ -9,22 +9,23 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
+from ...effects.sensor_file import SensorFile
 from ...geometry.design import check_nelectrode
-from ..report.verdict import Estimate, Finding, of_electrodes
+from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, of_electrodes
 from .base.channels import noisy_electrodes
-from .base.findings import base_findings
+from .base.findings import BaseCandidate, base_findings
 from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .beliefs import Beliefs, believed
 from .fitting import Fit, fit_effects
-from .levels import few_off
+from .levels import excess, few_off
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
-from .proof import proved
-from .remarks import jumps, of_base, of_data, strays
-from .screening import isolability, next_experiment
+from .proof import Proof, proved
+from .remarks import jumps, next_experiment, of_base, of_data, scattered, strays
 from .search import found
 from .settings import SETTINGS
+from .signatures import isolability
 from .trajectory import FEWEST, measurement_noise
 from .where import depends_on, where
 from .whitening import REPEATABILITY, Comparison
@@ -34,49 +35,40 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
+_GROUPS = {"electrodes": "the electrodes", "pdc": "the liquid's pressure (PDC)", "force": "the force"}
 _SURE = 1 - SETTINGS.rate  # the most that is stated: so many of all names are false
 
 __all__ = ["TrajectoryDiagnosis", "about_rests", "diagnose"]
 
 
-@dataclasses.dataclass
-class TrajectoryDiagnosis:
-    """What `diagnose` found.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrajectoryDiagnosis(Verdict):
+    """A verdict on data with poses; `effects` are those of single electrodes, too, with their channels.
 
     Attributes:
-      verdict: one line. effects: Findings, those of single electrodes with their channels.
-      ranking: list of (id, evidence over the base model [nats], p) of the first round. where: list of cells.
-      before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
-        them.
-      isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
-      fit: Fit, with the effects that are named and added. refuted: Findings that explain what was fitted and
-        that locked trajectories contradict.
-      comparison, selection, locked: what it was made of. residuals: (before, after), of every
-        locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
-        file can hold them. beside: BaseCandidates, which `effects` names too. beliefs: how likely which
-      explanation is.
+      given: the simulator that was compared. fit: Fit, with the effects that are named and added.
+      beside: BaseCandidates, which `effects` names too. proof: on trajectories kept aside, the skin solved
+        again. comparison, selection, locked: what it was made of. beliefs: how likely which explanation is.
+      trace: numbers that thresholds are set on, as a file can hold them.
     """
 
-    verdict: str
-    effects: list[Finding]
-    ranking: list
-    where: list
-    before: dict
-    after: dict
-    closed: float
-    isolability: dict
-    next_experiment: str
-    notes: list
+    given: Simulator
     fit: Fit
+    beside: list[BaseCandidate]
+    proof: Proof
     comparison: Comparison
     selection: np.ndarray
     locked: np.ndarray
-    residuals: tuple
-    remainder: str = ""
-    trace: dict = dataclasses.field(default_factory=dict)
-    beside: list = dataclasses.field(default_factory=list)
-    beliefs: Beliefs | None = None
-    refuted: list[Finding] = dataclasses.field(default_factory=list)
+    beliefs: Beliefs
+    trace: dict
+
+    def pictures(self) -> list[Picture]:
+        from .pictures import pictures_of
+
+        return pictures_of(self)
+
+    def sensor(self) -> SensorFile:
+        return self.apply(self.given).file
 
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with them;
@@ -155,7 +147,7 @@ def diagnose(
         comparison, null, search = _explained(stated, usable, chosen, seed, bar)
         search.hidden = hidden
         bar.update()
-        report = _settle(comparison, null, search, chosen, aside, notes, usable)
+        report = _settle(sim, comparison, null, search, chosen, aside, notes, usable)
         bar.update()
     return report
 
@@ -284,8 +276,8 @@ def _refuted(found):
     return f"{what} would explain what was fitted, and trajectories kept aside contradict it"
 
 
-def _settle(comparison, null, search, chosen, aside, notes, usable):
-    """Report of a Search: what of it has a name, what the base model is off by, the proof."""
+def _settle(given, comparison, null, search, chosen, aside, notes, usable):
+    """Diagnosis by a Search: what of it has a name, what the base model is off by, the proof."""
     current, found, explained, why = _named(comparison, null, search)
     names = {e.id: e.name for e in usable}
     _tie_aliases(current, found, names)
@@ -320,39 +312,104 @@ def _settle(comparison, null, search, chosen, aside, notes, usable):
         stray = stray or jumps(comparison, null) or _refuted(refuted) or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
-    table = isolability(comparison, current, usable, effects, chosen)
+    table = isolability(comparison, current, usable, chosen)
     more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
-    notes = [*notes, *why, *of_base(comparison, current, chosen)]
+    notes = [*notes, *why, *of_base(comparison, current, chosen), *table.pop("notes")]
+    before, after = (dict(zip(("level", "peak"), _off(comparison, fit))) for fit in (null, current))
     trace = {
-        "before": dict(zip(("level", "peak"), _off(comparison, null))),
-        "after": dict(zip(("level", "peak"), _off(comparison, current))),
+        "before": before,
+        "after": after,
         "explained": explained,
         "rounds": [[c.record() for c in step] for step in search.rounds],
         "closed": proof.closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
+    cells, gaps = where(comparison, null, chosen), _gaps(comparison, proof)
+    added = [effect.name for effect, _ in proof.fit.effects] + [one.finding.name for one in beside]
     return TrajectoryDiagnosis(
-        verdict,
-        effects,
-        [(c.effect.id, c.gain, c.p) for c in search.rounds[0]],
-        where(comparison, null, chosen),
-        proof.before,
-        proof.after,
-        proof.closed,
-        table,
-        next_experiment(effects, table, more, comparison.sim.tier),
-        notes + table.pop("notes"),
-        proof.fit,
-        comparison,
-        chosen,
-        aside,
-        proof.residuals,
-        remainder,
-        trace,
-        beside,
-        beliefs,
-        [_described(item, fitted, _sure(beliefs, item), names, False) for item in refuted],
+        kind="trajectories",
+        name="trajectories",
+        data=f"{len(chosen)} fitted, {len(aside)} kept aside",
+        verdict=verdict,
+        significant=bool(seen or stray),
+        effects=[_proved(one, proof, beside, gaps) for one in effects],
+        not_named=[_described(item, fitted, _sure(beliefs, item), names, False) for item in refuted],
+        gap=gaps,
+        warnings=[line] if (line := scattered(comparison)) else [],
+        aside=f"{len(aside)} trajectories that took no part in the search, errors of their poses taken out",
+        closed=proof.closed,
+        where=cells,
+        where_note=(
+            f"{len(cells)} pairs of channel and condition stand out, 5 % false all together; the model is "
+            f"off by {before['level']:.2g} times what is expected of it in the worst group of channels and "
+            f"{before['peak']:.2g} in the worst channel, by {after['level']:.2g} and {after['peak']:.2g} "
+            f"with the causes added; beyond {SETTINGS.beyond:g} or {SETTINGS.beyond**2:g} something is missed"
+        ),
+        remainder=remainder,
+        unknown=bool(seen or stray) and bool(remainder),
+        tried=[
+            {"id": c.effect.id, "name": c.effect.name, "evidence_nats": c.gain, "p": c.p}
+            for c in search.rounds[0]
+        ],
+        tried_note="evidence of each cause alone over the base model, its parameters marginalised",
+        notes=notes,
+        next_experiment=f"{beliefs.text}; {next_experiment(effects, table, more, comparison.sim.tier)}",
+        next_command="" if beliefs.decided else "biotac next REPORT --budget 20 --out plan.csv",
+        amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
+        details={
+            "isolability": table,
+            "mean_square": {
+                "before": proof.before["mean_square"],
+                "after": proof.after["mean_square"],
+            },
+            "trajectories": {
+                "fitted": len(chosen),
+                "kept_aside": [comparison.trajectories[i].id for i in aside],
+            },
+            "settings": dataclasses.asdict(SETTINGS),
+            "settings_hash": SETTINGS.hash,
+            "repeatability_m": comparison.repeatability,
+            "explanations": [{"effects": one.ids, "probability": one.weight} for one in beliefs.explanations],
+        },
+        given=given,
+        fit=proof.fit,
+        beside=beside,
+        proof=proof,
+        comparison=comparison,
+        selection=chosen,
+        locked=aside,
+        beliefs=beliefs,
+        trace=trace,
     )
+
+
+def _gaps(comparison, proof):
+    """Group of channels -> Gap on trajectories kept aside."""
+    out = {}
+    for group, part in comparison.groups.items():
+        each = [tuple(gap["channels"][part]) for gap in (proof.before, proof.after)]
+        out[group] = Gap(
+            "N" if group == "force" else "counts",
+            proof.before[group],
+            proof.after[group],
+            float(np.sqrt(np.mean(comparison.sigma[part] ** 2))),
+            _GROUPS[group],
+            tuple(comparison.channels[part]),
+            *each,
+        )
+    return out
+
+
+def _proved(finding, proof, beside, gaps):
+    """A Finding with what trajectories kept aside say of it: whether it was added and they are nearer, and,
+    where it alone was added, the gap that it closes most of."""
+    if any(finding.id == one.finding.id for one in beside):
+        return finding  # of the base model, which both sides have
+    before, after = (excess(gap["mean_square"]) for gap in (proof.before, proof.after))
+    added = [e.id for e, _ in proof.fit.effects]
+    closed = [gap for gap in gaps.values() if np.isfinite(gap.closed)] if added == [finding.id] else []
+    gap = max(closed, key=lambda one: one.closed, default=None)
+    return dataclasses.replace(finding, confirmed=finding.id in added and after < before, gap=gap)
 
 
 def _sure(beliefs, item) -> float:

@@ -7,9 +7,9 @@ import typing
 import numpy as np
 
 from ....effects.rubber import Modulus
+from ...evidence import ODDS
 from ...report.verdict import Estimate, Finding, of_electrodes
 from ..fitting import fit_effects
-from ..settings import SETTINGS
 from .channels import noisy_electrodes, offsets
 
 if typing.TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _modulus(comparison, fit, chosen):
         return None
     bare = fit_effects(comparison, fit.effects, chosen, fit, known=("log_modulus",))
     gain = fit.score - bare.score
-    if gain < np.log(SETTINGS.odds):
+    if gain < np.log(ODDS):
         return None
     factor, half = float(np.exp(by)), 1.96 * fit.modulus_error
     sure = {"factor": (factor * np.exp(-half), factor * np.exp(half))}

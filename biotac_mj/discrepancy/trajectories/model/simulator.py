@@ -469,13 +469,18 @@ class Simulator:
 
     # --- YAML  ---
 
-    def save(self, path: pathlib.Path | str) -> None:
-        """Writes the stages and effects as YAML."""
+    @property
+    def file(self) -> SensorFile:
+        """The stages and effects as a sensor file has them."""
         base = {"skin": self.skin, "tier": self.tier, "material": plain(self.material)}
         base |= {"options": plain(self.options)} if self.options else {}
         base |= {"sensor": self.sensor, "constitutive": self.constitutive}
         base["modulus_factor"] = float(self.modulus)
-        write_sensor_file(path, SensorFile(base, self.effects, self.intervals))
+        return SensorFile(base, self.effects, self.intervals)
+
+    def save(self, path: pathlib.Path | str) -> None:
+        """Writes the stages and effects as YAML."""
+        write_sensor_file(path, self.file)
 
 
 def _turned(t, turn):

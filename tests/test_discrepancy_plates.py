@@ -14,14 +14,14 @@ from made_up_plate import made_up_states
 from verdicts import check_verdict
 
 import biotac_mj
+from biotac_mj.discrepancy.plates import models, tables
+from biotac_mj.discrepancy.plates.diagnosis import diagnose_presses
+from biotac_mj.discrepancy.plates.models import press_rows
 from biotac_mj.discrepancy.recordings.recording import PlainRecording, read_recording
 from biotac_mj.discrepancy.recordings.search import diagnose_recording
+from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.discrepancy.simulated import diagnosis
-from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
-from biotac_mj.discrepancy.simulated.report import verdict_of, write_simulated
-from biotac_mj.discrepancy.simulated.tables import COARSER, base_response
-from biotac_mj.discrepancy.verbs import diagnose_verb
+from biotac_mj.discrepancy.verbs import diagnose_verb, diagnose_with_states
 from biotac_mj.effects.plate import PLATE, bonded, moved
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants
@@ -39,7 +39,7 @@ AT_TIP = [0.0, 0.8]
 
 
 @pytest.fixture(scope="module")
-def tables():
+def answers():
     """A synthetic base model with two changes, of the tip's answers and of E17 to E19, and one without
     drag."""
     states, log_z = made_up_states(drag=(1.0,))
@@ -56,7 +56,7 @@ def tables():
     )
 
 
-def synthetic(tables, amount, seed, memory=0.0):
+def synthetic(answers, amount, seed, memory=0.0):
     """A synthetic recording of a sensor that has an amount (2,) of the changes, with 3 counts of noise."""
     rng, n = np.random.default_rng(seed), 420
     time = np.arange(n) / n
@@ -72,25 +72,25 @@ def synthetic(tables, amount, seed, memory=0.0):
     rest = log_impedance(REST_COUNTS["2"]) + rng.normal(0, 0.02, 19)
     const = Constants(rest, np.ones(19), np.array([-0.1, np.log(0.3)]), MODULUS, memory, np.array(amount))
     load = (pressing + memory * (past - pressing)) / MODULUS
-    value, _ = tables[0].at_load(load, const.amount)(state, False)
+    value, _ = answers[0].at_load(load, const.amount)(state, False)
     counts = counts_from_log_impedance(const.log_z(value[:, :19], time)) + rng.normal(0, 3, (n, 19))
     force = np.column_stack([value[:, 19:] * MODULUS, pressing]) @ np.linalg.inv(SIGNS)
     return PlainRecording(counts, force, rate=100.0, name=f"synthetic {seed}"), past
 
 
 @pytest.fixture(scope="module")
-def of_both(tables):
+def of_both(answers):
     """Two synthetic sensors whose tips answer more than the base model's, and what is found."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diagnosis, "_ROWS", 50)
-        patch.setattr(diagnosis, "_MEMORY", ())
-        recordings = [synthetic(tables, AT_TIP, seed)[0] for seed in (1, 2)]
-        return diagnose_simulated(recordings, *tables, TRIED, quiet=True)
+        patch.setattr(models, "_ROWS", 50)
+        patch.setattr(models, "_MEMORY", ())
+        recordings = [synthetic(answers, AT_TIP, seed)[0] for seed in (1, 2)]
+        return diagnose_presses(recordings, *answers, TRIED, quiet=True)
 
 
 def test_what_two_sensors_share_is_the_base_models(of_both):
-    assert of_both.named == ("fill",) and "base model" in of_both.verdict
-    by_id = {f.id: f for f in of_both.tried}
+    assert [f.id for f in of_both.named] == ["fill"] and "base model" in of_both.verdict
+    by_id = {f.id: f for f in of_both.models}
     for sensor, tested in zip(of_both.sensors, by_id["fill"].tested):
         assert set(sensor.worst) & set(TIP), "it finds the tip by itself"
         assert np.allclose(tested.value, 0.8 * CALIBRATED_FILL, atol=0.25 * CALIBRATED_FILL)
@@ -98,22 +98,23 @@ def test_what_two_sensors_share_is_the_base_models(of_both):
     assert all(by_id["drag"].significant), "drag, which it has, is missed where it is left out"
 
 
-def test_what_is_written_runs(of_both, tables, tmp_path):
-    verdict = verdict_of(of_both).to_dict()
+def test_what_is_written_runs(of_both, answers, tmp_path):
+    verdict = of_both.to_dict()
     assert verdict["effects"][0]["id"] == "fill" and verdict["effects"][0]["confirmed"]
     assert verdict["effects"][0]["ties"] == []
     cells = verdict["simulated"]["where"]["synthetic 1"]["cells"]
     assert cells[0]["red"] and cells[0]["counts"] > cells[0]["expected"]
-    first = diagnose_recording(synthetic(tables, AT_TIP, 1)[0])
-    paths = write_simulated(of_both, first, tmp_path)
+    first = diagnose_recording(synthetic(answers, AT_TIP, 1)[0])
+    joined = of_both.beside(first)
+    paths = write_report(joined, tmp_path)
     written = json.loads(paths[1].read_text())
     check_verdict(verdict)
     check_verdict(written)
     assert written["verdict"] == f"{first.verdict}; {of_both.verdict}"
-    assert written["effects"][-1]["id"] == "fill" and "gap" in written and written["simulated"]["tried"]
+    assert written["effects"][-1]["id"] == "fill" and "gap" in written and written["tried"]
     assert paths[-1].name == "simulated.png" and paths[-1].stat().st_size > 10_000
-    assert "synthetic 2" in summary(verdict_of(of_both)) and "synthetic 2" in paths[0].read_text()
-    attached = next(one["attach"] for one in verdict["simulated"]["tried"] if one["id"] == "fill")
+    assert "synthetic 2" in summary(of_both) and "synthetic 2" in paths[0].read_text()
+    attached = {one["sensor"]: one["attach"] for one in verdict["tried"] if one["id"] == "fill"}
     fill = attached["synthetic 1"]["options"]["skin"]["fill_volume"]
     assert 0.5 * CALIBRATED_FILL < fill < 1.1 * CALIBRATED_FILL
     spec = mujoco.MjSpec()
@@ -126,22 +127,22 @@ def test_what_is_written_runs(of_both, tables, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_one_sensor_has_alone_is_the_sensors(tables, monkeypatch):
-    monkeypatch.setattr(diagnosis, "_ROWS", 150)
-    monkeypatch.setattr(diagnosis, "_MEMORY", ())
-    recordings = [synthetic(tables, AT_TIP, 1)[0], synthetic(tables, [0.0, 0.0], 2)[0]]
-    found = diagnose_simulated(recordings, *tables, TRIED, quiet=True)
-    finding = next(f for f in found.tried if f.id == "fill")
+def test_what_one_sensor_has_alone_is_the_sensors(answers, monkeypatch):
+    monkeypatch.setattr(models, "_ROWS", 150)
+    monkeypatch.setattr(models, "_MEMORY", ())
+    recordings = [synthetic(answers, AT_TIP, 1)[0], synthetic(answers, [0.0, 0.0], 2)[0]]
+    found = diagnose_presses(recordings, *answers, TRIED, quiet=True)
+    finding = next(f for f in found.models if f.id == "fill")
     assert finding.significant == (True, False) and finding.whose == "sensor synthetic 1"
-    assert found.named == ()
+    assert found.named == []
     clean = found.sensors[1]
-    assert not [c for c in clean.cells if c.red], "noise and the fit's own uncertainty are all there is"
+    assert not [c for c in clean.cells if c["red"]], "noise and the fit's own uncertainty are all there is"
 
 
-def test_a_load_that_is_remembered(tables):
-    recording, past = synthetic(tables, [0.0, 0.0], 3, memory=0.4)
+def test_a_load_that_is_remembered(answers):
+    recording, past = synthetic(answers, [0.0, 0.0], 3, memory=0.4)
     rows, _ = press_rows(recording)
-    plain = tables[0].amended(np.zeros(2))
+    plain = answers[0].amended(np.zeros(2))
     at = np.rint(rows.time * len(past)).astype(int)
     rows = Rows(rows.counts, rows.force, rows.time, past[at])
     const, _ = fit_constants(plain, rows[::2], Setup(gains=0.0, memory=0.3))
@@ -174,7 +175,7 @@ def test_shapes_of_the_wall():
         moved(geometry, -2e-3, 1e-3)
     states, _ = made_up_states()
     with pytest.raises(ValueError, match="choose among these"):
-        states.on(COARSER)
+        states.on(tables.COARSER)
 
 
 def test_what_it_needs_is_told():
@@ -183,15 +184,15 @@ def test_what_it_needs_is_told():
         diagnose_verb(types.SimpleNamespace(**given))
 
 
-def test_one_constant_for_all_sensors_on_rows_kept_aside(tables, repo, monkeypatch):
+def test_one_constant_for_all_sensors_on_rows_kept_aside(answers, repo, monkeypatch):
     """On a synthetic sensor whose tip answers more, the model that has it errs less there than gains do."""
     monkeypatch.syspath_prepend(str(repo / "benchmarks"))
     import real_tip
 
-    monkeypatch.setattr(diagnosis, "_ROWS", 100)
-    rows, aside = press_rows(synthetic(tables, AT_TIP, 4)[0])
-    whole = tables[0].amended(np.array(AT_TIP))
-    found = real_tip.locked({"base": tables[0].amended(np.zeros(2)), "tip": whole}, rows, aside)
+    monkeypatch.setattr(models, "_ROWS", 100)
+    rows, aside = press_rows(synthetic(answers, AT_TIP, 4)[0])
+    whole = answers[0].amended(np.array(AT_TIP))
+    found = real_tip.locked({"base": answers[0].amended(np.zeros(2)), "tip": whole}, rows, aside)
     assert found["tip, gains 1"]["tip"]["rms"] < 5, "3 counts are noise"
     assert found["tip, gains 1"]["tip"]["rms"] < found["base, gains fitted"]["tip"]["rms"]
     assert found["tip, gains 1"]["not seen"]["blocks_better"] > 12
@@ -216,27 +217,25 @@ def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
 
     folder = pathlib.Path(os.environ["BIOTAC_RECORDINGS"])
     recordings = [read_recording(*(folder / name for name in pair)) for pair in the_tip.PRESSES]
-    base, straight, _ = base_response(load_skin("coarse"), quiet=True)
-    found = diagnose_simulated(recordings, base, straight, (), quiet=True)
+    base, straight, _ = tables.base_response(load_skin("coarse"), quiet=True)
+    found = diagnose_presses(recordings, base, straight, (), quiet=True)
     for sensor in found.sensors:
         assert {6, 7, 8} <= set(sensor.worst) and all(sensor.slope[[6, 7, 8]] > 0)
     assert found.alike[0] > 0.5 and found.alike[1] < 0.05
 
 
 @pytest.mark.slow  # quick: what two sensors share, and what is written
-def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, capsys):
+def test_one_recording_cannot_tell_whose_it_is(answers, monkeypatch, tmp_path, capsys):
     """From the verb on, with synthetic tables in place of the skin's."""
-    from biotac_mj.discrepancy.simulated import verb
-
-    monkeypatch.setattr(diagnosis, "_ROWS", 60)
-    monkeypatch.setattr(diagnosis, "_MEMORY", ())
-    base, straight = tables[0].amended(np.zeros(2)), tables[1]
-    monkeypatch.setattr(verb, "base_response", lambda *_: (base, straight, None))
-    monkeypatch.setattr(verb, "with_effects", lambda base, *_: base)
-    recording = synthetic(tables, AT_TIP, 5)[0]
-    found = verb.diagnose_with_states([recording], tmp_path, True, ())
-    drag = next(f for f in found.tried if f.id == "drag")
+    monkeypatch.setattr(models, "_ROWS", 60)
+    monkeypatch.setattr(models, "_MEMORY", ())
+    base, straight = answers[0].amended(np.zeros(2)), answers[1]
+    monkeypatch.setattr(tables, "base_response", lambda *_: (base, straight, None))
+    monkeypatch.setattr(tables, "with_effects", lambda base, *_: base)
+    recording = synthetic(answers, AT_TIP, 5)[0]
+    found = diagnose_with_states([recording], tmp_path, True, ())
+    drag = next(f for f in found.models if f.id == "drag")
     assert drag.significant == (True,) and drag.whose == "unknown"
     assert found.alike is None and "verdict:" in capsys.readouterr().out
     with pytest.raises(ValueError, match="no force"):
-        verb.diagnose_with_states([dataclasses.replace(recording, force=None)], tmp_path, True, ())
+        diagnose_with_states([dataclasses.replace(recording, force=None)], tmp_path, True, ())

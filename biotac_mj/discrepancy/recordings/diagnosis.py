@@ -1,0 +1,185 @@
+"""What a plain recording's diagnosis has found, as a verdict with its figures and its sensor."""
+
+import dataclasses
+import math
+
+from ...effects.catalogue import name_of
+from ...effects.sensor_file import SensorFile
+from ...recordings.protocol import Protocol
+from ...recordings.recording import REST_LIKE
+from ..report.verdict import Estimate, Finding, Picture, Verdict
+from .amended import amended_sensor, running
+from .candidates import Candidate
+from .model import LEAST, WINDOW
+from .proof import views
+from .recording import FORCE_MOVED, PlainRecording
+from .rest import Rest, rest
+from .segments import memory_of
+from .session import Session
+
+__all__ = ["RecordingDiagnosis", "concluded"]
+
+_NEXT = 3  # experiments
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordingDiagnosis(Verdict):
+    """A verdict on a plain recording.
+
+    Attributes:
+      recording: with upper bits put back where counts overflowed; locked: share kept aside at the end;
+      findings: named, the largest gap closed first; rejected: those that the part kept aside contradicts or
+        that are too weak to be named; late: those that begin in the part kept aside;
+      rest: what is left; session: counts without the effects; protocol: of a checkup, None of a plain log.
+    """
+
+    recording: PlainRecording
+    locked: float
+    findings: list[Candidate]
+    rejected: list[Candidate]
+    late: list[Candidate]
+    rest: Rest
+    session: Session
+    protocol: Protocol | None = None
+
+    def pictures(self) -> list[Picture]:
+        from .pictures import pictures_of
+
+        return pictures_of(self)
+
+    def sensor(self) -> SensorFile:
+        return amended_sensor(self.session)
+
+
+def concluded(
+    session: Session, locked: float, late: list[Candidate], protocol: Protocol | None = None
+) -> RecordingDiagnosis:
+    """The diagnosis of a session from which all that is named has been taken out."""
+    r, left, found = session.recording, rest(session), [*session.findings, *late]
+    seconds = len(r) / r.rate
+    data = f"{r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
+    data += ", with force" if r.force is not None else ""
+    return RecordingDiagnosis(
+        kind="plain recording",
+        name=r.name,
+        data=f"{data}; last {locked:.0%} kept aside",
+        warnings=list(r.warnings),
+        verdict=_in_words(found, left),
+        significant=bool(found) or left.significant,
+        effects=[_finding(f) for f in found],
+        not_named=[_finding(f) for f in session.weak],
+        gap=views(session),
+        aside="rows that took no part in any fit",
+        where=left.cells,
+        where_note="electrodes that depart, from and to [s], RMS [counts]",
+        remainder=left.text,
+        unknown=left.significant,
+        notes=_notes(session, protocol),
+        next_experiment=_next(session.findings, protocol),
+        next_command="" if protocol else "biotac checkup --out protocol.yaml",
+        amended=_amended(session),
+        details={
+            "recording": {
+                "name": r.name,
+                "design": r.design.name,
+                "rows": len(r),
+                "rate_hz": r.rate,
+                "rate_source": r.rate_source,
+                "seconds": seconds,
+                "force": r.force is not None,
+                "tdc": r.tdc is not None,
+                "loaded": session.loaded,
+                "locked_share": locked,
+            },
+        },
+        recording=r,
+        locked=locked,
+        findings=session.findings,
+        rejected=session.weak,
+        late=late,
+        rest=left,
+        session=session,
+        protocol=protocol,
+    )
+
+
+def _in_words(found, left):
+    if not (found or left.significant):
+        return "no significant disagreement"
+    names = dict.fromkeys(f.kind.name + f.where for f in found)
+    parts = ["found: " + "; ".join(names)] if names else []
+    if left.significant:
+        parts.append(("remainder " if parts else "") + "unknown: " + left.text)
+    return "; ".join(parts)
+
+
+def _finding(f: Candidate) -> Finding:
+    known = f.kind.params
+    return Finding.of(
+        f.kind,
+        channels=tuple(f.channels),
+        parameters={name: Estimate.of(known[name], *values) for name, values in f.parameters.items()},
+        evidence=f.nats,
+        p=f.p,
+        confidence=f.confidence,
+        confirmed=f.verified,
+        ties={i: name_of(i) for i in f.ties},
+        gap=f.gap,
+        note=f.note,
+        start=f.start,
+        end=f.end,
+    )
+
+
+def _next(findings, protocol):
+    """What would tell names from those they are confused with, and what a checkup would add."""
+    tied = [(f.kind, i) for f in findings for i in f.ties]
+    rivals = [(kind, i) for kind in dict.fromkeys(f.kind for f in findings) for i in [*kind.confusable][:1]]
+    out = {
+        f"to tell {kind.name} from {name_of(i)}: {kind.confusable.get(i, 'no experiment is known')}": None
+        for kind, i in (tied or rivals)[:_NEXT]
+    }
+    if protocol is None:
+        out["three minutes of touches that isolate one effect each tell what a plain log mixes"] = None
+    return "; ".join(out)
+
+
+def _amended(session):
+    lines = [
+        "sensor_amended.yaml has calibrated rubber, as real sensors were matched with: softer than default"
+    ]
+    if left := running(session)[1]:
+        lines.append(
+            f"not in sensor_amended.yaml: {', '.join(left)}: of the logger, of the force or of the moment, "
+            "or no running sensor has it"
+        )
+    return lines
+
+
+def _notes(session, protocol):
+    """What the data cannot tell."""
+    recording, loads, out = session.recording, "saturation", []
+    if recording.force is None:
+        out.append("no force: how late the electrodes follow it")
+    if recording.tdc is None:
+        out.append("no TDC: whether a warm-up is the liquid's temperature")
+    if not session.model().parted:
+        out.append(
+            f"too short to tell touches from drift, record {math.ceil(LEAST / session.fit.mean())} s or "
+            f"more: slow changes of single electrodes, {loads}"
+        )
+    elif not session.loaded and recording.force is not None and recording.force.std(0).max() > FORCE_MOVED:
+        out.append(
+            "touches could not be told from drift, record some at several places that each change electrodes "
+            f"by tens of counts within {WINDOW[0]:g} s: {loads}"
+        )
+    elif not session.loaded:
+        out.append(f"not loaded: {loads}")
+    out += recording.not_identifiable
+    if recording.absolute and recording.rest_correlation < REST_LIKE:
+        out.append(
+            "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
+        )
+    if protocol is not None and (memory := memory_of(session, protocol)):
+        out.append(memory)
+    return out

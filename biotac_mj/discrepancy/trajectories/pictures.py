@@ -1,0 +1,80 @@
+"""Figures of the report of data with poses."""
+
+import numpy as np
+
+from ..evidence import ODDS
+from ..report import plots
+from ..report.verdict import Picture, Verdict
+from .fitting import fit_effects
+from .where import residual_cells
+
+__all__ = ["pictures_of"]
+
+_SHOWN = 4  # trajectories, of each of two channels
+
+
+def pictures_of(diagnosis: Verdict) -> list[Picture]:
+    """Curves and channels on trajectories kept aside, where the model is off, evidence, what can be told."""
+    drawn = {
+        "curves": ("curves", _curves),
+        "channels": ("gap", _channels),
+        "where": ("where", _where),
+        "evidence": ("tried", _evidence),
+        "isolability": ("unknown", _isolability),
+    }
+    return [Picture(name, section, draw(diagnosis)) for name, (section, draw) in drawn.items()]
+
+
+def _curves(diagnosis):
+    """Of the two channels that are furthest off, in some of the trajectories kept aside."""
+    c, panels, proof = diagnosis.comparison, [], diagnosis.proof
+    names = c.channels
+    for channel in np.argsort(-np.array(proof.before["channels"]) / c.sigma)[:2]:
+        for k, i in enumerate(diagnosis.locked[:_SHOWN]):
+            measured = c.measured[i][:, channel]
+            panels.append(
+                plots.Panel(
+                    f"{names[channel]}, {c.trajectories[i].id}",
+                    "N" if names[channel].startswith("F") else "counts",
+                    c.trajectories[i].time,
+                    measured,
+                    *(measured - part[k][:, channel] for part in proof.residuals),
+                )
+            )
+    return plots.curves(panels, columns=min(_SHOWN, len(diagnosis.locked)))
+
+
+def _channels(diagnosis):
+    c, proof = diagnosis.comparison, diagnosis.proof
+    each = [np.array(gap["channels"]) / c.sigma for gap in (proof.before, proof.after)]
+    title, unit = "trajectories kept aside", "times noise and resolution"
+    return plots.channels([plots.Bars(title, unit, c.channels, *each, 1.0)])
+
+
+def _where(diagnosis):
+    """Mean residual of the model without effects, in noise and resolution, or its trend over trajectories."""
+    c = diagnosis.comparison
+    null = fit_effects(c, [], diagnosis.selection)
+    columns = {name: slice(k, k + 1) for k, name in enumerate(c.channels)}
+    cells = residual_cells(c, null, diagnosis.selection, columns)
+    asked, column = list(cells.conditions), {"force": "Fy"}
+    dots = [
+        (asked.index(one["condition"]), c.channels.index(column.get(one["channel"], one["channel"])))
+        for one in diagnosis.where
+    ]
+    return plots.matrix(cells.overall, asked, c.channels, dots, "mean residual, or trend [sigma]")
+
+
+def _evidence(diagnosis):
+    tried, named = diagnosis.tried, {one.id for one in diagnosis.effects}
+    return plots.ranking(
+        [one["name"] for one in tried],
+        [one["evidence_nats"] for one in tried],
+        [one["id"] in named for one in tried],
+        float(np.log(ODDS)),
+    )
+
+
+def _isolability(diagnosis):
+    table = diagnosis.details["isolability"]
+    return plots.isolability(table["ids"], table["matrix"], table["nats"])
