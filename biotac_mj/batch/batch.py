@@ -299,7 +299,8 @@ class Batch(Skins):
     def restrain(self, worlds: Marks, going: Marks) -> None:
         """Takes the push on bodies that have not the energy for it, after `find_energy` and `evaluate`, and
         marks their worlds."""
-        self._settle(energy.restrain, worlds, outputs=[going.struct])
+        known = [self.model, self.skin.bodies.compliance]
+        self._settle(energy.restrain, worlds, known, [going.struct])
 
     def find_gain(self, taking_part: Marks, gains: Marks) -> None:
         """Marks worlds where withholding all does not help, after `evaluate`."""

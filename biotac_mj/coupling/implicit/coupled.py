@@ -52,11 +52,12 @@ class Coupled:
         if instance.inertial:
             self.core = instance.touching.core_motion(data, instance.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
-        self.asked = self.result = self.compliance = self.forced = None
+        self.asked = self.result = self.forced = None
         self.written, self.settled = False, True
         self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.arrays = arrays = instance.begin_arrays(*instance.touching.predict(data, 0.0))
         self.square, self.tangent, self.moved = arrays.square, arrays.tangent0, arrays.moved
+        self.compliance = arrays.compliance
         self.correction, self.amiss, self.excess = np.zeros((3, *arrays.wrench.shape))
         self._velocity = (self._rows @ data.qvel).reshape(arrays.wrench.shape)
         arrays.straight[:] = instance.horizon * self._velocity
@@ -109,7 +110,8 @@ class Coupled:
             return
         spin = arrays.drift[:, 3:] + arrays.moved[:, 3:]
         wrench = arrays.acting / self.instance.touching.fraction[:, None]
-        self._solve(target, BodyMotion(self.compliance, wrench, target[0], arrays.here_pos.copy(), spin))
+        where = target[0], arrays.here_pos.copy(), spin
+        self._solve(target, BodyMotion(self.compliance.copy(), wrench, *where))
 
     def finish(self) -> None:
         """Solves the skin where its bodies are sure to come."""
@@ -189,7 +191,6 @@ class Coupled:
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Wrenches (n, 6) without acceleration, and how they fall as the bodies move on (n, 6, 6)."""
-        self.arrays.push[:] = 1.0
         self.arrays.find_wrenches()
         return self.arrays.wrench.copy(), self.tangent
 

@@ -10,7 +10,7 @@ from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
 from .marks import MarkedWorlds, mark
 from .rounds import Model, Rounds, Solid, force_of
-from .rules import EULER, in_store, lacking, spared
+from .rules import EULER, beta_of, in_store, lacking, share_within, spared
 
 __all__ = [
     "conclude",
@@ -28,6 +28,7 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 _in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))
+_beta_of, _share_within = (wp.func(rule) for rule in (beta_of, share_within))
 
 
 @wp.func
@@ -104,10 +105,11 @@ def find_energy(
             store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
         r.most[g, w] = most
         r.store[g, w] = store
-    least = real(EULER)
+    undamped = 0
     for g in range(r.pos.shape[0]):
-        least = wp.min(least, r.gamma[g, w])
-    if solid.inertial == 0 and least < real(EULER) and overdraws(r, w, real(0.0)):
+        if r.gamma[g, w] < real(EULER):
+            undamped += 1
+    if solid.inertial == 0 and undamped > 0 and overdraws(r, w, real(0.0)):
         greedy_out[w] = 1
         mark(damped, w)
 
@@ -116,19 +118,30 @@ def find_energy(
 def restrain(
     # In:
     worlds: wp.array(dtype=int),
+    model: Model,
+    compliance: wp.array3d(dtype=mat66),
     # In and out:
     r: Rounds,
     going: MarkedWorlds,
 ):
-    """Takes the push on bodies that would get more energy than they have, and marks their worlds. What
-    remains without it is the skin's tangent about the present pose: a damper."""
+    """Withholds so much of the push on bodies that would get more energy than they have that they get what
+    they have, all where that was not enough, and marks their worlds. compliance: of `Bodies`."""
     w = wp.tid()
     if worlds[w] == 0 or not overdraws(r, w, real(0.0)):
         return
     for g in range(r.pos.shape[0]):
         gets = given(r, g, w)
         if r.push[g, w] > real(0.0) and not _lacking(r.store[g, w], gets) == real(0.0):
-            r.push[g, w] = real(0.0)
+            acts = r.acting[g, w]
+            moves = compliance[g, g, w] * acts
+            own = real(0.5) / _beta_of(r.gamma[g, w]) * wp.dot(acts, moves)
+            share = real(0.0)
+            if r.push[g, w] == real(1.0):
+                share = _share_within(r.store[g, w], gets - own, own)
+            # the rows stay, and take their part of the change
+            change = (real(1.0) - share) * (acts + model.tangent0[g, w] * moves)
+            r.withheld[g, w] = r.withheld[g, w] + change
+            r.push[g, w] = share * r.push[g, w]
             mark(going, w)
 
 
@@ -168,6 +181,7 @@ def withdraw(
     r.settled[w] = 0
     for g in range(correction.shape[0]):
         r.push[g, w] = real(0.0)
+        r.withheld[g, w] = vec6()
         model.wrench0[g, w] = vec6()
         model.tangent0[g, w] = mat66()
         correction[g, w] = vec6()
@@ -191,8 +205,7 @@ def conclude(
     passed = wp.min(both[0], both[1])  # from some bodies to others
     for g in range(r.pos.shape[0]):
         gets = given(r, g, w)
-        # what is withheld is in the skin all the same; a damper, which is all that acts then, keeps nothing
-        left = r.store[g, w] - wp.where(r.push[g, w] > real(0.0), gets, wp.max(gets, real(0.0)))
+        left = r.store[g, w] - gets
         if passed > real(0.0):
             left += passed * _lacking(r.store[g, w], gets) / both[0]
             left -= passed * _spared(r.left[g, w], r.store[g, w], gets) / both[1]

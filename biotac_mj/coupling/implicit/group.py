@@ -53,7 +53,7 @@ class SkinGroup:
             A = give(damped, slice(6 * part.start, 6 * part.stop), own).reshape(n, 6, n, 6)
             # of two bodies whose steps differ the mean, so that it stays symmetric
             square = np.sqrt(skin.square[:, None] * skin.square)[:, :, None, None]
-            skin.compliance = square * np.ascontiguousarray(A.transpose(0, 2, 1, 3))
+            skin.compliance[:] = square * np.ascontiguousarray(A.transpose(0, 2, 1, 3))
 
     def frequencies(self) -> list[np.ndarray | None]:
         """Of each skin (n,) angular frequencies [rad/s] at which its bodies bounce in the stiffest mode in

@@ -104,7 +104,8 @@ class Rounds:
     placed: wp.array2d(dtype=int)  # a body was put where it is from outside
     inside: wp.array(dtype=int)  # and one of them into the skin
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
-    push: wp.array2d(dtype=real)  # 1 where the wrench at the present pose acts, 0 where it is withheld
+    push: wp.array2d(dtype=real)  # share of its wrench that a body gets
+    withheld: wp.array2d(dtype=vec6)  # by which its wrench without acceleration is less
     left: wp.array2d(dtype=real)  # [J] energy that the last step left a body in the skin at most, or inf
     store: wp.array2d(dtype=real)  # [J] and with what was put into it since
     most: wp.array2d(dtype=real)  # [J] that the skin can hold of it
@@ -156,9 +157,8 @@ def wrenches(
     # Out:
     wrench_out: wp.array2d(dtype=vec6),
 ):
-    """On each group without acceleration, without what is withheld of the push at the present pose. Ways are
-    measured as the rows do: what acts where the bodies come is what the skin says there. Finds `acting`, too,
-    after `follow`."""
+    """On each group without acceleration, without what is withheld. Ways are measured as the rows do: what
+    acts where the bodies come is what the skin says there. Finds `acting`, too, after `follow`."""
     g, w = wp.tid()
     total = vec6()
     if is_finite(r.start_pos[g, w], r.start_mat[g, w]):
@@ -170,10 +170,7 @@ def wrenches(
             r.here_pos[g, w],
             _turns(r.drift[g, w]),
         )
-        total = model.wrench0[g, w] + model.tangent0[g, w] * motion
-        if r.push[g, w] == real(0.0):
-            # against the drift itself: the way from here to the pose is another one where bodies turn far
-            total = -(model.tangent0[g, w] * r.drift[g, w])
+        total = model.wrench0[g, w] + model.tangent0[g, w] * motion - r.withheld[g, w]
     wrench_out[g, w] = total
     r.acting[g, w] = total - model.tangent0[g, w] * r.moved[g, w] + r.amiss[g, w]
 
@@ -227,6 +224,7 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     for g in range(r.pos.shape[0]):
         r.placed[g, w] = 1 - r.began[w]
         r.push[g, w] = real(1.0)
+        r.withheld[g, w] = vec6()
         if r.began[w] == 0:
             r.left[g, w] = real(0.0)
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])

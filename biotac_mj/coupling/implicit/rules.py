@@ -17,6 +17,7 @@ __all__ = [
     "lacking",
     "poorly_corrected",
     "share_that_pushes",
+    "share_within",
     "spared",
     "stayed",
 ]
@@ -31,6 +32,7 @@ PATIENCE = 3  # steps in which a skin may stay where it was, after which it begi
 EULER = 1.5  # gamma of backward Euler's member of the family of steps
 LOSS_FREQUENCY = 50.0  # [Hz] at which the rubber has its loss factor
 _UNKNOWN = math.inf  # [J] of energy
+_LESS = 0.99  # of the push that gives a body what it may get: batches have single precision
 
 
 def gamma_of(pace: Any, delay: Any, touches: Any) -> Any:
@@ -81,6 +83,23 @@ def spared(left: Any, store: Any, given: Any) -> Any:
     if growth > type(store)(0.0) and growth < type(store)(_UNKNOWN):
         return growth
     return type(store)(0.0)
+
+
+def share_within(store: Any, without: Any, own: Any) -> Any:
+    """Share of a wrench with which it gives a body no more energy than `store` [J], see `lacking`.
+
+    Args:
+      without: [J] work of the whole wrench on the way that the body goes without it. own: on the way by
+        which it moves the body itself, which goes with the square of the share.
+    """
+    most = max(store, type(store)(0.0))
+    root = math.sqrt(without * without + type(store)(4.0) * own * most)
+    share = type(store)(0.0)
+    if without > type(store)(0.0):
+        share = (most + most) / (without + root)
+    elif own > type(store)(0.0):
+        share = (root - without) / (own + own)
+    return type(store)(_LESS) * min(share, type(store)(1.0))
 
 
 def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> Any:

@@ -54,6 +54,7 @@ class StepArrays:
 
     Attributes:
       gain: (ngroup, 6) accelerations of the bodies, for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
+      compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
       last: views by name of the linear model of the last step.
     """
@@ -71,10 +72,12 @@ class StepArrays:
                     setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
             self._wrench, self._gain = (wp.zeros(shape, dtype=vec6) for _ in range(2))
             self._left_out = wp.zeros(shape, dtype=real)
+            self._compliance = wp.zeros((ngroup, *shape), dtype=wp.spatial_matrixd)
             self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
             self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
         self._one.fill_(1)
         self.wrench, self.gain, self.left_out = map(_seen, (self._wrench, self._gain, self._left_out))
+        self.compliance = self._compliance.numpy()[:, :, 0]
         self.off, self._is_greedy, self._is_marked, self._found = (
             a.numpy() for a in (self._off, self._greedy, self._marks.any, self._reason)
         )
@@ -110,7 +113,7 @@ class StepArrays:
         self._find_energy = row(
             (energy.find_energy, 1, [*one, self._last, self._solid, r, self._greedy, marks])
         )
-        self._restrain = row((energy.restrain, 1, [*one, r, marks]))
+        self._restrain = row((energy.restrain, 1, [*one, self._model, self._compliance, r, marks]))
         self._find_gain = row((energy.find_gain, 1, [*one, 0.0, r, marks]))
         self._conclude = row((energy.conclude, 1, [*one, self._reason, r, self._left_out]))
 

@@ -327,17 +327,17 @@ class World:
             return 0
         for skin in greedy:
             skin.use_euler()
+        self._group.find_compliance(self.integrator if self._damped else None)
         rounds = self._find_balance(skins, outside)
         for skin in skins:
             skin.arrays.find_energy()
         return rounds
 
     def _restrain(self, skins, outside):
-        """Withholds the push on bodies that would get more energy than they have put in.
+        """Withholds so much of the push on bodies that they get no more energy than they have put in.
 
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
-        nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
-        about the present pose: a damper, where MuJoCo's solver finds what its rows push.
+        nothing a wrong one does may feed on itself.
         """
         by_rows = all(skin.forced is None for skin in skins)
         while [skin for skin in skins if by_rows and skin.arrays.restrain()]:
