@@ -105,7 +105,7 @@ def find_energy(
             store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
         r.most[g, w] = most
         r.store[g, w] = store
-    undamped = 0
+    undamped = int(0)
     for g in range(r.pos.shape[0]):
         if r.gamma[g, w] < real(EULER):
             undamped += 1
