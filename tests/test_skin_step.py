@@ -10,7 +10,7 @@ from blocks import shell, skin
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.newton import worlds
+from biotac_mj.skin.newton import convergence
 from biotac_mj.skin.newton.worlds import INSIDE_CORE
 from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.step import SkinStep
@@ -358,7 +358,7 @@ def test_viscosity_acts_near_balance_only_without_progress(model, error, stale, 
         "viscosity": 0.0,
     }.items():
         getattr(st, name).fill_(value)
-    wp.launch(worlds.choose_viscosity, 1, [model.options.tolerance, st], device="cpu")
+    wp.launch(convergence.choose_viscosity, 1, [model.options.tolerance, st], device="cpu")
     assert st.viscosity.numpy()[0] == lag
 
 

@@ -25,14 +25,9 @@ from biotac_mj.skin import (
     step,
 )
 from biotac_mj.skin.contact.touch import CONSISTENT, CURRENT, LAGGED
+from biotac_mj.skin.newton.convergence import check_convergence
 from biotac_mj.skin.newton.load_path import choose_increment
-from biotac_mj.skin.newton.worlds import (
-    CONVERGED,
-    INSIDE_CORE,
-    NOT_CONVERGED,
-    NOT_FINITE,
-    check_convergence,
-)
+from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.types import DOUBLE, SINGLE, real

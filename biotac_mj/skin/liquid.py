@@ -177,7 +177,7 @@ def settle_pressure(
     tangent_out: wp.array(dtype=real),
 ):
     """Volume of the liquid and its pressure in world w. enclosed: the liquid's volume minus that of the faces
-    [m^3]. keep_pressure: 1: the tangent keeps its pressure, see `newton.worlds.choose_length`."""
+    [m^3]. keep_pressure: 1: the tangent keeps its pressure, see `newton.line_search.choose_length`."""
     w, t = wp.tid()
     if on[w] == 0:
         return

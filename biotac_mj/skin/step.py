@@ -35,7 +35,7 @@ from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet
 from .model import SkinModel
-from .newton import krylov, load_path, nodes, worlds
+from .newton import convergence, krylov, line_search, load_path, nodes, worlds
 from .precondition import Residual
 from .precondition.batched_inverse import kernels_up_to
 from .program import Launcher, Program, compile_ahead, compile_kernels
@@ -491,7 +491,7 @@ class SkinStep:
         self._search()
         self._launcher.loop(self._search_on, self._continue_search)
         self.M.watch_products(self._launcher, self.d.x)
-        self._launch(worlds.choose_viscosity, self.d.nworld, [self.m.options.tolerance, self.st])
+        self._launch(convergence.choose_viscosity, self.d.nworld, [self.m.options.tolerance, self.st])
         self._check()
 
     def _check(self):
@@ -499,7 +499,7 @@ class SkinStep:
         m, k, st = self.m, self.k, self.st
         self._precondition()
         bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid), self.d.rest_pressure]
-        self._decide(worlds.check_convergence, [*bounds, k.partial, k.norms, st], [self._newton_on])
+        self._decide(convergence.check_convergence, [*bounds, k.partial, k.norms, st], [self._newton_on])
         if m.has_liquid:
             given = [m.free_mask, self.d.gradient, st]
             self._launch(nodes.correct_pressure, self.d.x.shape, given, [self.d.x, self.d.force])
@@ -572,7 +572,7 @@ class SkinStep:
         )
         if self._compliant:
             self._compliant.add_slope(self._launcher, k.partial)
-        self._decide(worlds.choose_length, [k.partial, self.st], [self._search_on])
+        self._decide(line_search.choose_length, [k.partial, self.st], [self._search_on])
 
     def _finish(self, motion, touched_by, wrench):
         d, k, st, g = self.d, self.k, self.st, self.geoms

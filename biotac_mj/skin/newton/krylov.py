@@ -8,8 +8,9 @@ import warp as wp
 
 from ..contact.faces import block_index
 from ..types import Precision, real, sum_of_lanes, vec3
+from .line_search import begin_line_search
 from .nodes import LiquidForces, NodeSlots, SurfaceForces
-from .worlds import Worlds, begin_line_search, total_of, totals_of
+from .worlds import Worlds, total_of, totals_of
 
 __all__ = ["Inertia", "begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
 
@@ -49,7 +50,7 @@ def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_ac
             st.alpha[w] = real(0.0)
             st.pressure_response[w] = real(0.0)
         return
-    # read before the sums, as in `worlds.check_convergence`
+    # read before the sums, as in `convergence.check_convergence`
     kappa = st.kappa[w]
     iterations = st.iterations_cg[w]
     done = st.work[w]

@@ -221,8 +221,8 @@ def correct_pressure(
     force: wp.array2d(dtype=vec3),
 ):
     """Moves node i along the volume's gradient so that the volume fits the pressure that
-    `worlds.check_convergence` has found, and corrects the liquid's force. The motion is too small to change
-    other forces."""
+    `convergence.check_convergence` has found, and corrects the liquid's force. The motion is too small to
+    change other forces."""
     i, w = wp.tid()
     pressure_correction = st.pressure_correction[w]
     if pressure_correction == real(0.0):

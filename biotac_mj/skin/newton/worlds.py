@@ -1,11 +1,11 @@
-"""Control of Newton's method in each world: start of a step, convergence test, artificial viscosity, line
-search, end of a step. Kernels run one thread per world, or one block where they sum over nodes."""
+"""The numbers of each world in a step: start of a step and of its tries, end of a step. Kernels run one
+thread per world. `convergence` and `line_search` decide about iterations."""
 
 import warp as wp
 
 from ..contact.posed import Geoms, LoadPath
-from ..contact.touch import CURRENT, LAGGED
-from ..types import real, sum_of_block, vec3, vec6
+from ..contact.touch import CURRENT
+from ..types import real, sum_of_block, vec3
 
 __all__ = [
     "NEGLIGIBLE_RESIDUAL",
@@ -20,15 +20,13 @@ __all__ = [
     "TRIED",
     "TRYING",
     "UNTRIED",
+    "VISCOUS_AFTER",
     "Worlds",
     "all_on",
     "begin_try",
     "begin_worlds",
-    "choose_viscosity",
-    "choose_length",
     "end_worlds",
     "mark_failed",
-    "check_convergence",
     "modulus_of",
     "set_viscosity",
     "begin_reference_try",
@@ -42,23 +40,9 @@ wp.set_module_options({"enable_backward": False})
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
 NEGLIGIBLE_RESIDUAL = 1e-9  # [N] norm of the residual that is rounding, where nothing touches
-_PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
-_PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
-# a pressure error of up to this many tolerances is corrected without an iteration, if `compliance_ratio` is
-# at most the second number
-_CORRECTED, _STIFF_LIQUID = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
-_LAGGED_TOLERANCE = wp.constant(wp.float64(0.05))  # of the error at which a round of lagged friction starts
 _LEAST_REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] lower limit of `reference`
-_PATIENCE = wp.constant(40)  # iterations in which the error must halve
-_MAX_TRIES = wp.constant(12)  # evaluations of a line search
-_VISCOUS_AFTER = wp.constant(8)  # iterations of a try before artificial viscosity may start
-# the viscosity is divided by the first after a good full step, and multiplied by the second after a bad one
-_DECREASE, _INCREASE = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
-# a lower viscosity is set to zero; a higher one makes the skin stiffer than contact, and the try fails
-_LEAST_VISCOSITY, _MOST_VISCOSITY = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
+VISCOUS_AFTER = wp.constant(8)  # iterations of a try before artificial viscosity may start
 _LIQUID_STIFFNESS = wp.constant(wp.float64(40.0))  # bulk modulus of the liquid in a line search, over E
-# error below which a bad iteration may be rounding: no viscosity starts, and adhesion does not lengthen steps
-_SMALL_ERROR = wp.constant(wp.float64(0.01))
 
 # values of `Worlds.reference_try`
 UNTRIED, TRYING, TRIED = (wp.constant(i) for i in range(3))
@@ -169,16 +153,6 @@ def totals_of(partial: wp.array3d(dtype=real), w: int, t: int):
     for c in range(t, partial.shape[1], wp.block_dim()):
         own += vec3(partial[0, c, w], partial[1, c, w], partial[2, c, w])
     return sum_of_block(own)
-
-
-@wp.func
-def begin_line_search(st: Worlds, w: int):
-    st.low[w] = real(0.0)
-    st.high[w] = real(-1.0)  # no upper end yet
-    st.side[w] = 0
-    st.tries[w] = 0
-    st.alpha[w] = real(1.0)
-    st.inverted[w] = 0
 
 
 @wp.func
@@ -302,164 +276,6 @@ def begin_worlds(
     st.reference[w] = wp.max(wp.abs(st.last_pressure[w]), _LEAST_REFERENCE)
 
 
-@wp.func
-def _finishes(error: real, last: real, tolerance: real, left: int):
-    """Whether a try converges within the work `left` if its error keeps falling at the rate of the last
-    iteration. A full Newton step costs a work of two."""
-    return error < last and wp.log(tolerance / error) * real(2.0) > real(left) * wp.log(error / last)
-
-
-@wp.kernel
-def check_convergence(
-    # In:
-    tolerance: real,
-    max_work: int,
-    has_liquid: int,
-    rest_pressure: wp.array(dtype=real),
-    partial: wp.array3d(dtype=real),
-    norms: wp.array3d(dtype=real),
-    st: Worlds,
-    # Out:
-    any_active: wp.array(dtype=int),
-):
-    """Convergence test of each active world: in the energy norm, and of the pressure above rest, which the
-    sensor reads. partial: residual . z and gradient . z; norms: see `nodes.residuals`.
-
-    If only the pressure is above its tolerance, by at most a factor of `_CORRECTED`, the world converges with
-    the pressure that z predicts. In a stiff liquid the nodes move by picometres for it, see
-    `nodes.correct_pressure`."""
-    w, t = wp.tid()
-    if st.active[w] == 0:
-        if t == 0:
-            st.pressure_correction[w] = real(0.0)
-        return
-    # read before the sums, so that both take place at the same time: a read after a write waits for it
-    viscosity = st.viscosity[w]
-    best = st.best_square[w]
-    iterations = st.iterations[w]
-    start_iterations = st.start_iterations[w]
-    start_error = st.start_error[w]
-    since = st.since[w]
-    limit = st.iteration_limit[w]
-    done = st.work[w]
-    allowed = st.work_limit[w]
-    touched = st.touched[w]
-    kappa = st.kappa[w]
-    rest = rest_pressure[w]
-    pressure = st.pressure[w] - rest
-    volume = st.volume[w]
-    error = st.error[w]
-    friction_mode = st.friction_mode[w]
-    compliance_ratio = st.compliance_ratio[w]
-    increment = st.increment[w]
-    body_residual = st.body_residual[w]
-    own = vec6()
-    for c in range(t, partial.shape[1], wp.block_dim()):
-        own += vec6(
-            norms[0, c, w], partial[0, c, w], norms[1, c, w], norms[3, c, w], partial[1, c, w], norms[2, c, w]
-        )
-    total = sum_of_block(own)
-    if t > 0:
-        return
-    rr = total[0]
-    rz = total[1]
-    load = total[2]
-    fly = total[3]
-    gz = total[4]
-    gg = total[5]
-    st.pressure_correction[w] = real(0.0)
-    if not wp.isfinite(rr + rz):
-        st.active[w] = 0
-        st.failed[w] = 1
-        return
-    free = touched == 0 and body_residual == real(0.0)
-    if free and rr < real(NEGLIGIBLE_RESIDUAL) * real(NEGLIGIBLE_RESIDUAL):
-        st.active[w] = 0
-        st.error[w] = real(0.0)
-        return
-    # in single precision the residual of a vibration without contact is not zero: the work of inertia is its
-    # scale
-    work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
-    stiffer = real(1.0) + viscosity
-    off = wp.abs(rz) + body_residual
-    far = stiffer * stiffer * off  # stiffer rubber moves less by the same force
-    st.last_error[w] = error
-    st.error[w] = wp.sqrt(far / work)
-    enough = tolerance
-    needs_pressure = has_liquid
-    if iterations == start_iterations:
-        st.start_error[w] = wp.sqrt(far / work)
-    elif friction_mode == LAGGED:  # the friction bounds are not known more accurately
-        enough = wp.max(tolerance, _LAGGED_TOLERANCE * start_error)
-        needs_pressure = 0
-    if far < real(0.25) * best:
-        st.best_square[w] = far
-        since = iterations
-        st.since[w] = since
-    # viscous rubber moves less than the tangent says, at most by the factor `stiffer`: this bounds the error
-    settled = wp.where(viscosity == real(0.0) or increment > real(0.0), 1, 0)
-    corrects = int(0)
-    if needs_pressure == 1:
-        pushes = stiffer * kappa * wp.abs(gz)
-        allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
-        if pushes > allowed_off:
-            stiff = compliance_ratio <= _STIFF_LIQUID
-            if viscosity == real(0.0) and pushes <= _CORRECTED * allowed_off and stiff:
-                corrects = 1
-            else:
-                settled = 0
-    # an error that did not halve in more iterations than are left will not do so in these
-    patience = wp.min(_PATIENCE, limit - iterations)
-    # rz may be negative where rounding makes the preconditioner indefinite: its size is the error
-    if stiffer * off <= enough * enough * work and settled == 1:
-        st.active[w] = 0
-        if corrects == 1:
-            st.pressure_correction[w] = gz / gg
-            st.pressure_response[w] = kappa * gz
-            st.pressure[w] = pressure + rest - kappa * gz
-            st.volume[w] = volume + gz
-    elif iterations - since >= patience or (
-        done >= allowed and not _finishes(wp.sqrt(far / work), error, enough, max_work - done)
-    ):
-        st.active[w] = 0
-        st.failed[w] = 1
-    else:
-        st.iterations[w] = iterations + 1
-        st.rz[w] = rz
-        st.start_rz[w] = rz
-        any_active[0] = 1
-
-
-@wp.kernel
-def choose_viscosity(tolerance: real, st: Worlds):
-    """Adds artificial viscosity where Newton's method cycles, as when friction reverses or skin snaps off a
-    small geom. An iteration is then an implicit time step of rubber whose viscosity is proportional to its
-    elasticity. Near equilibrium the viscosity falls to zero, so that results contain none."""
-    w = wp.tid()
-    if st.active[w] == 0:
-        return
-    if st.iterations[w] - st.start_iterations[w] < _VISCOUS_AFTER:
-        return
-    viscosity = st.viscosity[w]
-    good = int(0)
-    if st.alpha[w] == real(1.0) and st.tries[w] < _MAX_TRIES:
-        if viscosity > real(0.0) or st.error[w] < st.last_error[w]:
-            good = 1
-    stale = st.iterations[w] - st.since[w]
-    if good == 0 and viscosity == real(0.0) and st.error[w] < _SMALL_ERROR and stale < _VISCOUS_AFTER:
-        return
-    if good == 0:
-        viscosity = _INCREASE * wp.max(viscosity, real(1.0))
-    elif viscosity > _LEAST_VISCOSITY and st.error[w] > tolerance:
-        viscosity = viscosity / _DECREASE
-    else:
-        viscosity = real(0.0)
-    set_viscosity(st, w, viscosity)
-    if viscosity > _MOST_VISCOSITY:
-        st.active[w] = 0
-        st.failed[w] = 1
-
-
 @wp.kernel
 def mark_failed(st: Worlds, any_failed: wp.array(dtype=int)):
     """Marks worlds (as moving) whose first try failed and that may be tried from the reference configuration,
@@ -483,109 +299,7 @@ def begin_reference_try(max_work: int, st: Worlds):
         st.reference_try[w] = TRYING
         st.failed[w] = 0
         set_viscosity(st, w, real(0.0))
-        begin_try(st, w, _VISCOUS_AFTER, max_work)
-
-
-@wp.kernel
-def choose_length(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
-    """Line search: finds the length at which the residual has almost no component along the direction, by
-    regula falsi.
-
-    The curvature of the liquid's volume along a step causes megapascals, so that steps with the true pressure
-    would be short. The search uses the pressure that the linear solve predicts, as in Newton's method for
-    nodes and pressure, plus `bulk_fraction` of the deviation from it. The next step corrects the volume.
-
-    partial: force . direction after the step; before the step, in the first try; gradient . direction.
-    """
-    w, t = wp.tid()
-    if st.moving[w] == 0:
-        return
-    # read before the sums, as in `check_convergence`
-    alpha = st.alpha[w]
-    viscous_work = st.viscous_work[w]
-    done = st.work[w]
-    tries = st.tries[w]
-    inverted = st.inverted[w]
-    adhesive = st.adhesive[w]
-    viscosity = st.viscosity[w]
-    error = st.error[w]
-    highest = st.high[w]
-    total = totals_of(partial, w, t)
-    if t > 0:
-        return
-    now = total[0]
-    slope = total[1]
-    pressure_response = total[2]
-    st.work[w] = done + 1
-    if tries == 0:
-        bulk = real(0.0)  # the liquid's part of the slope
-        if st.kappa[w] > real(0.0):
-            change = st.predicted_pressure[w] - st.start_pressure[w]
-            bulk = change * change / st.kappa[w]
-        st.bulk_fraction[w] = st.compliance_ratio[w]
-        if not (bulk < real(0.99) * slope):  # without the liquid the direction would not descend
-            st.bulk_fraction[w] = real(1.0)
-        slope -= (real(1.0) - st.bulk_fraction[w]) * bulk
-    now += (real(1.0) - st.bulk_fraction[w]) * (st.predicted_pressure[w] - st.pressure[w]) * pressure_response
-    now -= alpha * viscous_work
-    if tries == 0:
-        st.slope[w] = slope
-        st.slope_low[w] = slope
-        st.slope_high[w] = slope
-    else:
-        slope = st.slope[w]
-    valid = int(0)
-    if wp.isfinite(now) and inverted % 2 == 0:  # most laws recover from an inverted element
-        valid = 1
-    if viscosity > real(0.0) or error < _SMALL_ERROR:
-        adhesive = 0
-    has_high = int(0)
-    if highest >= real(0.0):
-        has_high = 1
-    enough = int(0)
-    if valid == 1 and now >= real(-0.5) * slope:
-        if adhesive == 1:
-            if now <= real(0.2) * slope:
-                enough = 1
-        elif has_high == 0 or now <= real(0.5) * slope:
-            enough = 1
-    st.tries[w] = tries + 1
-    if enough == 1 or tries + 1 == _MAX_TRIES:
-        st.moving[w] = 0
-        change = st.predicted_pressure[w] - st.tangent_pressure[w]
-        st.tangent_pressure[w] = st.tangent_pressure[w] + wp.min(alpha, real(1.0)) * change
-        return
-    st.inverted[w] = 0
-    if valid == 0 or now < real(0.0):
-        if st.side[w] == 1:  # Illinois method: halve the slope of an end that stays twice
-            st.slope_low[w] = st.slope_low[w] / real(2.0)
-        st.side[w] = 1
-        st.high[w] = st.alpha[w]
-        st.slope_high[w] = now
-        if valid == 0:
-            st.slope_high[w] = real(-1.0e300)
-    else:
-        if st.side[w] == -1:
-            st.slope_high[w] = st.slope_high[w] / real(2.0)
-        st.side[w] = -1
-        st.low[w] = st.alpha[w]
-        st.slope_low[w] = now
-    if adhesive == 1 and st.high[w] < real(0.0):
-        # the tangent has no adhesion that softens as the gap opens: lengthen the step
-        further = wp.clamp(slope / wp.max(slope - now, slope / real(4.0)), real(1.25), real(4.0))
-        st.alpha[w] = alpha * further
-        st.alpha_change[w] = st.alpha[w] - alpha
-        any_active[0] = 1
-        return
-    low = st.low[w]
-    high = st.high[w]
-    guess = real(0.5) * (low + high)
-    if st.slope_high[w] > real(-1.0e299):
-        guess = low + (high - low) * st.slope_low[w] / (st.slope_low[w] - st.slope_high[w])
-    margin = real(0.05) * (high - low)
-    st.alpha[w] = wp.clamp(guess, low + margin, high - margin)
-    st.alpha_change[w] = st.alpha[w] - alpha
-    any_active[0] = 1
+        begin_try(st, w, VISCOUS_AFTER, max_work)
 
 
 @wp.kernel
