@@ -146,16 +146,23 @@ def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=v
 @wp.func
 def _may_meet_core(f: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Constants):
     """Whether an inner face may be nearer to the core than a fraction of its displacement: none has come
-    nearer by more than it has moved."""
-    moved = wp.sqrt(_moved(f, w, c.inner_face, x, c))
-    return c.inner_far[f] < moved + fraction * moved + _NEARLY
+    nearer by more than it has moved, or by much more than the slope of its gaps predicts."""
+    face = c.inner_face[f]
+    moved = real(0.0)
+    away = real(wp.inf)
+    for k in range(3):
+        u = x[face[k], w] - c.rest[face[k], 0]
+        moved = wp.max(moved, wp.length_sq(u))
+        away = wp.min(away, wp.dot(c.inner_mean_slope[f], u))
+    moved = wp.sqrt(moved)
+    nearer = wp.min((c.inner_bend[f] + c.inner_spread[f]) * moved - away, moved)
+    return c.inner_far[f] < nearer + fraction * moved + _NEARLY
 
 
 @wp.func
 def _meets_core(f: int, i: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether sample i of an inner face is nearer to the core than a fraction of the face's displacement. No
-    sample has come nearer by more than it has moved, or by much more than the slope of its gap predicts: so
-    few distances are evaluated."""
+    """Whether sample i of an inner face is nearer to the core than a fraction of the face's displacement. The
+    bounds of `_may_meet_core` exclude most samples: few distances are evaluated."""
     face = c.inner_face[f]
     reach = fraction * wp.sqrt(_moved(f, w, c.inner_face, x, c))
     x0 = x[face[0], w]
@@ -163,7 +170,8 @@ def _meets_core(f: int, i: int, w: int, fraction: real, x: wp.array2d(dtype=vec3
     x2 = x[face[2], w]
     b = c.sample[i]
     u = b[0] * (x0 - c.rest[face[0], 0]) + b[1] * (x1 - c.rest[face[1], 0]) + b[2] * (x2 - c.rest[face[2], 0])
-    nearer = wp.min(c.inner_bend[f] * wp.length(u) - wp.dot(c.inner_slope[f, i], u), wp.length(u))
+    moved = wp.length(u)
+    nearer = wp.min(c.inner_bend[f] * moved - wp.dot(c.inner_slope[f, i], u), moved)
     if c.inner_gap[f, i] - nearer >= reach + _NEARLY:
         return False
     p = b[0] * x0 + b[1] * x1 + b[2] * x2

@@ -215,6 +215,10 @@ class LinearSkin:
         c.inner_gap = wp.array(self._spline_gap, dtype=real, ndim=2)
         c.inner_slope = wp.array(self._slope, dtype=vec3, ndim=2)
         c.inner_bend = wp.array(self._bend, dtype=real)
+        mean = self._slope.mean(1)
+        c.inner_mean_slope = wp.array(mean, dtype=vec3)
+        spread = np.linalg.norm(self._slope - mean[:, None], axis=2).max(1)
+        c.inner_spread = wp.array(spread, dtype=real)
         c.inner_far = wp.array(self._spline_gap.min(1), dtype=real)
         k = self.correction
         c.depth, c.most, c.width, c.stretch, c.squeeze = k.depth, k.most, k.width, k.stretch, k.squeeze

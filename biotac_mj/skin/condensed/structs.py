@@ -61,6 +61,8 @@ class Constants:
     inner_far: wp.array(dtype=real)
     inner_slope: wp.array2d(dtype=vec3)  # their slopes
     inner_bend: wp.array(dtype=real)  # by which share of a motion at most that is off which they foretell
+    inner_mean_slope: wp.array(dtype=vec3)  # of each face, and how far its slopes are from it at most
+    inner_spread: wp.array(dtype=real)
     # of `correction.Correction`
     depth: real
     most: real

@@ -13,7 +13,7 @@ import types
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .broadphase import ALL, ClearanceCache, has, store_clearance
+from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
 from .meshes import mesh_curvature
 from .posed import Geoms, carried_anchor, distance_to, face_radius, least_to, meet, place_on, touch_bound
@@ -401,11 +401,17 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         friction_mode: int,
     ):
         """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block
-        with one sample for each thread, or on the CPU by a single thread."""
+        with one sample for each thread, or on the CPU by a single thread, which leaves out faces whose ball
+        touches nothing."""
         if one_thread() == 1:
             for n in range(count):
                 f = listed[w, n]
-                _clearance = touch_face(f, w, geoms, x, c, friction_mode, near[w, f])
+                v = c.face[f]
+                clearance = face_clearance(x[v[0], w], x[v[1], w], x[v[2], w], w, geoms, near[w, f])
+                if clearance > contact_range(c.laws, w):
+                    write_face(f, w, 0, FaceSum(), c)
+                else:
+                    _clearance = touch_face(f, w, geoms, x, c, friction_mode, near[w, f])
             return
         nsample = c.sample.shape[0]
         parallel_faces = threads // nsample
