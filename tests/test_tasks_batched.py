@@ -139,7 +139,7 @@ def test_an_observation_has_the_last_decisions():
 
 
 def test_every_episode_has_gains_of_its_own():
-    """What counts change by is felt times a factor of each finger's electrodes, one of PDC, one of PAC."""
+    """What counts change by is felt times a factor of each electrode, one of PDC, one of PAC."""
     settings = dataclasses.replace(FollowEdge.settings, substeps=1, decisions=2)
     env = make("follow_edge", 3, observe="electrodes+pac", settings=settings, device="cpu", model_error=0.1)
 
@@ -151,10 +151,10 @@ def test_every_episode_has_gains_of_its_own():
         return env.observe()["touch"]
 
     seen = felt()
-    for part in seen.split([19, 1, 22], dim=1):
-        assert torch.allclose(part, part[:, :1].expand_as(part), rtol=1e-5)
-        assert len(part[:, 0].unique()) == 3
-    assert 0.02 < seen[:, [0, 19, 20]].std() < 0.3 and abs(seen.mean() - 1) < 0.2
+    electrodes, pdc, pac = seen.split([19, 1, 22], dim=1)
+    assert torch.allclose(pac, pac[:, :1].expand_as(pac), rtol=1e-5)
+    assert len(pdc.unique()) == len(pac[:, 0].unique()) == 3 and len(electrodes.unique()) == 57
+    assert 0.05 < electrodes.std() < 0.3 and abs(seen.mean() - 1) < 0.2
     env.reset()
     assert not torch.isclose(felt(), seen).any()  # another episode
     env.model_error = (0.0, 0.1, 0.0)
@@ -166,6 +166,34 @@ def test_every_episode_has_gains_of_its_own():
     for wrong in (-0.1, (0.1, 0.1), "much"):
         with pytest.raises(ValueError, match="model_error"):
             make("follow_edge", 1, device="cpu", model_error=wrong)
+
+
+def test_a_lesson_is_sensed_anew():
+    """With other noise of the encoders, the same where a young episode repeats its first decision, and other
+    gains; without both as a policy saw it."""
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1, encoder=1e-3)
+    env = make("follow_edge", 2, settings=settings, device="cpu", history=4, model_error=(0.0, 0.1, 0.0))
+    for _ in range(2):
+        env.step(torch.ones(2, 4))
+    sensed = {name: value.repeat(200, *[1] * (value.ndim - 1)) for name, value in env.sensed().items()}
+    sensed["changes"] = sensed["changes"] + 100.0
+    body, touch = env.sense_anew("electrodes", **sensed).split([4 * 13, 4 * 20], dim=1)
+    noise = body.unflatten(1, (4, 13)) - sensed["body"]
+    np.testing.assert_allclose(noise[:, 3], noise[:, 2], atol=1e-5)
+    assert not torch.isclose(noise[:, 1, :8], noise[:, 0, :8]).all(1).any() and not noise[..., 8:].any()
+    deviation = 1e-3 * torch.tensor([100.0, 100.0, 100.0, 1.0])
+    wanted = torch.cat([deviation, deviation / settings.timestep])
+    np.testing.assert_allclose(noise[:, :3, :8].std((0, 1)), wanted, rtol=0.1)
+    changes = touch.unflatten(1, (4, 20)) * 100
+    np.testing.assert_allclose(changes[..., :19], sensed["changes"][:, :, 0, :19], atol=1e-3)
+    gain = changes[..., 19] / sensed["changes"][:, :, 0, 19]
+    assert 0.08 < gain[:, 0].std() < 0.12 and torch.allclose(gain[:, 0], gain[:, 1])
+    env.model_error, env._blur = (0.0, 0.0, 0.0), 0.0 * env._blur
+    env.reset()
+    seen = env.observe()
+    assert torch.equal(
+        env.sense_anew("electrodes", **env.sensed()), torch.cat([seen["body"], seen["touch"]], 1)
+    )
 
 
 def test_sensors_in_learning_have_their_own_gain_of_pdc():
@@ -213,10 +241,11 @@ def learn_a_line(learner, updates, lessons=None):
             paid = -(action + 0.5 * seen).square()[:, 0]
             learner.record(paid, torch.ones(128, dtype=torch.bool), torch.zeros(128, dtype=torch.bool))
             if lessons:
-                lessons.add({"none": seen}, -0.5 * seen)
+                lessons.add({"seen": seen}, -0.5 * seen)
         learner.update(seen, lessons is None)
         for _ in range(20 if lessons else 0):
-            learner.imitate(*lessons.draw("none", 128))
+            sensed, taught = lessons.draw(128)
+            learner.imitate(sensed["seen"], taught)
     seen = torch.linspace(-2, 2, 41)[:, None]
     with torch.no_grad():
         return float((learner.policy(seen) + 0.5 * seen).abs().max())
@@ -232,20 +261,20 @@ def test_a_teacher_is_followed_sooner_than_reward():
     """In a third of the updates."""
     numbers = Numbers(steps=4, gamma=0.0)
     alone = learn_a_line(Learner(1, 1, 1, 0, "cpu", numbers), 10)
-    taught = learn_a_line(Learner(1, 1, 1, 0, "cpu", numbers), 10, Lessons({"none"}, 1000, 0, "cpu"))
+    taught = learn_a_line(Learner(1, 1, 1, 0, "cpu", numbers), 10, Lessons(1000, 0, "cpu"))
     assert taught < 0.1 and taught < 0.5 * alone
 
 
 def test_only_the_newest_lessons_are_remembered():
     """Four of size 4, of six that were given."""
-    lessons = Lessons({"none", "force"}, 4, 0, "cpu")
+    lessons = Lessons(4, 0, "cpu")
     for k in range(3):
         number = torch.tensor([[2.0 * k], [2.0 * k + 1]])
-        lessons.add({"none": number, "force": 10 * number}, -number)
-    for choice, factor in (("none", 1), ("force", 10)):
-        seen, taught = lessons.draw(choice, 200)
-        assert set(taught[:, 0].tolist()) == {-2.0, -3.0, -4.0, -5.0}
-        np.testing.assert_array_equal(seen, -factor * taught)
+        lessons.add({"body": number, "changes": 10 * number}, -number)
+    sensed, taught = lessons.draw(200)
+    assert set(taught[:, 0].tolist()) == {-2.0, -3.0, -4.0, -5.0}
+    for name, factor in (("body", 1), ("changes", 10)):
+        np.testing.assert_array_equal(sensed[name], -factor * taught)
 
 
 def test_a_policy_comes_back_from_its_file(tmp_path):

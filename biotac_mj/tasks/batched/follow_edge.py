@@ -131,8 +131,8 @@ class FollowEdge(BatchTask):
     def _command(self):
         self._ctrl[:] = self._moved
 
-    def _sense_body(self):
-        place, speed = self._noisy(self._qpos, self._qvel)
+    def _sense_body(self, off, speed_off):
+        place, speed = self._qpos + off, self._qvel + speed_off
         scale = torch.tensor([100.0, 100.0, 100.0, 1.0], device=self.device)
         time = self.episode_length_buf[:, None] / self.cfg.decisions
         return [place * scale, speed * scale, self._moved / self._reach, time]

@@ -171,8 +171,8 @@ class InsertPeg(BatchTask):
         self._ctrl[:, self._moving] = self._moved
         self._ctrl[:, self._closing] = (closing * (_GAP + s.squeeze)).expand(-1, 2)
 
-    def _sense_body(self):
-        place, speed = self._noisy(self._qpos[:, self._joints], self._qvel[:, self._dofs])
+    def _sense_body(self, off, speed_off):
+        place, speed = self._qpos[:, self._joints] + off, self._qvel[:, self._dofs] + speed_off
         scale = torch.tensor([100.0, 100.0, 1.0], device=self.device)
         time = self.episode_length_buf[:, None] / self.cfg.decisions
         return [place * scale, speed * scale, self._moved / self._reach, time]

@@ -47,32 +47,32 @@ class Numbers:
 
 
 class Lessons:
-    """What was seen in the newest `size` states, by each kind of touch, and what the teacher would have done
-    there.
+    """What was sensed in the newest `size` states, and what the teacher would have done there.
 
     Args:
-      choices: kinds of touch. size: in states. seed: of draws. device: of torch.
+      size: in states. seed: of draws. device: of torch.
     """
 
-    def __init__(self, choices: set[str], size: int, seed: int, device: str):
-        self._rows, self._size, self._count = dict.fromkeys([*choices, "taught"]), size, 0
+    def __init__(self, size: int, seed: int, device: str):
+        self._rows, self._size, self._count = {}, size, 0
         self._draw = torch.Generator(device).manual_seed(seed)
 
-    def add(self, seen: dict[str, torch.Tensor], taught: torch.Tensor) -> None:
-        """Takes (n, nseen) of each kind of touch and (n, nout)."""
+    def add(self, sensed: dict[str, torch.Tensor], taught: torch.Tensor) -> None:
+        """Takes {name: (n, ...)} and (n, nout)."""
         index = torch.arange(self._count, self._count + len(taught), device=taught.device) % self._size
-        for name, new in {**seen, "taught": taught}.items():
-            if self._rows[name] is None:
-                self._rows[name] = new.new_empty(self._size, new.shape[1])
+        for name, new in {**sensed, "taught": taught}.items():
+            if name not in self._rows:
+                self._rows[name] = new.new_empty(self._size, *new.shape[1:])
             self._rows[name][index] = new
         self._count += len(taught)
 
-    def draw(self, choice: str, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """What a kind of touch saw (count, nseen), and what the teacher would have done (count, nout)."""
-        taught = self._rows["taught"]
+    def draw(self, count: int) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """What was sensed {name: (count, ...)}, and what the teacher would have done (count, nout)."""
         known = min(self._count, self._size)
-        which = torch.randint(known, (count,), generator=self._draw, device=taught.device)
-        return self._rows[choice][which], taught[which]
+        device = self._rows["taught"].device
+        which = torch.randint(known, (count,), generator=self._draw, device=device)
+        drawn = {name: rows[which] for name, rows in self._rows.items()}
+        return drawn, drawn.pop("taught")
 
 
 class Learner:

@@ -234,10 +234,10 @@ class RollRod(BatchTask):
         goal = self._opened + closing * (self._closed - self._opened) + moved
         self._ctrl[:, self._actuators] = goal.clamp(self._limits[0], self._limits[1])
 
-    def _sense_body(self):
+    def _sense_body(self, off, speed_off):
         s = self.cfg
-        angles = self._qpos[:, self._joints] - self._start[self._joints]
-        angles, velocities = self._noisy(angles, self._qvel[:, self._dofs])
+        angles = self._qpos[:, self._joints] - self._start[self._joints] + off
+        velocities = self._qvel[:, self._dofs] + speed_off
         time = self.episode_length_buf[:, None] / s.decisions
         moved = self._moved / s.reach if self._pads is not None else self._moved
         told = self._target if s.goal == "angle" else 1e3 * self._target

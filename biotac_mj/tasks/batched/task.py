@@ -68,7 +68,8 @@ class BatchTask(abc.ABC):
       history: decisions of which "body" and "touch" have what was sensed, the last one first; an episode that
         is younger repeats its first.
       model_error: deviations of the factors by which counts change more or less than the skins of this tier
-        say, drawn in each episode: of a finger's electrodes, of its PDC, of its PAC; or one for all.
+        say, drawn in each episode: of a finger's electrodes (one for all, one for each), of PDC, of PAC; or
+        one deviation.
       settings: the task's numbers; None takes the class's own.
       biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`. Skins are coarse and condensed where
         nothing else is said.
@@ -150,7 +151,8 @@ class BatchTask(abc.ABC):
         self._moved = torch.zeros(n, self.num_actions, device=self.device)
         # decisions since the last frame in which nothing was touched
         self._age = torch.zeros(n, dtype=torch.long, device=self.device)
-        self._bank = self._past = None
+        self._bank = self._past = self._blur = None
+        self._gain = torch.ones_like(self._touch.tare)
         with wp.ScopedDevice(where):
             self._read(mjm, prefixes)
             self._begin(self._everyone)
@@ -198,8 +200,9 @@ class BatchTask(abc.ABC):
         """Writes the controls of `_moved`."""
 
     @abc.abstractmethod
-    def _sense_body(self):
-        """[(num_envs, k)] of what the machine knows."""
+    def _sense_body(self, off, speed_off):
+        """[(num_envs, k)] of what the machine knows by encoders that are off by so much [rad or m, and that
+        per second]; linear in both."""
 
     @abc.abstractmethod
     def _state(self):
@@ -319,10 +322,30 @@ class BatchTask(abc.ABC):
         Args:
           choice: of `touch.OBSERVE` in place of the environment's own, of the same sensors.
         """
-        body, changes = self._past
-        touch = self._touch.observe(choice or self.observes, changes)
-        state = torch.cat(self._state(), dim=1)
+        body, noise, changes = self._past
+        touch = self._touch.observe(choice or self.observes, changes * self._gain[:, None])
+        state, body = torch.cat(self._state(), dim=1), body + noise
         return {"body": body.flatten(1), "touch": touch.flatten(1), "state": state}
+
+    def sensed(self) -> dict:
+        """{"body" (num_envs, history, n), "changes" (num_envs, history, nfinger, k), "world" (num_envs,)} of
+        the last decisions, without the encoders' error and the model's, for `sense_anew`."""
+        body, _, changes = self._past
+        return {"body": body, "changes": changes, "world": torch.arange(self.num_envs, device=self.device)}
+
+    def sense_anew(
+        self, choice: str, body: torch.Tensor, changes: torch.Tensor, world: torch.Tensor
+    ) -> torch.Tensor:
+        """(n, m) of body and touch, by a choice of `touch.OBSERVE`, that a policy might have seen where this
+        was `sensed` in n worlds: with other errors of encoders and of the model."""
+        gain = self._touch.draw_gains(len(body), self.model_error, self._draw)
+        touch = self._touch.observe(choice, changes * gain[:, None], world)
+        # an episode that is young repeats its first decision, with its noise
+        repeats = (body[:, 1:] == body[:, :-1]).all(2)
+        first = torch.arange(1, self.history, device=self.device).where(~repeats, 0)
+        first = torch.nn.functional.pad(first, (1, 0)).cummax(1).values
+        noise = self._noise(body).gather(1, first[..., None].expand_as(body))
+        return torch.cat([(body + noise).flatten(1), touch.flatten(1)], dim=1)
 
     def prepare_held(self, seed: int | None = None) -> int:
         """Has all worlds act as `settings.prepare` says, and keeps the states of those that hold what they
@@ -379,8 +402,9 @@ class BatchTask(abc.ABC):
         """What is sensed after a decision goes before what was sensed earlier; in worlds (num_envs,) of bool
         that begin there is nothing earlier."""
         touched = (self._age > 0)[:, None, None]
-        changes = torch.where(touched, self._touch.changes, 0.0)
-        now = [torch.cat(self._sense_body(), dim=1), changes]
+        changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
+        body = torch.cat(self._sense_body(0.0, 0.0), dim=1)
+        now = [body, self._noise(body), changes]
         first = [one[:, None].expand(-1, self.history, *one.shape[1:]) for one in now]
         if self._past is None:
             self._past = first
@@ -402,7 +426,8 @@ class BatchTask(abc.ABC):
         if not which.any():
             return
         self.episode_length_buf[which] = 0
-        self._touch.draw_gains(which, self.model_error, self._draw)
+        gain = self._touch.draw_gains(self.num_envs, self.model_error, self._draw)
+        self._gain = gain.where(which[:, None, None], self._gain)
         if self._bank:
             worlds = which.nonzero()[:, 0]
             self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])
@@ -426,13 +451,13 @@ class BatchTask(abc.ABC):
     def _integers(self, high):
         return torch.randint(high, (self.num_envs,), generator=self._draw, device=self.device)
 
-    def _noisy(self, position, velocity):
-        """Joints' positions and velocities (num_envs, k) as encoders tell them."""
-        s = self.cfg
-        if not s.encoder:
-            return position, velocity
-        noise = torch.randn(2, *position.shape, generator=self._draw, device=self.device) * s.encoder
-        return position + noise[0], velocity + noise[1] / (s.substeps * s.timestep)
+    def _noise(self, body):
+        """By how much encoders are off in what a body knows (..., k)."""
+        if self._blur is None:
+            s = self.cfg
+            off = self._sense_body(s.encoder, s.encoder / (s.substeps * s.timestep))
+            self._blur = (torch.cat(off, dim=1) - torch.cat(self._sense_body(0.0, 0.0), dim=1))[0]
+        return self._blur * torch.randn(body.shape, generator=self._draw, device=self.device)
 
     def _give_mass(self, name, mass):
         """A free body's mass (num_envs,) [kg] and inertia of each world, and what MuJoCo derives from them:

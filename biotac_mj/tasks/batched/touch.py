@@ -72,29 +72,27 @@ class Touch:
         self._seeds = [_as_int64(a.seed) for a in acquired]
         self._noise = [wp.to_torch(a.state)[:, a.place.pdc_noise] for a in acquired]
         self.tare = torch.zeros(self.channels.shape, device=sensordata.device)
-        self._gain = torch.ones_like(self.tare)
 
     @property
     def channels(self) -> torch.Tensor:
         """(nworld, nfinger, k) counts of electrodes, PDC and PAC."""
         return self._sensed[:, self._place]
 
-    @property
-    def changes(self) -> torch.Tensor:
-        """(nworld, nfinger, k) of the channels from `tare`, times what `draw_gains` has drawn."""
-        return (self.channels - self.tare) * self._gain
+    def draw_gains(self, count: int, deviation: tuple[float, ...], draw: torch.Generator) -> torch.Tensor:
+        """Factors (count, nfinger, k) on changes of the channels, 1 +- deviation: of each finger one for all
+        electrodes times one for each, one for PDC and one for PAC."""
+        shape, more = (count, self.tare.shape[1]), {"generator": draw, "device": draw.device}
+        common = torch.tensor(deviation, device=draw.device) * torch.randn(*shape, 3, **more)
+        gain = 1 + common.repeat_interleave(torch.tensor(self._split, device=draw.device), dim=2)
+        n = self._split[0]
+        gain[..., :n] *= 1 + deviation[0] * torch.randn(*shape, n, **more)
+        return gain
 
-    def draw_gains(self, which: torch.Tensor, deviation: tuple[float, ...], draw: torch.Generator) -> None:
-        """Draws factors 1 +- deviation on the changes in worlds (nworld,) of bool: of each finger one for its
-        electrodes, one for PDC and one for PAC."""
-        gain = torch.randn(*self.tare.shape[:2], len(deviation), generator=draw, device=draw.device)
-        deviation, split = (torch.tensor(x, device=draw.device) for x in (deviation, self._split))
-        gain = (1 + deviation * gain).repeat_interleave(split, dim=2)
-        self._gain = gain.where(which[:, None, None], self._gain)
-
-    def observe(self, choice: str, changes: torch.Tensor) -> torch.Tensor:
+    def observe(
+        self, choice: str, changes: torch.Tensor, worlds: torch.Tensor | slice = slice(None)
+    ) -> torch.Tensor:
         """(nworld, h, n) of a choice of OBSERVE, from the `channels` as changes from those at rest, (nworld,
-        h, nfinger, k) of h decisions.
+        h, nfinger, k) of h decisions, in these worlds.
 
         Of each finger "none" has nothing; "binary" whether PDC is 50 deviations of its noise above its level
         at rest; "force" the force [N] and the mean place of what presses [cm] by `WeightedElectrodes`,
@@ -106,6 +104,7 @@ class Touch:
         elif choice == "binary":
             # noise of the 12-bit converter besides
             noise = torch.stack([n.to(pdc.dtype) for n in self._noise], dim=1).square() + 1 / 12
+            noise = noise[worlds]
             parts = [(pdc > _SIGMA * noise.sqrt()[:, None, :, None]).to(pdc.dtype)]
         elif choice == "force":
             fall = (-electrodes).clamp(min=0.0)

@@ -161,8 +161,7 @@ def train(
     about = _about(env) | (about or {})
     env.reset(seed=sum(run.decisions for run in learners))
     env.stagger()
-    choices = {observe for observe, _ in runs}
-    lessons = Lessons(choices, numbers.remembered, 0, env.device)
+    lessons = Lessons(numbers.remembered, 0, env.device)
     begin = last = kept = time.perf_counter()
     # decisions in which a teacher acts, and by which a policy scales what it sees
     first = 0 if resume else env.max_episode_length
@@ -173,8 +172,8 @@ def train(
         for _ in range(numbers.steps):
             actions = torch.cat([run.learner.act(run.seen(), run.known()) for run in learners])
             if learns:
-                seen, right = {o: seen_by(env, o) for o in choices}, env.script().clamp(-1, 1)
-                lessons.add(seen, right)
+                right = env.script().clamp(-1, 1)
+                lessons.add(env.sensed(), right)
                 for run in learners:
                     run.compare(right)
             if first > 0:
@@ -223,11 +222,13 @@ def _now(env):
 
 def _study(learners, lessons, acted, progress):
     """All learn from lessons for a part of the time (`Numbers.study`) in which they acted [s]; progress: part
-    of the teacher's time that is over."""
+    of the teacher's time that is over. Errors of encoders and of the model are others in each lesson: states
+    are few, and would be known by them."""
     numbers, begin = learners[0].learner.numbers, time.perf_counter()
     for _ in range(numbers.lessons):
         for run in learners:
-            run.learner.imitate(*lessons.draw(run.observe, numbers.several), progress)
+            sensed, right = lessons.draw(numbers.several)
+            run.learner.imitate(run.env.sense_anew(run.observe, **sensed), right, progress)
         if _now(run.env) - begin > numbers.study * acted:
             break
 
