@@ -107,9 +107,10 @@ class Hook:
         if moving:
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
-                if first:  # all is run once, which takes the memory that a capture must find
-                    self._taking_part.fill()
-                wp.capture_if(self._taking_part.any, lambda: self._look_ahead(m, d, moving, first))
+                if first:  # also where nothing is near: it takes the memory that a capture must find
+                    self._look_ahead(m, d, moving)
+                else:
+                    wp.capture_if(self._taking_part.any, lambda: self._look_ahead(m, d, moving))
             self._fork.run(*(functools.partial(batch.pass_by, self._taking_part) for batch in moving))
             self._act(m, d, moving)
         self._fork.run(*(batch.end_step for batch in batches))
@@ -139,9 +140,9 @@ class Hook:
         for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):
             batch.take_part(m, self._slope.correction, int(first), rows, int(row))
 
-    def _look_ahead(self, m, d, moving, whole):
+    def _look_ahead(self, m, d, moving):
         """Where the bodies go under the models of the last step; and, in worlds whose skins act or are
-        touched there, the balance. whole: in all worlds."""
+        touched there, the balance."""
         going, taking_part = self._going, self._taking_part
         going.copy(taking_part)
         _begin_dynamics(m, d)
@@ -150,8 +151,6 @@ class Hook:
         self._accelerate(m, d, moving, first=True)
         taking_part.clear()
         self._fork.run(*(functools.partial(batch.look_ahead, m, taking_part) for batch in moving))
-        if whole:
-            taking_part.fill()
         self._fork.run(*(functools.partial(batch.rest.leave, taking_part) for batch in moving))
         wp.capture_if(taking_part.any, lambda: self._find_balance(m, d, moving))
 

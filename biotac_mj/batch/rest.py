@@ -25,6 +25,8 @@ real = wp.float64
 vec3 = wp.vec3d
 mat33 = wp.mat33d
 vec4 = wp.vec4d
+vec6 = wp.spatial_vectord
+mat66 = wp.spatial_matrixd
 # by which distances may change faster than places: grids are trilinear
 _ROOT3 = wp.constant(wp.float64(3**0.5))
 
@@ -235,11 +237,20 @@ def fall_asleep(
     seen: Seen,
     # Out:
     constants_out: wp.array(dtype=vec4),
+    touched_by_out: wp.array2d(dtype=int),
+    wrench_out: wp.array2d(dtype=vec6),
+    tangent_out: wp.array2d(dtype=mat66),
 ):
     """Which skins were in balance where they were, untouched. One that was let go and that a geom is near to
-    stays awake: when the geom leaves, `Release` puts it to rest."""
+    stays awake: when the geom leaves, `Release` puts it to rest. Those that rested touch nothing, whatever
+    the solves of other worlds wrote."""
     w = wp.tid()
     if awake[w] == 0:
+        for g in range(touched_by_out.shape[0]):
+            touched_by_out[g, w] = 0
+        for g in range(wrench_out.shape[0]):
+            wrench_out[g, w] = vec6()
+            tangent_out[g, w] = mat66()
         return
     _forget(seen, w)
     still = settled[w]
@@ -341,7 +352,8 @@ class Rest:
             st = self._skin.data.worlds
             release = self._skin.release
             inputs = [model, settled, rounds, release.near, release.at_rest, self.awake, st]
-            self._launch(fall_asleep, self._skin.nworld, inputs, [self._resting, self._seen, self._constants])
+            outputs = [self._resting, self._seen, self._constants, *self._skin.outcome]
+            self._launch(fall_asleep, self._skin.nworld, inputs, outputs)
 
     def reset(self, mask: wp.array) -> None:
         """Worlds of mask rest."""

@@ -128,6 +128,11 @@ class BatchSkin:
         """Device memory that grows with the number of worlds [bytes]."""
         return _world_bytes(self.nworld, self.data, self.geoms.struct, self)
 
+    @property
+    def outcome(self) -> list[wp.array]:
+        """What a solve says of contact: which geoms touch, `wrench`, `tangent`."""
+        return [self._touched_by, self.wrench, self.tangent]
+
     def solve_skins(self) -> None:
         """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
         may be captured in a CUDA graph. After `release.begin`, before `come_to_rest`.
@@ -196,7 +201,7 @@ class BatchSkin:
             rest_worlds,
             self.nworld,
             [release.gone, release.reset],
-            [d.worlds, self.geoms.struct, self.motion, self._touched_by, self.wrench, self.tangent],
+            [d.worlds, self.geoms.struct, self.motion, *self.outcome],
         )
 
     def prepare_keep(self) -> None:

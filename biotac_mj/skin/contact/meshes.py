@@ -33,6 +33,7 @@ __all__ = [
     "mesh_distance",
     "mesh_field",
     "pack_grids",
+    "spline_distance",
     "to_triangles",
 ]
 
@@ -383,6 +384,16 @@ def mesh_distance(grids: Grids, k: int, p: vec3):
     if d > TRILINEAR * grids.spacing[k]:  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     return mesh_field(grids, k, p, d)
+
+
+@wp.func
+def spline_distance(grids: Grids, k: int, p: vec3):
+    """Distance of `mesh_distance` from a smooth mesh. On CUDA each thread that calls `to_triangles` copies
+    the struct of the grids, which takes much longer than the spline."""
+    d = grid_value(grids, k, p)
+    if d > TRILINEAR * grids.spacing[k]:
+        return d
+    return _from_spline(grids, k, p)[3]
 
 
 @wp.func
