@@ -151,8 +151,8 @@ class Hysteresis(Effect):
         run.force = run.force * (1 + theta["fraction"] * z / width)[:, None]
         run.pressure = run.pressure * (1 + (theta["fraction"] + theta.get("liquid", 0.0)) * z / width)
         if theta.get("film"):
-            lag = 1 - theta["film"] * z[:, None] / width
-            run.log_z = run.log_z[0] + lag * (run.log_z - run.log_z[0])
+            followed = 1 - theta["film"] * z[:, None] / width
+            run.log_z = run.log_z[0] + followed * (run.log_z - run.log_z[0])
         _scaled_film(run, theta)
 
 
@@ -357,11 +357,11 @@ class Inhomogeneity(Effect):
         if "along" not in run.answers:
             run.scale_load(float(modulus_of(theta)(run.place[None])[0]))
             return
-        for way, slope in ((w, run.answers[w]) for w in self.params if w in run.answers):
+        for direction, slope in ((w, run.answers[w]) for w in self.params if w in run.answers):
             # the skin was solved with a varying modulus
-            run.force = run.force + theta[way] * run.modulus * slope["force"]
-            run.pressure = run.pressure + theta[way] * run.modulus * slope["pressure"]
-            run.log_z = run.log_z + theta[way] * slope["log_z"]
+            run.force = run.force + theta[direction] * run.modulus * slope["force"]
+            run.pressure = run.pressure + theta[direction] * run.modulus * slope["pressure"]
+            run.log_z = run.log_z + theta[direction] * slope["log_z"]
 
 
 class Spots(Inhomogeneity):

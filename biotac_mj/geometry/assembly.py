@@ -70,8 +70,8 @@ def _open_surfaces(mesh, face, fixed, core_vert):
         )
     if len(parts) == 1:
         return parts[0], np.zeros((0, 3), np.int32)
-    apart = [cKDTree(core_vert).query(mesh.vert[np.unique(part)])[0].mean() for part in parts]
-    inner = int(np.argmin(apart))
+    distance = [cKDTree(core_vert).query(mesh.vert[np.unique(part)])[0].mean() for part in parts]
+    inner = int(np.argmin(distance))
     return parts[1 - inner], parts[inner]
 
 

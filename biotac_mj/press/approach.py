@@ -114,8 +114,8 @@ def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> fl
     )
     unit = np.asarray(direction, float) / np.linalg.norm(direction)
     start = np.asarray(point, float) - _TOUCHING * unit
-    reached = [_hits(vert[face], start, unit).min(initial=np.inf) for vert, face in solids]
-    return max(float(min(reached)) - _TOUCHING, 0.0)
+    distances = [_hits(vert[face], start, unit).min(initial=np.inf) for vert, face in solids]
+    return max(float(min(distances)) - _TOUCHING, 0.0)
 
 
 def _split(tri):

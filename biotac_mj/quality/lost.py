@@ -29,7 +29,7 @@ _PLAINEST, _LEAPS = 3, 2.5
 _END, _MEETS = 4, 2.0  # rows at either end, and their largest distance in noise units if they join
 _LINE = 4  # rows of the line fitted on either side
 # least score of a jump, least ratio to its neighbourhood, and least distance between jumps in rows
-_SCORE, _TIMES, _APART = 4.0, 3.0, 13
+_SCORE, _TIMES, _SPACING = 4.0, 3.0, 13
 # [s] length of a bin and of a window; fraction of windows to ignore, since a step is no load; change [counts]
 # of the six most active of 19 channels within windows with contact
 _BIN, _SPAN, _LIVELIEST, _MOVED = 0.1, 3.0, 0.04, 6.0
@@ -158,7 +158,7 @@ def _ends(x):
 def _isolated(score, around):
     """Places whose score exceeds those around, by decreasing ratio."""
     times = np.where(score > _SCORE, score / around, 0.0)
-    places, _ = find_peaks(times, height=_TIMES, distance=_APART)
+    places, _ = find_peaks(times, height=_TIMES, distance=_SPACING)
     return places[np.argsort(-times[places], kind="stable")].tolist()
 
 

@@ -490,7 +490,7 @@ class SkinStep:
         self._launcher.loop(self._solve_on, self._continue_solve)
         self._search()
         self._launcher.loop(self._search_on, self._continue_search)
-        self.M.watch_products(self._launcher, self.d.x)
+        self.M.renew_if_due(self._launcher, self.d.x)
         self._launch(convergence.choose_viscosity, self.d.nworld, [self.m.options.tolerance, self.st])
         self._check()
 

@@ -25,8 +25,8 @@ def legible(eye: np.ndarray, pos: np.ndarray, normal: np.ndarray, room: float = 
     across = pos - pos @ direction[:, None] * direction  # projection in the direction of sight
     visible = np.zeros(len(pos), bool)
     for i in np.argsort(-facing):
-        apart = np.linalg.norm(across[visible] - across[i], axis=1)
-        visible[i] = facing[i] > _FACING and (apart > room).all()
+        distance = np.linalg.norm(across[visible] - across[i], axis=1)
+        visible[i] = facing[i] > _FACING and (distance > room).all()
     return visible
 
 

@@ -30,7 +30,7 @@ _PRESS = {
     "indenter_face": Array((None, 3), "index"),
 }
 _FRAME = 0.04  # [s] between pictures
-_APART = 0.033  # [m] between two recorded sensors
+_SPACING = 0.033  # [m] between two recorded sensors
 
 
 def play_model(
@@ -140,7 +140,7 @@ def play_file(
         name = pathlib.Path(path).resolve().parent.name or "biotac"
         presses[name if name not in presses else f"{name} {len(presses) + 1}"] = _Press(path)
     for i, one in enumerate(presses.values()):
-        one.pos[0] = _APART * i
+        one.pos[0] = _SPACING * i
     if page is None:
         page = _served({name: one.finger for name, one in presses.items()}, **server)
     return _play(presses, page, speed, rounds)

@@ -196,11 +196,11 @@ def solve_by_gmres(
     Raises:
       ValueError: no convergence within `most`: a matrix is nearly singular.
     """
-    x, left = torch.zeros_like(right), right
+    x, residual = torch.zeros_like(right), right
     if start is not None and start.any():
-        x, left = start.clone(), right - product(start)
-    z = inverse(left)
-    size = _lengths(_rows(z if left is right else x))
+        x, residual = start.clone(), right - product(start)
+    z = inverse(residual)
+    size = _lengths(_rows(z if residual is right else x))
     wanted, count = precision * size, 0
     while True:
         beta = _lengths(_rows(z))

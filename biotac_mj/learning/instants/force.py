@@ -54,9 +54,9 @@ def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
     explained = np.linalg.qr(np.column_stack([np.ones(len(force)), force, force[:, i] * force[:, j]]))[0]
     rise = 1 - np.exp(-np.arange(len(force)) / tau)
     remaining_rise = rise - explained @ (explained.T @ rise)
-    left = log_z - explained @ (explained.T @ log_z)
-    each = remaining_rise @ left / (remaining_rise @ remaining_rise)
-    weight = 1 / np.maximum((left - remaining_rise[:, None] * each).var(0), 1e-8)
+    residual = log_z - explained @ (explained.T @ log_z)
+    each = remaining_rise @ residual / (remaining_rise @ remaining_rise)
+    weight = 1 / np.maximum((residual - remaining_rise[:, None] * each).var(0), 1e-8)
     return float(weight @ each / weight.sum())
 
 

@@ -86,11 +86,11 @@ def _columns(terms, log_z):
 def _amended(columns, believed, force, rows, touch):
     """Prediction for all rows (n, 3), and its mean square on held-out touches (3,)."""
     starts = (np.zeros_like(believed), believed)
-    left = [force - start[rows] for start in starts]
-    error = np.concatenate([held_out_errors(columns[rows], y, touch, _RIDGE, _FOLDS) for y in left])
+    residuals = [force - start[rows] for start in starts]
+    error = np.concatenate([held_out_errors(columns[rows], y, touch, _RIDGE, _FOLDS) for y in residuals])
     out = np.empty_like(believed)
     for c, which in enumerate(error.argmin(0)):
         start, strength = divmod(which, len(_RIDGE))
-        weight, offset = ridge(columns[rows], left[start][:, [c]], _RIDGE[strength])
+        weight, offset = ridge(columns[rows], residuals[start][:, [c]], _RIDGE[strength])
         out[:, c] = starts[start][:, c] + (columns @ weight + offset)[:, 0]
     return out, error.min(0) + 1e-12

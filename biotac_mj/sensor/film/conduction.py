@@ -308,11 +308,11 @@ def _check_numbers(given, geometry):
         if not 0 < value < np.inf:
             raise ValueError(f"{name} is {value}: pass a positive number in SI units")
     places = electrode_positions(BIOTAC if geometry is None else geometry.design)
-    apart = 1e-3 * pdist(places).min(initial=np.inf) / 2
-    if given.get("electrode_radius", 0.0) >= apart:
+    half_distance = 1e-3 * pdist(places).min(initial=np.inf) / 2
+    if given.get("electrode_radius", 0.0) >= half_distance:
         raise ValueError(
             f"electrode_radius is {given['electrode_radius']}: the electrodes would touch; pass less than "
-            f"{apart:.2g} m, half of what the nearest two are apart"
+            f"{half_distance:.2g} m, half of what the nearest two are apart"
         )
     if geometry is None:
         return

@@ -30,7 +30,7 @@ __all__ = [
     "distance_from",
     "distance_to",
     "face_radius",
-    "carried_anchor",
+    "convected_anchor",
     "least_to",
     "meet",
     "place_on",
@@ -252,7 +252,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
 
 
 @wp.func
-def carried_anchor(geoms: Geoms, g: int, w: int, stick: vec3):
+def convected_anchor(geoms: Geoms, g: int, w: int, stick: vec3):
     """Anchor of the last step in the present frame of geom g. On another skin it moves half as far, as the
     surface between both does."""
     if geoms.kind[g] == SKIN:

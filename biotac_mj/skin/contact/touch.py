@@ -16,7 +16,7 @@ from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
 from .meshes import mesh_curvature
-from .posed import Geoms, carried_anchor, distance_to, face_radius, least_to, meet, place_on, touch_bound
+from .posed import Geoms, convected_anchor, distance_to, face_radius, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
 __all__ = [
@@ -321,7 +321,7 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                         last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
                         stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
                     if wp.static(shapes == SKINS):
-                        stick = carried_anchor(geoms, touched, w, stick)
+                        stick = convected_anchor(geoms, touched, w, stick)
                     most = mu * fn
                     if friction_mode == LAGGED:
                         most = c.bound[i, w]

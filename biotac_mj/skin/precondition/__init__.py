@@ -74,7 +74,7 @@ class Preconditioner(Protocol):
     ) -> None:
         """Computes z for another r in the running worlds. partial: square of r by chunks."""
 
-    def watch_products(self, program: Launcher, x: wp.array) -> None:
+    def renew_if_due(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve at x [nvert, nworld]: takes the factor of this shape if solves were long."""
 
     def renew(self, program: Launcher, x: wp.array) -> None:

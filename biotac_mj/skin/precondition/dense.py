@@ -101,11 +101,11 @@ class DensePreconditioner:
         """Takes x, for the deformed shape; the undeformed inverse is valid for every step."""
         self._x = x
 
-    def watch_products(self, program: Launcher, x: wp.array) -> None:
+    def renew_if_due(self, program: Launcher, x: wp.array) -> None:
         """Does nothing: a new inverse would take longer than the products that it saves."""
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Does nothing, see `watch_products`."""
+        """Does nothing, see `renew_if_due`."""
 
     def update(
         self,

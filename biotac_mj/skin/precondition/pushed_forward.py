@@ -157,7 +157,7 @@ class PushForward:
         """M^T f of forces f (nvert, k, 3); as `apply`."""
         return self._turned(1, worlds, force)
 
-    def _turned(self, transposed, worlds, sides):
+    def _turned(self, transposed, worlds, values):
         key = transposed, len(worlds)
         if key not in self._launches:
             with wp.ScopedDevice("cpu"):
@@ -166,7 +166,7 @@ class PushForward:
             launch = recorded(_turn, side.shape, [self._matrix, world, transposed], [side])
             self._launches[key] = world.numpy(), side.numpy(), launch
         world, side, launch = self._launches[key]
-        world[:], side[...] = worlds, sides
+        world[:], side[...] = worlds, values
         launch()
         return side.copy()
 

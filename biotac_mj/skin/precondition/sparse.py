@@ -150,17 +150,17 @@ class SparsePreconditioner:
         self.factor, self._rows = self._rest, self._undeformed_rows
         self._pushed = self._push_forward is not None
 
-    def watch_products(self, program: Launcher, x: wp.array) -> None:
+    def renew_if_due(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve: renews the factor if solves take too long."""
         x = x.numpy()
 
-        def watch():
+        def check():
             self._products += int(self._iterations[0])
             if self._products > _FACTOR:
                 self._renew(x)
 
         if self._renews:
-            program.call(watch)
+            program.call(check)
 
     def renew(self, program: Launcher, x: wp.array) -> None:
         """Takes the factor of the shape x."""
@@ -211,8 +211,8 @@ class SparsePreconditioner:
             if gradient is None:
                 y = self._solve(r[:, these], worlds)
             else:  # two right-hand sides take less than twice the time of one
-                sides = np.concatenate([r[:, these].swapaxes(0, 1), gradient[:, these].swapaxes(0, 1)])
-                y, along = np.split(self._solve(sides.swapaxes(0, 1), worlds), 2, axis=1)
+                both = np.concatenate([r[:, these].swapaxes(0, 1), gradient[:, these].swapaxes(0, 1)])
+                y, along = np.split(self._solve(both.swapaxes(0, 1), worlds), 2, axis=1)
                 if self._along is None:
                     self._along = np.zeros(gradient.shape)
                 self._gradient, self._along[:, these] = gradient, along
