@@ -40,7 +40,7 @@ def make_files(folder, press):
     _recordings(folder, rng)
     relaxation = by_id("relax")
     Simulator(effects=[(relaxation, relaxation.default())], intervals={}).save(folder / "sensor.yaml")
-    _mesh(folder / "mesh", skin)
+    make_mesh(folder / "mesh", skin)
     write_obj(folder / "ball.obj", press.indenter_vert, press.indenter_face)
     for name, content in (("material", {"friction": 0.5}), ("options", {"skin": {"samples": 2}})):
         (folder / f"{name}.json").write_text(json.dumps(content))
@@ -73,7 +73,7 @@ def _recordings(folder, rng):
     np.savetxt(folder / "ruppel.csv", rows, "%.6g", ",", header=",".join(RUPPEL_COLUMNS), comments="")
 
 
-def _mesh(folder, skin):
+def make_mesh(folder, skin):
     folder.mkdir()
     corner, elem = np.unique(skin.elem[:, :4], return_inverse=True)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g} 1" for x, y, z in skin.vert[corner]]

@@ -11,6 +11,7 @@ import shlex
 import pytest
 from _pytest.mark.expression import Expression
 from documents import BLOCK, agree, blocks, pictures, printed, run, with_output
+from readers_files import lay
 
 from biotac_mj import cli
 from biotac_mj.view import find_gl
@@ -19,6 +20,7 @@ REPO = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [REPO / "README.md", REPO / "CONTRIBUTING.md", *sorted((REPO / "docs").rglob("*.md"))]
 PAGES = [page for page in PAGES if page.name != "api.md" and "_build" not in page.parts]
 NEEDS = {"ros.md": "rosbags", "mjlab.md": "mjlab", "isaaclab.md": "mujoco_warp", "mjx.md": "jax"}
+NEEDS |= {"recordings.md": "rosbags"}
 # page and beginning of a block -> why no test of the pages runs it, and what tests it
 LEFT_OUT = {
     ("README.md", "pip install ."): "a network; `make test-wheel` installs the wheel",
@@ -31,9 +33,6 @@ LEFT_OUT = {
     ("train.md", "biotac data generate --count 2600"): "a GPU; test_data_generate.py",
     ("train.md", "biotac_mj.attach(spec"): "three choices for one finger; test_attach.py",
     ("data_sets.md", "biotac data generate --count 2600"): "a GPU; test_data_generate.py",
-    ("mesh.md", "biotac lab mesh"): "a mesh of the reader's; test_geometry_import.py",
-    ("pads.md", "biotac design new dome"): "tables and meshes of the reader's; test_own_design.py",
-    ("recordings.md", "biotac recording import"): "logs of the reader's; test_recordings_loggers.py",
     ("recordings.md", "biotac data resimulate"): "a log of the reader's; test_resimulation.py",
     ("rendering.md", "biotac view --hand"): "MuJoCo Menagerie; test_menagerie.py",
     ("rendering.md", "biotac play ball"): "it serves until it is stopped; test_web_view.py",
@@ -46,7 +45,6 @@ LEFT_OUT = {
     ("ros.md", "from biotac_mj.neighbours.ros"): "ROS; test_ros.py has doubles of rclpy and rospy",
     ("your_hand.md", "spec = mujoco.MjSpec.from_file"): "MuJoCo Menagerie; test_menagerie.py",
     ("your_hand.md", "left = "): "MuJoCo Menagerie; test_menagerie.py",
-    ("verdict.md", "from biotac_mj.discrepancy"): "minutes; test_samples.py runs the verb of it",
     ("discrepancy.md", "from biotac_mj.discrepancy"): "data of the reader's; test_discrepancy_poses.py",
 }
 
@@ -240,6 +238,7 @@ def test_blocks_run_in_order(path, tmp_path):
         pytest.importorskip(NEEDS[path.name], reason=f"{path.name} needs {NEEDS[path.name]}")
     name, text = str(path.relative_to(REPO)), path.read_text()
     found = [block for block in blocks(text) if not left_out(path, block[2])]
+    lay(path.name, tmp_path)
     done = run(name, found, tmp_path)
     assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
     for (_, line, _, written), got in zip(found, printed(done), strict=True):

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from readers_files import GROUND, SIX
 
 import biotac_mj
 from biotac_mj.cli import main
@@ -11,8 +12,6 @@ from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 from biotac_mj.sensor.own_design import PadShape, new_design
 
-SIX = [[0, 0, -6], [2, 0, -5.6], [-2, 0, -5.6], [0, 2, -5.6], [0, -2, -5.6], [3, 3, -4]]
-GROUND = [[5, 0, -3], [-5, 0, -3]]
 DOMED = {"dome": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}
 DOME = PadShape(**DOMED, edge=2.4)
 

