@@ -1,8 +1,5 @@
 """Files that pages take a reader to have, made in the folder where the blocks of a page run."""
 
-import importlib.resources
-import zipfile
-
 import meshio
 import numpy as np
 from good_input import make_mesh
@@ -18,9 +15,7 @@ GROUND = [[5, 0, -3], [-5, 0, -3]]
 
 def lay(page, folder):
     """Writes the files of the page of this name into the folder."""
-    {"mesh.md": _mesh, "pads.md": _pads, "recordings.md": _logs, "verdict.md": _samples}.get(
-        page, lambda folder: None
-    )(folder)
+    {"mesh.md": _mesh, "pads.md": _pads, "recordings.md": _logs}.get(page, lambda folder: None)(folder)
 
 
 def _mesh(folder):
@@ -45,9 +40,3 @@ def _logs(folder):
     write_mat(folder / "hold.mat", one)
     write_btd(folder / "touch.btd.gz", one, packed=True)
     write_bag(folder, one, ros=1).rename(folder / "run.bag")
-
-
-def _samples(folder):
-    archive = importlib.resources.files("biotac_mj.assets") / "samples.zip"
-    with archive.open("rb") as file, zipfile.ZipFile(file) as found:
-        found.extract("electrodes.txt", folder)
