@@ -3,13 +3,13 @@
 python benchmarks/real_table.py --data DIR --json OUT --figure OUT.png
 
 Under DIR, packed (.gz) or not, in folders of any depth: `ForceData.txt` with a pressed sensor's
-`SynImpF*.txt` beside it (the first; others are unloaded neighbours), `*_HOLD.mat` of two sensors that hold an
-object, `*.btd` of a sensor that rests, is pressed and let go. The simulated sensor is the default one on
-`--skin` under a flat plate; pressed rows have the state that `matching` finds for them with all gains 1 and
-the rubber's own modulus, so that both columns are of the same presses. Such a row is inside where no
-simulated value is further from the real one of the same recording than the real ones are from each other
-(of a single one: than 10 %); a row of what a sensor has of its own, where no simulated value leaves the
-real ones' spread by more than 10 %."""
+`SynImpF*.txt` beside it (the first; others are unloaded neighbours), `*_HOLD.mat` of two sensors that hold
+an object, `*.btd` of a sensor that rests, is pressed and let go, and is tapped. The simulated sensor is the
+default one on `--skin` under a flat plate; pressed rows have the state that `matching` finds for them with
+all gains 1 and the rubber's own modulus, so that both columns are of the same presses. Such a row is inside
+where no simulated value is further from the real one of the same recording than the real ones are from each
+other (of a single one: than 10 %); a row of what a sensor has of its own, where no simulated value leaves
+the real ones' spread by more than 10 %."""
 
 import argparse
 import gzip
@@ -53,6 +53,12 @@ _TIP = [6, 7, 8]
 _PRESSED, _MOST = 100, 300
 _PLATE = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><site name="mount" quat="1 -1 0 0"/>
 <body mocap="true" pos="-.009 0 .011"><geom type="box" size=".02 .02 .002"/></body></worldbody></mujoco>"""
+_BALL = """<mujoco><option timestep=".001" gravity="0 0 0"/><worldbody><site name="mount" quat="1 -1 0 0"/>
+<body pos="-.009 0 .0183"><joint type="slide" axis="0 0 -1"/><geom size=".005" mass=".002"/></body>
+</worldbody></mujoco>"""  # thrown at the pad
+# [s] from a tap's loudest sample: what is quiet before it and after it; RMS there, of the loudest; [counts]
+# of PDC from one to the other
+_BEFORE, _AFTER, _QUIET, _SAME = (-0.06, -0.01), (0.04, 0.1), 0.1, 10
 _NEAR, _FAR = 5e-3, 12e-3  # [m] between electrodes that are near and far
 
 
@@ -233,6 +239,65 @@ def _lifted(skin, load):
     return _after(time - end, pdc, fast - end, np.array(pac).T.ravel(), load)
 
 
+def tap(path: pathlib.Path, skin: str) -> dict | None:
+    """{row: (real, simulated)} of the loudest tap of a native log, and of a ball of 2 g thrown so that PAC
+    becomes as loud; None of a log without. What taps the real sensor is not known."""
+    rows = read_rows(path)
+    slow, fast = (rows[rows[:, 1] == channel][:, [0, 2]].T for channel in (1, 0))
+    real = _rung(slow, fast)
+    if real is None:
+        return None
+    name, speed = next(iter(real)), 0.05
+    for _ in range(2):
+        mine = _rung(*_thrown(skin, speed))
+        speed *= real[name] / mine[name]
+    return {name: (one, mine[name]) for name, one in real.items()}
+
+
+def _rung(slow, fast):
+    """Of PDC and PAC, (2, n) time [s] and counts each: how the loudest tap dies away. None without a tap."""
+    time, pac = fast[0], fast[1] - np.median(fast[1])
+
+    def around(at, series, window):
+        return series[1][(series[0] >= at + window[0]) & (series[0] < at + window[1])]
+
+    for k in np.argsort(-np.abs(pac))[: len(pac) // 20]:
+        peak, at = abs(pac[k]), time[k]
+        parts = [around(at, fast, window) - np.median(fast[1]) for window in (_BEFORE, _AFTER)]
+        levels = [around(at, slow, window) for window in (_BEFORE, _AFTER)]
+        if min(map(len, parts)) < 40 or min(map(len, levels)) < 2 or max(map(_rms, parts)) >= _QUIET * peak:
+            continue
+        rest, end = map(np.median, levels)
+        if abs(end - rest) > _SAME:
+            continue
+        during, later = (time >= at) & (time < at + _AFTER[1]), around(at, slow, (0.0, _AFTER[1])) - rest
+        left = [time[during & (np.abs(pac) > part * peak)][-1] - at for part in (1 / np.e, 0.1)]
+        return {
+            "a tap: PAC's largest [counts]": float(peak),
+            "the same: PAC under 1/e of it after [ms]": 1e3 * float(left[0]),
+            "the same: under a tenth after [ms]": 1e3 * float(left[1]),
+            "the same: PDC's largest rise [counts]": float(later.max()),
+            "the same: PDC's largest fall [counts]": float((-later).max()),
+        }
+    return None
+
+
+def _thrown(skin, speed):
+    """PDC and PAC as in `_rung` of the default sensor without noise, which a ball hits at a speed [m/s]."""
+    spec = mujoco.MjSpec.from_string(_BALL)
+    handle = biotac_mj.attach(spec, site="mount", tier="condensed", skin=skin, readings={"noise": False})
+    model = spec.compile()
+    data, rows = mujoco.MjData(model), []
+    data.qvel[0] = speed
+    while data.time < 0.3:
+        mujoco.mj_step(model, data)
+        if model.opt.timestep > (data.time + 1e-9) % 0.01:
+            rows.append((data.time, handle.read(data, "pdc")[0], *handle.read(data, "pac")))
+    time, pdc, *pac = np.array(rows).T
+    fast = (time[:, None] + np.arange(-len(pac), 0) / (100 * len(pac))).ravel()
+    return np.array([time, pdc]), np.array([fast, np.array(pac).T.ravel()])
+
+
 def measures(counts: np.ndarray, rest: np.ndarray, pressing: np.ndarray) -> dict:
     """What the table says of pressed rows: counts (n, 19), at rest (n, 19), force (n,) [N]."""
     change, log_z = counts - rest, log_impedance(counts) - log_impedance(rest)
@@ -293,7 +358,7 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> tuple[
         real, mine = resting(path)
         for name, one in (("std [counts]", np.std), ("lag-1 correlation", _lag)):
             add(f"PAC at rest, {name}", path.name, float(one(real)), float(one(mine)))
-        for name, pair in (let_go(path, skin) or {}).items():
+        for name, pair in {**(let_go(path, skin) or {}), **(tap(path, skin) or {})}.items():
             add(name, path.name, *pair)
     with tempfile.TemporaryDirectory() as folder:
         pressed, free = presses(data, folder)

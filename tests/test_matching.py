@@ -214,6 +214,21 @@ def test_the_tables_measures(real_table):
     assert abs(found["correlation of near electrodes"]) < 0.1
 
 
+def test_a_tap_is_told_from_presses(real_table):
+    """PAC that dies away with a time constant of 4 ms; a louder push moves PDC for good."""
+    rng, time = np.random.default_rng(0), np.arange(0, 3, 1 / 2200)
+    pac = 2048 + rng.normal(0, 2, len(time))
+    slow = np.arange(0, 3, 0.01)
+    pdc = 1300.0 + 100 * (slow > 2.0)
+    for start, size in ((1.0, 600), (2.0, 900)):
+        after = time - start
+        pac[after >= 0] += size * np.exp(-after[after >= 0] / 4e-3)
+    found = list(real_table._rung(np.array([slow, pdc]), np.array([time, pac])).values())
+    assert found[0] == pytest.approx(600, rel=0.02)
+    assert found[1:3] == pytest.approx([4.0, 4.0 * np.log(10)], rel=0.1) and found[3:] == [0, 0]
+    assert real_table._rung(np.array([slow, pdc]), np.array([time, 2048 + 0 * pac])) is None
+
+
 def test_the_table_of_a_folder(real_table, response, truth, tmp_path, monkeypatch):
     rows, folder = truth[2], tmp_path / "recordings" / "sensor"
     folder.mkdir(parents=True)
