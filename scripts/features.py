@@ -76,6 +76,7 @@ DESIGN_ROWS = {
         "no, likewise",
     ),
     'signal "learned"': ("yes", "no: its weights are of a BioTac's skin", "no, likewise"),
+    "`biotac data samples`": ("yes", "no: its sensor is a BioTac", "no, likewise"),
     "messages of ROS": ("biotac_sensors, tactile_msgs", "tactile_msgs", "tactile_msgs"),
 }
 
@@ -304,7 +305,7 @@ _READINGS = (
 # How `mj_step` and `mujoco_warp.step` find the force of a skin and the motion of bodies together.
 _COUPLING = (
     ("`status` tells how the step went: tier, steps without a balance, rounds, share of the bodies' way, "
-     "whether push on a body was withheld", "attach, condensed, batch; generate keeps `converged`"),
+     "share of the push on a body that was withheld", "attach, condensed, batch; generate keeps `converged`"),
     ("Two-way, skin and bodies are solved in rounds until they agree. A skin that cannot be solved where the "
      "bodies go is solved on the way there. Core, nail and clamp are solid. No blow gives back more energy "
      "than it put in", "attach, condensed, batch"),
