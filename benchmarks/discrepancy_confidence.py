@@ -19,7 +19,6 @@ from discrepancy_recordings import table
 from records import read_json, write_json
 
 from biotac_mj.discrepancy.recordings.confidence import NAMED, farthest
-from biotac_mj.discrepancy.recordings.rest import LIKELY
 from biotac_mj.quality.confidence import PER_CANDIDATE, WEIGHTS, probability
 
 __all__ = ["authors_left_out", "fit"]
@@ -38,14 +37,14 @@ FEATURES = {
     "slip": {},
     "late": {"gain": 1, "size": 1},
 }
-_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "swells")
+_ROWS = ("rhythm", "sharp", "sharp1", "again")
 # of what is left: each may be what no name fits. Under a load levels are in recordings without an effect what
 # they are in others
 LEFT = {
     "loaded": _ROWS,
     "short": _ROWS,
-    "moving": ("rhythm", "rhythm1", "sharp1", "low6", "again", "swells"),
-    "still": ("counts1", "level3", "stands", *_ROWS, "low1", "low6"),
+    "moving": ("rhythm", "sharp1", "low6", "again"),
+    "still": ("level3", *_ROWS, "low1", "low6"),
 }
 UNKNOWN = 0.1  # of recordings without an effect, that are as unusual as is called unknown
 RIDGE = {"detector": 0.3, "feature": 0.5}
@@ -147,16 +146,14 @@ def authors_left_out(rows: list) -> list:
         if lacking:
             kinds = " and ".join(lacking)
             raise SystemExit(f"without {author}'s no {kinds} recording has no effect: give more pieces")
-        said, likely = [[n for n in r["named"] if n["detector"] in WEIGHTS] for r in mine], set()
+        said = [[n for n in r["named"] if n["detector"] in WEIGHTS] for r in mine]
         for n in _candidates(mine):
             p = probability(n["detector"], n["features"], n["beside"], weights)
             if p >= NAMED:
                 said[n["row"]].append(n | {"confidence": p})
-            elif p >= LIKELY and n["detector"] != "shared":
-                likely.add(n["row"])
-        for i, (r, names) in enumerate(zip(mine, said)):
+        for r, names in zip(mine, said):
             usual = fitted["usual"][r["left"]]
-            unknown = farthest(r["rest"], usual["features"])[0] > usual["limit"] or i in likely
+            unknown = farthest(r["rest"], usual["features"])[0] > usual["limit"]
             out.append(r | {"named": names, "unknown": unknown})
     return out
 

@@ -393,17 +393,15 @@ def test_a_small_jump_is_told_while_the_load_moves():
 
 
 @pytest.mark.slow  # quick: a small jump while the load moves
-@pytest.mark.parametrize("many", [3, pytest.param(8, marks=pytest.mark.slow)])
-def test_common_jumps_under_load_are_not_single_electrodes(many):
-    """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
+def test_common_jumps_under_load_are_not_single_electrodes():
+    """Eight that jump are unknown: what moves so many has one cause."""
     e, _, rng = pressed(8, 40)
     e += 4 * rng.standard_normal(e.shape)
-    for k in range(many):
+    for k in range(8):
         e[700 + 180 * k :, 2 * k] += 200
     d = diagnose_recording(PlainRecording(np.clip(np.rint(e), 0, 4095)))
     alone = [f for f in d.findings if f.id == "drift" and len(f.channels) == 1]
     assert len(alone) < 3 and d.rest.significant, d.verdict
-    assert ("perhaps" in d.verdict) == (many == 3), d.verdict
 
 
 def test_a_random_walk_at_rest_is_a_course():

@@ -27,20 +27,29 @@ class RecordingDiagnosis(Verdict):
     """A verdict on a plain recording.
 
     Attributes:
-      recording: with upper bits put back where counts overflowed; locked: share kept aside at the end;
-      findings: named, the largest gap closed first; rejected: those that the part kept aside contradicts or
-        that are too weak to be named; late: those that begin in the part kept aside;
-      rest: what is left; session: counts without the effects; protocol: of a checkup, None of a plain log.
+      session: counts without the effects; locked: share kept aside at the end; late: named, and begun in
+        the part kept aside; rest: what is left.
     """
 
-    recording: PlainRecording
+    session: Session
     locked: float
-    findings: list[Candidate]
-    rejected: list[Candidate]
     late: list[Candidate]
     rest: Rest
-    session: Session
-    protocol: Protocol | None = None
+
+    @property
+    def recording(self) -> PlainRecording:
+        """With upper bits put back where counts overflowed."""
+        return self.session.recording
+
+    @property
+    def findings(self) -> list[Candidate]:
+        """Named, the largest gap closed first."""
+        return self.session.findings
+
+    @property
+    def rejected(self) -> list[Candidate]:
+        """Those that the part kept aside contradicts or that are too weak to be named."""
+        return self.session.weak
 
     def pictures(self) -> list[Picture]:
         from .pictures import pictures_of
@@ -92,14 +101,10 @@ def concluded(
                 "locked_share": locked,
             },
         },
-        recording=r,
+        session=session,
         locked=locked,
-        findings=session.findings,
-        rejected=session.weak,
         late=late,
         rest=left,
-        session=session,
-        protocol=protocol,
     )
 
 

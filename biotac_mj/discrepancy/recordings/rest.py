@@ -7,12 +7,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from ...quality.clock import CLOCK_FAULT
-from ...quality.noise import noise_level, running_median, sound_noise
-from .confidence import USUAL, farthest
+from ...quality.noise import noise_level, running_median
+from .confidence import NAMED, USUAL, farthest
 from .recording import MIN_ROWS
 from .session import Session
 
-__all__ = ["LIKELY", "Rest", "rest"]
+__all__ = ["Rest", "rest"]
 
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
@@ -20,11 +20,6 @@ _LIVELY = 1.0
 # of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
-# of a name that is not given: more likely than not it is right, and if it is not, something else is there
-LIKELY = 0.5
-_ROUND = 0.2  # [counts] below which a noise is not told from rounding
-_WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
-_P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
 _STILL, _QUIET = (
     10,
@@ -65,20 +60,14 @@ def rest(session: Session) -> Rest:
     features, said = _of_rows(session)
     features["seconds"] = float(np.log(m.time[m.inside][-1]))
     if counts.max() >= _RESOLVED:
-        size = level * (m.activity + 2 * m.noise) * m.slope
-        features["counts1"] = float(np.log(size.max()))
         features["level3"] = float(np.log(np.sort(level)[-min(3, len(level))]))
-        # what was seen and could not be named
-        weak = [f for f in session.weak if f.detector.single and f.p < _P]
-        features["stands"] = max((f.features.get("stands", 0.0) for f in weak), default=0.0)
     kind = _kind(session, features["low"])
     listed = [
         {"channel": f"e{m.used[i] + 1}"} | _where(counts[:, i], time)
         for i in np.argsort(-np.maximum(level, aside))[:3]
     ]
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
-    if not faults:
-        faults = _guess(session)
+    faults += _contradicted(session)
     far, name = farthest(features, USUAL[kind]["features"])
     # as few rows as in a recording that is refused say nothing
     if far > USUAL[kind]["limit"] and len(session.recording) * session.fresh >= MIN_ROWS:
@@ -87,12 +76,9 @@ def rest(session: Session) -> Rest:
             f"{c['from']:.0f} s to {c['to']:.0f} s"
             for c in listed
         )
-        faults = [*faults, departs if name in _OF_LEVELS else said[name]]
+        faults = [*faults, departs if name == "level3" else said[name]]
     text = "; ".join(faults) or "what each electrode does, the others and its own earlier blocks explain"
     return Rest(bool(faults), text, kind, listed, features)
-
-
-_OF_LEVELS = ("counts1", "level3", "stands")  # features of departures in counts
 
 
 def _kind(session, low):
@@ -113,15 +99,13 @@ def _where(counts, time):
     return {"from": float(first), "to": float(last), "counts": float(counts[w])}
 
 
-def _guess(session):
-    """The likeliest name that is not given, in words: a list of none or one."""
-    # a sensor that warms up a little is any sensor
-    likely = [f for f in session.weak if f.share is None and f.confidence >= LIKELY and f.p < _P]
-    if not likely:
+def _contradicted(session):
+    """What is said of names that the rows kept aside contradict; a warm-up is none, every sensor has some."""
+    weak = [f for f in session.weak if f.verified is False and f.confidence >= NAMED and f.share is None]
+    names = [f.kind.name + f.where for f in weak]
+    if not names:
         return []
-    most = max(likely, key=lambda f: f.confidence)
-    why = "too little to be named" if most.verified is not False else "but not in the part kept aside"
-    return [f"perhaps {most.kind.name}{most.where}, at {most.confidence:.2f} {why}"]
+    return [f"{' and '.join(names)} would explain the rows fitted, and those kept aside contradict it"]
 
 
 def _of_rows(session):
@@ -141,10 +125,8 @@ def _of_rows(session):
     if r.force is not None:  # a touch that comes again is none of the sensor's
         over = over - np.maximum(_spectrum(r.force[rows], size, 1e-12)[1][band].max(1), 0)[:, None]
     beats = 2 * np.sqrt(power[band]) / np.hanning(size).sum()  # [counts]
-    third = np.argsort(over, axis=1)[:, -3]
-    at = {"rhythm": int(over.mean(1).argmax())}
-    at["rhythm1"] = int(over[np.arange(len(over)), third].argmax())
-    swing = {k: float(np.sort(beats[i])[-3]) for k, i in at.items()}
+    most_over = int(over.mean(1).argmax())
+    swing = float(np.sort(beats[most_over])[-3])
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
     # from one row to the next, more than noise and than the rows around
     step = np.abs(np.diff(x, axis=0))
@@ -159,27 +141,22 @@ def _of_rows(session):
     if session.loaded and sharp[~touch].sum() <= max(1, _STRAY * number):
         sharp, number = np.zeros_like(sharp), 0
     most = np.argsort(-sharp.sum(0))[:2]
-    said = {
-        k: f"a rhythm of {f[band][i]:.1f} Hz and up to {beats[i].max():.0f} counts" for k, i in at.items()
-    }
-    said |= dict.fromkeys(
+    rhythm = f"a rhythm of {f[band][most_over]:.1f} Hz and up to {beats[most_over].max():.0f} counts"
+    said = {"rhythm": rhythm} | dict.fromkeys(
         ("sharp", "sharp1"),
         f"{number} samples change from one row to the next by more than noise and the rows around do, most "
         f"of {' and '.join(f'e{k + 1}' for k in most)}",
     )
     said |= dict.fromkeys(("low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most")
     said["again"] = "rows come again, in all electrodes"
-    said["swells"] = "the noise of all electrodes grows and falls against the law of sound sensors"
     return {
-        "rhythm": float(over.mean(1).max()) if swing["rhythm"] >= _RESOLVED else 0.0,
-        "rhythm1": float(np.sort(over, axis=1)[:, -3].max()) if swing["rhythm1"] >= _RESOLVED else 0.0,
+        "rhythm": float(over.mean(1).max()) if swing >= _RESOLVED else 0.0,
         "sharp": float(np.log(sharp.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
         "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
         "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
         "low": float(np.median(low)),
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),
-        "swells": _swells(x) if r.absolute else 0.0,  # the law is one of counts
     }, said
 
 
@@ -205,19 +182,6 @@ def _touched(x):
     after = near[np.clip(i + _NEAR, 1, n)] > near[np.clip(i + 1 + half, 0, n - 1)]
     far = _moved(x, 2 * _NEAR + 1)[:-1] > _TOUCHED * noise_level(x) + 4
     return (before | after) & (far.sum(1) >= 3)
-
-
-def _swells(x):
-    """By how much the noise of most electrodes x (n, 19) changes over time against what the law says at their
-    counts: a logarithm. What amplifies, bends, or smooths what is read does that to its noise, too."""
-    size = max(_SHORT, len(x) // _WINDOWS)
-    d = np.abs(np.diff(x, n=5, axis=0))
-    ratio = []
-    for first in range(0, len(d) - size + 1, size):
-        noise = 1.4826 * np.median(d[first : first + size], axis=0) / np.sqrt(252)
-        law = sound_noise(np.median(x[first : first + size], axis=0))
-        ratio.append(np.median(np.log((noise + _ROUND) / (law + _ROUND))))
-    return float(np.quantile(ratio, 0.9) - np.quantile(ratio, 0.1)) if ratio else 0.0
 
 
 def _moved(x: np.ndarray, rows: int) -> np.ndarray:

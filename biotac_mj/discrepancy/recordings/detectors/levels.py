@@ -157,20 +157,18 @@ def _single(session, trend, k, options):
         f"{'a step' if trend.kind == 'step' else 'a trend over time'} of "
         f"{trend.size * m.slope[i]:.0f} counts against what the other electrodes say",
         features=_features(session, trend)
-        | dict(zip(("stands", "apart"), _stands(m, k, designed(session.counts))))
+        | {"apart": _apart(m, k, designed(session.counts))}
         | {"lead": float(np.clip(lead, -1, _PLAINLY))},
         correct=correct,
         trend=trend,
     )
 
 
-def _stands(m, k, design):
-    """Logarithms of how much more the levels of electrode k wander about their mean than those of the others,
-    in counts: than their median, than those that have no trend of their own."""
+def _apart(m, k, design):
+    """Logarithm of how much more the levels of electrode k wander about their mean, in counts, than those of
+    the others that have no trend of their own."""
     level, _ = m.levels(m.alone())
-    size = np.log(level.std(0) * m.slope + 0.3)
-    mine, others = size[m.used == k][0], size[m.used != k]
-    return float(mine - np.median(others)), ahead(size, m.used, k, design)
+    return ahead(np.log(level.std(0) * m.slope + 0.3), m.used, k, design)
 
 
 def settle(session: Session) -> None:

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from ...evidence import sign_flip
+from ...evidence import log_ratio, sign_flip
 
 __all__ = ["BLOCKS", "SHARP", "Trend", "compare", "trends", "goes_on", "hats", "sharp"]
 
@@ -85,8 +85,8 @@ def compare(null: np.ndarray, other: np.ndarray, block: np.ndarray, scale: float
     """(blocks,) nats by which residuals `other` (w,) beat `null` (w,), both predicted from other blocks: half
     the logarithm of the ratio of mean squares for every cell, with noise of variance scale^2 beneath."""
     number = np.bincount(block)
-    square = [np.bincount(block, r**2) / number + scale**2 for r in (null, other)]
-    return 0.5 * number * np.log(square[0] / square[1])
+    square = [np.bincount(block, r**2) / number for r in (null, other)]
+    return log_ratio(*square, number, scale**2)
 
 
 def trends(
