@@ -16,7 +16,7 @@ from ..contact.penetration import core_clearance
 from ..contact.posed import SKIN, Geoms, face_radius
 from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
-from .lanes import block_max, block_rank, sync
+from .lanes import block_max, block_rank, keep_rows, sync
 from .structs import BACK, Constants, Remembered, Scratch
 
 __all__ = [
@@ -351,6 +351,8 @@ def find_nodes(
                 s.coordinate[w, 3 * k + a] = 3 * s.node[w, k] + a
         for k in range(t, nin, threads):
             s.coordinate[w, 3 * nnode + k] = 3 * c.node.shape[0] + s.core_node[w, k]
+        if threads == 1:
+            keep_rows(w, 3 * nnode + nin, s.coordinate, s.last, s.known)
     sync()
     return nnode, nin
 

@@ -10,15 +10,16 @@ __all__ = [
     "block_max",
     "block_rank",
     "block_sum",
-    "begin_row",
+    "add_row",
+    "add_rows",
     "dot_column",
     "dot_columns",
     "eliminate",
-    "fill_row",
-    "fill_rows",
     "gather_rows",
+    "keep_rows",
     "sum_rows",
     "sync",
+    "take_columns",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -331,44 +332,42 @@ def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
     ...
 
 
-# By one thread, row by row, of which a processor's vectors do many columns at a time. A has rows of length
-# `wide`, of which the first n are meant.
-_ROWS = """
+# By one thread the compliance between the candidates is kept, contiguous: B has rows of length m, one for
+# each candidate's coordinate, which are gathered when they are first used. So a processor's vectors do many
+# columns at a time.
+@wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
-{what}
+    const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
+    int* __restrict old = last.data + (long long)world * last.shape[1];
+    int* __restrict there = known.data + (long long)world * known.shape[1];
+    bool same = old[0] == m;
+    for (int j = 0; j < m && same; ++j) same = old[1 + j] == at[j];
+    if (same) return;
+    old[0] = m;
+    for (int j = 0; j < m; ++j) old[1 + j] = at[j], there[j] = 0;
 #endif
-"""
-
-
-@wp.func_native(
-    _ROWS.format(
-        what="""
-    const float* __restrict b = push.data + (long long)world * push.shape[1];
-    for (int j = 0; j < n; ++j) a[j] = -held * b[j];"""
-    )
-)
-def begin_row(
-    A: wp.array2d(dtype=float),
+""")
+def keep_rows(
     world: int,
-    n: int,
-    wide: int,
-    row: int,
-    held: float,
-    push: wp.array2d(dtype=float),
+    m: int,
+    coordinate: wp.array2d(dtype=int),
+    last: wp.array2d(dtype=int),
+    known: wp.array2d(dtype=int),
 ):
-    """Makes a row -held times push[world]."""
+    """Forgets the rows of B where the candidates are others than the last ones."""
     ...
 
 
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    const int* __restrict to = row.data + (long long)world * row.shape[1];
-    const int* __restrict at = column.data + (long long)world * column.shape[1];
-    float* __restrict a = A.data + (long long)world * A.shape[1];
-    for (int i = 0; i < m; ++i, a += n) {
-        const float* __restrict c = C.data + to[i] * (long long)C.shape[1];
-        for (int j = 0; j < n; ++j) a[j] = c[at[j]];
+    const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
+    int* __restrict there = known.data + (long long)world * known.shape[1];
+    for (int i = row; i < row + count; ++i) {
+        if (there[i]) continue;
+        there[i] = 1;
+        float* __restrict b = B.data + (long long)world * B.shape[1] + (long long)i * m;
+        const float* __restrict c = C.data + at[i] * (long long)C.shape[1];
+        for (int j = 0; j < m; ++j) b[j] = c[at[j]];
     }
 #endif
 """)
@@ -376,63 +375,90 @@ def gather_rows(
     C: wp.array2d(dtype=float),
     world: int,
     m: int,
-    row: wp.array2d(dtype=int),
-    n: int,
-    column: wp.array2d(dtype=int),
-    A: wp.array2d(dtype=float),
-):
-    """Makes A[world] the m x n entries of C at listed rows and columns, one row after another."""
-    ...
-
-
-@wp.func_native(
-    _ROWS.format(
-        what="""
-    const float* __restrict c = C.data + (long long)world * C.shape[1] + (long long)from_ * n;
-    for (int j = 0; j < n; ++j) a[j] += x * c[j];"""
-    )
-)
-def fill_row(
-    A: wp.array2d(dtype=float),
-    world: int,
-    n: int,
-    wide: int,
+    coordinate: wp.array2d(dtype=int),
     row: int,
-    x: float,
-    C: wp.array2d(dtype=float),
-    from_: int,
+    count: int,
+    known: wp.array2d(dtype=int),
+    B: wp.array2d(dtype=float),
 ):
-    """Adds x times a row of C[world] of `gather_rows` to a row."""
+    """Makes `count` rows of B from `row` on the entries of C at the candidates' coordinates."""
     ...
 
 
-@wp.func_native(
-    _ROWS.format(
-        what="""
-    float *__restrict b = a + wide, *__restrict d = b + wide;
-    const float* __restrict c = C.data + (long long)world * C.shape[1] + (long long)from_ * n;
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    float* __restrict a = sum.data + (long long)world * sum.shape[1];
+    float *__restrict b = a + m, *__restrict d = b + m;
+    const float* __restrict c = B.data + (long long)world * B.shape[1] + (long long)row * m;
     const float x0 = x.data[0][0], x1 = x.data[0][1], x2 = x.data[0][2];
     const float y0 = x.data[1][0], y1 = x.data[1][1], y2 = x.data[1][2];
     const float z0 = x.data[2][0], z1 = x.data[2][1], z2 = x.data[2][2];
-    for (int j = 0; j < n; ++j) {
-        const float u = c[j], v = c[n + j], w = c[2 * n + j];
-        a[j] += x0 * u + x1 * v + x2 * w;
-        b[j] += y0 * u + y1 * v + y2 * w;
-        d[j] += z0 * u + z1 * v + z2 * w;
-    }"""
-    )
-)
-def fill_rows(
+    for (int j = 0; j < m; ++j) {
+        const float u = c[j], v = c[m + j], w = c[2 * m + j];
+        a[j] = (first ? 0.0f : a[j]) + (x0 * u + x1 * v + x2 * w);
+        b[j] = (first ? 0.0f : b[j]) + (y0 * u + y1 * v + y2 * w);
+        d[j] = (first ? 0.0f : d[j]) + (z0 * u + z1 * v + z2 * w);
+    }
+#endif
+""")
+def add_rows(
+    world: int,
+    m: int,
+    first: int,
+    x: wp.mat33,
+    B: wp.array2d(dtype=float),
+    row: int,
+    sum: wp.array2d(dtype=float),
+):
+    """Adds x times three rows of B to three rows of length m, which the first makes."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    float* __restrict a = sum.data + (long long)world * sum.shape[1];
+    const float* __restrict c = B.data + (long long)world * B.shape[1] + (long long)row * m;
+    for (int j = 0; j < m; ++j) a[j] = (first ? 0.0f : a[j]) + x * c[j];
+#endif
+""")
+def add_row(
+    world: int,
+    m: int,
+    first: int,
+    x: float,
+    B: wp.array2d(dtype=float),
+    row: int,
+    sum: wp.array2d(dtype=float),
+):
+    """Adds x times a row of B to a row of length m."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
+    const float* __restrict b = push.data + (long long)world * push.shape[1];
+    const int* __restrict at = place.data + (long long)world * place.shape[1];
+    const float* __restrict c = sum.data + (long long)world * sum.shape[1] + begin;
+    for (int j = 0; j < n; ++j) a[j] = (empty ? 0.0f : c[at[j]]) - held * b[j];
+    a[row] += 1.0f;
+#endif
+""")
+def take_columns(
     A: wp.array2d(dtype=float),
     world: int,
     n: int,
     wide: int,
     row: int,
-    x: wp.mat33,
-    C: wp.array2d(dtype=float),
-    from_: int,
+    held: float,
+    push: wp.array2d(dtype=float),
+    place: wp.array2d(dtype=int),
+    sum: wp.array2d(dtype=float),
+    begin: int,
+    empty: int,
 ):
-    """Adds x times three rows of C[world] to three rows."""
+    """Makes n entries of a row of A, of length `wide`, those of sum[world] from `begin` on at listed places,
+    or nothing, less held times push[world], and adds one on the diagonal."""
     ...
 
 
@@ -442,17 +468,14 @@ _SUMS = """
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = listed.data + (long long)world * listed.shape[1];
     const float* __restrict f = factor.data + (long long)world * factor.shape[1];
-    const long long wide = C.shape[1];
     for (int first = 0; first < n; first += 512) {{
         const int most = n - first < 512 ? n - first : 512;
         float* __restrict total = sum.data + (long long)world * sum.shape[1] + first;
         const {kind} *__restrict c0, *__restrict c1, *__restrict c2, *__restrict c3;
-        {columns}
         for (int j = 0; j < most; ++j) total[j] = 0.0f;
         int a = 0;
         for (; a + 4 <= count; a += 4) {{
-            c0 = C.data + at[a] * wide, c1 = C.data + at[a + 1] * wide;
-            c2 = C.data + at[a + 2] * wide, c3 = C.data + at[a + 3] * wide;
+            c0 = {row0}, c1 = {row1}, c2 = {row2}, c3 = {row3};
             const float f0 = {scale0}, f1 = {scale1}, f2 = {scale2}, f3 = {scale3};
             for (int j = 0; j < most; ++j) {{
                 const float p = {entry0} * f0;
@@ -466,7 +489,7 @@ _SUMS = """
             }}
         }}
         for (; a < count; ++a) {{
-            c0 = C.data + at[a] * wide;
+            c0 = {row0};
             const float f0 = {scale0};
             for (int j = 0; j < most; ++j) {{
                 const float p = {entry0} * f0;
@@ -478,35 +501,37 @@ _SUMS = """
 """
 
 
-def _sums(kind, columns, scale, entry):
-    names = {f"scale{k}": scale.format(k=f"a + {k}") for k in range(4)}
-    names |= {f"entry{k}": entry.format(c=f"c{k}") for k in range(4)}
-    return _SUMS.format(kind=kind, columns=columns, **names)
+def _sums(kind, row, scale, entry):
+    names = {f"row{k}": row.format(k=f"at[a + {k}]") for k in range(4)}
+    names |= {f"scale{k}": scale.format(k=f"a + {k}") for k in range(4)}
+    names |= {f"entry{k}": entry.format(c=f"c{k}[j]") for k in range(4)}
+    return _SUMS.format(kind=kind, **names)
 
 
 @wp.func_native(
-    _sums(
-        "float",
-        "const int* __restrict to = column.data + (long long)world * column.shape[1] + first;",
-        "f[{k}]",
-        "{c}[to[j]]",
-    )
+    _sums("float", "B.data + (long long)world * B.shape[1] + (long long){k} * n + first", "f[{k}]", "{c}")
 )
 def sum_rows(
-    C: wp.array2d(dtype=float),
+    B: wp.array2d(dtype=float),
     world: int,
     n: int,
-    column: wp.array2d(dtype=int),
     count: int,
     listed: wp.array2d(dtype=int),
     factor: wp.array2d(dtype=float),
     sum: wp.array2d(dtype=float),
 ):
-    """Makes the first n of sum[world] `dot_column` of columns column[world]."""
+    """Makes the first n of sum[world] the sums over listed rows of B of `gather_rows`, whose length is n."""
     ...
 
 
-@wp.func_native(_sums("wp::half", "", "f[{k}] * largest.data[at[{k}]]", "wp::half_to_float({c}[first + j])"))
+@wp.func_native(
+    _sums(
+        "wp::half",
+        "C.data + {k} * (long long)C.shape[1] + first",
+        "f[{k}] * largest.data[at[{k}]]",
+        "wp::half_to_float({c})",
+    )
+)
 def sum_rows(  # noqa: F811
     C: wp.array2d(dtype=wp.float16),
     largest: wp.array(dtype=float),
@@ -517,7 +542,7 @@ def sum_rows(  # noqa: F811
     factor: wp.array2d(dtype=float),
     sum: wp.array2d(dtype=float),
 ):
-    """The same by `dot_columns` of the first n columns."""
+    """Makes the first n of sum[world] `dot_columns` of the first n columns."""
     ...
 
 

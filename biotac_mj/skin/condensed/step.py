@@ -197,6 +197,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
         ("core_node", core_nodes),
         ("coordinate", n),
         ("loaded", n),
+        ("loaded_place", n),
         ("on", nodes + core_nodes),
         ("touched", touched),
     ):
@@ -206,16 +207,17 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
     s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)
     s.load = wp.zeros((nworld, n), dtype=float)
-    sums = 0 if model.device.is_cuda else max(n, 3 * len(model.free))
-    s.sum = wp.zeros((nworld, max(sums, 3 * touched)), dtype=float)
-    s.between = wp.empty((nworld, 0 if model.device.is_cuda else 3 * touched * n), dtype=float)
-    s.held = wp.zeros((nworld, 3 * touched), dtype=float)
+    alone = 0 if model.device.is_cuda else n  # by one thread; memory of rows that are never used is not taken
+    s.sum = wp.zeros((nworld, 3 * max(alone, len(model.free))), dtype=float)
+    s.between = wp.empty((nworld, alone * alone), dtype=float)
+    s.known, s.last = wp.zeros((nworld, alone), dtype=int), wp.zeros((nworld, alone + 1), dtype=int)
+    s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
     s.stiff = wp.zeros((nworld, core_nodes), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))
     ring = model.ring.shape[1]
     s.block = wp.zeros((nworld, touched, ring), dtype=wp.mat33)
     s.core_block = wp.zeros((nworld, touched, ring), dtype=float)
-    s.column = wp.zeros((nworld, 3 * touched), dtype=int)
+    s.column, s.column_place = (wp.zeros((nworld, 3 * touched), dtype=int) for _ in range(2))
     s.matrix = wp.zeros((nworld, (3 * touched + 6 * max(groups, 1)) ** 2), dtype=float)
     s.bodies, s.borders = make_bodies(groups, nworld), wp.zeros(nworld, dtype=int)
     s.arm, s.group = wp.zeros((nworld, nodes), dtype=vec3), wp.zeros((nworld, nodes), dtype=int)

@@ -103,7 +103,8 @@ class Scratch:
     coordinate: wp.array2d(dtype=int)
     loaded: wp.array2d(dtype=int)  # contact coordinates with a force, and it, of a product
     load: wp.array2d(dtype=float)
-    sum: wp.array2d(dtype=float)  # how pressure pushes the equations; sums of `lanes.sum_rows`
+    loaded_place: wp.array2d(dtype=int)  # and their places among the candidates'
+    push: wp.array2d(dtype=float)  # of the equations, how pressure pushes them
     vector: wp.array3d(dtype=real)
     on: wp.array2d(dtype=int)  # which touch
     stiff: wp.array2d(dtype=real)  # stiffness of inner coordinates, lumped [N/m]
@@ -114,7 +115,13 @@ class Scratch:
     block: wp.array3d(dtype=wp.mat33)  # stiffness of pairs of nodes [N/m]
     matrix: wp.array2d(dtype=float)
     column: wp.array2d(dtype=int)  # contact coordinates of the equations
-    between: wp.array2d(dtype=float)  # by one thread, compliance of candidates at what touches
+    column_place: wp.array2d(dtype=int)  # and their places among the candidates'
+    # by one thread, see `lanes.gather_rows`: compliance between candidates, its rows that are known, and the
+    # number of the candidates' coordinates and these; sums of rows
+    between: wp.array2d(dtype=float)
+    known: wp.array2d(dtype=int)
+    last: wp.array2d(dtype=int)
+    sum: wp.array2d(dtype=float)
     held: wp.array2d(dtype=float)  # of the equations, how they are held against the liquid's pressure
     solve: Solve
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]

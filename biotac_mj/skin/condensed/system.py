@@ -7,16 +7,16 @@ from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3
 from .bodies import move_nodes, number_bodies, rigid_column
 from .lanes import (
-    begin_row,
+    add_row,
+    add_rows,
     block_rank,
     block_sum,
     dot_column,
     eliminate,
-    fill_row,
-    fill_rows,
     gather_rows,
     sum_rows,
     sync,
+    take_columns,
 )
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
@@ -54,6 +54,7 @@ def gather_load(w: int, t: int, threads: int, n: int, p: int, c: Constants, s: S
         f = s.vector[w, p, a]
         if f != real(0.0):
             s.loaded[w, at] = s.coordinate[w, a]
+            s.loaded_place[w, at] = a
             s.load[w, at] = float(f)
             at += 1
     own = block_sum(own)  # its barriers make what was written readable
@@ -81,7 +82,9 @@ def multiply(
     if shifted == 1:
         push += l.bulk_stiffness * l.swell * l.bulge
     if threads == 1:
-        sum_rows(c.compliance, w, n, s.coordinate, count, s.loaded, s.load, s.sum)
+        for a in range(count):
+            gather_rows(c.compliance, w, n, s.coordinate, s.loaded_place[w, a], 1, s.known, s.between)
+        sum_rows(s.between, w, n, count, s.loaded_place, s.load, s.sum)
     for j in range(t, n, threads):
         cj = s.coordinate[w, j]
         total = float(0.0)
@@ -194,35 +197,37 @@ def _fill_by_rows(
 ):  # fmt: skip
     """The matrix of `fill_contact` by one thread."""
     n = 3 * outer + inner
-    gather_rows(c.compliance, w, 3 * nnode + nin, s.coordinate, n, s.column, s.between)
+    m = 3 * nnode + nin
     for k in range(outer):
+        p = s.node[w, s.touched[w, k]]
+        empty = int(1)
+        for e in range(c.ring_start[p], wp.where(lumped == 1, c.ring_start[p] + 1, c.ring_start[p + 1])):
+            block = s.block[w, k, e - c.ring_start[p]]
+            if wp.ddot(block, block) > 0.0:
+                row = 3 * wp.where(lumped == 1, s.touched[w, k], s.place[w, c.ring[e]])
+                gather_rows(c.compliance, w, m, s.coordinate, row, 3, s.known, s.between)
+                add_rows(w, m, empty, scale * block, s.between, row, s.sum)
+                empty = 0
         for a in range(3):
-            begin_row(s.matrix, w, n, wide, 3 * k + a, soft * s.held[w, 3 * k + a], s.sum)
-        if lumped == 1:
-            fill_rows(s.matrix, w, n, wide, 3 * k, scale * s.block[w, k, 0], s.between, 3 * s.touched[w, k])
-        else:
-            p = s.node[w, s.touched[w, k]]
-            for e in range(c.ring_start[p], c.ring_start[p + 1]):
-                block = s.block[w, k, e - c.ring_start[p]]
-                if wp.ddot(block, block) > 0.0:
-                    row = 3 * s.place[w, c.ring[e]]
-                    fill_rows(s.matrix, w, n, wide, 3 * k, scale * block, s.between, row)
+            i = 3 * k + a
+            held = soft * s.held[w, i]
+            take_columns(s.matrix, w, n, wide, i, held, s.push, s.column_place, s.sum, a * m, empty)
     for k in range(inner):
         i = 3 * outer + k
-        begin_row(s.matrix, w, n, wide, i, soft * s.held[w, i], s.sum)
-        place = coordinate_at(w, i, outer, nnode, s)
-        if lumped == 1:
-            stiff = scale * float(s.stiff[w, place - 3 * nnode])
-            fill_row(s.matrix, w, n, wide, i, stiff, s.between, place)
-        else:
-            p = s.core_node[w, place - 3 * nnode]
-            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
-                one = s.core_block[w, k, e - c.inner_ring_start[p]]
-                if one != 0.0:
-                    row = 3 * nnode + s.core_place[w, c.inner_ring[e]]
-                    fill_row(s.matrix, w, n, wide, i, scale * one, s.between, row)
-    for i in range(n):
-        s.matrix[w, i * wide + i] = s.matrix[w, i * wide + i] + 1.0
+        place = s.column_place[w, i]
+        p = s.core_node[w, place - 3 * nnode]
+        empty = int(1)
+        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+            one = s.core_block[w, k, e - c.inner_ring_start[p]]
+            row = 3 * nnode + s.core_place[w, c.inner_ring[e]]
+            if lumped == 1:
+                one = wp.where(row == place, float(s.stiff[w, place - 3 * nnode]), 0.0)
+            if one != 0.0:
+                gather_rows(c.compliance, w, m, s.coordinate, row, 1, s.known, s.between)
+                add_row(w, m, empty, scale * one, s.between, row, s.sum)
+                empty = 0
+        held = soft * s.held[w, i]
+        take_columns(s.matrix, w, n, wide, i, held, s.push, s.column_place, s.sum, 0, empty)
 
 
 @wp.func
@@ -239,7 +244,8 @@ def fill_contact(
         place = coordinate_at(w, i, outer, nnode, s)
         at = s.coordinate[w, place]
         s.column[w, i] = at
-        s.sum[w, i] = pressed * float(c.give_at[at])
+        s.column_place[w, i] = place
+        s.push[w, i] = pressed * float(c.give_at[at])
         held = float(0.0)  # against the liquid's pressure
         if i < 3 * outer and lumped == 1:
             q = at - i % 3
@@ -279,7 +285,7 @@ def fill_contact(
             total += s.block[w, k, e - begin] * v
         for a in range(3):
             i = 3 * k + a
-            value = scale * total[a] - soft * s.held[w, i] * s.sum[w, j]
+            value = scale * total[a] - soft * s.held[w, i] * s.push[w, j]
             s.matrix[w, i * wide + j] = value + wp.where(i == j, 1.0, 0.0)
     for m in range(t, inner * n, threads):
         i = 3 * outer + m / n
@@ -294,7 +300,7 @@ def fill_contact(
             for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
                 one = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
                 value += one * c.compliance[3 * c.node.shape[0] + c.inner_ring[e], at]
-        value = scale * value - soft * s.held[w, i] * s.sum[w, j]
+        value = scale * value - soft * s.held[w, i] * s.push[w, j]
         s.matrix[w, i * wide + j] = value + wp.where(i == j, 1.0, 0.0)
 
 
