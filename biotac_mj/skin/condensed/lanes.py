@@ -116,6 +116,8 @@ def block_rank(own: int) -> wp.vec2i:
 # changed by all eight at once. On CUDA rows stay where they are. Eight columns are copied to shared memory,
 # where a thread has whole rows and a pivot takes one barrier; right of them it has a column and every
 # warps-th row, four at once, since a load takes long.
+# A system of up to some 95 equations fits in shared memory on CUDA. There each pivot clears its column in all
+# rows (Gauss and Jordan); each warp finds it for itself, its row being the last bits of what is compared.
 @wp.func_native(f"""
     const int width = n + m;
     float* a = A.data + (long long)world * A.shape[1];
@@ -127,6 +129,44 @@ def block_rank(own: int) -> wp.vec2i:
     __shared__ unsigned short order[{MOST_EQUATIONS}];
     __shared__ unsigned char used[{MOST_EQUATIONS}];
     if (n > {MOST_EQUATIONS} || m > 8) return 0;
+    const int wide = width | 1;
+    if (n * wide <= 9 * {MOST_EQUATIONS}) {{
+        float* whole = &panel[0][0];
+        unsigned done = 0;  // which of this lane's rows were pivots
+        __syncthreads();
+        for (int i = warp; i < n; i += warps)
+            for (int k = lane; k < width; k += 32) whole[i * wide + k] = a[(long long)i * width + k];
+        __syncthreads();
+        for (int j = 0; j < n; ++j) {{
+            unsigned largest = 0;
+            for (int i = lane; i < n; i += 32) {{
+                const float v = fabsf(whole[i * wide + j]);
+                const unsigned key = (__float_as_uint(v) & ~127u) | (127 - i);
+                if (v > 0.0f && !(done >> i / 32 & 1) && key > largest) largest = key;
+            }}
+            for (int far = 16; far > 0; far /= 2) {{
+                const unsigned other = __shfl_xor_sync(0xffffffffu, largest, far);
+                largest = other > largest ? other : largest;
+            }}
+            if (largest == 0) return 0;
+            const int p = 127 - (int)(largest & 127u);
+            const float inverse = 1.0f / whole[p * wide + j];
+            if (p % 32 == lane) done |= 1u << p / 32;
+            if (t == 0) order[j] = p;
+            for (int i = warp; i < n; i += warps) {{
+                if (i == p) continue;
+                const float f = whole[i * wide + j] * inverse;
+                for (int k = j + 1 + lane; k < width; k += 32) whole[i * wide + k] -= f * whole[p * wide + k];
+            }}
+            __syncthreads();
+        }}
+        for (int o = t; o < n * m; o += threads) {{
+            const float* row = whole + order[o / m] * wide;
+            a[(long long)(o / m) * width + n + o % m] = row[n + o % m] / row[o / m];
+        }}
+        __syncthreads();
+        return 1;
+    }}
     for (int i = t; i < n; i += threads) used[i] = 0;
     for (int first = 0; first < n; first += 8) {{
         const int next = first + 8 < n ? first + 8 : n;
