@@ -61,6 +61,9 @@ def test_all_that_a_step_launches_is_found_and_nothing_runs(monkeypatch):
     # compiled once each, for the blocks that it is launched by
     assert [found[at][1] for at in convex] == [m.block_dim.convex_ccd] * len({found[at][0] for at in convex})
     assert np.abs(d.qpos.numpy() - before).max() > 0
+    hashes = [found[at][0].get_module_hash() for at in convex]
+    kernels_of_step(mjm, m)  # as each BioTac of a model does
+    assert [found[at][0].get_module_hash() for at in convex] == hashes
 
 
 @contextlib.contextmanager
@@ -113,16 +116,24 @@ def test_all_launches_of_a_batch_step_are_found_data_unchanged():
 
 def test_another_simulators_batch_finds_its_launches():
     spec = mujoco.MjSpec()
-    spec.worldbody.add_geom(size=[3.5e-3, 0, 0], pos=[-12e-3, -11.5e-3, 0])
+    spec.worldbody.add_body(name="ball", mocap=True).add_geom(size=[3.5e-3, 0, 0])
     prefix = batch.add(spec, body="world", skin="coarse")
     mjm = spec.compile()
     made = batch.make(mjm, 2, "cpu", prefix=prefix, skin="coarse", tier="condensed")
     where = [wp.zeros((2, mjm.nbody), dtype=kind, device="cpu") for kind in (wp.vec3, wp.mat33, wp.vec3)]
+    where[1].fill_(wp.mat33(np.eye(3)))
+    xpos, ball = where[0].numpy(), mjm.body("ball").id
+    xpos[:, ball] = [-12e-3, -11.5e-3, 0]
+    where[0].assign(xpos)
     found = {module for module, _ in launched_by(lambda: made.step(*where))}
     assert not made.began.numpy().any()
     with launched() as needed:
         made.step(*where)
-    assert found == needed and made.began.numpy().all()
+        assert made.began.numpy().all() and (np.abs(made.wrench).max((1, 2)) > 1e-3).all()
+        xpos[:, ball] = 1.0  # what was touched comes to rest
+        where[0].assign(xpos)
+        made.step(*where)
+    assert found == needed and not made.wrench.any()
 
 
 def test_warp_is_itself_again_after_an_error(monkeypatch):

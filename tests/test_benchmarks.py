@@ -509,12 +509,12 @@ def test_speed_in_the_hand_counts_what_was_lost(repo, accuracy):
         rates = {"ms_per_step": ms, "hand_steps_per_s": 64e3 / ms, "unsettled": unsettled, "lost": lost}
         return {"checkout": "here", "worlds": 64, "decision": decision, **rates, "held": 1.0, "force_n": 0.5}
 
-    runs = [row(k, 8.0 if k else 2.0, lost=k == 9) for k in range(18)]
-    again = [row(k, 9.0 if k % 2 else 4.0, unsettled=1.0) for k in range(18)]
+    runs = [row(-1, 1.0), *(row(k, 8.0 if k else 2.0, lost=k == 9) for k in range(18))]
+    again = [row(k, 9.0 if k % 2 else 4.0, unsettled=1.0) for k in range(-1, 18)]
     rows = in_hand_speed.best(runs + again)
-    assert [r["ms_per_step"] for r in rows] == [2.0, *[8.0, 4.0] * 8, 8.0]
+    assert [r["ms_per_step"] for r in rows] == [1.0, 2.0, *[8.0, 4.0] * 8, 8.0]
     (one,) = in_hand_speed.summary(rows)
-    assert one["untouched"] == 32e3 and one["lost"] == 1 and one["unsettled"] == 1.0
+    assert (one["nothing_near"], one["near"]) == (64e3, 32e3) and one["lost"] == 1 and one["unsettled"] == 1.0
     assert one["held"] == pytest.approx(64e3 / 6.0)  # as many decisions took 4 ms as 8
     setup = {"checkout": "here", "worlds": 64, "import_s": 1.0, "seconds": 9.0}
     setup |= {"modules_compiled": 3, "modules_before": 40, "kept_before": 2}
@@ -522,7 +522,7 @@ def test_speed_in_the_hand_counts_what_was_lost(repo, accuracy):
     found["failed"] = [{"checkout": "here", "worlds": 8, "why": "x"}]
     lines = in_hand_speed.table(found).splitlines()
     assert "| here | 64 | 1.0 | 9.0 | 3 (40) | 2 |" in lines and "here, 8 worlds: x" in lines
-    assert "| here | 64 | 32000 | 10667 | 1 | 1 |" in lines
+    assert "| here | 64 | 64000 | 32000 | 10667 | 1 | 1 |" in lines
 
 
 def test_touch_is_weighed_against_none(repo, accuracy):
@@ -588,7 +588,8 @@ def test_worlds_of_the_hand_are_timed_by_decision(repo, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
     assert found["setup_s"][0]["seconds"] > 0 and found["setup_s"][0]["modules_before"] >= 0
-    (row,) = found["rows"]
+    away, row = found["rows"]
+    assert [away[name] for name in ("decision", "lost", "held", "force_n")] == [-1, 0, 1.0, 0.0]
     assert (row["worlds"], row["decision"], row["lost"], row["held"]) == (2, 0, 0, 1.0)
     assert row["hand_steps_per_s"] == pytest.approx(2e3 / row["ms_per_step"]) and row["unsettled"] == 0
 

@@ -44,8 +44,9 @@ def kernels_of_step(
         m.callback = own
     convex = [module for module, _ in found if _CONVEX in module.name]
     if wp.config.optimization_level is None:
-        for module in convex:
-            wp.set_module_options({"optimization_level": _LEVEL}, module)
+        for module in convex:  # once: a module whose options are set again is compiled again
+            if module.options["optimization_level"] != _LEVEL:
+                wp.set_module_options({"optimization_level": _LEVEL}, module)
     return sorted(found, key=lambda launched: launched[0] not in convex)
 
 
