@@ -15,7 +15,7 @@ import biotac_mj
 from biotac_mj.coupling import attach
 from biotac_mj.coupling.implicit import coupled
 from biotac_mj.coupling.implicit import world as coupled_world
-from biotac_mj.geometry.rigid import displace, displacement, displacement_at_once, rotation
+from biotac_mj.geometry.rigid import cross, displace, displacement, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
 GHOST = 'contype="0" conaffinity="0"'  # a geom that nothing collides with
@@ -384,6 +384,15 @@ def test_priority_decides_whose_friction_counts():
         biotac_mj.coupling.register_stepper(name, Watching)
         scene(block.format(friction), priority=priority, friction=0.3, stepper=name)
         assert seen["friction"] == pytest.approx(expected)
+
+
+def displacement_at_once(pos, mat, pos0, mat0, here, spin):
+    """Motions (n, 6) for which `displace(pos0, mat0, motion, here, spin)` gives pos, mat; exact to third
+    order in turn and spin (Baker-Campbell-Hausdorff)."""
+    turn = displacement(pos, mat, pos0, mat0)[:, 3:]
+    both = cross(turn, spin)
+    turn = turn + 0.5 * both + cross(turn - spin, both) / 12
+    return np.concatenate([pos - pos0 - cross(turn, here), turn], axis=1)
 
 
 def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):

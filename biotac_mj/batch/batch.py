@@ -98,12 +98,10 @@ class Batch(Skins):
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
         marks the worlds whose skin takes part; finds this step's rows."""
         r = self._of_step
-        bodies = [self._core, self._body, d.xpos, d.xmat]
-        self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
-        where, start = [d.xpos, d.xmat, d.subtree_com], [r.start_pos, r.start_mat]
-        self._advance(m, d, self._step)
-        turning = [self._core, self._body, m.body_rootid, m.body_isdofancestor, *where, d.cdof, *start]
-        self._launch(dynamics.relative_jacobians, self._jacobian.shape, turning, [self._jacobian])
+        start = r.start_pos, r.start_mat
+        self._launch(*self._bodies.here(d, r.here_pos, r.here_mat))
+        self._launch(*self._bodies.ahead(m, d, self._step, *start))
+        self._launch(*self._bodies.jacobians(m, d, *start, self._jacobian))
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, taking_part)
         if self.moving:
             by = [self.dt, 0.0, self._delay, self._solid, self.model]
@@ -117,18 +115,10 @@ class Batch(Skins):
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
 
-    def _advance(self, m, d, horizon):
-        """Finds where the bodies go in a horizon [group, world] [s] without acceleration."""
-        r = self._of_step
-        going = [self._core, self._body, horizon, m.body_rootid, d.xpos, d.xmat, d.subtree_com, d.cvel]
-        self._launch(dynamics.advance_groups, self.groups, going, [r.start_pos, r.start_mat])
-
     def _find_drift(self, m, d):
-        """Finds where they go so to where the skins are solved, of their gamma."""
-        r = self._of_step
-        self._advance(m, d, r.horizon)
-        known = [self.dt, r.horizon, self._jacobian, d.qvel]
-        self._launch(dynamics.find_drift, self.groups, known, [r.straight, r.drift])
+        """Finds where the bodies go without acceleration to where the skins are solved, of their gamma."""
+        for launch in self._bodies.drift(m, d, self.dt, self._jacobian, self._of_step):
+            self._launch(*launch)
 
     def use_euler(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Makes greedy worlds' step that of backward Euler, after `restrain`. Launches only."""
@@ -193,8 +183,7 @@ class Batch(Skins):
     def evaluate(self, qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""
         self._qacc = qacc
-        known = [self.dt, self._jacobian, qacc]
-        self._launch(dynamics.accelerate, self.groups, known, [self._of_step])
+        self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, self._of_step))
 
     def _look_inside(self, m):
         """Whether bodies that were put somewhere were put into the skin."""
@@ -224,23 +213,9 @@ class Batch(Skins):
         these go without acceleration."""
         r, skin = self._of_step, self.skin
         if skin.inertial:
-            data = skin.data
-            arrays = [
-                m.body_rootid,
-                m.body_isdofancestor,
-                d.xpos,
-                d.xmat,
-                d.subtree_com,
-                d.cvel,
-                d.cdof,
-                self._qacc if self.moving else d.qacc,
-            ]
-            self._launch(
-                dynamics.advance_core,
-                self.nworld,
-                [self._core, self.dt, int(self.moving), *arrays],
-                [skin.core_pos, skin.core_mat, data.frame_pos, data.frame_mat],
-            )
+            qacc, square = (self._qacc, self.dt**2) if self.moving else (d.qacc, 0.0)
+            frames = [skin.core_pos, skin.core_mat, skin.data.frame_pos, skin.data.frame_mat]
+            self._launch(*self._bodies.core_motion(m, d, self.dt, square, qacc, frames))
         on_bodies = m.geom_pos, m.geom_quat
         if not self.moving:
             self.solve_at(r.start_pos, r.start_mat, *on_bodies)
@@ -330,9 +305,7 @@ class Batch(Skins):
 
     def finish(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
-        ends = [self._of_step.end_pos, self._of_step.end_mat]
-        bodies = [self._core, self._body, end.xpos, end.xmat]
-        self._launch(kernels.relative_poses, self.groups, bodies, ends)
+        self._launch(*self._bodies.here(end, self._of_step.end_pos, self._of_step.end_mat))
 
     def find_acting(self, d: "mjw.Data") -> None:
         """Finds what acts on the bodies in the step, after mujoco_warp's constraint solver."""

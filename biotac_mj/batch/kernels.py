@@ -20,7 +20,6 @@ __all__ = [
     "core_pose",
     "count_failures",
     "geom_poses",
-    "relative_poses",
     "reset_models",
     "write_force",
     "write_sensors",
@@ -35,24 +34,6 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 _share_that_pushes = wp.func(share_that_pushes)
-
-
-@wp.kernel
-def relative_poses(
-    # In:
-    core: int,
-    body: wp.array(dtype=int),
-    xpos: wp.array2d(dtype=wp.vec3),
-    xmat: wp.array2d(dtype=wp.mat33),
-    # Out:
-    pos_out: wp.array2d(dtype=vec3),
-    mat_out: wp.array2d(dtype=mat33),
-):
-    """Poses of the touching bodies now [group, world]."""
-    g, w = wp.tid()
-    turn = wp.transpose(widen(xmat[w, core]))
-    pos_out[g, w] = turn * (double(xpos[w, body[g]]) - double(xpos[w, core]))
-    mat_out[g, w] = turn * widen(xmat[w, body[g]])
 
 
 @wp.kernel

@@ -1,12 +1,15 @@
 """The BioTacs of many worlds: skins, liquid and sensors. They are told where things are, so it does not
 matter who steps the bodies."""
 
+import types
+
 import mujoco
 import numpy as np
 import warp as wp
 
 from ..coupling.handle import SENSORS, sensor_widths
 from ..coupling.implicit.marks import Marks
+from ..coupling.implicit.poses import Bodies
 from ..coupling.implicit.rounds import Model
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
@@ -56,6 +59,7 @@ class Skins:
             addresses = [-1 if c in design.widths else a for c, a in zip(SENSORS, addresses)]
         with wp.ScopedDevice(self.device):
             self._body = wp.array(touching.body.astype(np.int32), dtype=int)
+            self._bodies = Bodies(self._core, self._body)
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
             self._group = wp.array(touching.group.astype(np.int32), dtype=int)
             self._addresses = wp.array(np.array(addresses, np.int32), dtype=int)
@@ -213,7 +217,7 @@ class Skins:
         """(ngroup, nworld)."""
         return self.model.wrench0.shape
 
-    def _launch(self, kernel, dim, inputs, outputs):
+    def _launch(self, kernel, dim, inputs, outputs=()):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
@@ -266,9 +270,8 @@ class PoseBatch(Skins):
                 ("xipos", xipos, wp.vec3),
             )
         )
-        self._launch(
-            kernels.relative_poses, self.groups, [self._core, self._body, xpos, xmat], [self._pos, self._mat]
-        )
+        at = types.SimpleNamespace(xpos=xpos, xmat=xmat)
+        self._launch(*self._bodies.here(at, self._pos, self._mat))
         if self.skin.inertial:
             skin, data = self.skin, self.skin.data
             self._launch(

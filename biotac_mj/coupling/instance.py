@@ -15,6 +15,7 @@ import numpy as np
 from ..geometry.rigid import cross
 from ..skin.bodies import BodyMotion
 from .config import TIERS
+from .implicit.kinematics import Kinematics
 from .implicit.metric import Metric
 from .implicit.rules import EULER, PATIENCE, stayed
 from .implicit.step_arrays import StepArrays
@@ -51,7 +52,9 @@ class Instance:
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
       step_gamma: (ngroup,) Newmark's gamma of the bodies in the last step that was solved.
+      frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s]; None leaves the stored one.
       state_address: of its plugin state, which stays where it is.
+      kinematics: `Kinematics` of the touching bodies.
       sensed: whether the readings of this step are written.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
@@ -73,6 +76,7 @@ class Instance:
         for name in self.sensor:
             model.sensor_needstage[sensors[name]] = int(mujoco.mjtStage.mjSTAGE_POS)
         self._tier, self._said_unmeasured = TIERS.index(setup.config.tier), False
+        self.kinematics = Kinematics(model, data, setup.touching)
         self.two_way = two_way
         if self.two_way:
             slots = sorted(
@@ -92,7 +96,7 @@ class Instance:
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved, self.sensed = {}, False
         self._error, self._outcome = False, _ALONE
-        self.step_gamma, self._frequency = np.full(setup.ngroup, EULER), None
+        self.step_gamma, self.frequency = np.full(setup.ngroup, EULER), None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
         self.skins_met = ()
@@ -139,7 +143,7 @@ class Instance:
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         self.sensed = False
-        self.step_gamma, self._frequency = np.full(self.setup.ngroup, EULER), None
+        self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
@@ -161,21 +165,21 @@ class Instance:
     def _arrays(self):
         setup = self.setup
         how = setup.thickness, setup.surface_energy, self.inertial, setup.config.loss
-        return StepArrays(setup.ngroup, *how)
+        return StepArrays(self.kinematics, setup.ngroup, *how)
 
-    def begin_arrays(self, pos: np.ndarray, mat: np.ndarray) -> StepArrays:
-        """The arrays of a coupled step that begins with bodies at (ngroup, 3), (ngroup, 3, 3): the linear
-        model in force is that of the last step."""
+    def begin_arrays(self) -> StepArrays:
+        """The arrays of a coupled step that begins: the linear model in force is that of the last step."""
         arrays, (head, models, *_) = self._arrays, self.setup.parts(self.state)
         arrays.record(self.horizon, 0.5 * self.by_stages)
         n = len(models)
         parts = models[:, :6], models[:, 6:42].reshape(n, 6, 6), models[:, 42:45], models[:, 45:54]
         for name, part in zip(arrays.last, parts):
             arrays.last[name][:] = getattr(arrays, name)[:] = part.reshape(getattr(arrays, name).shape)
-        arrays.here_pos[:], arrays.here_mat[:] = pos, mat
         arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(n, 3, 3)
         arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
         arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
+        arrays.begin()
+        self.touching.check(arrays.start_pos, arrays.start_mat)
         return arrays
 
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
@@ -322,11 +326,6 @@ class Instance:
         """
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
-    def bounced(self, gamma: np.ndarray, frequency: np.ndarray | None) -> None:
-        """Stores Newmark's gamma of the step and the angular frequency [rad/s] at which bodies bounce on the
-        skin, (ngroup,) each; None leaves the stored one."""
-        self.step_gamma, self._frequency = gamma, frequency
-
     def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
         """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
         they were to go; asked only with Runge-Kutta, whose status is written when the step ends."""
@@ -421,13 +420,13 @@ class Instance:
         acting = self._outcome[5]
         return self._result.wrench if acting is None else acting
 
-    def touches(self, wrench: np.ndarray) -> list:
+    def touches(self, wrench: np.ndarray, by_place: bool) -> list:
         """What the geoms get of wrenches (ngroup, 6) on the touching bodies: [(number of the geom, centre of
         pressure (3,) [m], normal (3,) out of the skin there, force (3,), torque (3,) about the centre)].
 
-        A body's wrench is shared by its geoms as the skin pushes on them. Where no push is known, the first
-        gets all, on the axis of the wrench."""
-        load, moment, outward = self._pushes()
+        A body's wrench is shared by its geoms as the skin pushes on them. Where no push is known, or not
+        asked for, the first gets all, on the axis of the wrench."""
+        load, moment, outward = self._pushes(by_place)
         out = []
         for k in wrench.any(axis=1).nonzero()[0]:
             force, torque = wrench[k : k + 1, :3], wrench[k : k + 1, 3:]
@@ -445,12 +444,12 @@ class Instance:
                 out.append((g, x, n, a * force[0], a * turn))
         return out
 
-    def _pushes(self):
+    def _pushes(self, wanted):
         """Of the skin's normal push on each geom: its size (ngeom,) [N], size times place and size times
         normal (ngeom, 3)."""
         skin, ngeom = self.setup.skin, len(self.touching.geoms)
         load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
-        known = self._result is not None and self._result.state is not None
+        known = wanted and self._result is not None and self._result.state is not None
         if not known or not hasattr(skin.stepper, "touched_faces"):
             return load, moment, outward
         with skin.lock:
@@ -548,8 +547,8 @@ class Instance:
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
         models[:, 54:57], models[:, 57:66], models[:, ENERGY] = ends[0], ends[1].reshape(n, 9), energy
-        if self._frequency is not None:
-            models[:, FREQUENCY] = self._frequency
+        if self.frequency is not None:
+            models[:, FREQUENCY] = self.frequency
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

@@ -10,14 +10,12 @@ The rows of a skin lie where MuJoCo expects those of welds: what they push is le
 here."""
 
 import ctypes
-import math
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import cross
-from .solid_contacts import CONTACT
+from .solid_contacts import CONTACT, contact_frame
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
 __all__ = ["PYRAMID", "Loads", "core_geom"]
@@ -54,6 +52,8 @@ class Loads:
             model, np.flatnonzero(now & np.isin(kind, (_FORCE, _TORQUE, _CONTACT)))
         )
         self._touch_sensors = np.flatnonzero(now & (kind == _TOUCH)).tolist()
+        # others feel what a body gets, whatever the places are at which it gets it
+        self._by_place = bool((now & np.isin(kind, (_TOUCH, _CONTACT))).any())
         self._core_geom = {t.touching.core: core_geom(model, t.touching.core) for t in coupled}
 
     def write(self, acting: dict) -> None:
@@ -79,7 +79,7 @@ class Loads:
     def _touches(self, instance, wrench):
         core = instance.touching.core
         frame, origin = self.data.xmat[core].reshape(3, 3), self.data.xpos[core]
-        for k, pos, normal, force, torque in instance.touches(wrench):
+        for k, pos, normal, force, torque in instance.touches(wrench, self._by_place):
             geom = int(instance.touching.geom[k])
             yield _Touch(core, geom, origin + frame @ pos, frame @ normal, frame @ force, frame @ torque)
 
@@ -97,7 +97,7 @@ class Loads:
         pyramidal = self.model.opt.cone == _PYRAMIDAL
         for k, t in enumerate(touches):
             row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]
-            frame = _frame(t.normal)
+            frame = contact_frame(t.normal)
             one["pos"], one["frame"], one["friction"], one["dim"] = t.pos, frame.ravel(), 1.0, 6
             one["geom"] = one["geom1"], one["geom2"] = self._core_geom[t.core], t.geom
             one["flex"] = one["elem"] = one["vert"] = -1
@@ -131,16 +131,6 @@ class Loads:
                 data.sensordata[adr] += max(float(t.force @ t.normal), 0.0)
         if cutoff > 0.0:
             data.sensordata[adr] = min(data.sensordata[adr], cutoff)
-
-
-def _frame(normal):
-    """Axes (3, 3) of a contact as MuJoCo makes them of its normal."""
-    frame = np.zeros((3, 3))
-    frame[0], frame[1, 1 if abs(normal[1]) < 0.5 else 2] = normal, 1.0
-    frame[1] -= (frame[1] @ normal) * normal
-    frame[1] /= math.sqrt(frame[1] @ frame[1])
-    frame[2] = cross(frame[:1], frame[1:2])[0]
-    return frame
 
 
 def core_geom(model: ModelView, core: int) -> int:

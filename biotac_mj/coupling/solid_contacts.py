@@ -7,16 +7,17 @@ with hulls of meshes that have hollows by those with the meshes themselves."""
 
 import ctypes
 import functools
+import math
 
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import matrix
+from ..geometry.rigid import cross, matrix
 from ..geometry.solid import fills_hull
 from .structs import LIBRARY, DataView, ModelView, c_structs
 from .touching import Touching, mesh_of
 
-__all__ = ["CONTACT", "SolidContacts", "SolidPairs", "contacts_of"]
+__all__ = ["CONTACT", "SolidContacts", "SolidPairs", "contact_frame", "contacts_of"]
 
 LIBRARY.mj_addContact.argtypes = (ctypes.c_void_p,) * 3
 CONTACT = np.dtype(c_structs("mjContact"))
@@ -132,7 +133,11 @@ class SolidContacts(SolidPairs):
         data.struct.ncon = len(kept)
         for pair, pos, normal, depth in self._found(data, list(templates)):
             contact, sign = templates[pair]
-            contact["dist"], contact["pos"], contact["frame"] = -depth, pos, _frame(sign * normal).ravel()
+            contact["dist"], contact["pos"], contact["frame"] = (
+                -depth,
+                pos,
+                contact_frame(sign * normal).ravel(),
+            )
             contact["includemargin"], contact["exclude"], contact["efc_address"] = 0.0, 0, -1
             made = np.atleast_1d(contact)
             if LIBRARY.mj_addContact(self.model.address, data.address, made.ctypes.data):
@@ -167,8 +172,11 @@ class SolidContacts(SolidPairs):
             yield int(pair), where, away, float(depth[pair, seed])
 
 
-def _frame(normal):
-    """(3, 3) of a contact: the normal and two tangents, as rows."""
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return np.stack([normal, first, np.cross(normal, first)])
+def contact_frame(normal: np.ndarray) -> np.ndarray:
+    """Axes (3, 3) of a contact, as rows, as MuJoCo makes them of its normal (3,)."""
+    frame = np.zeros((3, 3))
+    frame[0], frame[1, 1 if abs(normal[1]) < 0.5 else 2] = normal, 1.0
+    frame[1] -= (frame[1] @ normal) * normal
+    frame[1] /= math.sqrt(frame[1] @ frame[1])
+    frame[2] = cross(frame[:1], frame[1:2])[0]
+    return frame

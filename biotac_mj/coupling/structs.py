@@ -19,7 +19,6 @@ LIBRARY = ctypes.CDLL(
 )  # already loaded: this only finds it
 LIBRARY.mj_getPluginConfig.restype = ctypes.c_char_p
 LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p)
-LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
 LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 for _stage in (
@@ -118,10 +117,8 @@ class _View:
         self.struct = c_structs(kind).from_address(address)
         self.address = address
         self._field = _pointer_fields(kind)
+        self._own, self._other = {name for name, *_ in self.struct._fields_}, None  # who has a size
         self._seen = {}
-
-    def _size(self, name):
-        return getattr(self.struct, name)
 
     def pointer(self, name, shape):
         """(shape) view of the memory that pointer `name` points to now, without looking up its size."""
@@ -144,8 +141,11 @@ class _View:
 
     def array(self, name):
         """View of array `name` with the shape that MuJoCo documents."""
-        extents = self._field[name][1]
-        return self.pointer(name, tuple([e if e.__class__ is int else self._size(e) for e in extents]))
+        extents, own = self._field[name][1], self._own
+        sizes = [
+            e if e.__class__ is int else getattr(self.struct if e in own else self._other, e) for e in extents
+        ]
+        return self.pointer(name, tuple(sizes))
 
 
 def _extent(extent):
@@ -204,11 +204,7 @@ class DataView(_View):
 
     def __init__(self, address: int, model: ModelView):
         super().__init__("mjData", address)
-        self.model = model
-        self._own = {name for name, *_ in self.struct._fields_}
-
-    def _size(self, name):
-        return getattr(self.struct if name in self._own else self.model.struct, name)
+        self.model, self._other = model, model.struct
 
     def __getattr__(self, name):
         if name not in self._field:
@@ -219,15 +215,6 @@ class DataView(_View):
         ):
             self.__dict__[name] = value
         return value
-
-    def jacobian(self, body: int, point: np.ndarray) -> np.ndarray:
-        """(6, nv) Jacobian of the point [m, world] that moves with `body`: translation, then rotation."""
-        out = np.empty((6, self.model.nv))
-        address = out.ctypes.data
-        LIBRARY.mj_jac(
-            self.model.address, self.address, address, address + 24 * self.model.nv, point.ctypes.data, body
-        )
-        return out
 
     def make_constraints(self) -> None:
         """Makes all constraint rows again, as mj_fwdPosition does: equalities were switched since."""

@@ -8,11 +8,11 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import cross, matrix, rotation
+from ..geometry.rigid import matrix
 from ..geometry.solid import bounds_solid, close_rim, convex_hull, ground
 from .config import OWN, Config
 from .stepper import Geom
-from .structs import DataView, ModelView
+from .structs import ModelView
 
 __all__ = ["Touching", "deformable", "find_geoms", "forget_notes", "geom_type", "mesh_of", "outside_geoms"]
 
@@ -87,10 +87,6 @@ class Touching:
         # one that is only read answers for nothing, and where others do not meet this one it answers for all
         if self.skins and not compiling and config.coupling == "two-way" and _is_met(model, core):
             self.fraction[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
-        # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees'
-        # centres of mass
-        self._body = np.concatenate([[core], self.body]).astype(np.int64)
-        self._root = model.body_rootid[self._body]
         self._geom_pos, self._geom_mat = model.geom_pos[ids], matrix(model.geom_quat[ids])
 
     def warn(self, model: ModelView | None = None) -> None:
@@ -110,55 +106,13 @@ class Touching:
                 parts.append(g.vert.tobytes() + g.face.tobytes())
         return b"|".join(parts)
 
-    def predict(self, data: DataView, horizon: float | np.ndarray) -> tuple:
-        """Poses of the touching bodies in the BioTac frame when everything goes on at its present velocity
-        for `horizon` [s], for all bodies or (ngroup,) for each.
-
-        Returns:
-          (ngroup, 3) positions [m], (ngroup, 3, 3) rotations.
-
-        Raises:
-          ValueError: a pose or a velocity is not finite, or huge.
-        """
-        if np.ndim(horizon) and (horizon == horizon[:1]).all():
-            horizon = horizon[0] if len(horizon) else 0.0
-        if np.ndim(horizon):  # the BioTac is elsewhere for each
-            core = np.zeros(len(horizon), int)
-            origin, frame = self._ahead(data, self._body[core], self._root[core], horizon)
-            pos, mat = self._ahead(data, self._body[1:], self._root[1:], horizon)
-            pos = ((pos - origin)[:, None] @ frame)[:, 0]
-            mat = frame.transpose(0, 2, 1) @ mat
-        else:
-            pos, mat = self._ahead(data, self._body, self._root, horizon)
-            frame = mat[0]
-            pos, mat = (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
-        self._check(pos, mat)
-        return pos, mat
-
-    def core_motion(self, data: DataView, horizon: float) -> tuple:
-        """Poses (2, 3), (2, 3, 3) of the BioTac in the world, now and after `horizon` [s] at its present
-        velocity."""
-        now, then = (self._ahead(data, self._body[:1], self._root[:1], h) for h in (0.0, horizon))
-        return np.concatenate([now[0], then[0]]), np.concatenate([now[1], then[1]])
-
-    @staticmethod
-    def _ahead(data, body, root, horizon):
-        pos, mat = data.xpos[body], data.xmat[body].reshape(-1, 3, 3)
-        if np.any(horizon):
-            horizon = np.reshape(horizon, (-1, 1))
-            velocity = data.cvel[body]  # rotation, then translation of the point at the tree's centre of mass
-            spin = velocity[:, :3]
-            pos = pos + horizon * (velocity[:, 3:] + cross(spin, pos - data.subtree_com[root]))
-            mat = rotation(horizon * spin) @ mat
-        return pos, mat
-
     def geom_pose(self, pos: np.ndarray, mat: np.ndarray) -> tuple:
         """Poses (ngeom, 3), (ngeom, 3, 3) of the geoms on bodies at (ngroup, 3), (ngroup, 3, 3).
 
         Raises:
           ValueError: a pose is not finite, or huge.
         """
-        self._check(pos, mat)
+        self.check(pos, mat)
         owner = mat[self.group]
         geom_pos = pos[self.group] + (owner @ self._geom_pos[:, :, None])[:, :, 0]
         geom_mat = owner @ self._geom_mat
@@ -179,7 +133,8 @@ class Touching:
         mat = geom_mat[first] @ self._geom_mat[first].transpose(0, 2, 1)
         return geom_pos[first] - (mat @ self._geom_pos[first, :, None])[:, :, 0], mat
 
-    def _check(self, pos, mat):
+    def check(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Raises ValueError for poses (ngroup, 3), (ngroup, 3, 3) that are not finite, or huge."""
         if np.abs(pos).max(initial=0.0) < _HUGE and math.isfinite(mat.sum()):
             return
         bad = ~((np.abs(pos) < _HUGE).all(axis=1) & np.isfinite(mat.sum(axis=(1, 2))))

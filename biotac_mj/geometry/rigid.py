@@ -13,7 +13,6 @@ __all__ = [
     "cross",
     "displace",
     "displacement",
-    "displacement_at_once",
     "matrix",
     "matrix_entries",
     "quaternion",
@@ -127,19 +126,6 @@ def displace(
     if spin is not None:
         turn, mat = spin + turn, rotation(-spin) @ mat
     return pos + motion[:, :3] + cross(motion[:, 3:], arm), rotation(turn) @ mat
-
-
-def displacement_at_once(
-    pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray, here: np.ndarray, spin: np.ndarray
-) -> np.ndarray:
-    """Motions (n, 6) for which `displace(pos0, mat0, motion, here, spin)` gives pos, mat; exact to third
-    order in turn and spin."""
-    turn = displacement(pos, mat, pos0, mat0)[:, 3:]
-    both = cross(
-        turn, spin
-    )  # for the rotation vector of two rotations in sequence (Baker-Campbell-Hausdorff)
-    turn = turn + 0.5 * both + cross(turn - spin, both) / 12
-    return np.concatenate([pos - pos0 - cross(turn, here), turn], axis=1)
 
 
 def rigid_motions(x: np.ndarray, size: int) -> np.ndarray:

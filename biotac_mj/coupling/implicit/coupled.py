@@ -3,7 +3,7 @@ energy that it can give."""
 
 import numpy as np
 
-from ...geometry.rigid import displacement, rotation
+from ...geometry.rigid import displacement
 from ...skin.bodies import BodyMotion
 from ..instance import LEVER, STAGES, Instance
 from ..stepper import SkinResult
@@ -42,42 +42,26 @@ class Coupled:
         self.instance, self.data = instance, data
         self.touching, self.idle = _touching(instance.last_model()[1]), False
         if not len(self.touching):  # maybe nothing is near
-            self.pose = instance.touching.predict(data, instance.horizon)
+            self.pose = instance.kinematics.predict(instance.horizon)
             self.idle = instance.is_out_of_reach(*self.pose)
-        self.core, self.jacobian = (), None
         if self.idle:
             return
-        self.passed = self.jacobian = instance.metric.jacobians(data)
-        self._rows = self.jacobian.reshape(6 * len(self.jacobian), self.jacobian.shape[2])
-        if instance.inertial:
-            self.core = instance.touching.core_motion(data, instance.horizon)
-            self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.asked = self.result = self.forced = None
         self.written, self.settled = False, True
         self.off, self.may_act, self._cost = np.inf, True, 0.0
-        self.arrays = arrays = instance.begin_arrays(*instance.touching.predict(data, 0.0))
+        self.passed = self.jacobian = instance.kinematics.jacobians()
+        self.arrays = arrays = instance.begin_arrays()
+        self._rows = self.jacobian.reshape(6 * len(self.jacobian), self.jacobian.shape[2])
         self.square, self.tangent, self.moved = arrays.square, arrays.tangent0, arrays.moved
         self.compliance = arrays.compliance
         self.correction, self.amiss, self.excess = np.zeros((3, *arrays.wrench.shape))
-        self._velocity = (self._rows @ data.qvel).reshape(arrays.wrench.shape)
-        arrays.straight[:] = instance.horizon * self._velocity
-        arrays.choose_gamma()
-        self._find_start()
-        arrays.begin()
         if arrays.inside[0] and instance.is_clear(arrays.here_pos, arrays.here_mat):
             arrays.inside[0] = 0
-
-    def _find_start(self):
-        """Finds where its bodies go without acceleration, of their gamma."""
-        arrays = self.arrays
-        arrays.start_pos[:], arrays.start_mat[:] = self.instance.touching.predict(self.data, arrays.horizon)
-        np.multiply(arrays.horizon[:, None], self._velocity, out=arrays.drift)
-        self.written = False
 
     def use_euler(self) -> None:
         """Makes the bodies' step that of backward Euler."""
         self.arrays.use_euler()
-        self._find_start()
+        self.written = False
 
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
@@ -90,7 +74,7 @@ class Coupled:
         """Finds where its bodies go with accelerations (nv,), what acts on them so, and how far they go from
         where it was solved."""
         arrays, self.acceleration = self.arrays, acceleration
-        arrays.gain[:] = (self._rows @ acceleration).reshape(arrays.gain.shape)
+        arrays.qacc[:] = acceleration
         np.add(self.amiss, self.excess, out=arrays.amiss)
         arrays.evaluate()
         if self.forced is not None:
@@ -152,12 +136,10 @@ class Coupled:
         self.correction = correction
 
     def _core_motion(self):
-        if not self.core:
+        if not self.instance.inertial:
             return ()
-        (start, end), (turned, turning) = self.core
-        moved_by = self.instance.horizon**2 * (0.5 if self.instance.by_stages else 1.0)
-        move = moved_by * (self.core_jacobian @ self.acceleration)
-        return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
+        step, half = self.instance.horizon, 0.5 if self.instance.by_stages else 1.0
+        return self.instance.kinematics.core_motion(step, half * step**2, self.acceleration)
 
     # --- in MuJoCo's dynamics ---
 
@@ -220,13 +202,13 @@ class Coupled:
         arrays, withheld = self.arrays, 1.0 - self.arrays.push.min(initial=1.0)
         left = arrays.conclude(self.result.converged)
         self.instance.concluded(rounds, self.settled, withheld, left, self.target, arrays.acting.copy())
-        self.instance.bounced(arrays.gamma.copy(), frequency)
+        self.instance.step_gamma, self.instance.frequency = arrays.gamma.copy(), frequency
 
     def arrived(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of
         now. near: [m] from where they were to go."""
         arrays = self.arrays
-        ends, travel = self.instance.touching.predict(self.data, 0.0), self.passed @ moved
+        ends, travel = self.instance.kinematics.predict(0.0), self.passed @ moved
         if not self.instance.by_stages:  # they went by the velocity after the step
             travel += arrays.straight - arrays.travel
         error = size(travel - arrays.travel)

@@ -49,8 +49,6 @@ class Metric:
                 "adding the objects, or name the geoms that may touch with geoms=[...]"
             )
         self.root = roots
-        moves = tree[self.body] >= 0
-        self._moving, self._still = np.flatnonzero(moves).tolist(), np.flatnonzero(~moves)
         self._layout, self._written, self._known = None, {}, {}
         self.slot = dict(zip(needed, slots))
         for root, slot in self.slot.items():
@@ -60,20 +58,6 @@ class Metric:
         # MuJoCo does not see what the skin carries: a body asleep has no rows and would not be woken
         for t in {int(tree[b]) for b in (self.core, *self.slot)} - {-1}:
             model.tree_sleep_policy[t] = _NEVER
-
-    def jacobians(self, data: DataView) -> np.ndarray:
-        """(ngroup, 6, nv) of the touching bodies relative to the BioTac, about the origin of its frame and in
-        that frame."""
-        frame = data.xmat[self.core].reshape(3, 3)
-        origin = np.ascontiguousarray(data.xpos[self.core])
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = frame.T
-        own = data.jacobian(self.core, origin)
-        out = np.empty((len(self.body), 6, self.model.nv))
-        out[self._still] = turn @ -own
-        for i in self._moving:
-            out[i] = turn @ (data.jacobian(int(self.body[i]), origin) - own)
-        return out
 
     def switch_on(self, data: DataView) -> bool:
         """Activates its constraint slots. Returns whether one was inactive, so that MuJoCo has to build its

@@ -181,7 +181,7 @@ def follow(r: Rounds, g: int, w: int, h: real, gain: vec6):
     from the pose without acceleration, moved by beta h^2 times that. The travel is that of the mean velocity
     in the step.
 
-    Bodies turn by both at once: `geometry.rigid.displace` with its spin."""
+    Bodies turn by both at once, see `displace_at_once`."""
     m = r.square[g, w] * gain
     r.moved[g, w] = m
     r.travel[g, w] = r.straight[g, w] + real(0.5) * h * h * gain

@@ -2,17 +2,16 @@
 from numpy."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
 from ...geometry.rigid_warp import motion, size_of
-from ...launches import in_a_row, recorded
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from . import energy, rounds
+from .kinematics import Kinematics, row
 from .marks import Marks
-from .rounds import Model, Rounds, Solid, follow
+from .rounds import Model, Rounds, Solid
 from .rules import LOSS_FREQUENCY
 
 __all__ = ["StepArrays"]
@@ -24,21 +23,16 @@ vec6 = wp.spatial_vectord
 
 
 @wp.kernel
-def evaluate(
+def find_off(
     # In:
-    h: real,
-    gain: wp.array2d(dtype=vec6),
-    # In and out:
     r: Rounds,
     # Out:
     off_out: wp.array(dtype=real),
 ):
-    """Where bodies go that gain these accelerations (`rounds.follow`), and how far that is at most from where
-    the skin was solved [m]."""
+    """How far the bodies go at most from where the skin was solved [m]."""
     w = wp.tid()
     off = real(0.0)
     for g in range(r.pos.shape[0]):
-        follow(r, g, w, h, gain[g, w])
         way = motion(r.pos[g, w], r.mat[g, w], r.asked_pos[g, w], r.asked_mat[g, w])
         off = wp.max(off, size_of(way))
     off_out[w] = off
@@ -49,18 +43,26 @@ class StepArrays:
     and `Model`. A launch takes 1 us, several numpy calls on so few numbers.
 
     Args:
-      ngroup: number of bodies that can touch. thickness: [m], surface_energy: [J] most of adhesion, inertial:
-        of the skin. loss: of its rubber.
+      kinematics: of the bodies. ngroup: number of bodies that can touch. thickness: [m], surface_energy: [J]
+        most of adhesion, inertial: of the skin. loss: of its rubber.
 
     Attributes:
-      gain: (ngroup, 6) accelerations of the bodies, for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
+      qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
       last: views by name of the linear model of the last step.
     """
 
-    def __init__(self, ngroup: int, thickness: float, surface_energy: float, inertial: bool, loss: float):
-        shape = ngroup, 1
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        ngroup: int,
+        thickness: float,
+        surface_energy: float,
+        inertial: bool,
+        loss: float,
+    ):
+        self._kinematics, shape = kinematics, (ngroup, 1)
         self._loss, self._key, solid = loss, None, Solid()
         solid.thickness, solid.area, solid.inertial = thickness, 1.0, int(inertial)
         self._solid = solid
@@ -70,14 +72,14 @@ class StepArrays:
             for name, variable in Model.vars.items():
                 for model in (self._model, self._last):
                     setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
-            self._wrench, self._gain = (wp.zeros(shape, dtype=vec6) for _ in range(2))
+            self._wrench, self._qacc = wp.zeros(shape, dtype=vec6), wp.zeros_like(kinematics.d.qvel)
             self._left_out = wp.zeros(shape, dtype=real)
             self._compliance = wp.zeros((ngroup, *shape), dtype=wp.spatial_matrixd)
             self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
             self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
         self._one.fill_(1)
-        self.wrench, self.gain, self.left_out = map(_seen, (self._wrench, self._gain, self._left_out))
-        self.compliance = self._compliance.numpy()[:, :, 0]
+        self.wrench, self.left_out = _seen(self._wrench), _seen(self._left_out)
+        self.qacc, self.compliance = self._qacc.numpy()[0], self._compliance.numpy()[:, :, 0]
         self.off, self._is_greedy, self._is_marked, self._found = (
             a.numpy() for a in (self._off, self._greedy, self._marks.any, self._reason)
         )
@@ -95,20 +97,23 @@ class StepArrays:
         self._key, r, n = (step, ahead), self._rounds, self.wrench.shape[0]
         delay = self._loss / (2 * math.pi * LOSS_FREQUENCY * step)
 
-        def row(*launches) -> Callable[[], None]:
-            # none over no bodies
-            runs = in_a_row([recorded(kernel, dim, given) for kernel, dim, given in launches if np.prod(dim)])
-            return runs[0] if len(runs) == 1 else lambda: [run() for run in runs]
-
         forces = rounds.wrenches, (n, 1), [self._model, r, self._wrench]
         one = [self._one]
-        self.choose_gamma = row(
-            (rounds.choose_gamma, (n, 1), [step, ahead, delay, self._solid, self._last, r])
+        k = self._kinematics
+        drift = k.bodies.drift(k.m, k.d, step, k.jacobian, r)
+        self.begin = row(
+            k.bodies.here(k.d, r.here_pos, r.here_mat),
+            (rounds.choose_gamma, (n, 1), [step, ahead, delay, self._solid, self._last, r]),
+            *drift,
+            (rounds.begin_rounds, 1, [*one, r]),
         )
-        self.use_euler = row((rounds.use_euler, 1, [step, ahead, *one, r]))
-        self.begin = row((rounds.begin_rounds, 1, [*one, r]))
+        self.use_euler = row((rounds.use_euler, 1, [step, ahead, *one, r]), *drift)
         self.find_wrenches = row(forces)
-        self.evaluate = row((evaluate, 1, [step, self._gain, r, self._off]), forces)
+        self.evaluate = row(
+            k.bodies.accelerate(step, k.jacobian, self._qacc, r),
+            (find_off, 1, [r, self._off]),
+            forces,
+        )
         marks = self._marks.struct
         self._find_energy = row(
             (energy.find_energy, 1, [*one, self._last, self._solid, r, self._greedy, marks])

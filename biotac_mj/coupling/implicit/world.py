@@ -160,8 +160,9 @@ class World:
             self._refuse_reset()
         if not instance.two_way:
             instance.forget_last_solve()
-            core = instance.touching.core_motion(self.data, instance.horizon) if instance.inertial else ()
-            instance.solve_for_pose(*instance.touching.predict(self.data, instance.horizon), core)
+            bodies, step = instance.kinematics, instance.horizon
+            core = bodies.core_motion(step, 0.0, np.zeros(self.model.nv)) if instance.inertial else ()
+            instance.solve_for_pose(*bodies.predict(step), core)
         elif instance.index == self.first:
             for other in self.coupled:
                 other.forget_last_solve()
@@ -234,7 +235,7 @@ class World:
         for t in self.coupled:
             t.metric.release()
         for skin in self._acting:
-            jacobian = skin.instance.metric.jacobians(self.data)
+            jacobian = skin.instance.kinematics.jacobians()
             skin.passed += STAGES[self._stage - 1] * jacobian
             self.data.qfrc_passive += np.einsum("ni,nij->j", skin.forced, jacobian)
         self._project()

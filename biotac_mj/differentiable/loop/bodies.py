@@ -8,6 +8,7 @@ import copy
 import mujoco
 import numpy as np
 
+from ...coupling.implicit.kinematics import Kinematics
 from ...coupling.implicit.rules import beta_of
 from ...coupling.instance import Instance
 from ...coupling.structs import DataView, ModelView, c_structs
@@ -48,8 +49,12 @@ class Bodies:
         # MuJoCo makes no model without its plugins: the step runs with a plugin count of zero
         struct = c_structs("mjModel").from_address(bare._address)
         struct.nplugin = 0
-        self._view = DataView(self.data._address, ModelView(bare._address))
-        self.instances = instances
+        view = ModelView(bare._address)
+        seen = DataView(self.data._address, view)
+        self.instances, self._kinematics = (
+            instances,
+            [Kinematics(view, seen, one.touching) for one in instances],
+        )
         nv, na, nu, nm = model.nv, model.na, model.nu, model.nmocap
         names = "qpos", "qvel", "act", "ctrl", "qfrc_applied", "mocap_pos", "mocap_quat"
         self.sizes = dict(zip(names, (nv, nv, na, nu, nv, 3 * nm, 3 * nm)))
@@ -84,10 +89,9 @@ class Bodies:
         data = self.data
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        for one, wrench in zip(self.instances, wrenches):
+        for one, bodies, wrench in zip(self.instances, self._kinematics, wrenches):
             if one.two_way and wrench.any():
-                jacobian = one.metric.jacobians(self._view)
-                data.qfrc_applied += np.einsum("ni,nij->j", wrench, jacobian)
+                data.qfrc_applied += np.einsum("ni,nij->j", wrench, bodies.jacobians())
         mujoco.mj_step(self.model, data)
 
     def _end(self):
@@ -124,11 +128,10 @@ class Bodies:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         by_wrench = []
-        for one in self.instances:
-            n = 6 * one.setup.ngroup
-            jacobian = (
-                one.metric.jacobians(self._view).reshape(n, -1) if one.two_way else np.zeros((n, self.nv))
-            )
+        for one, bodies in zip(self.instances, self._kinematics):
+            jacobian = np.zeros((6 * one.setup.ngroup, self.nv))
+            if one.two_way:
+                jacobian = bodies.jacobians().reshape(jacobian.shape)
             by_wrench.append(out["qfrc_applied"] @ jacobian.T)
         return out, by_wrench
 
@@ -154,7 +157,8 @@ class Bodies:
             mujoco.mj_kinematics(self.model, data)
             mujoco.mj_comPos(self.model, data)
             mujoco.mj_comVel(self.model, data)
-            return one.touching.geom_pose(*one.touching.predict(self._view, one.horizon))
+            bodies = self._kinematics[self.instances.index(one)]
+            return one.touching.geom_pose(*bodies.predict(one.horizon))
 
         def slopes_of(one, gamma):
             weight = {"qvel": 1.0}  # of velocities in the pose of the solve

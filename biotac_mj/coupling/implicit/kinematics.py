@@ -1,0 +1,95 @@
+"""Poses and Jacobians of the bodies that touch a BioTac in one mjData: the kernels of `poses` on MuJoCo's own
+arrays."""
+
+import types
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from ...launches import in_a_row, recorded
+from ..structs import DataView, ModelView
+from ..touching import Touching
+from .poses import Bodies
+
+__all__ = ["Kinematics", "row"]
+
+real = wp.float64
+vec3 = wp.vec3d
+mat33 = wp.mat33d
+vec6 = wp.spatial_vectord
+
+
+class Kinematics:
+    """Of the bodies of a `Touching`, about the origin of the BioTac frame and in that frame.
+
+    Attributes:
+      bodies: `poses.Bodies`. m, d: what it reads of mjModel and mjData: arrays of Warp on their memory.
+      jacobian: (ngroup, 1, nv) wp.array of vec6.
+    """
+
+    def __init__(self, model: ModelView, data: DataView, touching: Touching):
+        self._touching, nbody, nv = touching, model.nbody, model.nv
+        shape = len(touching.body), 1
+        moves = np.zeros((nbody, nv), np.int32)  # whether a body is moved by a degree of freedom
+        for b in range(1, nbody):
+            moves[b] = moves[model.body_parentid[b]]
+            moves[b, model.body_dofadr[b] : model.body_dofadr[b] + model.body_dofnum[b]] = 1
+        with wp.ScopedDevice("cpu"):
+            root = wp.array(model.body_rootid, dtype=int)
+            self.m = types.SimpleNamespace(body_rootid=root, body_isdofancestor=wp.array(moves, dtype=int))
+            self.bodies = Bodies(touching.core, wp.array(touching.body.astype(np.int32), dtype=int))
+            self._horizon, self._qacc = wp.zeros(shape, dtype=real), wp.zeros((1, nv), dtype=real)
+            self._pos, self._mat = wp.zeros(shape, dtype=vec3), wp.zeros(shape, dtype=mat33)
+            self._core = [wp.zeros(1, dtype=kind) for kind in (vec3, mat33, vec3, mat33)]
+            self.jacobian = wp.zeros((*shape, nv), dtype=vec6)
+        self.d = types.SimpleNamespace(cdof=_own(data, "cdof", vec6, nv), qvel=_own(data, "qvel", real, nv))
+        for name, kind in (("xpos", vec3), ("xmat", mat33), ("subtree_com", vec3), ("cvel", vec6)):
+            setattr(self.d, name, _own(data, name, kind, nbody))
+        self._seen = [a.numpy()[:, 0] for a in (self._horizon, self._pos, self._mat)]
+        self._columns = self.jacobian.numpy()[:, 0].transpose(0, 2, 1)
+        m, d, bodies, at = self.m, self.d, self.bodies, (self._pos, self._mat)
+        self._advance = row(bodies.ahead(m, d, self._horizon, *at))
+        self._find_jacobians = row(bodies.here(d, *at), bodies.jacobians(m, d, *at, self.jacobian))
+
+    def predict(self, horizon: float | np.ndarray) -> tuple:
+        """Poses (ngroup, 3) [m], (ngroup, 3, 3) of the touching bodies when everything goes on at its present
+        velocity for `horizon` [s].
+
+        Raises:
+          ValueError: a pose or a velocity is not finite, or huge.
+        """
+        wanted, pos, mat = self._seen
+        wanted[:] = horizon
+        self._advance()
+        self._touching.check(pos, mat)
+        return pos.copy(), mat.copy()
+
+    def jacobians(self) -> np.ndarray:
+        """(ngroup, 6, nv) of the touching bodies relative to the BioTac, a copy."""
+        self._find_jacobians()
+        return np.array(self._columns, order="C")
+
+    def core_motion(self, horizon: float, square: float, acceleration: np.ndarray) -> tuple:
+        """Poses (2, 3), (2, 3, 3) of the BioTac in the world, now and after `horizon` [s] at its present
+        velocity, moved by accelerations (nv,) times `square` [s^2]."""
+        self._qacc.numpy()[0] = acceleration
+        launch = self.bodies.core_motion(self.m, self.d, horizon, square, self._qacc, self._core)
+        wp.launch(*launch, device="cpu")
+        pos, mat, pos_end, mat_end = (a.numpy() for a in self._core)
+        return np.concatenate([pos, pos_end]), np.concatenate([mat, mat_end])
+
+
+def row(*launches: tuple) -> Callable[[], None]:
+    """One call for launches (kernel, dim, arguments) on the CPU, with numbers as they are now."""
+    # none over no bodies
+    runs = in_a_row([recorded(kernel, dim, given) for kernel, dim, given in launches if np.prod(dim)])
+    return runs[0] if len(runs) == 1 else lambda: [run() for run in runs]
+
+
+def _own(data, name, kind, count):
+    """MuJoCo's memory as an array (1, count)."""
+    if not count:
+        return wp.zeros((1, 0), dtype=kind, device="cpu")
+    address = getattr(data, name).ctypes.data
+    return wp.array(ptr=address, dtype=kind, shape=(1, count), device="cpu", copy=False)

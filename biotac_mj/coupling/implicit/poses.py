@@ -1,0 +1,250 @@
+"""Poses, Jacobians and accelerations of the bodies that touch BioTacs, from an engine's own arrays: MuJoCo's
+in double precision, those of mujoco_warp in single, which lead with the world.
+
+Ours are [group, world] and double. A wrench or a small motion has its linear part first. Everything is in the
+BioTac frame, about its origin, unless something else is said."""
+
+from typing import Any
+
+import warp as wp
+
+from ...geometry.rigid_warp import is_finite, rotation
+from .rounds import Rounds, follow
+
+__all__ = ["Bodies"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec3 = wp.vec3d
+mat33 = wp.mat33d
+vec6 = wp.spatial_vectord
+
+
+@wp.func
+def _double(p: Any):
+    return vec3(real(p[0]), real(p[1]), real(p[2]))
+
+
+@wp.func
+def _wide(A: Any):
+    return mat33(
+        real(A[0, 0]), real(A[0, 1]), real(A[0, 2]),
+        real(A[1, 0]), real(A[1, 1]), real(A[1, 2]),
+        real(A[2, 0]), real(A[2, 1]), real(A[2, 2]),
+    )  # fmt: skip
+
+
+@wp.func
+def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=Any),
+               com: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):  # fmt: skip
+    """Where a body is after h at its present velocity."""
+    pos = _double(xpos[w, b])
+    spin = _double(wp.spatial_top(cvel[w, b]))
+    arm = pos - _double(com[w, rootid[b]])
+    return pos + h * (_double(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, arm))
+
+
+@wp.func
+def _ahead_mat(b: int, w: int, h: real, xmat: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):
+    return rotation(h * _double(wp.spatial_top(cvel[w, b]))) * _wide(xmat[w, b])
+
+
+@wp.kernel
+def relative_poses(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    xpos: wp.array2d(dtype=Any),
+    xmat: wp.array2d(dtype=Any),
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+    mat_out: wp.array2d(dtype=mat33),
+):
+    """Poses of the touching bodies now [group, world]."""
+    g, w = wp.tid()
+    turn = wp.transpose(_wide(xmat[w, core]))
+    pos_out[g, w] = turn * (_double(xpos[w, body[g]]) - _double(xpos[w, core]))
+    mat_out[g, w] = turn * _wide(xmat[w, body[g]])
+
+
+@wp.kernel
+def advance_groups(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    horizon: wp.array2d(dtype=real),
+    rootid: wp.array(dtype=int),
+    xpos: wp.array2d(dtype=Any),
+    xmat: wp.array2d(dtype=Any),
+    com: wp.array2d(dtype=Any),
+    cvel: wp.array2d(dtype=Any),
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+    mat_out: wp.array2d(dtype=mat33),
+):
+    """Poses of the touching bodies after a horizon [s] at present velocities [group, world]."""
+    g, w = wp.tid()
+    b = body[g]
+    h = horizon[g, w]
+    frame = wp.transpose(_ahead_mat(core, w, h, xmat, cvel))
+    origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
+    pos_out[g, w] = frame * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
+    mat_out[g, w] = frame * _ahead_mat(b, w, h, xmat, cvel)
+
+
+@wp.kernel
+def relative_jacobians(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    rootid: wp.array(dtype=int),
+    isdofancestor: wp.array2d(dtype=int),
+    xpos: wp.array2d(dtype=Any),
+    xmat: wp.array2d(dtype=Any),
+    com: wp.array2d(dtype=Any),
+    cdof: wp.array2d(dtype=Any),
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+    # Out:
+    jacobian_out: wp.array3d(dtype=vec6),
+):
+    """Jacobians of the touching bodies relative to the BioTac, column i by thread i; pos, mat of
+    `advance_groups`."""
+    g, w, i = wp.tid()
+    b = body[g]
+    sign = real(isdofancestor[b, i] - isdofancestor[core, i])
+    # the bodies' own columns differ in sign alone: both are about the BioTac's origin
+    j = vec6()
+    if sign != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
+        turn = wp.transpose(_wide(xmat[w, core]))
+        spin = _double(wp.spatial_top(cdof[w, i]))
+        arm = _double(xpos[w, core]) - _double(com[w, rootid[wp.where(sign > real(0.0), b, core)]])
+        linear = sign * (turn * (_double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+        angular = sign * (turn * spin)
+        j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
+    jacobian_out[g, w, i] = j
+
+
+@wp.kernel
+def find_drift(
+    # In:
+    h: real,
+    jacobian: wp.array3d(dtype=vec6),
+    qvel: wp.array2d(dtype=Any),
+    # In and out:
+    r: Rounds,
+):
+    """Motions of the touching bodies at present velocities, in the step h and in the horizon."""
+    g, w = wp.tid()
+    velocity = vec6()
+    for i in range(jacobian.shape[2]):
+        velocity += real(qvel[w, i]) * jacobian[g, w, i]
+    r.straight[g, w] = h * velocity
+    r.drift[g, w] = r.horizon[g, w] * velocity
+
+
+@wp.kernel
+def accelerate(
+    # In:
+    h: real,
+    jacobian: wp.array3d(dtype=vec6),
+    qacc: wp.array2d(dtype=Any),
+    # In and out:
+    r: Rounds,
+):
+    """Where the bodies go with accelerations (nworld, nv), see `rounds.follow`."""
+    g, w = wp.tid()
+    gain = vec6()
+    for i in range(jacobian.shape[2]):
+        gain += real(qacc[w, i]) * jacobian[g, w, i]
+    follow(r, g, w, h, gain)
+
+
+@wp.kernel
+def advance_core(
+    # In:
+    core: int,
+    h: real,
+    square: real,
+    rootid: wp.array(dtype=int),
+    isdofancestor: wp.array2d(dtype=int),
+    xpos: wp.array2d(dtype=Any),
+    xmat: wp.array2d(dtype=Any),
+    com: wp.array2d(dtype=Any),
+    cvel: wp.array2d(dtype=Any),
+    cdof: wp.array2d(dtype=Any),
+    qacc: wp.array2d(dtype=Any),
+    # Out:
+    pos_out: wp.array(dtype=vec3),
+    mat_out: wp.array(dtype=mat33),
+    pos_end_out: wp.array(dtype=vec3),
+    mat_end_out: wp.array(dtype=mat33),
+):
+    """Poses of the BioTac frame in the world: now, and after h at present velocities, moved by `square` times
+    J a."""
+    w = wp.tid()
+    here = _double(xpos[w, core])
+    arm = here - _double(com[w, rootid[core]])
+    linear = vec3()
+    angular = vec3()
+    if square > real(0.0):
+        for i in range(cdof.shape[1]):
+            if isdofancestor[core, i] != 0:
+                spin = _double(wp.spatial_top(cdof[w, i]))
+                a = square * real(qacc[w, i])
+                linear += a * (_double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
+                angular += a * spin
+    pos_out[w] = here
+    mat_out[w] = _wide(xmat[w, core])
+    pos_end_out[w] = _ahead_pos(core, w, h, rootid, xpos, com, cvel) + linear
+    mat_end_out[w] = rotation(angular) * _ahead_mat(core, w, h, xmat, cvel)
+
+
+# an overload that a launch makes would change the module after it was compiled
+for _real, _vec3, _mat33, _vec6 in ((float, wp.vec3, wp.mat33, wp.spatial_vector), (real, vec3, mat33, vec6)):
+    _kinds = {"qvel": _real, "qacc": _real, "xpos": _vec3, "com": _vec3, "xmat": _mat33}
+    _kinds |= {"cvel": _vec6, "cdof": _vec6}
+    for _kernel in (relative_poses, advance_groups, relative_jacobians, find_drift, accelerate, advance_core):
+        _names = [a.label for a in _kernel.adj.args if a.label in _kinds]
+        wp.overload(_kernel, {name: wp.array2d(dtype=_kinds[name]) for name in _names})
+
+
+class Bodies:
+    """Launches (kernel, dim, arguments) for the bodies of one BioTac. m, d: Model and Data of mujoco_warp, or
+    what has the same arrays by the same names.
+
+    Args:
+      core: id of the BioTac's body. body: (group,) of int, ids of the touching ones.
+    """
+
+    def __init__(self, core: int, body: wp.array):
+        self._own = [core, body]
+
+    def here(self, d: Any, pos: wp.array, mat: wp.array) -> tuple:
+        """Finds poses of now."""
+        return relative_poses, pos.shape, [*self._own, d.xpos, d.xmat, pos, mat]
+
+    def ahead(self, m: Any, d: Any, horizon: wp.array, pos: wp.array, mat: wp.array) -> tuple:
+        """Finds poses after a horizon [group, world] [s] without acceleration."""
+        moving = [m.body_rootid, d.xpos, d.xmat, d.subtree_com, d.cvel]
+        return advance_groups, pos.shape, [*self._own, horizon, *moving, pos, mat]
+
+    def jacobians(self, m: Any, d: Any, pos: wp.array, mat: wp.array, jacobian: wp.array) -> tuple:
+        """Finds the Jacobians [group, world, dof], after poses."""
+        where = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cdof]
+        return relative_jacobians, jacobian.shape, [*self._own, *where, pos, mat, jacobian]
+
+    def drift(self, m: Any, d: Any, step: float, jacobian: wp.array, r: Rounds) -> tuple[tuple, tuple]:
+        """Two that find where the bodies go without acceleration to where the skin is solved."""
+        ahead = self.ahead(m, d, r.horizon, r.start_pos, r.start_mat)
+        return ahead, (find_drift, r.pos.shape, [real(step), jacobian, d.qvel, r])
+
+    def accelerate(self, step: float, jacobian: wp.array, qacc: wp.array, r: Rounds) -> tuple:
+        """Finds where they go with accelerations (nworld, nv)."""
+        return accelerate, r.pos.shape, [real(step), jacobian, qacc, r]
+
+    def core_motion(self, m: Any, d: Any, step: float, square: float, qacc: wp.array, out: list) -> tuple:
+        """Finds poses `out` of the BioTac in the world, see `advance_core`."""
+        where = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof, qacc]
+        return advance_core, out[0].shape, [self._own[0], real(step), real(square), *where, *out]
