@@ -10,7 +10,7 @@ import warp as wp
 from ..coupling.handle import SENSORS, sensor_widths
 from ..coupling.implicit.marks import Marks
 from ..coupling.implicit.poses import Bodies
-from ..coupling.implicit.rounds import Model
+from ..coupling.implicit.rounds import Model, make_model
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
 from ..skin.program import compile_ahead, finish_compiling
@@ -63,10 +63,7 @@ class Skins:
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
             self._group = wp.array(touching.group.astype(np.int32), dtype=int)
             self._addresses = wp.array(np.array(addresses, np.int32), dtype=int)
-            self.model, self._last = Model(), Model()
-            for name, variable in Model.vars.items():
-                for model in (self.model, self._last):
-                    setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
+            self.model, self._last = (make_model(*shape) for _ in range(2))
             self.failed, self.began = (wp.zeros(self.nworld, dtype=int) for _ in range(2))
             # how a step goes in which bodies and skin do not meet: one round, all of the push
             self._settled, self._rounds = (wp.ones(self.nworld, dtype=int) for _ in range(2))

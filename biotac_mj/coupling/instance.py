@@ -40,7 +40,6 @@ NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
 _TINY = np.finfo(float).tiny
-LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
@@ -163,9 +162,7 @@ class Instance:
 
     @functools.cached_property
     def _arrays(self):
-        setup = self.setup
-        how = setup.thickness, setup.surface_energy, self.inertial, setup.config.loss
-        return StepArrays(self.kinematics, setup.ngroup, *how)
+        return StepArrays(self.kinematics, self.setup, self.inertial)
 
     def begin_arrays(self) -> StepArrays:
         """The arrays of a coupled step that begins: the linear model in force is that of the last step."""

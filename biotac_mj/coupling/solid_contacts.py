@@ -133,11 +133,8 @@ class SolidContacts(SolidPairs):
         data.struct.ncon = len(kept)
         for pair, pos, normal, depth in self._found(data, list(templates)):
             contact, sign = templates[pair]
-            contact["dist"], contact["pos"], contact["frame"] = (
-                -depth,
-                pos,
-                contact_frame(sign * normal).ravel(),
-            )
+            frame = contact_frame(sign * normal).ravel()
+            contact["dist"], contact["pos"], contact["frame"] = -depth, pos, frame
             contact["includemargin"], contact["exclude"], contact["efc_address"] = 0.0, 0, -1
             made = np.atleast_1d(contact)
             if LIBRARY.mj_addContact(self.model.address, data.address, made.ctypes.data):

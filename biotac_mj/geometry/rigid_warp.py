@@ -5,9 +5,7 @@ A small motion has the translation of the point at the origin first, then the ro
 import warp as wp
 
 __all__ = [
-    "displace",
     "displace_at_once",
-    "displace_from",
     "is_finite",
     "motion",
     "motion_at_once",
@@ -49,20 +47,6 @@ def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
         v = wp.atan2(sine, real(0.5) * (wp.trace(turn) - real(1.0))) / sine * v
     t = pos - pos0 - wp.cross(v, pos0)
     return vec6(t[0], t[1], t[2], v[0], v[1], v[2])
-
-
-@wp.func
-def displace_from(here: vec3, pos: vec3, mat: mat33, m: vec6):
-    """The pose after a small motion that was measured with the body's reference point at `here`."""
-    turn = vec3(m[3], m[4], m[5])
-    return pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here), rotation(turn) * mat
-
-
-@wp.func
-def displace(pos: vec3, mat: mat33, m: vec6):
-    """The pose after a small motion, the inverse of `motion`; the body's reference point moves along a
-    line."""
-    return displace_from(pos, pos, mat, m)
 
 
 @wp.func

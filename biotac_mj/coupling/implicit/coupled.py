@@ -4,8 +4,9 @@ energy that it can give."""
 import numpy as np
 
 from ...geometry.rigid import displacement
+from ...geometry.rigid_warp import LEVER
 from ...skin.bodies import BodyMotion
-from ..instance import LEVER, STAGES, Instance
+from ..instance import STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import share_that_pushes

@@ -5,16 +5,7 @@ Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
-from ...geometry.rigid_warp import (
-    LEVER,
-    displace_at_once,
-    displace_from,
-    is_finite,
-    motion,
-    motion_at_once,
-    rotation,
-    size_of,
-)
+from ...geometry.rigid_warp import LEVER, displace_at_once, is_finite, motion, motion_at_once, size_of
 from ...skin.bodies import Bodies
 from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
@@ -36,6 +27,7 @@ __all__ = [
     "use_euler",
     "look",
     "look_inside",
+    "make_model",
     "make_rounds",
     "tell_bodies",
     "wrenches",
@@ -121,6 +113,14 @@ class Solid:
     inertial: int
 
 
+def make_model(groups: int, nworld: int) -> Model:
+    """No forces of any body, on Warp's default device."""
+    model = Model()
+    for name, variable in Model.vars.items():
+        setattr(model, name, wp.zeros((groups, nworld), dtype=variable.type.dtype))
+    return model
+
+
 def make_rounds(groups: int, nworld: int, limit: int = 0) -> Rounds:
     """Those of `groups` bodies, on Warp's default device; all zero but for what acts: all of the push, and
     skins that settled in one round."""
@@ -185,11 +185,9 @@ def follow(r: Rounds, g: int, w: int, h: real, gain: vec6):
     m = r.square[g, w] * gain
     r.moved[g, w] = m
     r.travel[g, w] = r.straight[g, w] + real(0.5) * h * h * gain
-    here = r.here_pos[g, w]
-    spin = _turns(r.drift[g, w])
-    both = vec6(m[0], m[1], m[2], m[3] + spin[0], m[4] + spin[1], m[5] + spin[2])
-    p, R = displace_from(here, r.start_pos[g, w], rotation(-spin) * r.start_mat[g, w], both)
-    r.pos[g, w] = p - wp.cross(spin, here)
+    start, spin = r.start_pos[g, w], _turns(r.drift[g, w])
+    p, R = displace_at_once(start, r.start_mat[g, w], m, r.here_pos[g, w], spin)
+    r.pos[g, w] = p
     r.mat[g, w] = R
 
 

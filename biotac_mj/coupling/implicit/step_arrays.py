@@ -8,6 +8,7 @@ import warp as wp
 
 from ...geometry.rigid_warp import motion, size_of
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
+from ..setup import Setup
 from . import energy, rounds
 from .kinematics import Kinematics, row
 from .marks import Marks
@@ -43,8 +44,7 @@ class StepArrays:
     and `Model`. A launch takes 1 us, several numpy calls on so few numbers.
 
     Args:
-      kinematics: of the bodies. ngroup: number of bodies that can touch. thickness: [m], surface_energy: [J]
-        most of adhesion, inertial: of the skin. loss: of its rubber.
+      kinematics: of the bodies. setup: of the BioTac. inertial: whether its skin has inertia.
 
     Attributes:
       qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
@@ -53,25 +53,15 @@ class StepArrays:
       last: views by name of the linear model of the last step.
     """
 
-    def __init__(
-        self,
-        kinematics: Kinematics,
-        ngroup: int,
-        thickness: float,
-        surface_energy: float,
-        inertial: bool,
-        loss: float,
-    ):
-        self._kinematics, shape = kinematics, (ngroup, 1)
-        self._loss, self._key, solid = loss, None, Solid()
-        solid.thickness, solid.area, solid.inertial = thickness, 1.0, int(inertial)
+    def __init__(self, kinematics: Kinematics, setup: Setup, inertial: bool):
+        self._kinematics, shape = kinematics, (setup.ngroup, 1)
+        self._loss, self._key, solid = setup.config.loss, None, Solid()
+        solid.thickness, solid.area, solid.inertial = setup.thickness, 1.0, int(inertial)
         self._solid = solid
         with wp.ScopedDevice("cpu"):
-            self._rounds, self._model, self._last = rounds.make_rounds(*shape), Model(), Model()
-            self._rounds.surface = wp.array([surface_energy], dtype=real)
-            for name, variable in Model.vars.items():
-                for model in (self._model, self._last):
-                    setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
+            self._rounds = rounds.make_rounds(*shape)
+            self._model, self._last = (rounds.make_model(*shape) for _ in range(2))
+            self._rounds.surface = wp.array([setup.surface_energy], dtype=real)
             self._wrench, self._qacc = wp.zeros(shape, dtype=vec6), wp.zeros_like(kinematics.d.qvel)
             self._left_out = wp.zeros(shape, dtype=real)
             self._compliance = wp.zeros((ngroup, *shape), dtype=wp.spatial_matrixd)
@@ -80,8 +70,8 @@ class StepArrays:
         self._one.fill_(1)
         self.wrench, self.left_out = _seen(self._wrench), _seen(self._left_out)
         self.qacc, self.compliance = self._qacc.numpy()[0], self._compliance.numpy()[:, :, 0]
-        self.off, self._is_greedy, self._is_marked, self._found = (
-            a.numpy() for a in (self._off, self._greedy, self._marks.any, self._reason)
+        self.off, self._is_marked, self._found = (
+            a.numpy() for a in (self._off, self._marks.any, self._reason)
         )
         for part, names in ((self._rounds, Rounds.vars), (self._model, Model.vars)):
             for name in names:
@@ -124,8 +114,7 @@ class StepArrays:
 
     def find_energy(self) -> bool:
         """Makes the account; whether the skin is greedy."""
-        self._find_energy()
-        return bool(self._is_greedy[0])
+        return self._marked(self._find_energy)
 
     def restrain(self) -> bool:
         """Whether push on a body had to be withheld, which now is."""

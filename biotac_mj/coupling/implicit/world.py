@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 
+from ...geometry.rigid_warp import LEVER
 from ...threads import run_in_threads
-from ..instance import LEVER, NO_PASSIVE, NO_SENSOR, STAGES, Instance
+from ..instance import NO_PASSIVE, NO_SENSOR, STAGES, Instance
 from ..loads import Loads
 from ..solid import SOLVED
 from ..solid_contacts import SolidContacts
