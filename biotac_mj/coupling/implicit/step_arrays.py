@@ -64,7 +64,7 @@ class StepArrays:
             self._rounds.surface = wp.array([setup.surface_energy], dtype=real)
             self._wrench, self._qacc = wp.zeros(shape, dtype=vec6), wp.zeros_like(kinematics.d.qvel)
             self._left_out = wp.zeros(shape, dtype=real)
-            self._compliance = wp.zeros((ngroup, *shape), dtype=wp.spatial_matrixd)
+            self._compliance = wp.zeros((setup.ngroup, *shape), dtype=wp.spatial_matrixd)
             self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
             self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
         self._one.fill_(1)
