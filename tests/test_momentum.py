@@ -76,7 +76,7 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     "integrator, tier, speed",
     [
         pytest.param("Euler", "full", 2.22, marks=pytest.mark.slow),
-        ("implicit", "condensed", 2.22),
+        ("implicit", "condensed", 2.2),
     ],
 )
 def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier, speed):
