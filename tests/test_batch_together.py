@@ -117,8 +117,8 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
         correction = wp.array(wrench, dtype=wp.spatial_vectord)
         gains, going, every = Marks(n), Marks(n), wp.ones(n, dtype=int)
         model_before = model.tangent0.numpy()[0, 1]
-        # bodies that do not give way get the share of a push that gives what they have; none where that was not
-        # enough, or what acts is no number
+        # bodies that do not give way get the share of a push that gives what they have; none where that was
+        # not enough, or what acts is no number
         rigid = wp.zeros((1, 1, n), dtype=wp.spatial_matrixd)
         wp.launch(energy.restrain, n, [every, model, rigid, r, going.struct])
         share, whole = r.push.numpy()[0, :2] / (1e-4 / 5e-3, 1.0)
