@@ -820,7 +820,7 @@ def numbers():
     flat = lambda path: np.savetxt(path, np.zeros((420, 3)), "%d")  # noqa: E731
     words = "learn judge --quiet electrodes.txt --force force.txt"
     yield Row(words, "electrodes: the force never changes, so that it cannot be learned", "force.txt", flat)
-    for hold, timestep in (("20ms", "1e-9ms"), ("1e12", "4ms")):
+    for hold, timestep in (("20ms", "1e-9ms"), ("1e12s", "4ms")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
     for timestep in ("101ms", "1e30"):
         yield Row(f"press --timestep {timestep}", "to 100 ms can be given")

@@ -208,7 +208,7 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
 def test_the_command_line_says_what_does_not_go_together(arguments, text, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "biotac_mj.discrepancy.trajectories.verb.read_trajectories",
+        "biotac_mj.discrepancy.trajectories.trajectory.read_trajectories",
         lambda path: [types.SimpleNamespace(electrodes=None)],
     )
     Simulator().save("r.yaml")
