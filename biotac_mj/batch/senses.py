@@ -12,7 +12,6 @@ from ..coupling.stepper import Geom
 from ..effects.sensors import take_sensor
 from ..geometry.design import BIOTAC, Design
 from ..sensor.acquisition import BatchAcquisition
-from ..sensor.film import BatchFilm
 from ..sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
 from ..sensor.materials import Material
 from ..sensor.presets import Sensor
@@ -166,7 +165,7 @@ class Senses:
         self.heat = self.vibration = self._touched = None
         with wp.ScopedDevice(device):
             self._known, self._changed = (wp.zeros(nworld, dtype=int) for _ in range(2))
-            self._any = wp.zeros(1, dtype=int)
+            self._any, self._always = wp.zeros(1, dtype=int), wp.ones(nworld, dtype=int)
         self._rests, begins = [], None
         if warm:
             self.heat = Heat(rows[0].bodies, nworld=nworld, device=device)
@@ -255,18 +254,15 @@ class Senses:
             self._touched.end(wrench, tangent)
         if self.heat:
             self.heat.advance(self._dt)
-        self._due = due = self.acquisition.find_due(self._dt)
-        if isinstance(self.film, BatchFilm):
-            self._any.zero_()
-            outputs = [self._known, self._changed, self._any]
-            wp.launch(find_changed, self._skin.nworld, [due, awake], outputs, device=due.device)
+        due = self.acquisition.find_due(self._dt)
+        self._any.zero_()
+        inputs = [due, self._always if self.film.remembers else awake]
+        outputs = [self._known, self._changed, self._any]
+        wp.launch(find_changed, self._skin.nworld, inputs, outputs, device=due.device)
 
     def solve_film(self) -> None:
         """The films that are wanted, after `look`."""
-        if isinstance(self.film, BatchFilm):
-            wp.capture_if(self._any, lambda: self.film.solve_film(self._skin.x, self._changed))
-        else:  # a network may remember, and sees every frame
-            self.film.solve_film(self._skin.x, self._due)
+        wp.capture_if(self._any, lambda: self.film.solve_film(self._skin.x, self._changed))
 
     def sample(self) -> wp.array:
         """The step's slots, after `solve_film`; returns the states (nworld, nstate). Launches only."""

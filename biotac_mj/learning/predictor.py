@@ -31,7 +31,8 @@ class _Served(nn.Module):
             raise ValueError(
                 f"displacement has shape {tuple(displacement.shape)}: this model reads (n, {self.nvert}, 3)"
             )
-        if not torch.isfinite(displacement).all():
+        captured = displacement.is_cuda and torch.cuda.is_current_stream_capturing()  # has no values yet
+        if not captured and not torch.isfinite(displacement).all():
             raise ValueError(
                 "displacement holds values that are not finite: the skin's step did not converge; "
                 "keep the last good state"

@@ -67,8 +67,8 @@ class NetworkFilm:
 class LearnedBatchFilm:
     """Replacement of `sensor.film.BatchFilm`: impedances of `nworld` skins, on their device.
 
-    Computes all worlds whenever one may be due, in single precision. Not capturable in a CUDA graph: torch
-    launches are not Warp's.
+    Computes all worlds whenever one is due, in single precision. Capturable in a CUDA graph: torch's memory
+    comes from a pool of its own, which lives as long as this object.
 
     Args:
       geometry, weights: as for `NetworkFilm`. sensor: whose rest it reads. nworld: worlds. device: Warp
@@ -76,7 +76,7 @@ class LearnedBatchFilm:
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
-        design. lasting: the arrays that persist between steps.
+        design. lasting: the arrays that persist between steps. remembers: whether the network has a window.
     """
 
     def __init__(
@@ -103,34 +103,36 @@ class LearnedBatchFilm:
         self._average = (
             torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
         )
+        self.remembers = bool(self.model.window)
         self.lasting = [self.impedance, self.valid]
         if self._average is not None:
             self.lasting.append(wp.from_torch(self._average))
         self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
+        self._pool = torch.cuda.MemPool() if self.device.is_cuda else None
+        if self.device.is_cuda:  # torch's libraries take their memory before a capture begins
+            x = self._vert[:, None].expand(-1, nworld, -1).contiguous()
+            with wp.ScopedDevice(self.device):
+                self.solve_film(wp.from_torch(x, dtype=wp.vec3d), wp.zeros(nworld, dtype=int))
 
     @torch.no_grad()
     def solve_film(self, x: "wp.array", due: "wp.array") -> None:
         """Computes new impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due
-        (nworld,) wp.array of int."""
+        (nworld,) wp.array of int. Launches only: may be captured in a CUDA graph."""
         import contextlib
 
         import warp as wp
 
-        cuda = self.device.is_cuda
-        # synchronise with Warp's stream before and after
-        with (
-            torch.cuda.stream(wp.stream_to_torch(wp.get_stream(self.device)))
-            if cuda
-            else contextlib.nullcontext()
-        ):
-            wanted = wp.to_torch(due) != 0
-            if bool(wanted.any()):
-                self._solve(
-                    wp.to_torch(x).view(*x.shape, 3),
-                    wanted,
-                    wp.to_torch(self.impedance),
-                    wp.to_torch(self.valid),
-                )
+        with contextlib.ExitStack() as stack:
+            if self.device.is_cuda:  # in order with Warp's launches
+                stream = wp.stream_to_torch(wp.get_stream(self.device))
+                stack.enter_context(torch.cuda.stream(stream))
+                stack.enter_context(torch.cuda.use_mem_pool(self._pool))
+            self._solve(
+                wp.to_torch(x).view(*x.shape, 3),
+                wp.to_torch(due) != 0,
+                wp.to_torch(self.impedance),
+                wp.to_torch(self.valid),
+            )
 
     def _solve(self, x, wanted, impedance, valid):
         u = (1e3 * (x.transpose(0, 1) - self._vert)).float()

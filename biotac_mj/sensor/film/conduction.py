@@ -364,11 +364,13 @@ class BatchFilm:
       valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
         position that is not finite.
       lasting: the arrays that persist between steps: these two.
-      rest: (n,) impedance at rest [ohm]. design: of the skin.
+      rest: (n,) impedance at rest [ohm]. design: of the skin. remembers: False, without a memory of frames.
       middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
         world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
       nbytes: device memory of all worlds.
     """
+
+    remembers = False
 
     def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
