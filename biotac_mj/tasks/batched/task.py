@@ -158,7 +158,7 @@ class BatchTask(abc.ABC):
             self._begin(self._everyone)
             self._run = self._substep
             self._substep()  # takes the memory that a capture must find
-            if where.is_cuda and biotac.get("signal") in (None, "physics"):  # torch's networks are no graph
+            if where.is_cuda:
                 with wp.ScopedCapture(device=where) as capture:
                     self._substep()
                 self._run = functools.partial(wp.capture_launch, capture.graph)
