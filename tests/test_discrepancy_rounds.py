@@ -11,12 +11,12 @@ from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-from biotac_mj.discrepancy.trajectories.beliefs import Beliefs, Explanation, pooled, weights
+from biotac_mj.discrepancy.trajectories.beliefs import Beliefs, Explanation, _effect, pooled, weights
 from biotac_mj.discrepancy.trajectories.contacts import Bounds, drawn, trajectory_of
 from biotac_mj.discrepancy.trajectories.design import Separation, planned
 from biotac_mj.discrepancy.trajectories.plan_files import COLUMNS, write_plan
 from biotac_mj.discrepancy.trajectories.trajectory import read_trajectories
-from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.catalogue import CATALOGUE, by_id
 
 BOUNDS = Bounds(force=1.2, depth=1.2e-3, tools=("sphere_7mm", "sphere_14mm"))
 
@@ -223,3 +223,14 @@ def test_too_little_for_a_name_is_not_agreement(alone, agrees):
     said = Beliefs(some, 5e-5, {}, 1.0).against_none
     assert (said == "") == agrees
     assert agrees or by_id("mount").name in said and by_id("rocking").name in said
+
+
+@pytest.mark.parametrize("entry", CATALOGUE, ids=lambda e: e.id)
+def test_an_effect_that_is_read_back_has_its_parameters(entry):
+    """Of a realistic size, as in what may be there unseen; every parameter can be moved."""
+    start = Explanation([], Nuisance(), 0.0, np.zeros((0, 0)))
+    theta = start.with_unseen(entry, 0.0).effects[0][1]
+    read = _effect(entry.id, theta, (), entry.design)
+    assert read.params.keys() == theta.keys()
+    moved = Explanation([(read, theta)], Nuisance(), 0.0, np.zeros((0, 0))).moves()
+    assert len(list(moved)) >= len(theta)

@@ -63,12 +63,12 @@ def _gaps(v: Verdict):
         for name, gap in v.gap.items()
     ]
     closed = [f"    of what is above noise {v.closed:.0%} is closed"] if math.isfinite(v.closed) else []
-    return [f"  on {v.aside}:", *_table(rows), *closed]
+    return [f"  on {v.aside}:", *_table(rows, hidden=set()), *closed]
 
 
-def columns(rows: list[dict]) -> list[str]:
+def columns(rows: list[dict], hidden: set[str] = _HIDDEN) -> list[str]:
     """Names of what dicts of a table have, but what is for programs."""
-    return [name for name in dict.fromkeys(k for row in rows for k in row) if name not in _HIDDEN]
+    return [name for name in dict.fromkeys(k for row in rows for k in row) if name not in hidden]
 
 
 def cell(value: object) -> str:
@@ -78,9 +78,9 @@ def cell(value: object) -> str:
     return "" if value is None else str(value)
 
 
-def _table(rows):
+def _table(rows, hidden=_HIDDEN):
     """Lines of a table with one column for each key."""
-    names = columns(rows)
+    names = columns(rows, hidden)
     cells = [[name.replace("_", " ") for name in names]]
     cells += [[cell(row.get(name)) for name in names] for row in rows]
     width = [max(map(len, column)) for column in zip(*cells)]

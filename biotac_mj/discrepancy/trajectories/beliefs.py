@@ -260,7 +260,8 @@ def _round(folder):
 
 
 def _effect(name, theta, extra, design):
-    return by_id(name, extra).on(design).given(list(theta)).only(list(theta))
+    effect = by_id(name, extra).on(design).given(list(theta))
+    return effect if effect.params.keys() == theta.keys() else effect.only(list(theta))
 
 
 def believed(comparison: "Comparison", search: "Search", doubts: list[str], chosen: np.ndarray) -> Beliefs:
