@@ -476,7 +476,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
         np.testing.assert_allclose(d.qvel.numpy()[w, :3], data.qvel[:3], atol=0.03 * v[1])
 
 
-@pytest.mark.parametrize("speed", [0.45, 0.5, 0.52, 0.6])
+@pytest.mark.parametrize("speed", [0.5, 0.52, 0.6, 0.65])
 def test_a_step_without_a_balance_pulls_no_ball(speed):
     """Of 100 g, in `mj_step` and in a batch, whose solves are cut off as it leaves skin that lay on the
     core."""
@@ -502,7 +502,7 @@ def test_a_step_without_a_balance_pulls_no_ball(speed):
         (batch_push[1:], batch_settled[1:], d.qvel.numpy()[0, 1]),
     ):
         assert not all(good) and max(force) > 5 and min(force) > -1e-3 * max(force)
-        assert -speed < after < -0.4 * speed  # -0.48 on CUDA at 0.5 m/s, where another solve is cut off
+        assert -speed < after < -0.5 * speed
 
 
 @pytest.mark.parametrize(

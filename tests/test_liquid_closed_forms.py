@@ -205,7 +205,11 @@ def elastic_product(here, data, p):
     return out
 
 
-def test_tangent_is_exact(on_core):
+CURVED = pytest.mark.xfail(strict=True, reason="how the core's normals turn is left out of the tangent: 14 %")
+
+
+@pytest.mark.parametrize("bound", [pytest.param(0.06, marks=CURVED), 0.15])
+def test_tangent_is_exact(on_core, bound):
     """Of liquid and core contact by differences of their forces, along directions rough and smooth."""
     model, data, geoms = on_core
     here = prepare_step(model, data, geoms)
@@ -231,9 +235,9 @@ def test_tangent_is_exact(on_core):
             here.evaluate_forces()
             data.outer.touching.zero_()
             difference = (forces[1] - forces[0]) / (2 * h)
-            # how the liquid's force turns with dry faces is left out, and contact this soft shows that: 5 %
-            # (14 % without the turn of the core's normals)
-            assert np.linalg.norm(product - difference) < 0.06 * np.linalg.norm(difference)
+            # how the core's normals turn is left out of the tangent, which would not be definite with it (5 %
+            # without dry faces' turn of the liquid's force), and contact this soft shows that: 14 %
+            assert np.linalg.norm(product - difference) < bound * np.linalg.norm(difference)
 
 
 def test_tangent_of_the_liquid_alone(coarse):

@@ -20,7 +20,7 @@ from ...geometry.closest import (
     pseudonormals,
 )
 from ...geometry.solid import bounds_solid
-from ..types import double, mat33, real, single, vec3
+from ..types import double, real, single, vec3
 
 __all__ = [
     "NEAR_SURFACE",
@@ -29,7 +29,6 @@ __all__ = [
     "Grids",
     "bake_distance_grid",
     "grid_value",
-    "mesh_curvature",
     "mesh_distance",
     "mesh_field",
     "pack_grids",
@@ -341,39 +340,6 @@ def _from_spline(grids: Grids, k: int, p: vec3):
             gradient += vec3(dx[a] * y[b] * row[0], x[a] * dy[b] * row[0], x[a] * y[b] * row[1])
     gradient = gradient / h
     return wp.vec4d(gradient[0], gradient[1], gradient[2], value)
-
-
-@wp.func(inline=False)  # long, and rarely called
-def mesh_curvature(grids: Grids, k: int, p: vec3):
-    """Second derivatives of a spline's distance [1/m]; zero for a mesh with edges, whose faces are flat."""
-    K = mat33()
-    if grids.coefficient.shape[0] > 0:
-        n = grids.shape[k]
-        h = grids.spacing[k]
-        i, t = _spline_centre(grids, k, p)
-        values = mat33()  # weights of the coefficients around the point; a row for each axis
-        slopes = mat33()
-        for a in range(3):
-            values[a] = _spline_weights(t[a])
-            slopes[a] = _spline_slopes(t[a])
-        bend = vec3(real(1.0), real(-2.0), real(1.0))
-        first = grids.first[k] + ((i[0] - 1) * n[1] + i[1] - 1) * n[2] + i[2] - 1
-        for a in range(3):
-            for b in range(3):
-                at = first + (a * n[1] + b) * n[2]
-                row = _spline_row(grids, at, values[2], slopes[2])
-                over = _spline_row(grids, at, bend, bend)[0]
-                K[0, 0] = K[0, 0] + bend[a] * values[1, b] * row[0]
-                K[1, 1] = K[1, 1] + values[0, a] * bend[b] * row[0]
-                K[2, 2] = K[2, 2] + values[0, a] * values[1, b] * over
-                K[0, 1] = K[0, 1] + slopes[0, a] * slopes[1, b] * row[0]
-                K[0, 2] = K[0, 2] + slopes[0, a] * values[1, b] * row[1]
-                K[1, 2] = K[1, 2] + values[0, a] * slopes[1, b] * row[1]
-        K[1, 0] = K[0, 1]
-        K[2, 0] = K[0, 2]
-        K[2, 1] = K[1, 2]
-        K = K / (h * h)
-    return K
 
 
 @wp.func

@@ -15,7 +15,6 @@ import warp as wp
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
-from .meshes import mesh_curvature
 from .posed import Geoms, convected_anchor, distance_to, face_radius, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
@@ -305,11 +304,8 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                         push = smooth_traction(k, width, gap)
                         fn = push[0]
                         K = push[1] * wp.outer(normal, normal)
-                if wp.static(shapes != SOLIDS):
-                    if (
-                        geoms.kind[touched] == 7
-                    ):  # the normal of a smooth surface turns as the skin moves along it
-                        K = K - fn * mesh_curvature(geoms.grids, geoms.grid[touched], local)
+                # K leaves out how a smooth surface turns the normal: with it the tangent is not definite, and
+                # Newton's method finds balances that are not stable
                 force = fn * normal
                 if friction_mode == RECORDED and mu > real(0.0):
                     c.bound[i, w] = wp.max(mu * fn, real(0.0))
