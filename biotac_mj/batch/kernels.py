@@ -12,7 +12,7 @@ from ..geometry.rigid_warp import LEVER, motion
 from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
-from ..skin.types import double, widen
+from ..skin.types import double, mat33, mat66, real, vec3, vec6, widen
 
 __all__ = [
     "accept_models",
@@ -27,11 +27,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 
 _share_that_pushes = wp.func(share_that_pushes)
 

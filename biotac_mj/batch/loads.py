@@ -12,7 +12,7 @@ from mujoco_warp._src.ray import ray_geom
 from mujoco_warp._src.types import ContactType, vec5
 
 from ..coupling.loads import PYRAMID
-from ..skin.types import double, widen
+from ..skin.types import double, real, vec3, vec6, widen
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -21,9 +21,6 @@ __all__ = ["Loads"]
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-vec6 = wp.spatial_vectord
 _FORCE, _TORQUE, _TOUCH, _CONTACT = (
     int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH", "CONTACT")
 )

@@ -16,16 +16,12 @@ from ..skin.geoms import GeomSet
 from ..skin.model import SkinModel
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from ..skin.state import allocate
+from ..skin.types import mat66, real, vec3, vec4, vec6
 
 __all__ = ["NEAR", "Clearance", "Release", "constants_of", "count_stays", "find_close", "margin_of"]
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-vec4 = wp.vec4d
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 _CLEAR = wp.constant(wp.float64(CLEAR))
 _PATIENCE = wp.constant(PATIENCE)
 _stayed = wp.func(stayed)

@@ -14,6 +14,7 @@ from ..skin.contact.broadphase import contact_range, motion_bound
 from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
+from ..skin.types import mat33, mat66, real, vec3, vec4, vec6
 from .release import NEAR, Clearance, constants_of, find_close, margin_of
 from .skin import BatchSkin
 
@@ -21,12 +22,6 @@ __all__ = ["Rest"]
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec4 = wp.vec4d
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 # by which distances may change faster than places: grids are trilinear
 _ROOT3 = wp.constant(wp.float64(3**0.5))
 

@@ -4,6 +4,7 @@ import warp as wp
 
 from ..skin.contact.posed import Geoms, bound_to, distance_from
 from ..skin.newton.worlds import Worlds
+from ..skin.types import mat33, real, vec3, vec6
 
 __all__ = [
     "begin_at_rest",
@@ -15,10 +16,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec6 = wp.spatial_vectord
 _ROUNDS = wp.constant(24)  # each takes the deepest point's depth off
 _LEFT = wp.constant(wp.float64(1e-6))  # [m] of depth that will do
 

@@ -3,15 +3,11 @@
 
 import warp as wp
 
-from ..skin.types import double, widen
+from ..skin.types import double, real, vec6, widen
 
 __all__ = ["add_push", "sum_contacts"]
 
 wp.set_module_options({"enable_backward": False})
-
-real = wp.float64
-vec3 = wp.vec3d
-vec6 = wp.spatial_vectord
 
 
 @wp.kernel

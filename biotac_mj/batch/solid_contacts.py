@@ -9,7 +9,7 @@ import warp as wp
 
 from ..coupling.solid_contacts import SolidPairs
 from ..skin.contact.overlap import MOST
-from ..skin.types import double, widen
+from ..skin.types import double, mat33, real, vec3, widen
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -18,9 +18,6 @@ __all__ = ["SolidContacts"]
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
 _CONSTRAINT = wp.constant(1)  # bit of mujoco_warp's ContactType
 
 

@@ -15,20 +15,24 @@ __all__ = [
     "Precision",
     "double",
     "mat33",
+    "mat66",
     "narrow",
     "real",
     "single",
     "sum_of_block",
     "sum_of_lanes",
     "vec3",
+    "vec4",
     "vec6",
     "widen",
 ]
 
 real = wp.float64
 vec3 = wp.vec3d
+vec4 = wp.vec4d
 vec6 = wp.spatial_vectord
 mat33 = wp.mat33d
+mat66 = wp.spatial_matrixd
 
 
 @wp.func

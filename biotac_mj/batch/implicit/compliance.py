@@ -12,6 +12,7 @@ import warp as wp
 from ...coupling.implicit.rounds import Model
 from ...skin.condensed.lanes import sync
 from ...skin.program import Launcher
+from ...skin.types import real, vec6
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -20,8 +21,6 @@ __all__ = ["Factor", "Response", "add_powers", "add_stiffness", "drive", "find_f
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec6 = wp.spatial_vectord
 
 _BLOCK = 64  # threads that factor a world's matrix
 _QUADRATIC = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC))

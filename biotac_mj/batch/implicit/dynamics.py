@@ -8,6 +8,7 @@ import mujoco
 import warp as wp
 
 from ...skin.newton.worlds import NOT_FINITE
+from ...skin.types import mat66, real, vec6
 
 __all__ = [
     "acting_wrenches",
@@ -18,11 +19,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 
 _EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
 _NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL

@@ -16,6 +16,7 @@ from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
 from ...skin.condensed.lanes import eliminate, sync
 from ...skin.program import Launcher
+from ...skin.types import real, vec6
 from .compliance import Factor, substitute
 
 if typing.TYPE_CHECKING:
@@ -34,8 +35,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec6 = wp.spatial_vectord
 
 _BLOCK = 64  # threads that solve for the corrections of a world
 _MAX_CORRECTIONS = wp.constant(MAX_CORRECTIONS)

@@ -8,6 +8,7 @@ import warp as wp
 
 from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
+from ...skin.types import mat66, real, vec6
 from .marks import MarkedWorlds, mark
 from .rounds import Model, Rounds, Solid, force_of
 from .rules import EULER, beta_of, in_store, lacking, share_within, spared
@@ -23,9 +24,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 
 _in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))
 _beta_of, _share_within = (wp.func(rule) for rule in (beta_of, share_within))

@@ -8,16 +8,12 @@ import numpy as np
 import warp as wp
 
 from ...launches import in_a_row, recorded
+from ...skin.types import mat33, real, vec3, vec6
 from ..structs import DataView, ModelView
 from ..touching import Touching
 from .poses import Bodies
 
 __all__ = ["Kinematics", "row"]
-
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec6 = wp.spatial_vectord
 
 
 class Kinematics:

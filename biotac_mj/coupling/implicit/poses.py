@@ -9,16 +9,12 @@ from typing import Any
 import warp as wp
 
 from ...geometry.rigid_warp import is_finite, rotation
+from ...skin.types import mat33, real, vec3, vec6
 from .rounds import Rounds, follow
 
 __all__ = ["Bodies"]
 
 wp.set_module_options({"enable_backward": False})
-
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec6 = wp.spatial_vectord
 
 
 @wp.func

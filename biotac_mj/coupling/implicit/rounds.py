@@ -10,6 +10,7 @@ from ...skin.bodies import Bodies
 from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
 from ...skin.newton.worlds import CONVERGED
+from ...skin.types import mat33, mat66, real, vec3, vec6
 from .marks import MarkedWorlds, mark
 from .rules import EULER, TELEPORT, TOLERANCE, beta_of, gamma_of
 
@@ -35,11 +36,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-real = wp.float64
-vec3 = wp.vec3d
-mat33 = wp.mat33d
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 
 _gamma_of, _beta_of = (wp.func(rule) for rule in (gamma_of, beta_of))
 _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPORT))

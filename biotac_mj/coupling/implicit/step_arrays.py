@@ -8,6 +8,7 @@ import warp as wp
 
 from ...geometry.rigid_warp import motion, size_of
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
+from ...skin.types import real, vec6
 from ..setup import Setup
 from . import energy, rounds
 from .kinematics import Kinematics, row
@@ -18,9 +19,6 @@ from .rules import LOSS_FREQUENCY
 __all__ = ["StepArrays"]
 
 wp.set_module_options({"enable_backward": False})
-
-real = wp.float64
-vec6 = wp.spatial_vectord
 
 
 @wp.kernel
