@@ -226,8 +226,11 @@ def test_turned_weights_of_the_same_shape_are_refused(reader, tmp_path):
 
 
 def test_too_few_touches_are_refused():
+    few = touches(20, 5)
     with pytest.raises(ValueError, match="intervals of 90 % need 9 aside"):
-        judge(touches(20, 5))
+        fit_reader(few, np.arange(12), np.arange(12, 20))
+    with pytest.raises(ValueError, match="the set has 20 interactions: .* needs 49, of which 9"):
+        judge(few)
 
 
 def test_terms_without_the_common_mode_do_not_see_it():

@@ -430,6 +430,7 @@ def test_a_model_is_shown_while_it_steps():
             ["play", "/no/such.h5"],
             "no recording at /no/such.h5: make one with `biotac press --out DIR`",
         ),
+        (["play", "notask"], "give a task: roll_rod, insert_peg, follow_edge"),
         (["play", __file__], "is no recording"),
         (
             ["play", "--hand", "/no/hand.xml"],

@@ -304,6 +304,10 @@ def _play(args):
     if given:
         said = " ".join(args.recording) or "nothing"
         raise ValueError(f"{given[0]} is of one task, and {said} is none: pass one of {', '.join(TASKS)}")
+    remedy = "make one with `biotac press --out DIR` and give DIR/skin.h5, or give a task"
+    for path in args.recording:  # the page's own error knows no tasks
+        with reading(path, "recording", f"{remedy}: {', '.join(TASKS)}"):
+            pass
     from ..view import view
 
     more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)

@@ -2,10 +2,13 @@
 neighbouring ones are similar."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 
-__all__ = ["FRACTIONS", "Split", "assign", "split_by_interaction", "split_by_object"]
+from .schema import SPLITS
+
+__all__ = ["FRACTIONS", "Split", "assign", "least_count", "split_by_interaction", "split_by_object"]
 
 FRACTIONS = (0.72, 0.18, 0.10)  # train, validation, test: Narang et al., ICRA 2021
 
@@ -20,11 +23,12 @@ class Split:
 
     def check(self) -> "Split":
         """Returns itself; ValueError if a part is empty."""
-        for name in ("train", "validation", "test"):
+        count = len(self.train) + len(self.validation) + len(self.test)
+        for name in SPLITS:
             if not len(getattr(self, name)):
                 raise ValueError(
-                    f"the {name} part of the split is empty: "
-                    "more interactions are needed, or another object or fractions"
+                    f"the {name} part of the split of {count} interactions is empty: random splits need "
+                    f"{least_count()}, or give another object or fractions"
                 )
         return self
 
@@ -39,7 +43,16 @@ def assign(count: int, seed: int = 0, fractions: tuple = FRACTIONS) -> np.ndarra
     bound = np.rint(np.cumsum(fractions) * count).astype(int)
     subset = np.searchsorted(bound, np.arange(count), side="right")
     # not scikit-learn's ShuffleSplit: published numbers and saved models refer to these splits by seed
-    return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(subset)]
+    return np.array(SPLITS)[np.random.default_rng(seed).permutation(subset)]
+
+
+def least_count(train: int = 1, validation: int = 1, test: int = 1) -> int:
+    """Smallest number of interactions of which `assign` gives each part so many."""
+    needed = dict(zip(SPLITS, (train, validation, test)))
+    for count in itertools.count(1):
+        part = assign(count)
+        if all((part == name).sum() >= least for name, least in needed.items()):
+            return count
 
 
 def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIONS) -> Split:
@@ -57,7 +70,7 @@ def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIO
     for k, flag in enumerate((False, True)):
         mine = np.flatnonzero(data.labelled == flag)
         subset[mine] = assign(len(mine), [seed, k], fractions)
-    return Split(*(np.flatnonzero(subset == name) for name in ("train", "validation", "test"))).check()
+    return Split(*(np.flatnonzero(subset == name) for name in SPLITS)).check()
 
 
 def split_by_object(
@@ -80,4 +93,4 @@ def split_by_object(
     for k, flag in enumerate((False, True)):
         mine = np.flatnonzero(~test & (data.labelled == flag))
         subset[mine] = assign(len(mine), [seed, k], (1 - validation, validation, 0.0))
-    return Split(*(np.flatnonzero(subset == name) for name in ("train", "validation", "test"))).check()
+    return Split(*(np.flatnonzero(subset == name) for name in SPLITS)).check()

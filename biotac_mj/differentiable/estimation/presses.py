@@ -7,6 +7,7 @@ interpolated by splines."""
 import dataclasses
 import functools
 import itertools
+import sys
 
 import numpy as np
 import torch
@@ -206,6 +207,9 @@ class Presses:
         films, n = None, len(self.geometry.vert)
         places = list(itertools.product(enumerate(capsule.along), enumerate(capsule.around)))
         shown = self._progress
+        if shown:
+            text = f"note: simulating {len(places)} presses all over the skin, once, minutes on one core"
+            print(text, file=sys.stderr, flush=True)  # a bar is hidden where stderr is a file
         for (i, along), (j, around) in tqdm(places, "table, once", unit="press", disable=not shown or None):
             with self.skin.lock:
                 trajectory, steps = self.simulate(along, around)

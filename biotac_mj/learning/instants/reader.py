@@ -9,7 +9,7 @@ import pathlib
 import numpy as np
 
 from ...data.schema import SPLITS
-from ...data.splits import assign
+from ...data.splits import assign, least_count
 from ...fields import check_entries
 from ...files import replacing
 from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
@@ -32,6 +32,7 @@ __all__ = [
 
 TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": ()}  # names of columns
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
+_LEVEL = 0.9  # of the intervals
 _CODE = 8
 _SPACES = ("rows", "level")  # novelty of electrodes, and of baselines
 _FOLDS = 4  # of whole trajectories, for the choice of a ridge
@@ -204,8 +205,13 @@ def _scale(strange):
     return 1 + strange
 
 
+def _least_aside(level):
+    """Fewest trajectories that calibrate intervals of this level."""
+    return int(np.ceil(level / (1 - level) - 1e-9))
+
+
 def fit_reader(
-    data: Examples, train: np.ndarray, kept: np.ndarray, level: float = 0.9, seed: int = 0
+    data: Examples, train: np.ndarray, kept: np.ndarray, level: float = _LEVEL, seed: int = 0
 ) -> Reader:
     """Fits to trajectories `train` and calibrates the intervals on others, `kept` (numbers of `data.owner`).
 
@@ -215,7 +221,7 @@ def fit_reader(
     Raises:
       ValueError: too few trajectories.
     """
-    least = int(np.ceil(level / (1 - level) - 1e-9))
+    least = _least_aside(level)
     if len(kept) < least or len(train) < _FOLDS:
         raise ValueError(
             f"{len(train)} trajectories train and {len(kept)} are kept aside: intervals of "
@@ -282,7 +288,13 @@ def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
     Raises:
       ValueError: too few trajectories.
     """
-    names = np.unique(data.owner)
+    names, aside = np.unique(data.owner), _least_aside(_LEVEL)
+    needed = least_count(_FOLDS, aside)
+    if len(names) < needed:
+        raise ValueError(
+            f"the set has {len(names)} interactions: a model with intervals of {100 * _LEVEL:.0f} % needs "
+            f"{needed}, of which {aside} calibrate them; make more with `biotac data generate --count`"
+        )
     part = assign(len(names), seed)
     train, kept, test = (names[part == name] for name in SPLITS)
     reader = fit_reader(data, train, kept, seed=seed)
