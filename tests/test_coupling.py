@@ -449,9 +449,9 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep, monkeypatch):
     there is. Both skins make it bounce, and each knows how fast."""
     seen, conclude = {}, coupled.Coupled.conclude
 
-    def watch(self, rounds, frequency):
-        seen[self.instance.index] = self.jacobian, self.tangent, frequency
-        conclude(self, rounds, frequency)
+    def watch(self, rounds):
+        conclude(self, rounds)
+        seen[self.instance.index] = self.jacobian, self.tangent, self.instance.frequency
 
     monkeypatch.setattr(coupled.Coupled, "conclude", watch)
     fingers = "".join(

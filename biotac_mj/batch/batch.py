@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..coupling.implicit import energy, rounds
+from ..coupling.implicit.compliance import Response, add_stiffness
 from ..coupling.implicit.marks import Marks
 from ..coupling.implicit.rules import LOSS_FREQUENCY
 from ..coupling.loads import core_geom
@@ -16,8 +17,8 @@ from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from . import kernels, solid
-from .implicit import compliance, dynamics, integrator
-from .implicit.compliance import Response
+from .implicit import dynamics, integrator
+from .implicit.factor import Factor
 from .release import Clearance
 from .senses import Senses
 from .skin import BatchSkin
@@ -71,7 +72,6 @@ class Batch(Skins):
             self._touches = [wp.zeros((len(touching.geom), self.nworld), dtype=kind) for kind in kinds]
             self._of_step = r = rounds.make_rounds(*self.groups, limit)
             self._step = wp.full(self.groups, self.dt, dtype=wp.float64)
-            self._power = wp.zeros((self.nworld, 6 * skin.ngroup), dtype=wp.vec2d)
             self._greedy = wp.zeros(self.nworld, dtype=int)
         view = ModelView(mjm._address)
         self._core_geom, self.ngeom = core_geom(view, touching.core), len(touching.geom)
@@ -80,7 +80,7 @@ class Batch(Skins):
         self._delay = loss / (2 * math.pi * LOSS_FREQUENCY * self.dt)
         self._clearance = Clearance(skin.model, self.nworld)
         self._qacc = None  # with which the bodies go
-        self._response = None
+        self._response = self._factor = None
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         if self.moving:
@@ -152,9 +152,8 @@ class Batch(Skins):
     ) -> None:
         """Has its own groups in a correction of all skins, from number `first` on, and its own of the rows of
         all."""
-        self._all_rows, self._row = rows, rows[first_row : first_row + self.nslot]
-        self._response = Response(m, self.skin.ngroup, self.nworld)
-        self._driven = wp.empty_like(self._response.response)
+        self._row = rows[first_row : first_row + self.nslot]
+        self._response, self._factor = Response(self._jacobian), Factor(m, self.nworld)
         own = slice(first, first + self.groups[0])
         self._correction, self._first_group = correction, first
         self._correction_force, self._of_step.amiss = correction.force[own], correction.amiss[own]
@@ -204,9 +203,10 @@ class Batch(Skins):
     def find_compliance(self, m: "mjw.Model", d: "mjw.Data", going: wp.array, inertia: wp.array) -> None:
         """Finds how the bodies give way in worlds that are going (nworld,), after mujoco_warp's constraint
         solver; inertia: see `Integrator`. Launches only."""
-        self._response.find(m, d, going, inertia, self._row, self._jacobian)
-        self._response.write(going, self._jacobian, self._of_step.square, self.skin.bodies.compliance)
-        self._response.find(m, d, going, d.M, self._all_rows, self._jacobian)
+        self._factor.find(m, d, going, inertia, own=self._row)
+        self._launch(*self._response.find(going, self._factor.L))
+        square, compliance = self._of_step.square, self.skin.bodies.compliance
+        self._launch(*self._response.compliance(going, square, compliance))
 
     def begin_solve(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Begins to solve the wanted skins where the bodies go; those that move no bodies it solves, where
@@ -289,16 +289,15 @@ class Batch(Skins):
     def add_stiffness(self, stiffness: wp.array) -> None:
         """Adds the skin's to that of all (nworld, nv, nv)."""
         dim = stiffness.shape[:2]
-        self._launch(compliance.add_stiffness, dim, [self._jacobian, self.model], [stiffness])
+        self._launch(add_stiffness, dim, [self._jacobian, self.model, stiffness])
 
-    def conclude(self, taking_part: Marks, stiffness: wp.array) -> None:
-        """Settles the account of energy, after `evaluate`; stiffness: of all skins."""
-        found, driven = self._response, self._driven
-        self._launch(compliance.drive, self._power.shape, [stiffness, found.L, found.response], [driven])
-        known = [stiffness, found.response, driven, self.model]
-        self._launch(compliance.add_powers, self._power.shape, known, [self._power])
-        known, r = [taking_part.world, self._power], self._of_step
-        self._launch(compliance.find_frequencies, self.groups, known, [r.frequency])
+    def conclude(self, taking_part: Marks, stiffness: wp.array, L: wp.array) -> None:
+        """Finds the frequencies and settles the account of energy, after `evaluate`; stiffness, L: see
+        `Response.frequencies`."""
+        r, worlds = self._of_step, taking_part.world
+        self._launch(*self._response.find(worlds, L))
+        for launch in self._response.frequencies(worlds, stiffness, L, self.model, r.frequency):
+            self._launch(*launch)
         self._find_wrenches()
         known = [taking_part.world, self.skin.reason, r]
         self._launch(energy.conclude, self.nworld, known, [r.left])

@@ -24,6 +24,7 @@ from .ahead import kernels_of_step
 from .batch import Batch
 from .implicit import integrator
 from .implicit.ends import Ends
+from .implicit.factor import Factor
 from .implicit.integrator import Integrator
 from .memory import Scratch
 from .skin import solve_group
@@ -132,11 +133,11 @@ class Hook:
             self._outside = wp.empty_like(d.qfrc_passive)
             self._amiss = wp.zeros(1, dtype=int)
             self._stiffness = wp.zeros((d.nworld, m.nv, m.nv), dtype=wp.float64)
-            rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
+            self._rows = rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
             self._integrator, self._ends = Integrator(m, d), Ends(d)
             self._loads = Loads(m, d, self._corrected)
             self._slope = integrator.Slope(m, sum(groups), d.nworld)
-        self._scratch = Scratch(device)
+        self._scratch, self._free = Scratch(device), Factor(m, d.nworld)
         for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):
             batch.take_part(m, self._slope.correction, int(first), rows, int(row))
 
@@ -171,8 +172,9 @@ class Hook:
         self._stiffness.zero_()
         for batch in moving:
             batch.add_stiffness(self._stiffness)
+        self._free.find(m, d, taking_part.world, d.M, own=self._rows)
         for batch in moving:
-            batch.conclude(taking_part, self._stiffness)
+            batch.conclude(taking_part, self._stiffness, self._free.L)
         end = self._ends.find(m, d, self._integrator.qacc)
         self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
 

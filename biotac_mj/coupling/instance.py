@@ -55,6 +55,7 @@ class Instance:
       state_address: of its plugin state, which stays where it is.
       kinematics: `Kinematics` of the touching bodies.
       sensed: whether the readings of this step are written.
+      number: among the two-way instances; springs: `Springs` of the mjData.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
 
@@ -98,7 +99,7 @@ class Instance:
         self.step_gamma, self.frequency = np.full(setup.ngroup, EULER), None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
-        self.skins_met = ()
+        self.skins_met, self.number, self.springs = (), -1, None
         self._stages = []  # of Runge-Kutta: what acted, and where
         self._shown = None
 
@@ -162,7 +163,7 @@ class Instance:
 
     @functools.cached_property
     def _arrays(self):
-        return StepArrays(self.kinematics, self.setup, self.inertial)
+        return StepArrays(self.kinematics, self.setup, self.springs, self.inertial)
 
     def begin_arrays(self) -> StepArrays:
         """The arrays of a coupled step that begins: the linear model in force is that of the last step."""

@@ -67,7 +67,7 @@ class Touching:
             ids = np.array([i for i in ids if meshes.get(int(i), True) is not None], dtype=np.int64)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
-        self.body, group = np.unique(bodies, return_inverse=True)
+        self.body, self._first, group = np.unique(bodies, return_index=True, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
         for i in rounding:
             if model.geom_bodyid[i] == core:
@@ -128,8 +128,7 @@ class Touching:
 
     def body_pose(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> tuple:
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies whose geoms are at (ngeom, 3), (ngeom, 3, 3)."""
-        first = np.unique(self.group, return_index=True)[1]
-        geom_pos = geom_pos + self._apart(geom_mat)
+        first, geom_pos = self._first, geom_pos + self._apart(geom_mat)
         mat = geom_mat[first] @ self._geom_mat[first].transpose(0, 2, 1)
         return geom_pos[first] - (mat @ self._geom_pos[first, :, None])[:, :, 0], mat
 

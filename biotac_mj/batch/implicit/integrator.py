@@ -11,13 +11,14 @@ import typing
 import mujoco
 import warp as wp
 
+from ...coupling.implicit.compliance import substitute
 from ...coupling.implicit.rounds import Model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
 from ...skin.condensed.lanes import eliminate, sync
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
-from .compliance import Factor, substitute
+from .factor import Factor
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw

@@ -103,7 +103,7 @@ class Coupled:
         self._solve(self.target)
 
     def _solve(self, pose, bodies=None):
-        self._let_go = pose if bodies is None else bodies.without(np.arange(len(pose[0])), *pose)
+        self._solved_for = pose, bodies
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
         self.may_act = result.converged and self._cost < _MOST
@@ -128,7 +128,9 @@ class Coupled:
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
         arrays.pos0[:], arrays.mat0[:] = result.pose
         if not result.converged:
-            model = result.wrench, result.tangent, displacement(*self._let_go, *result.pose)
+            pose, bodies = self._solved_for
+            let_go = pose if bodies is None else bodies.without(np.arange(len(pose[0])), *pose)
+            model = result.wrench, result.tangent, displacement(*let_go, *result.pose)
             shares = np.array([share_that_pushes(*each, LEVER) for each in zip(*model)])
             arrays.tangent0 *= shares[:, None, None]
         self.written = False
@@ -198,12 +200,12 @@ class Coupled:
         """How far its bodies turn in the step at most [rad]."""
         return np.abs(self.arrays.travel[:, 3:]).max(initial=0.0)
 
-    def conclude(self, rounds: int, frequency: np.ndarray | None) -> None:
-        """Tells the instance how the step went; frequency: of `SkinGroup.frequencies`."""
+    def conclude(self, rounds: int) -> None:
+        """Tells the instance how the step went."""
         arrays, withheld = self.arrays, 1.0 - self.arrays.push.min(initial=1.0)
         left = arrays.conclude(self.result.converged)
         self.instance.concluded(rounds, self.settled, withheld, left, self.target, arrays.acting.copy())
-        self.instance.step_gamma, self.instance.frequency = arrays.gamma.copy(), frequency
+        self.instance.step_gamma, self.instance.frequency = arrays.gamma.copy(), arrays.frequency.copy()
 
     def arrived(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of

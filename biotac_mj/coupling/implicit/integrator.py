@@ -35,6 +35,9 @@ class Integrator:
     they are.
 
     Left out: what Euler takes from the damping of actuators.
+
+    Attributes:
+      inertia: (nM,) M - h D as far as that is symmetric, laid out as MuJoCo's M.
     """
 
     def __init__(self, model: ModelView, bodies: set | list):
@@ -83,6 +86,8 @@ class Integrator:
         if h * np.abs(scale[:, None] * derivative * scale).max(initial=0.0) < _NEGLIGIBLE:
             return False
         self._inertia, self._step = inertia, np.linalg.solve(inertia - h * derivative, inertia)
+        self.inertia = data.M.copy()
+        self.inertia[entry] -= 0.5 * h * (derivative[row, column] + derivative[column, row])
         return True
 
     def _derived(self, data, products, symmetric=False):

@@ -130,6 +130,11 @@ class Metric:
         self._all = slice(int(rows.min()), int(rows.max()) + 1) if len(rows) == np.ptp(rows) + 1 else rows
         return places
 
+    @property
+    def first_rows(self) -> list[int]:
+        """The first row of each slot."""
+        return [here.start for here, _ in self._rows.values()]
+
     def numbers(self) -> np.ndarray:
         """Numbers of its rows."""
         places = [np.arange(here.start, here.stop) for here, _ in self._rows.values()]

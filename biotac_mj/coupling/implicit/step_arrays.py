@@ -11,10 +11,12 @@ from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from ...skin.types import real, vec6
 from ..setup import Setup
 from . import energy, rounds
+from .compliance import Response, add_stiffness
 from .kinematics import Kinematics, row
 from .marks import Marks
 from .rounds import Model, Rounds, Solid
 from .rules import LOSS_FREQUENCY
+from .springs import Springs
 
 __all__ = ["StepArrays"]
 
@@ -42,7 +44,8 @@ class StepArrays:
     and `Model`. A launch takes 1 us, several numpy calls on so few numbers.
 
     Args:
-      kinematics: of the bodies. setup: of the BioTac. inertial: whether its skin has inertia.
+      kinematics: of the bodies. setup: of the BioTac. springs: of the mjData. inertial: whether its skin has
+        inertia.
 
     Attributes:
       qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
@@ -51,7 +54,7 @@ class StepArrays:
       last: views by name of the linear model of the last step.
     """
 
-    def __init__(self, kinematics: Kinematics, setup: Setup, inertial: bool):
+    def __init__(self, kinematics: Kinematics, setup: Setup, springs: Springs, inertial: bool):
         self._kinematics, shape = kinematics, (setup.ngroup, 1)
         self._loss, self._key, solid = setup.config.loss, None, Solid()
         solid.thickness, solid.area, solid.inertial = setup.thickness, 1.0, int(inertial)
@@ -71,12 +74,24 @@ class StepArrays:
         self.off, self._is_marked, self._found = (
             a.numpy() for a in (self._off, self._marks.any, self._reason)
         )
+        self._respond(springs)
         for part, names in ((self._rounds, Rounds.vars), (self._model, Model.vars)):
             for name in names:
                 array = getattr(part, name)
                 if isinstance(array, wp.array):
                     setattr(self, name, _seen(array))
         self.last = {name: _seen(getattr(self._last, name)) for name in Model.vars}
+
+    def _respond(self, springs):
+        """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
+        one, jacobian, r, L = self._one, self._kinematics.jacobian, self._rounds, springs.L
+        response = Response(jacobian)
+        respond, stiffness = response.find(one, L), springs.stiffness
+        self.find_compliance = row(respond, response.compliance(one, r.square, self._compliance))
+        dim = 1, jacobian.shape[2]
+        self.add_stiffness = row((add_stiffness, dim, [jacobian, self._model, stiffness]))
+        known = one, stiffness, L, self._model, r.frequency
+        self.find_frequencies = row(respond, *response.frequencies(*known))
 
     def record(self, step: float, ahead: float) -> None:
         """Makes the launches for a time step [s]; ahead: see `rounds.choose_gamma`."""

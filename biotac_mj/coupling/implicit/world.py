@@ -29,6 +29,7 @@ from .coupled import Coupled
 from .group import SkinGroup
 from .integrator import Integrator
 from .rules import MAX_CORRECTIONS, TOLERANCE, poorly_corrected
+from .springs import Springs
 
 __all__ = ["ASTRAY", "World"]
 
@@ -63,6 +64,10 @@ class World:
                 if other.touching.body[k] == t.touching.core
             ]
         self.first = self.coupled[0].index if self.coupled else -1
+        if self.coupled:
+            self._springs = Springs(model, data, [len(t.metric.slot) for t in self.coupled])
+        for number, t in enumerate(self.coupled):
+            t.number, t.springs = number, self._springs
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting = ()  # skins whose bodies are under way
         self._loads = None
@@ -182,8 +187,9 @@ class World:
         for t in self.coupled:
             t.metric.find_rows(self.data)
         self.data.reference_constraints()  # of all rows
-        for t in self.coupled:
+        for t, own in zip(self.coupled, self._springs.own):
             t.metric.take_references(self.data)
+            own[:] = t.metric.first_rows
 
     def _step(self):
         self._acting = ()
@@ -206,7 +212,7 @@ class World:
         skins = [skin for skin in skins if not skin.idle]
         if not skins:
             return
-        self._group = SkinGroup(skins)
+        self._group = SkinGroup(skins, self._springs)
         if skins[0].instance.horizon > 0 and self.model.nv > 0:
             rounds = self._find_balance(skins, outside)
             rounds += self._damp(skins, outside)
@@ -217,6 +223,7 @@ class World:
                 for skin in skins:
                     skin.hold()
                 self._forces(skins, outside)
+            self._group.find_frequencies()
             self._acting, self._now = skins, self.data.qpos.copy()
             self._began_at = self._now
         else:
@@ -227,8 +234,8 @@ class World:
             for skin in skins:
                 skin.evaluate(np.zeros(self.model.nv))
                 skin.arrays.find_energy()
-        for skin, frequency in zip(skins, self._group.frequencies()):
-            skin.conclude(rounds, frequency)
+        for skin in skins:
+            skin.conclude(rounds)
 
     def _go_on_holding(self):
         """Lets what was found in the first of Runge-Kutta's stages act where the bodies are in this one."""
@@ -281,7 +288,7 @@ class World:
             going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_act]
             if rounds == most or not going:
                 break
-            self._group.find_compliance(self.integrator if self._damped else None)
+            self._group.find_compliance(going, self.integrator if self._damped else None)
             self._solve_all({skin: skin.solve for skin in going})
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
@@ -329,7 +336,7 @@ class World:
             return 0
         for skin in greedy:
             skin.use_euler()
-        self._group.find_compliance(self.integrator if self._damped else None)
+        self._group.find_compliance(skins, self.integrator if self._damped else None)
         rounds = self._find_balance(skins, outside)
         for skin in skins:
             skin.arrays.find_energy()

@@ -1,45 +1,43 @@
-"""How the touching bodies of a batch give way to wrenches on them: beta h^2 J H^-1 J', for all worlds at
-once, and how fast they bounce on the skin.
+"""How the bodies that touch a skin give way to wrenches on them, beta h^2 J H^-1 J', and how fast they bounce
+on it, in one world or in all at once.
 
 H is M - h D, with D what the integrator treats implicitly, and the springs that MuJoCo's other constraints
-are where its solver left them."""
+are where its solver left them: joints that friction holds, contacts, the rows of other skins.
 
-import typing
+The kernels read an engine's own arrays, as those of `poses` do."""
+
+from typing import Any
 
 import mujoco
 import warp as wp
 
-from ...coupling.implicit.rounds import Model
 from ...skin.condensed.lanes import sync
-from ...skin.program import Launcher
 from ...skin.types import real, vec6
+from .rounds import Model
 
-if typing.TYPE_CHECKING:
-    import mujoco_warp as mjw
-
-__all__ = ["Factor", "Response", "add_powers", "add_stiffness", "drive", "find_frequencies", "substitute"]
+__all__ = ["Response", "add_stiffness", "factor", "substitute"]
 
 wp.set_module_options({"enable_backward": False})
 
 
-_BLOCK = 64  # threads that factor a world's matrix
 _QUADRATIC = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC))
 _LEAST = wp.constant(wp.float64(1e-12))  # of a pivot, of the entry that it came from
+_NONE = wp.constant(wp.float64(2e-15))  # of a row without stiffness, twice mjMINVAL
 
 
 @wp.kernel
 def factor(
     # In:
     going: wp.array(dtype=int),
-    inertia: wp.array2d(dtype=float),
+    inertia: wp.array2d(dtype=Any),
     rownnz: wp.array(dtype=int),
     rowadr: wp.array(dtype=int),
     colind: wp.array(dtype=int),
     own: wp.array2d(dtype=int),
     rows: wp.array(dtype=int),
     state: wp.array2d(dtype=int),
-    J: wp.array3d(dtype=float),
-    D: wp.array2d(dtype=float),
+    J: wp.array3d(dtype=Any),
+    D: wp.array2d(dtype=Any),
     sparse: int,
     J_rownnz: wp.array2d(dtype=int),
     J_rowadr: wp.array2d(dtype=int),
@@ -61,7 +59,7 @@ def factor(
             L_out[w, i, colind[rowadr[i] + k]] = real(inertia[w, rowadr[i] + k])
     sync()
     for r in range(wp.min(rows[w], state.shape[1])):
-        springs = wp.where(state[w, r] == _QUADRATIC, 1, 0)
+        springs = wp.where(state[w, r] == _QUADRATIC and real(D[w, r]) > _NONE, 1, 0)
         for k in range(own.shape[0]):
             if own[k, w] >= 0 and r >= own[k, w] and r < own[k, w] + 6:
                 springs = 0
@@ -120,6 +118,12 @@ def substitute(L: wp.array3d(dtype=real), w: int, c: int, x: wp.array3d(dtype=re
         x[w, c, i] = total / L[w, i, i]
 
 
+@wp.func
+def holds(model: Model, g: int, w: int):
+    """Whether a skin has a stiffness against a body."""
+    return wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0)
+
+
 @wp.kernel
 def give(
     # In:
@@ -174,8 +178,8 @@ def add_stiffness(
     """Adds a skin's stiffness against the degrees of freedom [world, dof, dof], a row by each thread."""
     w, i = wp.tid()
     for g in range(jacobian.shape[0]):
-        held = wp.transpose(model.tangent0[g, w]) * jacobian[g, w, i]
-        if wp.dot(held, held) > real(0.0):
+        if holds(model, g, w):
+            held = wp.transpose(model.tangent0[g, w]) * jacobian[g, w, i]
             for j in range(jacobian.shape[2]):
                 stiffness[w, i, j] = stiffness[w, i, j] + wp.dot(held, jacobian[g, w, j])
 
@@ -183,14 +187,19 @@ def add_stiffness(
 @wp.kernel
 def drive(
     # In:
+    taking_part: wp.array(dtype=int),
     stiffness: wp.array3d(dtype=real),
     L: wp.array3d(dtype=real),
     response: wp.array3d(dtype=real),
+    model: Model,
     # Out:
     driven_out: wp.array3d(dtype=real),
 ):
-    """Accelerations by what all skins do against motions of the degrees of freedom [world, column, dof]."""
+    """Accelerations by what all skins do against motions of the degrees of freedom [world, column, dof]; of
+    the wrenches on bodies that this skin holds."""
     w, c = wp.tid()
+    if taking_part[w] == 0 or not holds(model, c / 6, w):
+        return
     for i in range(stiffness.shape[1]):
         held = real(0.0)
         for j in range(stiffness.shape[1]):
@@ -202,6 +211,7 @@ def drive(
 @wp.kernel
 def add_powers(
     # In:
+    taking_part: wp.array(dtype=int),
     stiffness: wp.array3d(dtype=real),
     response: wp.array3d(dtype=real),
     driven: wp.array3d(dtype=real),
@@ -210,12 +220,12 @@ def add_powers(
     power_out: wp.array2d(dtype=wp.vec2d),
 ):
     """What each wrench on a skin's bodies [world, column] adds to the traces of the second and the fourth
-    power of the modes, see `SkinGroup.frequencies`."""
+    power of the modes, in which the largest square of a frequency outweighs all others."""
     w, c = wp.tid()
     g = c / 6
     second = vec6()
     fourth = vec6()
-    if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
+    if taking_part[w] == 1 and holds(model, g, w):
         for i in range(stiffness.shape[1]):
             once = real(0.0)
             twice = real(0.0)
@@ -237,7 +247,8 @@ def find_frequencies(
     # Out:
     frequency_out: wp.array2d(dtype=real),
 ):
-    """As `SkinGroup.frequencies`."""
+    """Angular frequencies [rad/s] at which bodies bounce in the stiffest mode in which a skin holds them,
+    with all other skins."""
     g, w = wp.tid()
     if taking_part[w] == 0:
         return
@@ -250,105 +261,43 @@ def find_frequencies(
     frequency_out[g, w] = frequency
 
 
-class Factor:
-    """Cholesky's factors of inertias, with the springs that MuJoCo's constraints are.
-
-    Args:
-      m: mujoco_warp Model. nworld: number of worlds.
-
-    Attributes:
-      L: (nworld, nv, nv), lower triangles.
-    """
-
-    def __init__(self, m: "mjw.Model", nworld: int):
-        self._inertia_rows = [m.M_rownnz, m.M_rowadr, m.M_colind]
-        with wp.ScopedDevice(m.qpos0.device):
-            self.L = wp.zeros((nworld, m.nv, m.nv), dtype=real)
-            self._none = wp.zeros(nworld, dtype=int), wp.zeros((0, nworld), dtype=int)
-
-    def find(
-        self,
-        m: "mjw.Model",
-        d: "mjw.Data",
-        going: wp.array,
-        inertia: wp.array,
-        springs: bool = True,
-        own: wp.array | None = None,
-    ) -> None:
-        """Factors the inertias. Launches only.
-
-        Args:
-          going: (nworld,) of int, 1 where it is to be done.
-          inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
-          springs: whether constraints hold, as its solver left them. own: (slot, nworld) the first of six
-            rows each that do not.
-        """
-        efc, (none, no_slot) = d.efc, self._none
-        held = [no_slot if own is None else own, d.nefc if springs else none]
-        held += [efc.state, efc.J, efc.D, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
-        known = [going, inertia, *self._inertia_rows, *held]
-        launcher, n = Launcher(self.L.device), len(self.L)
-        if self.L.device.is_cuda:
-            launcher.launch_blocks(factor, [n], known, [self.L], block_dim=_BLOCK)
-        else:
-            launcher.launch(factor, [n, 1], known, [self.L])
-
-
 class Response:
-    """Of the bodies that a skin meets to wrenches on them.
+    """Of the bodies that one skin meets to wrenches on them, as launches (kernel, dim, arguments).
 
     Args:
-      m: mujoco_warp Model. groups: number of the bodies. nworld: number of worlds.
+      jacobian: (group, world, dof) of the bodies.
 
     Attributes:
-      response: (nworld, 6 groups, nv) accelerations of the degrees of freedom by a unit of each component.
+      found: (nworld, 6 groups, nv) accelerations of the degrees of freedom by a unit of each component.
     """
 
-    def __init__(self, m: "mjw.Model", groups: int, nworld: int):
-        self._factor = Factor(m, nworld)
-        with wp.ScopedDevice(m.qpos0.device):
-            self.response = wp.zeros((nworld, 6 * groups, m.nv), dtype=real)
+    def __init__(self, jacobian: wp.array):
+        (groups, nworld, nv), self._jacobian = jacobian.shape, jacobian
+        self._columns = nworld, 6 * groups
+        with wp.ScopedDevice(jacobian.device):
+            self.found, self._driven = (wp.zeros((*self._columns, nv), dtype=real) for _ in range(2))
+            self._power = wp.zeros(self._columns, dtype=wp.vec2d)
 
-    @property
-    def L(self) -> wp.array:
-        """(nworld, nv, nv) Cholesky's factors of what was found last."""
-        return self._factor.L
+    def find(self, going: wp.array, L: wp.array) -> tuple:
+        """With factors of `factor`, in worlds that are going (nworld,)."""
+        return give, self._columns, [going, L, self._jacobian, self.found]
 
-    def find(
-        self,
-        m: "mjw.Model",
-        d: "mjw.Data",
-        going: wp.array,
-        inertia: wp.array,
-        own: wp.array,
-        jacobian: wp.array,
-    ) -> None:
-        """Finds the response of bodies whose Jacobians are (group, world, dof). Launches only.
+    def compliance(self, going: wp.array, square: wp.array, out: wp.array) -> tuple:
+        """Writes the compliance [group, group, world] of what was found. square: [group, world] by which an
+        acceleration moves bodies to where the skin is solved [m per m/s^2]."""
+        groups, _, nworld = out.shape
+        shape, where = (groups * groups, nworld, 6, 6), out.device
+        entries = wp.array(ptr=out.ptr, shape=shape, dtype=real, device=where, copy=False)
+        return move, self._columns, [going, square, self._jacobian, self.found, entries]
 
-        Args:
-          going: (nworld,) of int, 1 where it is to be done.
-          inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
-          own: (slot, nworld) the first of six rows each that do not hold.
-        """
-        self._factor.find(m, d, going, inertia, own=own)
-        dim, device = self.response.shape[:2], self.response.device
-        wp.launch(give, dim, [going, self._factor.L, jacobian], [self.response], device=device)
-
-    def write(self, going: wp.array, jacobian: wp.array, square: wp.array, compliance: wp.array) -> None:
-        """Writes the compliance [group, group, world] of what was found. Launches only.
-
-        Args:
-          going: (nworld,) of int, 1 where it is to be done.
-          square: [group, world] by which an acceleration moves bodies to where the skin is solved [m per
-            m/s^2].
-        """
-        groups, n, device = jacobian.shape[0], len(self.response), self.response.device
-        entries = wp.array(
-            ptr=compliance.ptr,
-            shape=(groups * groups, n, 6, 6),
-            dtype=real,
-            device=device,
-            copy=False,
-        )
-        known = [going, square, jacobian, self.response]
-        wp.launch(move, (n, 6 * groups), known, [entries], device=device)
+    def frequencies(
+        self, taking_part: wp.array, stiffness: wp.array, L: wp.array, model: Model, out: wp.array
+    ) -> list[tuple]:
+        """Writes the frequency of each body [group, world]: after `find` with factors L, in which no skin
+        holds anything; stiffness: of all skins (nworld, nv, nv)."""
+        known, held = [taking_part, stiffness], [self.found, self._driven, model, self._power]
+        return [
+            (drive, self._columns, [*known, L, self.found, model, self._driven]),
+            (add_powers, self._columns, [*known, *held]),
+            (find_frequencies, out.shape, [taking_part, self._power, out]),
+        ]
