@@ -176,9 +176,9 @@ def simulate(values: dict, traces: list[Trace], corner: float, dt: float = _DT) 
     own = {k: v for k, v in values.items() if k in HeatParameters.__dataclass_fields__ and k != "area"}
     own["near"] = min(own.get("near", HeatParameters.near), 0.95 * HeatParameters.core)
     sensor = HeatParameters(**own)
-    bodies = [[material_of(t.name)] for t in traces]
-    heat = Heat(bodies[0], [sensor.at_rest(t.start) for t in traces], len(traces))
-    heat.set_bodies(bodies)
+    sensors, bodies = [sensor.at_rest(t.start) for t in traces], [[material_of(t.name)] for t in traces]
+    heat = Heat(bodies[0], sensors, len(traces))
+    heat.state.assign(np.array([own.rest(touched) for own, touched in zip(sensors, bodies)]))
     force = np.array([t.force for t in traces])
     area = values["area"] * (force / _FORCE) ** values["exponent"]
     # every body has been coming nearer since `lead`: force and area grow evenly

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 import scipy.sparse.linalg as sparse_linalg
 import trimesh
+import warp as wp
+from scipy.sparse import coo_matrix
 
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
-from biotac_mj.sensor.film import FilmConduction, sheet_laplacian, spreading_resistance, spreading_table
+from biotac_mj.sensor.film import FilmConduction, kernels, spreading_resistance, spreading_table
+from biotac_mj.sensor.film.systems import edges
 
 RADIUS, LENGTH, GAP, SIGMA = 5.325e-3, 100e-3, 0.4e-3, 0.5
 EXCITATION = tuple((-0.045, angle) for angle in np.radians([-135, -45, 45, 135]))
@@ -66,6 +69,22 @@ def tube(naround=56, nalong=121, gap=GAP):
 @pytest.fixture(scope="module")
 def tube_film():
     return FilmConduction(tube(), conductivity=SIGMA, excitation=EXCITATION, sensor=None)
+
+
+def sheet_laplacian(point, face, conductance):
+    """P1 finite-element matrix (n, n) [S] of div(s grad u) on a surface, by the film's kernel; conductance:
+    (m,) s of each face [S]."""
+    i, j = edges(face)
+    with wp.ScopedDevice("cpu"):
+        edge = wp.zeros((3 * len(face), 1), dtype=wp.float64)
+        surface = wp.array(point[:, None], dtype=wp.vec3d, ndim=2), wp.ones((len(point), 1), dtype=wp.float64)
+        sheet = [wp.ones(1, dtype=int), wp.array(face, dtype=wp.vec3i), 1.0, *surface]
+        wp.launch(kernels.face_conductance, (len(face), 1), sheet, [edge])
+    off = np.repeat(conductance, 3) * edge.numpy()[:, 0]
+    rows, columns = np.concatenate([i, j, i, j]), np.concatenate([j, i, i, j])
+    return coo_matrix(
+        (np.concatenate([-off, -off, off, off]), (rows, columns)), shape=(len(point),) * 2
+    ).tocsr()
 
 
 def test_strip():

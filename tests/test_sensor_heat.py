@@ -217,7 +217,7 @@ def test_a_step_of_any_length_stays_between_the_temperatures():
 def test_worlds_do_not_know_of_each_other():
     sensors = [HeatParameters(), dataclasses.replace(HeatParameters(), air=8.0)]
     both = Heat([STEEL], sensors, 2)
-    both.set_bodies([[STEEL], [FOAM]])
+    both.state.assign(np.array([own.rest([body]) for own, body in zip(sensors, (STEEL, FOAM))]))
     state = touch(both, [[4e-5], [6e-5]], [[3.0], [9.0]], 0.01, 50)
     for w, (body, area, force) in enumerate(((STEEL, 4e-5, 3.0), (FOAM, 6e-5, 9.0))):
         alone = touch(Heat([body], sensors[w]), area, force, 0.01, 50)
@@ -227,7 +227,7 @@ def test_worlds_do_not_know_of_each_other():
 def test_steel_cools_more_than_acrylic_than_foam():
     names = ("steel", "glass", "acrylic", "wood", "flour", "foam")
     heat = Heat([STEEL], nworld=len(names))
-    heat.set_bodies([[material_of(name)] for name in names])
+    heat.state.assign(np.array([HeatParameters().rest([material_of(name)]) for name in names]))
     warm = heat.state.numpy()[0, THERMISTOR]
     after = touch(heat, 4e-5, 10.0, 0.01, 1000)[:, THERMISTOR]
     assert (np.diff(after) > 0).all() and 0.3 < warm - after[0] < 2

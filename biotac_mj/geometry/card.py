@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from biotac_mj.geometry.closest import ray_hits
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
 
@@ -20,12 +21,13 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     mesh = TetMesh(skin.vert, skin.tets)
     vert = skin.vert * 1e3  # trimesh drops small triangles of a mesh in metres
     outer = trimesh.Trimesh(vert, skin.outer_face, process=False)
-    inner = trimesh.Trimesh(vert, skin.inner_face, process=False)
     _, thickness, _ = trimesh.proximity.closest_point(outer, vert[np.unique(skin.inner_face)])
     cavity, core = (
         -enclosed_volume(vert, skin.inner_face),
         enclosed_volume(skin.core_vert * 1e3, skin.core_face),
     )
+    rays = zip(skin.electrode_pos * 1e3, skin.electrode_normal)
+    met = [ray_hits(vert[skin.inner_face], *ray) for ray in rays]
     lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
     return {
         "nodes": skin.nvert,
@@ -46,27 +48,10 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "thickness minimum": thickness.min(),
         "thickness maximum": thickness.max(),
         "box": [vert.min(axis=0), vert.max(axis=0)],
-        "gaps": _ray_lengths(inner, skin.electrode_pos * 1e3, skin.electrode_normal),
+        "gaps": np.array([hits.min() if len(hits) else np.nan for hits in met]),
     }
 
 
 def _inner_and_linked(skin):
     """Inner nodes, and all nodes that share a tetrahedron with an outer node."""
     return np.unique(skin.inner_face), np.unique(skin.tets[np.isin(skin.tets, skin.outer_face).any(axis=1)])
-
-
-def _ray_lengths(surface, origin, direction):
-    """Distance (n,) along each ray to the nearest face of a trimesh; nan where it misses
-    (Moeller-Trumbore)."""
-    a, b, c = (surface.triangles[:, i] for i in range(3))
-    length = np.full(len(origin), np.nan)
-    for i, (o, d) in enumerate(zip(origin, direction)):
-        p = np.cross(d, c - a)
-        det = np.sum((b - a) * p, axis=1)
-        with np.errstate(all="ignore"):
-            u = np.sum((o - a) * p, axis=1) / det
-            q = np.cross(o - a, b - a)
-            v, t = q @ d / det, np.sum((c - a) * q, axis=1) / det
-            hit = (np.abs(det) > 1e-12) & (u > -1e-9) & (v > -1e-9) & (u + v < 1 + 1e-9) & (t > 0)
-        length[i] = t[hit].min() if hit.any() else np.nan
-    return length

@@ -29,6 +29,7 @@ __all__ = [
     "nearest_listed",
     "pack_lists",
     "pseudonormals",
+    "ray_hits",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -39,6 +40,7 @@ FACE = wp.constant(
 )  # where a closest point is: a corner (0 to 2), the edge opposite to one (3 to 5), or this
 SLACK = 1e-4  # [mm] above the rounding of single precision
 _SLACK = wp.constant(real(SLACK))
+_ON_EDGE = 1e-9  # barycentric coordinate within which a ray meets a triangle's edge
 _FARTHEST = 1.0e5  # [mm] from the mesh at which a triangle is still found
 
 
@@ -264,3 +266,17 @@ def pseudonormals(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
     along[faces != 2] = 0.0
     around[ends[faces[edge] != 2]] = 0.0
     return np.concatenate([around[corner], along[edge]], 1)
+
+
+def ray_hits(corner: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Distances (k,) along a ray, in lengths of its direction (3,), from its start (3,) to the triangles that
+    it meets, of corners (n, 3, 3) (Moeller and Trumbore)."""
+    first, along, across = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    normal = np.cross(direction, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = 1 / (along * normal).sum(1)
+        u = ((start - first) * normal).sum(1) * over
+        side = np.cross(start - first, along)
+        v, t = (side @ direction) * over, (side * across).sum(1) * over
+        inside = (u > -_ON_EDGE) & (v > -_ON_EDGE) & (u + v < 1 + _ON_EDGE)
+    return t[inside & (t > 0) & np.isfinite(t)]

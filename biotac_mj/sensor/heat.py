@@ -462,14 +462,6 @@ class Heat:
         self._step.set_param_at_index(2, area)
         self._step.set_param_at_index(3, force)
 
-    def set_bodies(self, bodies: list[list[Material]]) -> None:
-        """Sets the bodies of each world: (nworld, ngroup) materials."""
-        state = self.state.numpy()
-        made = [[(b.effusivity, b.temperature, b.conductivity) for b in row] for row in bodies]
-        patches = state[:, BODIES:].reshape(self.nworld, self.ngroup, BODY)
-        patches[:, :, MADE:_TAKEN] = np.array(made, float).reshape(self.nworld, self.ngroup, 3)
-        self.state.assign(state)
-
     def advance(self, dt: float) -> None:
         """Steps by dt [s] with `area` and `force`. A launch only: may be captured in a CUDA graph."""
         self._step.set_param_at_index_from_ctype(0, dt)

@@ -3,11 +3,11 @@ Fishel and Loeb, "Estimating point of contact, force and torque in a biomimetic 
 skin" (2013)."""
 
 import dataclasses
-import functools
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..geometry.closest import ray_hits
 from ..geometry.design import BIOTAC
 from ..geometry.skin_geometry import SkinGeometry
 
@@ -92,19 +92,7 @@ class WeightedElectrodes:
             raise ValueError(f"change has shape {change.shape}: give (..., {n}) counts from rest")
         return np.maximum(0.0, -change)
 
-    @functools.cached_property
-    def _corners(self):
-        corner = self.geometry.vert[self.geometry.outer_face]
-        return corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-
     def _on_skin(self, start, out):
-        """Exit point of a ray from inside through the skin at rest (Moeller and Trumbore)."""
-        first, along, across = self._corners
-        normal = np.cross(out, across)
-        det = (along * normal).sum(1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = ((start - first) * normal).sum(1) / det
-            side = np.cross(start - first, along)
-            v, t = (side @ out) / det, (side * across).sum(1) / det
-            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(t)
-        return start + t[hit].max() * out if hit.any() else np.full(3, np.nan)
+        """Exit point of a ray from inside through the skin at rest."""
+        hits = ray_hits(self.geometry.vert[self.geometry.outer_face], start, out)
+        return start + hits.max() * out if len(hits) else np.full(3, np.nan)

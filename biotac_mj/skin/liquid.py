@@ -30,7 +30,6 @@ from .types import mat33, real, vec3
 __all__ = [
     "Liquid",
     "Rest",
-    "cavity_volume",
     "release_pressure",
     "settle_pressure",
     "volume_gradient",
@@ -42,36 +41,15 @@ wp.set_module_options({"enable_backward": False})
 WATER = 2.2e9  # [Pa]
 
 
-@wp.kernel
-def cavity_volume(
-    # In:
-    face: wp.array(dtype=wp.vec3i),
-    x: wp.array2d(dtype=vec3),
-    # Out:
-    volume_out: wp.array2d(dtype=real),
-):
-    """Part of inner face f in the cavity's volume [face, world] [m^3]; normals point into the cavity, hence
-    the sign."""
-    f, w = wp.tid()
-    t = face[f]
-    volume_out[f, w] = -wp.dot(x[t[0], w], wp.cross(x[t[1], w], x[t[2], w])) / real(6.0)
-
-
-@wp.kernel
-def volume_gradient(
-    # In:
-    face: wp.array(dtype=wp.vec3i),
-    x: wp.array2d(dtype=vec3),
-    # Out:
-    corner_out: wp.array2d(dtype=vec3),
-):
-    """dV/dx of a closed surface: a third of face f's area vector for each corner [m^2]."""
-    f, w = wp.tid()
-    t = face[f]
-    g = -wp.cross(x[t[1], w] - x[t[0], w], x[t[2], w] - x[t[0], w]) / real(6.0)
-    corner_out[3 * f, w] = g
-    corner_out[3 * f + 1, w] = g
-    corner_out[3 * f + 2, w] = g
+def volume_gradient(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """dV/dx (nvert, 3) [m^2] of the cavity in inner faces (n, 3), whose normals point into it; vert: (nvert,
+    3) [m]."""
+    a, b, c = np.moveaxis(vert[face], 1, 0)
+    third = -np.cross(b - a, c - a) / 6
+    out = np.zeros((len(vert), 3))
+    for corner in face.T:
+        np.add.at(out, corner, third)
+    return out
 
 
 @wp.func

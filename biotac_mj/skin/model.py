@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ..fields import check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.tet_mesh import enclosed_volume
 from ..quiet import announce_compilation
 from . import liquid
 from .contact.faces import face_samples
@@ -385,17 +386,8 @@ class SkinModel:
     def _volumes(self):
         if self.inner is None:
             return 0.0, 0.0
-        fraction = wp.zeros((len(self.inner.face), 1), dtype=real, device=self.device)
-        wp.launch(
-            liquid.cavity_volume,
-            dim=fraction.shape,
-            inputs=[self.inner.face, self.vert],
-            outputs=[fraction],
-            device=self.device,
-        )
-        cavity = float(fraction.numpy().sum())
-        a, b, c = np.moveaxis(self.geometry.core_vert[self.geometry.core_face], 1, 0)
-        core = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6) if len(a) else 0.0
+        g = self.geometry
+        cavity, core = -enclosed_volume(g.vert, g.inner_face), enclosed_volume(g.core_vert, g.core_face)
         if cavity - core <= 0:
             raise ValueError(
                 f"the core ({core * 1e9:.0f} mm^3) does not fit into the cavity ({cavity * 1e9:.0f} mm^3): "

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 from ..cache import cached
-from .liquid import WATER
+from .liquid import WATER, volume_gradient
 from .model import SkinModel
 
 __all__ = ["NMODE", "SkinModes", "skin_modes"]
@@ -57,7 +57,8 @@ def _make(model):
     solve = splu(model.stiffness.tocsc()).solve  # the solver's own factor is in single precision
     w, volume_compliance = np.zeros(n), 1.0
     if model.has_liquid:
-        gradient, bulk = _volume_gradient(model).ravel()[dof], model.options.bulk_modulus
+        geometry, bulk = model.geometry, model.options.bulk_modulus
+        gradient = volume_gradient(geometry.vert, geometry.inner_face).ravel()[dof]
         w = solve(gradient)
         # volume of cavity and liquid per unit pressure [m^3/Pa]
         volume_compliance = gradient @ w + model.liquid_volume / (bulk if np.isfinite(bulk) else WATER)
@@ -88,14 +89,3 @@ def _make(model):
         "static_pressure": pressure[order],
         "static": full[-1],
     }
-
-
-def _volume_gradient(model):
-    """dV/du (nvert, 3) of the cavity in the reference configuration [m^2]."""
-    face = model.geometry.inner_face
-    a, b, c = np.moveaxis(model.geometry.vert[face], 1, 0)
-    third = -np.cross(b - a, c - a) / 6
-    out = np.zeros((model.nvert, 3))
-    for corner in face.T:
-        np.add.at(out, corner, third)
-    return out

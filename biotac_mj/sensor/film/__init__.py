@@ -8,7 +8,6 @@ from .conduction import (
     NoFilmError,
     excitation_places,
     read_film,
-    sheet_laplacian,
     spreading_resistance,
     spreading_table,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "NoFilmError",
     "excitation_places",
     "read_film",
-    "sheet_laplacian",
     "spreading_resistance",
     "spreading_table",
 ]

@@ -25,7 +25,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
@@ -54,7 +54,6 @@ __all__ = [
     "NoFilmError",
     "excitation_places",
     "read_film",
-    "sheet_laplacian",
     "spreading_resistance",
     "spreading_table",
 ]
@@ -508,32 +507,6 @@ class BatchFilm:
             self._record.append(recorded(kernel, dim, inputs, outputs, tiled=launch is wp.launch_tiled))
             return
         launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
-
-
-def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike) -> csr_matrix:
-    """P1 finite-element matrix of div(s grad u) on a triangulated surface.
-
-    Args:
-      point: (n, 3) [m]; face: (m, 3); conductance: (m,) sheet conductance sigma h per face [S].
-
-    Returns:
-      scipy.sparse CSR (n, n) [S], positive semi-definite, constants in its kernel.
-    """
-    i, j = edges(face)
-    with wp.ScopedDevice("cpu"):
-        edge = wp.zeros((3 * len(face), 1), dtype=real)
-        surface = wp.array(point[:, None], dtype=vec3, ndim=2), wp.ones((len(point), 1), dtype=real)
-        sheet = [wp.ones(1, dtype=int), wp.array(face, dtype=wp.vec3i), 1.0, *surface]
-        wp.launch(kernels.face_conductance, (len(face), 1), sheet, [edge])
-    off = np.repeat(conductance, 3) * edge.numpy()[:, 0]
-    n = len(point)
-    return coo_matrix(
-        (
-            np.concatenate([-off, -off, off, off]),
-            (np.concatenate([i, j, i, j]), np.concatenate([j, i, i, j])),
-        ),
-        shape=(n, n),
-    ).tocsr()
 
 
 def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:

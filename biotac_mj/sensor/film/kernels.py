@@ -32,7 +32,7 @@ real = wp.float64
 vec3 = wp.vec3d
 vec4 = wp.vec4d
 samples = wp.types.vector(NSAMPLE, int)
-ground = wp.types.matrix((MOST_EXCITATION + 1, MOST_EXCITATION + 1), wp.float64)
+grounded = wp.types.vector(MOST_EXCITATION, wp.float64)
 _formulas = formulas_by_name(film_formulas, for_kernels)
 
 
@@ -234,26 +234,28 @@ def driving_point(
         return
     n = impedance_out.shape[1]
     m = local.shape[0] - n
-    a = ground()
+    # of the grounded electrodes among themselves; those that are not there stay apart
+    among = wp.identity(n=MOST_EXCITATION, dtype=real)
+    one = grounded()
     for i in range(m):
         for j in range(m):
-            a[i, j] = resistance[w, n + i, n + j]
-        a[i, m] = real(1.0)
-        a[m, i] = real(1.0)
-        a[i, i] = a[i, i] + _near(local[n + i, w], spreading, spreading_step, radius, footprint, conductivity)
-    inverse = _inverse(a, m)
+            among[i, j] = resistance[w, n + i, n + j]
+        near = _near(local[n + i, w], spreading, spreading_step, radius, footprint, conductivity)
+        among[i, i] = among[i, i] + near
+        one[i] = real(1.0)
+    inverse = wp.inverse(among)
+    equal = inverse * one  # currents of equal potentials
     for sweep in range(2):  # check all, then write
         for e in range(n):
             z = resistance[w, e, e] + _near(
                 local[e, w], spreading, spreading_step, radius, footprint, conductivity
             )
-            for i in range(m + 1):
-                current = real(0.0)
-                for j in range(m + 1):
-                    current += inverse[i, j] * wp.where(
-                        j < m, resistance[w, n + wp.min(j, m - 1), e], real(1.0)
-                    )
-                z -= current * wp.where(i < m, resistance[w, n + wp.min(i, m - 1), e], real(1.0))
+            into = grounded()
+            for i in range(m):
+                into[i] = resistance[w, n + i, e]
+            # their common potential, at which they take the whole current
+            potential = (wp.dot(equal, into) - real(1.0)) / wp.dot(equal, one)
+            z -= wp.dot(into, inverse * (into - potential * one)) + potential
             z = cell_constant[w % cell_constant.shape[0], e] * z
             if sweep == 0:
                 if not (z > real(0.0) and z < real(1.0e12)):
@@ -279,43 +281,3 @@ def _near(
     f = wp.min(s - real(i), real(1.0))  # beyond the table: its last value
     slab = spreading[i] * (real(1.0) - f) + spreading[i + 1] * f
     return _formulas.near_resistance(thickness, slab, radius, footprint, conductivity)
-
-
-@wp.func
-def _inverse(a: ground, m: int):
-    """Gauss-Jordan with row pivoting of the first m + 1 rows, whose last diagonal entry is zero."""
-    scale = real(0.0)
-    for i in range(m):
-        scale = wp.max(scale, wp.abs(a[i, i]))
-    b = ground()
-    for i in range(m + 1):
-        b[i, i] = real(1.0)
-    for i in range(m):  # resistances are of order 1e4 ohm, the border is one
-        a[i, m] = scale
-        a[m, i] = scale
-    for k in range(m + 1):
-        pivot = int(k)
-        for i in range(k + 1, m + 1):
-            if wp.abs(a[i, k]) > wp.abs(a[pivot, k]):
-                pivot = i
-        for j in range(m + 1):
-            swap = a[k, j]
-            a[k, j] = a[pivot, j]
-            a[pivot, j] = swap
-            swap = b[k, j]
-            b[k, j] = b[pivot, j]
-            b[pivot, j] = swap
-        inverse = real(1.0) / a[k, k]
-        for j in range(m + 1):
-            a[k, j] = a[k, j] * inverse
-            b[k, j] = b[k, j] * inverse
-        for i in range(m + 1):
-            if i != k:
-                factor = a[i, k]
-                for j in range(m + 1):
-                    a[i, j] = a[i, j] - factor * a[k, j]
-                    b[i, j] = b[i, j] - factor * b[k, j]
-    for i in range(m + 1):
-        b[i, m] = b[i, m] * scale
-        b[m, i] = b[m, i] * scale
-    return b

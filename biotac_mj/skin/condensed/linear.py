@@ -7,9 +7,10 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from .. import liquid
+from ...geometry.tet_mesh import enclosed_volume
 from ..contact.meshes import grid_value, mesh_distance, mesh_field
 from ..contact.posed import Geoms
+from ..liquid import volume_gradient
 from ..types import real, vec3
 from .compliance import SurfaceCompliance
 from .correction import correction
@@ -145,17 +146,11 @@ class LinearSkin:
         self.liquid_give = self.cavity = 0.0
         if model.inner is None:
             return
-        face = model.inner.face
-        x = wp.array(rest[:, None], dtype=vec3, device="cpu")
-        volume = wp.zeros((len(face), 1), dtype=real, device="cpu")
-        wp.launch(liquid.cavity_volume, volume.shape, [face, x], [volume], device="cpu")
-        self.cavity = float(volume.numpy().sum())
+        face = model.geometry.inner_face
+        self.cavity = -enclosed_volume(rest, face)
         if not model.has_liquid:
             return
-        corner = wp.zeros((3 * len(face), 1), dtype=vec3, device="cpu")
-        wp.launch(liquid.volume_gradient, volume.shape, [face, x], [corner], device="cpu")
-        gradient = np.zeros((model.nvert, 3))
-        np.add.at(gradient, face.numpy().ravel(), corner.numpy()[:, 0])
+        gradient = volume_gradient(rest, face)
         gradient[model.fixed] = 0
         self.gradient = gradient[model.free]
         self.give = self.compliance.vector(gradient).reshape(-1, 3)

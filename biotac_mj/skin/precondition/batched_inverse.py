@@ -18,13 +18,13 @@ wp.set_module_options({"enable_backward": False})
 _SIZES = (1, 3, 8), (2, 7, 4), (3, 7, 3), (4, 7, 2), (6, 15, 1)
 _THREADS = 512  # of a block that works in global memory, one for each row
 
-# Gauss-Jordan exchange with row pivots, see `woodbury.invert_serial`, by panels of eight columns. The matrix
-# is in registers: thread (r, c) of W warps has the entries (r + W i, c + 32 j). One more warp exchanges the
-# columns of a panel, lane c with the rows c + 32 m. This gives M: the other columns become M times the former
-# pivot rows, added to all other rows and replacing the pivot rows. Meanwhile the other warps work on the
-# panel before; they update the columns of the next panel first. A condition such as i == p / W on an unrolled
-# index would make the compiler index registers, and thus move them to local memory: conditions are therefore
-# ranges.
+# Gauss-Jordan exchange with row pivots, by panels of eight columns: unknown k and the right-hand side of its
+# pivot row change places. The matrix is in registers: thread (r, c) of W warps has the entries
+# (r + W i, c + 32 j). One more warp exchanges the columns of a panel, lane c with the rows c + 32 m. This
+# gives M: the other columns become M times the former pivot rows, added to all other rows and replacing the
+# pivot rows. Meanwhile the other warps work on the panel before; they update the columns of the next panel
+# first. A condition such as i == p / W on an unrolled index would make the compiler index registers, and thus
+# move them to local memory: conditions are therefore ranges.
 _EXCHANGE = """
     const int NC = %(tiles)d, W = %(warps)d, NR = (32 * NC + W - 1) / W, P = 8, PITCH = 12;
     const int t = threadIdx.x, r = t / 32, c = t %% 32;

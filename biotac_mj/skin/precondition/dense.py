@@ -83,7 +83,6 @@ class DensePreconditioner:
             links = nworld, capacity, self._ring.shape[1]
             self._link, self._spring = wp.zeros(links, dtype=int), wp.zeros(links, dtype=wp.mat33)
             self._W, self._A, self._G = (wp.zeros((nworld, size, size), dtype=float) for _ in range(3))
-            self._pivot = wp.zeros((0 if self.device.is_cuda else nworld, size), dtype=int)
             self._all = wp.full(nworld, 1, dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
         lanes = LANES_FEW if self.device.is_cuda and nworld <= FEW else 1
@@ -139,7 +138,7 @@ class DensePreconditioner:
 
         def push_forward():
             if self._inverse.pushed:
-                self._inverse.pushed.measure(program, self._launch, self._x, on)
+                self._launch(program, *self._inverse.pushed.measurement(self._x, on))
 
         def gather():
             self._gather(program, True, st, on, r, gradient)
@@ -211,14 +210,15 @@ class DensePreconditioner:
             from .batched_inverse import invert
 
             invert(program, self._in_parallel, self.liquid, self.size, on, self._A, self._W)
-        else:
-            self._launch(
-                program,
-                woodbury.invert_serial,
-                self.nworld,
-                [self.liquid, self.size, on, self._A, self._pivot],
-                [self._W],
-            )
+            return
+        worlds, rows, A, W = (a.numpy() for a in (on, self.size, self._A, self._W))
+
+        def invert_each():
+            for w in np.flatnonzero(worlds):
+                n = self.liquid + 3 * rows[w]
+                W[w, :n, :n] = np.linalg.inv(A[w, :n, :n])
+
+        program.call(invert_each)
 
     def _finish(self, program, st, on, r, gradient, z_out, partial_out):
         """Computes the forces of contact and liquid, and the result z."""

@@ -6,17 +6,16 @@ skin. M A0^-1 M^T, with M the deformation gradient at each node scaled to unit d
 volume where the deformed skin does. For the corotational law, which measures volume change along rotated
 axes, M is the rotation. The result depends on the shape only, and is symmetric and positive definite."""
 
+import functools
 import typing
-from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
 from ...launches import recorded
-from ..program import Launcher
 from ..rubber.law import LAWS
-from ..types import mat33, narrow, real, sum_of_lanes, vec3
+from ..types import DOUBLE, SINGLE, Precision, mat33, real, sum_of_lanes, vec3
 
 if typing.TYPE_CHECKING:
     from ..rubber.tetrahedra import Tetrahedra
@@ -44,61 +43,48 @@ def push_forward_matrix(F: mat33, turns: int):
     return M
 
 
-@wp.kernel
-def _measure(
-    # In:
-    start: wp.array(dtype=int),
-    other: wp.array(dtype=int),
-    gradient: wp.array(dtype=vec3),
-    turns: int,
-    x: wp.array2d(dtype=vec3),
-    on: wp.array(dtype=int),
-    # Out:
-    matrix_out: wp.array2d(dtype=mat33),
-):
-    """M of node i, from the mean deformation gradient of the elements at it."""
-    i, w = wp.tid()
-    if on[w] == 0:
-        return
-    F = mat33()
-    for k in range(start[i], start[i + 1]):
-        F += wp.outer(x[other[k], w], gradient[k])
-    matrix_out[i, w] = push_forward_matrix(F, turns)
+@functools.cache
+def _measurement(precision: Precision) -> wp.Kernel:
+    """Kernel that computes M in this precision."""
+    narrow = precision.narrow
 
+    @wp.kernel(module=f"{__name__}.{precision.name}", enable_backward=False)
+    def measure(
+        # In:
+        lanes: int,
+        start: wp.array(dtype=int),
+        other: wp.array(dtype=int),
+        gradient: wp.array(dtype=vec3),
+        turns: int,
+        x: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        # Out:
+        matrix_out: wp.array2d(dtype=precision.mat),
+    ):
+        """M of node i, from the mean deformation gradient of the elements at it, summed by `lanes`
+        threads."""
+        i, w, lane = wp.tid()
+        if on[w] == 0:
+            return
+        a = vec3()
+        b = vec3()
+        c = vec3()
+        for k in range(start[i] + lane, start[i + 1], lanes):
+            p = x[other[k], w]
+            g = gradient[k]
+            a += p[0] * g
+            b += p[1] * g
+            c += p[2] * g
+        a = sum_of_lanes(a, lanes)
+        b = sum_of_lanes(b, lanes)
+        c = sum_of_lanes(c, lanes)
+        M = push_forward_matrix(mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]), turns)
+        if wp.static(precision is SINGLE):
+            if wp.ddot(M, M) > real(_MOST_NORM * _MOST_NORM):
+                M = wp.identity(n=3, dtype=real)
+        matrix_out[i, w] = narrow(M)
 
-@wp.kernel
-def _measure_by_lanes(
-    # In:
-    lanes: int,
-    start: wp.array(dtype=int),
-    other: wp.array(dtype=int),
-    gradient: wp.array(dtype=vec3),
-    turns: int,
-    x: wp.array2d(dtype=vec3),
-    on: wp.array(dtype=int),
-    # Out:
-    matrix_out: wp.array2d(dtype=wp.mat33),
-):
-    """M of node i in single precision, summed by `lanes` threads."""
-    i, w, lane = wp.tid()
-    if on[w] == 0:
-        return
-    a = vec3()
-    b = vec3()
-    c = vec3()
-    for k in range(start[i] + lane, start[i + 1], lanes):
-        p = x[other[k], w]
-        g = gradient[k]
-        a += p[0] * g
-        b += p[1] * g
-        c += p[2] * g
-    a = sum_of_lanes(a, lanes)
-    b = sum_of_lanes(b, lanes)
-    c = sum_of_lanes(c, lanes)
-    M = push_forward_matrix(mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]), turns)
-    if wp.ddot(M, M) > real(_MOST_NORM * _MOST_NORM):
-        M = wp.identity(n=3, dtype=real)
-    matrix_out[i, w] = narrow(M)
+    return measure
 
 
 @wp.kernel
@@ -129,19 +115,10 @@ class PushForward:
     """
 
     def __init__(self, elements: "Tetrahedra", x: wp.array):
-        n, self._launches = elements.nvert, {}
-        start, other, gradient = _node_gradients(elements)
-        with wp.ScopedDevice("cpu"):
-            constants = [
-                wp.array(start, dtype=int),
-                wp.array(other, dtype=int),
-                wp.array(gradient, dtype=vec3),
-            ]
-            self._on = wp.zeros(x.shape[1], dtype=int)
-            self._matrix = wp.zeros((n, x.shape[1]), dtype=mat33)
-        self._flags, self.matrix = self._on.numpy(), self._matrix.numpy()
-        turns = int(elements.law == LAWS["corotational"])
-        self._measure = recorded(_measure, x.shape, [*constants, turns, x, self._on], [self._matrix])
+        matrices = PushForwardMatrices(elements, x.shape[1], x.device, 1, DOUBLE)
+        on, self._launches = wp.zeros(x.shape[1], dtype=int, device="cpu"), {}
+        self._flags, self._matrix, self.matrix = on.numpy(), matrices.matrix, matrices.matrix.numpy()
+        self._measure = recorded(*matrices.measurement(x, on))
 
     def measure(self, worlds: np.ndarray) -> None:
         """Computes M of worlds (k,) at their present nodes."""
@@ -182,17 +159,25 @@ class PushForward:
 
 
 class PushForwardMatrices:
-    """The matrices M of all nodes and worlds of one SkinData on its device, for the dense preconditioner.
+    """The matrices M of all nodes and worlds of one SkinData on its device.
 
     Args:
       elements: of the skin. nworld: number of worlds. device: Warp device. lanes: threads that sum one M.
+      precision: of the matrices; in single, M is bounded by the range of half precision.
 
     Attributes:
-      matrix: [nvert, nworld] M of the last `measure`, in single precision.
+      matrix: [nvert, nworld] M of the last `measurement`.
     """
 
-    def __init__(self, elements: "Tetrahedra", nworld: int, device: wp.Device, lanes: int):
-        self._dim = elements.nvert, nworld, lanes
+    def __init__(
+        self,
+        elements: "Tetrahedra",
+        nworld: int,
+        device: wp.Device,
+        lanes: int,
+        precision: Precision = SINGLE,
+    ):
+        self._dim, self._kernel = (elements.nvert, nworld, lanes), _measurement(precision)
         start, other, gradient = _node_gradients(elements)
         with wp.ScopedDevice(device):
             self._constants = [
@@ -202,11 +187,12 @@ class PushForwardMatrices:
                 wp.array(gradient, dtype=vec3),
                 int(elements.law == LAWS["corotational"]),
             ]
-            self.matrix = wp.zeros((elements.nvert, nworld), dtype=wp.mat33)
+            self.matrix = wp.zeros((elements.nvert, nworld), dtype=precision.mat)
 
-    def measure(self, program: Launcher, launch: Callable, x: wp.array, on: wp.array) -> None:
-        """Computes M in the worlds that are on. launch: launches a kernel, as in `DensePreconditioner`."""
-        launch(program, _measure_by_lanes, self._dim, [*self._constants, x, on], [self.matrix])
+    def measurement(self, x: wp.array, on: wp.array) -> tuple:
+        """Kernel, dim, inputs and outputs of the launch that computes M at x [nvert, nworld] in the worlds
+        that are on."""
+        return self._kernel, self._dim, [*self._constants, x, on], [self.matrix]
 
 
 def pushes_forward(elements: "Tetrahedra", poissons_ratio: float) -> bool:

@@ -14,7 +14,6 @@ from .right_hand_sides import STIFF, InverseEntries, entry, liquid_scale
 
 __all__ = [
     "add_bodies",
-    "invert_serial",
     "multiply_springs",
     "fill_compliance",
     "contact_forces",
@@ -256,50 +255,6 @@ def fill_system(
                     v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
             for a in range(3):
                 A_out[w, row + a, 0] = v[a]
-
-
-@wp.kernel
-def invert_serial(
-    has_liquid: int,
-    size: wp.array(dtype=int),
-    on: wp.array(dtype=int),
-    A: wp.array3d(dtype=float),
-    pivot: wp.array2d(dtype=int),
-    B_out: wp.array3d(dtype=float),
-):
-    """Inverse by Gauss-Jordan exchange with row pivots, one thread for each world: for the CPU."""
-    w = wp.tid()
-    if on[w] == 0:
-        return
-    n = has_liquid + 3 * size[w]
-    for i in range(n):
-        pivot[w, i] = -1  # column with which row i was exchanged
-    for k in range(n):
-        p = int(-1)
-        best = float(-1.0)
-        for i in range(n):
-            if pivot[w, i] < 0 and wp.abs(A[w, i, k]) > best:
-                best = wp.abs(A[w, i, k])
-                p = i
-        pivot[w, p] = k
-        d = 1.0 / A[w, p, k]
-        for j in range(n):
-            if j != k:
-                A[w, p, j] = A[w, p, j] * d
-        A[w, p, k] = d
-        for i in range(n):
-            if i != p:
-                f = A[w, i, k]
-                if f != 0.0:
-                    for j in range(n):
-                        if j != k:
-                            A[w, i, j] = A[w, i, j] - f * A[w, p, j]
-                    A[w, i, k] = -f * d
-    # row i of the exchanged matrix gives unknown pivot[i]; its column k belongs to the right-hand side of the
-    # row with pivot k
-    for i in range(n):
-        for j in range(n):
-            B_out[w, pivot[w, i], j] = A[w, i, pivot[w, j]]
 
 
 @wp.kernel
