@@ -19,6 +19,7 @@ from biotac_mj.effects.catalogue import by_id
 from biotac_mj.files import replacing
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import quaternion_from_y
+from biotac_mj.geometry.solid import bounds_solid
 from biotac_mj.press import PressOptions, approach, build_scene, plan_path, press, render, report
 from biotac_mj.press.indenter import make_indenter
 from biotac_mj.press.record import write_readings, write_skin
@@ -166,9 +167,9 @@ def test_quaternion_turns_y_to_the_direction():
         (dict(direction=(0.0, 0.0, 0.0)), "is no direction"),
         (dict(indenter="sphere_8mm"), "unknown indenter 'sphere_8mm': choose one of .*ring_7mm"),
         (dict(indenter="geom:torus:1"), "unknown geom type 'torus'.* sphere, capsule"),
-        (dict(indenter="geom:capsule:0.003"), "a capsule needs 2 positive sizes in metres"),
+        (dict(indenter="geom:capsule:0.003"), "no capsule: give its radius, half length, above 0"),
         (dict(indenter="geom:sphere:x"), "are not lengths"),
-        (dict(indenter="geom:box:0.1,-1,1"), "3 positive sizes"),
+        (dict(indenter="geom:box:0.1,-1,1"), "no box: give its half width x, y, z, above 0"),
     ],
 )
 def test_bad_input_names_cause_and_remedy(shell, change, text):
@@ -246,6 +247,9 @@ def test_indenter_meshes_are_checked(tmp_path):
     trimesh.Trimesh(ball.vertices, ball.faces[1:]).export(tmp_path / "open.obj")
     with pytest.raises(ValueError, match="is open.*close its holes"):
         make_indenter(f"mesh:{tmp_path / 'open.obj'}")
+    trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], process=False).export(tmp_path / "inside_out.obj")
+    shape = make_indenter(f"mesh:{tmp_path / 'inside_out.obj'}")
+    assert bounds_solid(shape.vert, shape.face)
     trimesh.creation.icosphere(radius=3.0).export(tmp_path / "big.obj")
     with pytest.raises(ValueError, match="must be in metres"):
         make_indenter(f"mesh:{tmp_path / 'big.obj'}")

@@ -341,14 +341,18 @@ def test_two_meshes_keep_apart():
 # --- bad input  ---
 
 
-def test_open_mesh():
+@pytest.mark.parametrize("face, text", [
+    (lambda face: face[1:], "is open: its inside is not defined, 3 edges have one face only; close"),
+    (lambda face: face[:0], "has no faces: give a triangle mesh"),
+    (lambda face: face[:, ::-1], "is inside out: flip its faces, so that all normals point outwards"),
+    (lambda face: np.concatenate([face[:1, ::-1], face[1:]]),
+     "has faces of both orientations: make all normals point outwards"),
+    (lambda face: np.concatenate([face, face[:, ::-1]]), "encloses no volume: give a solid"),
+])  # fmt: skip
+def test_a_mesh_that_bounds_no_solid_says_why(face, text):
     ball = trimesh.creation.icosphere(subdivisions=2)
-    with pytest.raises(ValueError, match="the mesh is open: its inside is not defined; close its holes"):
-        bake_distance_grid(ball.vertices, ball.faces[1:])
-    with pytest.raises(
-        ValueError, match="a mesh geom without faces has no distance field: give it a triangle mesh"
-    ):
-        bake_distance_grid(ball.vertices, np.zeros((0, 3), int))
+    with pytest.raises(ValueError, match=text):
+        bake_distance_grid(ball.vertices, face(ball.faces))
 
 
 @pytest.mark.parametrize("arguments, text", [

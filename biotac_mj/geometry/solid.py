@@ -3,22 +3,34 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["bounds_solid", "close_rim", "convex_hull", "fills_hull", "ground", "spread_points"]
+__all__ = ["bounds_solid", "close_rim", "convex_hull", "fills_hull", "ground", "no_solid", "spread_points"]
 
 
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
     """Whether a mesh (n, 3) [m], (m, 3) bounds a solid: every edge is traversed equally often in both
     directions, and faces are oriented outwards. Vertices within 1 nm are merged."""
+    return no_solid(vert, face) is None
+
+
+def no_solid(vert: np.ndarray, face: np.ndarray) -> str | None:
+    """Why a mesh does not bound a solid, see `bounds_solid`, and the remedy; None if it does."""
     if not len(face):
-        return False
+        return "has no faces: give a triangle mesh"
     _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
     welded = merged.reshape(-1)[face]
     edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
     there, back = (np.sort(edges @ [len(vert), 1][::step]) for step in (1, -1))
-    corner = vert[face] - vert.mean(axis=0)
-    volume = np.linalg.det(corner)
-    return bool(volume.sum() > 1e-6 * np.abs(volume).sum() and np.array_equal(there, back))
+    if not np.array_equal(there, back):
+        _, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+        odd = int((count % 2).sum())
+        if odd:
+            return f"is open: its inside is not defined, {odd} edges have one face only; close its holes"
+        return "has faces of both orientations: make all normals point outwards"
+    volume = np.linalg.det(vert[face] - vert.mean(axis=0))
+    if abs(volume.sum()) <= 1e-6 * np.abs(volume).sum():
+        return "encloses no volume: give a solid"
+    return None if volume.sum() > 0 else "is inside out: flip its faces, so that all normals point outwards"
 
 
 def close_rim(face: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ import numpy as np
 
 from ..geometry.indenters import INDENTERS, indenter
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
+from ..geometry.solid import no_solid
+from ..geometry.tet_mesh import enclosed_volume
 from ..reading import reading
 from ..triangles import trimesh
 from ..units import read_quantity
@@ -17,7 +19,11 @@ from ..units import read_quantity
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
 _LARGEST = 0.5  # [m] along any axis
-_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0}
+_ALONG = ("radius", "half length")
+_SIZES = {
+    "sphere": ("radius",), "capsule": _ALONG, "cylinder": _ALONG,
+    "ellipsoid": ("semi axis x", "y", "z"), "box": ("half width x", "y", "z"), "plane": (),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,13 +84,11 @@ def _from_geom(text):
         ) from None
     if kind == "plane":
         size = size or (0.02, 0.02, 0.001)
-        needed = 3
-    else:
-        needed = _SIZES[kind]
-    if len(size) != needed or not all(np.isfinite(s) and s > 0 for s in size):
+    needed = _SIZES[kind] or _SIZES["box"]
+    if len(size) != len(needed) or not all(np.isfinite(s) and s > 0 for s in size):
+        example = ",".join(["3mm", "5mm", "5mm"][: len(needed)])
         raise ValueError(
-            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: "
-            "as in geom:capsule:0.003,0.005"
+            f"'geom:{text}' is no {kind}: give its {', '.join(needed)}, above 0, as in geom:{kind}:{example}"
         )
     if kind != "plane" and max(size) > _LARGEST / 2:
         raise ValueError(
@@ -101,27 +105,21 @@ def _from_file(path):
         sound = len(getattr(raw, "faces", ())) and np.isfinite(raw.vertices).all()
         mesh = trimesh.Trimesh(raw.vertices, raw.faces) if sound else None
     if not sound:
-        raise ValueError(
-            f"the indenter mesh {path} has no faces or vertices that are not finite: "
-            "give a closed surface in metres"
-        )
+        wrong = "vertices that are not finite" if len(getattr(raw, "faces", ())) else "no faces"
+        raise ValueError(f"the indenter mesh {path} has {wrong}: give a closed surface in metres")
     if mesh.extents.max() > _LARGEST:
         raise ValueError(
             f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; "
             "scale it from millimetres"
         )
-    if not mesh.is_watertight:
-        raise ValueError(f"the indenter mesh {path} is open: its inside is not defined; close its holes")
-    return Indenter(
-        f"mesh:{path}",
-        "mesh",
-        (),
-        0.0,
-        np.zeros(3),
-        UPRIGHT,
-        np.asarray(mesh.vertices),
-        np.asarray(mesh.faces),
-    )
+    mesh.update_faces(mesh.unique_faces())
+    vert, face = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if enclosed_volume(vert, face) < 0:  # which side is the inside of a closed surface is no question
+        face = face[:, ::-1]
+    wrong = no_solid(vert, face)
+    if wrong is not None:
+        raise ValueError(f"the indenter mesh {path} {wrong}")
+    return Indenter(f"mesh:{path}", "mesh", (), 0.0, np.zeros(3), UPRIGHT, vert, face)
 
 
 def make_indenter(text: str) -> Indenter:

@@ -19,7 +19,7 @@ from ...geometry.closest import (
     pack_lists,
     pseudonormals,
 )
-from ...geometry.solid import bounds_solid
+from ...geometry.solid import no_solid
 from ..types import double, real, single, vec3
 
 __all__ = [
@@ -126,13 +126,12 @@ def bake_distance_grid(
         equilibria.
 
     Raises:
-      ValueError: the mesh bounds no solid (it is open, say) or is empty.
+      ValueError: the mesh bounds no solid.
     """
     vert, face = np.asarray(vert, float), np.asarray(face, np.int32)
-    if not len(vert) or not len(face):
-        raise ValueError("a mesh geom without faces has no distance field: give it a triangle mesh")
-    if not bounds_solid(vert, face):
-        raise ValueError("the mesh is open: its inside is not defined; close its holes")
+    wrong = no_solid(vert, face)
+    if wrong is not None:
+        raise ValueError(f"the mesh {wrong}")
     low, high = vert.min(0), vert.max(0)
     if spacing is None:
         longest = float((high - low).max())
