@@ -31,7 +31,7 @@ from biotac_mj.recordings.own import noise
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.presets import SENSORS, read_sensor
-from biotac_mj.skin import SkinModel, SkinOptions
+from biotac_mj.skin import Material, SkinModel, SkinOptions
 
 REAL = os.environ.get("BIOTAC_RECORDINGS")
 SKIN = four_nodes("coarse")
@@ -126,6 +126,14 @@ def test_a_sensor_begins_as_the_session_left_it():
     options = amend(plain, [(fill, {"rate": 0.2, "before": 0.05})]).options
     assert options["skin"]["fill_volume"] == pytest.approx(-0.05 * liquid, rel=1e-3)
     assert "skin" not in amend(plain, [(fill, {"rate": 0.2})]).options
+
+
+def test_rubber_keeps_what_it_has_of_its_own():
+    own = Material(stiffening=2.0, prony=((0.2, 1.0),))
+    plain, stiff = Material(), (by_id("stiffen"), {"c2": 0.3})
+    more = [amend(Model(None, m, None, None, None), [stiff]).material for m in (plain, own)]
+    assert more[1].stiffening == pytest.approx(2.0 + more[0].stiffening) and more[0].stiffening > 1
+    assert more[1].prony == own.prony
 
 
 def test_effects_of_the_set_up_are_left_out_by_name(plain_press):

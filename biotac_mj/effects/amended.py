@@ -12,12 +12,11 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import design_of, skin_reference
 from ..sensor.presets import Sensor, read_sensor
 from ..short_repr import short_repr
-from ..skin.contact.law import ContactLaw
 from ..skin.model import SkinOptions
 from ..skin.settings import plain, read_dict, read_material, read_modulus
 from .catalogue import CATALOGUE
 from .effect import STAGES, Effect, Whole
-from .in_skin import memory_of
+from .in_skin import memory_of, moduli
 from .sensor_file import SensorFile, read_sensor_file
 from .sensors import with_effects
 
@@ -109,13 +108,15 @@ def amend(model: Model, effects: Effects) -> Model:
     ]
     if diagnosis_only:
         warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(diagnosis_only)}", stacklevel=4)
-    material = dataclasses.replace(material, **_joined(material, inside.material))
+    material = inside.rubber(material)
     if inside.contact or whole.air or whole.lost:
-        liquid = _liquid(skin_reference(skin)[1])
-        bulk, lost = whole.air / (_AIR * liquid), whole.lost * liquid
-        options["skin"] = _skin_options(options.get("skin"), inside.contact, bulk, lost)
+        given = options.get("skin")
+        if not isinstance(given, SkinOptions):
+            given = SkinOptions(**read_dict(given, "options['skin']"))
+        options["skin"] = plain(_with_liquid(inside.options(given), whole, skin_reference(skin)[1]))
     if inside.model:
-        options["modulus"] = _modulus(options.get("modulus"), inside.model["modulus"], skin)
+        given = read_modulus(options.get("modulus"))
+        options["modulus"] = plain(moduli(given, inside.model["modulus"], skin_reference(skin)[1]))
     return Model(skin, material, options, _plain_sensor(with_effects(sensor, of_sensor)), friction)
 
 
@@ -134,37 +135,14 @@ def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
     return {**given, **{name: plain(getattr(out, name)) for name in names}}
 
 
-def _joined(material, new):
-    """The material with further terms of memory."""
-    out = {k: v for k, v in new.items() if k not in ("prony", "hysteresis")}
-    for name in ("prony", "hysteresis"):
-        if new.get(name):
-            out[name] = (*getattr(material, name), *new[name])
-    return out
-
-
-def _skin_options(given, contact, bulk, lost):
-    options = given if isinstance(given, SkinOptions) else SkinOptions(**read_dict(given, "options['skin']"))
-    changes = dict(contact)
-    if "contact_law" in changes:
-        law = options.contact_law or ContactLaw()
-        changes["contact_law"] = dataclasses.replace(law, **changes["contact_law"])
-    if bulk:  # liquid and air in series: V / K + V0 / p0
-        changes["bulk_modulus"] = 1 / (1 / options.bulk_modulus + bulk)
-    if lost:
-        changes["fill_volume"] = options.fill_volume - lost
-    if "tolerance" in changes:
-        changes["tolerance"] = min(changes["tolerance"], options.tolerance)
-    return plain(dataclasses.replace(options, **changes))
-
-
-def _modulus(given, function, skin):
-    """Combined factors on the elements' modulus."""
-    before, geometry = read_modulus(given), skin_reference(skin)[1]
-    factors = np.array(plain(function, geometry))
-    if before is not None:
-        factors = factors * (np.array(plain(before, geometry)) if callable(before) else before)
-    return factors.tolist()
+def _with_liquid(options, whole, geometry):
+    """SkinOptions with the air in the liquid and without what of it is lost."""
+    liquid, changes = _liquid(geometry), {}
+    if whole.air:  # liquid and air in series: V / K + V0 / p0
+        changes["bulk_modulus"] = 1 / (1 / options.bulk_modulus + whole.air / (_AIR * liquid))
+    if whole.lost:
+        changes["fill_volume"] = options.fill_volume - whole.lost * liquid
+    return dataclasses.replace(options, **changes)
 
 
 def _liquid(geometry):

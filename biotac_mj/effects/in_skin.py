@@ -3,11 +3,18 @@ material, contact, model and film.
 
 `docs/lab/discrepancy.md` says how much the reduced forms differ."""
 
+import dataclasses
 import typing
+from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["Inside", "friction_branch", "memory_of", "stiffening"]
+if typing.TYPE_CHECKING:
+    from ..geometry.skin_geometry import SkinGeometry
+    from ..skin import Material
+    from ..skin.model import SkinOptions
+
+__all__ = ["Inside", "friction_branch", "memory_of", "moduli", "stiffening"]
 
 
 # measured by benchmarks/discrepancy_in_skin_maps.py on presses of the coarse skin (docs/lab/memory.md):
@@ -54,6 +61,24 @@ class Inside(typing.NamedTuple):
     film: dict
     rest: list
 
+    def rubber(self, material: "Material") -> "Material":
+        """The material with these changes, in addition to the memory and the stiffening it has already."""
+        more = {n: self.material[n] for n in ("prony", "hysteresis", "stiffening") if n in self.material}
+        own = {name: getattr(material, name) + one for name, one in more.items()}
+        return dataclasses.replace(material, **self.material | own)
+
+    def options(self, options: "SkinOptions") -> "SkinOptions":
+        """The skin's options with these changes of the contact; the rest of its contact law stays."""
+        from ..skin.contact.law import ContactLaw
+
+        changes = dict(self.contact)
+        if "contact_law" in changes:
+            law = options.contact_law or ContactLaw()
+            changes["contact_law"] = dataclasses.replace(law, **changes["contact_law"])
+        if "tolerance" in changes:
+            changes["tolerance"] = min(changes["tolerance"], options.tolerance)
+        return dataclasses.replace(options, **changes)
+
 
 def memory_of(effects: list) -> Inside:
     """Changes of a skin that models effects [(Effect, theta)] inside."""
@@ -62,6 +87,18 @@ def memory_of(effects: list) -> Inside:
         if not effect.in_skin(inside, theta):
             inside.rest.append((effect, theta))
     return inside
+
+
+def moduli(
+    given: np.ndarray | Callable | None, more: Callable | None, geometry: "SkinGeometry"
+) -> np.ndarray | Callable | None:
+    """Factors on the modulus of each element: `given` (nelem,), a function of positions or None, times the
+    function `more`; `given` if that is None."""
+    if more is None:
+        return given
+    at = geometry.vert[geometry.elem[:, :4]].mean(1)
+    own = given(at) if callable(given) else given
+    return np.asarray(more(at) if own is None else own * more(at), float)
 
 
 def stiffening(c2: float, already: float) -> float:

@@ -7,12 +7,12 @@ import base64
 import dataclasses
 import functools
 import io
+import json
 import math
 import re
 import typing
 
 from ...effects.effect import STAGES
-from .plain_values import plain_values
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Effect, Param
@@ -346,29 +346,29 @@ class Verdict:
 
     def to_dict(self) -> dict:
         """What verdict.json holds: numbers, strings, lists and dicts only, no NaN."""
-        return plain_values(
-            {
-                "schema": SCHEMA,
-                "version": VERSION,
-                "kind": self.kind,
-                "name": self.name,
-                "verdict": self.verdict,
-                "headline": self.headline,
-                "significant": self.significant,
-                "effects": [f.to_dict() for f in self.effects],
-                "not_named": [f.to_dict() for f in self.not_named],
-                "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
-                "share_closed": self.closed,
-                "where": self.where,
-                "remainder": {"significant": self.unknown, "text": self.remainder},
-                "tried": self.tried,
-                "cannot_be_known": self.notes,
-                "next_experiment": self.next_experiment,
-                "next_command": self.next_command,
-                "warnings": self.warnings,
-                **self.details,
-            }
-        )
+        document = {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "kind": self.kind,
+            "name": self.name,
+            "verdict": self.verdict,
+            "headline": self.headline,
+            "significant": self.significant,
+            "effects": [f.to_dict() for f in self.effects],
+            "not_named": [f.to_dict() for f in self.not_named],
+            "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
+            "share_closed": self.closed,
+            "where": self.where,
+            "remainder": {"significant": self.unknown, "text": self.remainder},
+            "tried": self.tried,
+            "cannot_be_known": self.notes,
+            "next_experiment": self.next_experiment,
+            "next_command": self.next_command,
+            "warnings": self.warnings,
+            **self.details,
+        }
+        written = json.dumps(document, default=lambda array: array.tolist())
+        return json.loads(written, parse_constant=lambda _: None)
 
 
 def electrode_names(electrodes: typing.Sequence[int]) -> list[str]:

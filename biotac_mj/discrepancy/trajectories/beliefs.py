@@ -13,8 +13,8 @@ import numpy as np
 from ...effects.catalogue import CATALOGUE, by_id
 from ...files import replacing
 from ..evidence import ODDS
-from .base.nuisance import PRIOR, Nuisance
-from .fitting import SHAPE_PRIOR, sizes
+from .base.nuisance import Nuisance
+from .fitting import parameters, sizes
 from .model.sensor_file import load_simulator
 from .model.simulator import Simulator
 from .settings import SETTINGS
@@ -27,11 +27,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["Beliefs", "Explanation", "believed", "pooled", "weights"]
 
-# of the base model's parameters, for differences
-_STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
-_STEPS |= {"stands_off": 0.3}
 _MOST = 6  # explanations, the likeliest ones
-_SHAPE_STEP = 0.2  # of a shape's logarithm
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
 
 
@@ -43,7 +39,8 @@ class Explanation:
       effects: [(Effect, theta)]; none: the base model alone. nuisance: fitted with them.
       score: log evidence of all data, parameters marginalised [nats].
       weight: probability, of all explanations that are kept 1 together.
-      information: (k, k) of data and priors about the parameters as `moves` gives them.
+      information: (k, k) of data and priors about the parameters as `moves` gives them, in standard
+        deviations of the priors.
     """
 
     effects: list
@@ -60,22 +57,18 @@ class Explanation:
     def name(self) -> str:
         return " + ".join(effect.name for effect, _ in self.effects) or "the base model alone"
 
-    def moves(self) -> Iterator[tuple[float, float, list, Nuisance]]:
-        """(step, standard deviation of the prior, effects, nuisance) with one parameter moved by a step."""
-        for k, field in enumerate(dataclasses.fields(Nuisance)):
-            step = _STEPS.get(field.name, 0.05)
-            yield step, PRIOR[k], self.effects, self.nuisance.moved(**{field.name: step})
-        for i, (effect, theta) in enumerate(self.effects):
-            steps = [(name, effect.params[name].scale, size, False) for name, size in sizes(effect)]
-            steps += [(name, 1.0, _SHAPE_STEP, True) for name, p in effect.params.items() if p.shape]
-            for name, scale, size, shape in steps:
-                p = effect.params[name]
-                value = theta[name] * np.exp(size) if shape else theta[name] + size
-                if not p.low <= value <= p.high:
-                    size, value = -size, theta[name] * np.exp(-size) if shape else theta[name] - size
-                moved = (effect, theta | {name: float(value)})
-                effects = [*self.effects[:i], moved, *self.effects[i + 1 :]]
-                yield size / scale, SHAPE_PRIOR if shape else SETTINGS.wide, effects, self.nuisance
+    def moves(self) -> Iterator[tuple[float, list, Nuisance]]:
+        """(step in standard deviations of the prior, effects, nuisance) with one parameter moved by it."""
+        for k, name, spread, step in parameters(self.effects):
+            if k is None:
+                yield step / spread, self.effects, self.nuisance.moved(**{name: step})
+                continue
+            effect, theta = self.effects[k]
+            p, value = effect.params[name], theta[name]
+            if not p.low <= (value * np.exp(step) if p.shape else value + step) <= p.high:
+                step = -step
+            moved = (effect, theta | {name: float(value * np.exp(step) if p.shape else value + step)})
+            yield step / spread, [*self.effects[:k], moved, *self.effects[k + 1 :]], self.nuisance
 
     def residuals(
         self, comparison: "Comparison", known: list[tuple[np.ndarray, np.ndarray]] | None = None
@@ -92,7 +85,7 @@ class Explanation:
         here = scaled(self.effects, self.nuisance)
         columns = [
             [(a - b) / step for a, b in zip(here, scaled(effects, nuisance))]
-            for step, _, effects, nuisance in itertools.islice(self.moves(), *_after(known))
+            for step, effects, nuisance in itertools.islice(self.moves(), *_after(known))
         ]
         own = [np.stack(parts, axis=1) for parts in zip(*columns)]
         if known is not None:
@@ -109,7 +102,7 @@ class Explanation:
             theta[name] = float(np.clip(theta[name] + sign * size, p.low, p.high))
         out = dataclasses.replace(self, effects=[*self.effects, (effect, theta)], score=self.score + score)
         known = len(self.information)
-        information = np.diag([1 / prior**2 for _, prior, _, _ in out.moves()])
+        information = np.eye(len(parameters(out.effects)))
         information[:known, :known] = self.information
         return dataclasses.replace(out, information=information)
 
@@ -278,7 +271,7 @@ def believed(comparison: "Comparison", search: "Search", doubts: list[str], chos
     for fit in some:
         one = Explanation(fit.effects, fit.nuisance, fit.score, np.zeros((0, 0)))
         square = fit.mean_square(comparison)
-        information = np.diag([1 / prior**2 for _, prior, _, _ in one.moves()])
+        information = np.eye(len(parameters(fit.effects)))
         for i, (_, columns) in enumerate(one.residuals(comparison)):
             if i in chosen:
                 # where the fit leaves more than noise, a trajectory says less of it

@@ -15,12 +15,12 @@ if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
     from .whitening import Comparison
 
-__all__ = ["Fit", "SHAPE_PRIOR", "fit_effects", "sizes"]
+__all__ = ["Fit", "fit_effects", "parameters", "sizes"]
 
 _NUISANCE = [f.name for f in dataclasses.fields(Nuisance)]
 _MOVES = np.array([0.05, 0.05, 0.02, 0.2, 0.2, 0.2, 0.2, 0.3])  # of the nuisance, for differences
 _SMALL, _SHAPE = 0.3, 0.2  # the same of a parameter's scale and of a shape's logarithm
-SHAPE_PRIOR = 1.0  # standard deviation of a shape's logarithm
+_SHAPE_PRIOR = 1.0  # standard deviation of a shape's logarithm
 _STEPS, _DONE = 8, 0.1  # Gauss-Newton's; [nats] below which one more changes nothing
 _SHORTER = 1.0, 0.5, 0.2  # of a step
 _FARTHEST = 3.0  # standard deviations of priors that a step leads
@@ -99,6 +99,19 @@ def sizes(effect: "Effect") -> typing.Iterator[tuple[str, float]]:
         yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
 
 
+def parameters(effects: list, free: Sequence[str] = _NUISANCE) -> list[tuple[int | None, str, float, float]]:
+    """Parameters of the nuisance and of effects [(Effect, theta)]: (index of the effect, or None; name;
+    standard deviation of the prior; step of differences), of a shape those of its logarithm."""
+    out = [(None, name, PRIOR[k], _MOVES[k]) for k, name in enumerate(_NUISANCE) if name in free]
+    for k, (effect, _) in enumerate(effects):
+        out += [
+            (k, name, SETTINGS.wide * effect.params[name].scale, _SMALL * size)
+            for name, size in sizes(effect)
+        ]
+        out += [(k, name, _SHAPE_PRIOR, _SHAPE) for name, p in effect.params.items() if p.shape]
+    return out
+
+
 def fit_effects(
     comparison: "Comparison",
     effects: list,
@@ -122,8 +135,7 @@ def fit_effects(
 
 
 class _Model:
-    """Effects and nuisance as one list of parameters: (index of the effect, or None; name; standard deviation
-    of the prior; step of differences)."""
+    """Effects and nuisance as one list of `parameters`."""
 
     def __init__(self, comparison, own: likelihood.Likelihood, effects, known):
         self.comparison, self.likelihood = comparison, own
@@ -134,15 +146,7 @@ class _Model:
         absent |= {name for name in BETWEEN if name not in slopes}
         absent |= {"log_film"} if comparison.fields.film is None else set()
         self.free = [n for n in _NUISANCE if n not in absent]
-        known_of = dict(zip(_NUISANCE, zip(PRIOR, _MOVES)))
-        self.parameters = [(None, n, *known_of[n]) for n in self.free]
-        for k, (effect, _) in enumerate(effects):
-            for name, size in sizes(effect):
-                spread = SETTINGS.wide * effect.params[name].scale
-                self.parameters.append((k, name, spread, _SMALL * size))
-            for name, p in effect.params.items():
-                if p.shape:
-                    self.parameters.append((k, name, SHAPE_PRIOR, _SHAPE))
+        self.parameters = parameters(effects, self.free)
         self.spread = np.array([p[2] for p in self.parameters])
         self.middle = [dict(theta) for _, theta in effects]
 

@@ -1,4 +1,4 @@
-"""Where the residual stands out, and what a remainder that has no name depends on."""
+"""Where the residual stands out, and where a remainder does that has no name."""
 
 import typing
 
@@ -12,10 +12,11 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["channel_groups", "conditions", "depends_on", "phases", "residual_cells", "where"]
+__all__ = ["channel_groups", "conditions", "left_over", "phases", "residual_cells", "where"]
 
 TRENDS = "along finger", "across finger", "clock", "temperature"  # over trajectories
 _FEWEST = 5  # trajectories that know a cell
+_SAID = 3  # cells that are said of what has no name
 
 
 def phases(t: "Trajectory") -> dict:
@@ -105,50 +106,9 @@ def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dic
     return sorted(out, key=lambda c: -abs(c["t"]))
 
 
-def _features(t):
-    speed = np.gradient(t.depth, t.time)
-    touched = np.cumsum(t.depth > 20e-6) > 0
-    since = np.where(touched, t.time - t.time[np.argmax(touched)] if touched.any() else 0, 0)
-    return {
-        "depth": t.depth / 1e-3,
-        "speed": np.sign(speed) * np.log1p(np.abs(speed) / 1e-4),
-        "time since contact": np.log1p(since / 0.1),
-        "place along the finger": np.full(len(t.time), t.pos[np.argmax(t.depth), 0] / 5e-3),
-        "place across": np.full(len(t.time), t.pos[np.argmax(t.depth), 2] / 5e-3),
-        "session's clock": np.full(len(t.time), t.clock / 300),
-    }
-
-
-def depends_on(comparison: "Comparison", current: "Fit", chosen: np.ndarray) -> str:
-    """What the remainder depends on: held-out share that features explain, and what permuting each of them
-    costs."""
-    white = current.posed(comparison)
-    y = np.concatenate([white[i] for i in chosen])
-    u, s, vt = np.linalg.svd(y, full_matrices=False)
-    y = u[:, :3] * s[:3]
-    owner = np.concatenate([np.full(len(white[i]), k) for k, i in enumerate(chosen)])
-    table = [_features(comparison.trajectories[i]) for i in chosen]
-    names = list(table[0])
-    x = np.stack([np.concatenate([f[n] for f in table]) for n in names], axis=1)
-    x = (x - x.mean(0)) / np.maximum(x.std(0), 1e-9)
-    share = _explained(x, y, owner)
-    if share < 0.1:
-        return f"nothing that was looked at explains it on trajectories left out ({max(share, 0):.0%})"
-    loss = {n: share - _explained(np.delete(x, k, axis=1), y, owner) for k, n in enumerate(names)}
-    top = [n for n, v in sorted(loss.items(), key=lambda kv: -kv[1]) if v > 0.05 * share][:2]
-    rest = [n for n in names if n not in top]
-    return (
-        f"depends on {' and '.join(top) or 'several things together'}, not visibly on {', '.join(rest)}; "
-        f"these explain {share:.0%} of it on trajectories left out"
-    )
-
-
-def _explained(x, y, owner):
-    i, j = np.triu_indices(x.shape[1])
-    a = np.concatenate([np.ones((len(x), 1)), x, x[:, i] * x[:, j]], axis=1)
-    error = 0.0
-    for f in range(4):
-        test = owner % 4 == f
-        w = np.linalg.solve(a[~test].T @ a[~test] + 0.02 * len(a) * np.eye(a.shape[1]), a[~test].T @ y[~test])
-        error += ((y[test] - a[test] @ w) ** 2).sum()
-    return float(1 - error / (y**2).sum())
+def left_over(comparison: "Comparison", current: "Fit", chosen: np.ndarray) -> str:
+    """Where what a fit leaves stands out most, in words."""
+    cells = where(comparison, current, chosen)[:_SAID]
+    if not cells:
+        return "no channel stands out under any condition"
+    return "most in " + ", ".join(f"{one['channel']} ({one['condition']})" for one in cells)

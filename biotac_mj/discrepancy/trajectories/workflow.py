@@ -27,7 +27,7 @@ from .search import found
 from .settings import SETTINGS
 from .signatures import isolability
 from .trajectory import FEWEST, measurement_noise
-from .where import depends_on, where
+from .where import left_over, where
 from .whitening import REPEATABILITY, Comparison
 
 if typing.TYPE_CHECKING:
@@ -244,7 +244,7 @@ def _in_words(comparison, current, effects, named, chosen, refuted):
     if effects and named:
         return ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts), ""
     remainder = refuted or ("" if effects else jumps(comparison, current))
-    remainder = remainder or depends_on(comparison, current, chosen)
+    remainder = remainder or left_over(comparison, current, chosen)
     if not effects:
         return f"unknown ({remainder})", remainder
     return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder

@@ -11,7 +11,7 @@ import numpy as np
 import tqdm
 
 from ....effects.contact import TACKY, Adhesion
-from ....effects.in_skin import memory_of
+from ....effects.in_skin import memory_of, moduli
 from ....effects.rubber import Stiffening, modulus_of
 from ....geometry.skins import load_skin
 from ....skin.contact.law import GridTooCoarse
@@ -152,23 +152,18 @@ def _films(sim, trajectories, base, tick):
 def _uneven(sim, trajectories, base, tick):
     """Differences by a modulus that varies along and across the finger."""
     given = read_settings(sim.material, sim.options).modulus
-    geometry = load_skin(sim.skin)
-    at = geometry.vert[geometry.elem[:, :4]].mean(1)
-    own, out = 1.0 if given is None else np.asarray(given(at) if callable(given) else given), {}
+    geometry, out = load_skin(sim.skin), {}
     for way in (*MAPS, *spots(trajectories)):
         by = _UNEVEN if way in MAPS else _SPOT
-        factor = modulus_of({way: by})(at)
-        other = sim.but(options=sim.options | {"modulus": own * factor})
+        other = sim.but(options=sim.options | {"modulus": moduli(given, modulus_of({way: by}), geometry)})
         out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
     return out
 
 
 def _stiffer(sim, trajectories, base, tick):
     """Difference by c2 of rubber that stiffens inside the elements, as the condensed tier cannot."""
-    inside = memory_of([(Stiffening(), {"c2": _STIFFER})]).material["stiffening"]
-    rubber = read_material(sim.material)
-    more = dataclasses.replace(rubber, stiffening=rubber.stiffening + inside)
-    other = sim.but(material=plain(more))
+    inside = memory_of([(Stiffening(), {"c2": _STIFFER})])
+    other = sim.but(material=plain(inside.rubber(read_material(sim.material))))
     return _difference(other.solve(trajectories, progress=tick), base, _STIFFER)
 
 
@@ -180,11 +175,9 @@ def tacky(
     tick: Callable[[], object] | None = None,
 ) -> list:
     """Difference by a contact that sticks, of so much work of joining [J/m2]."""
-    inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})]).contact
-    settings = read_settings(sim.material, sim.options)[1]
-    if settings.contact_law:  # what is said of friction stays
-        inside["contact_law"] = dataclasses.replace(settings.contact_law, **inside["contact_law"])
-    other = sim.but(options=sim.options | {"skin": plain(dataclasses.replace(settings, **inside))})
+    inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})])
+    skin = plain(inside.options(read_settings(sim.material, sim.options)[1]))
+    other = sim.but(options=sim.options | {"skin": skin})
     return _difference(other.solve(trajectories, progress=tick), base)
 
 

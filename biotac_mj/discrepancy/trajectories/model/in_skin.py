@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ....effects.in_film import RoughFilm, drain, remaining_liquid
-from ....effects.in_skin import memory_of
+from ....effects.in_skin import memory_of, moduli
 from .fields import stack, unlike
 from .simulator import Simulator, _impedance, placed
 
@@ -213,28 +213,7 @@ class _Remembering(Simulator):
         if bubble not in self._models:
             super().skin_and_film(0.0, bubble)
             plain = self._models[bubble]
-            of = dict(self.inside.material)
-            for name in ("prony", "hysteresis", "stiffening"):  # beside what the material has of its own
-                if name in of:
-                    of[name] = getattr(plain.material, name) + of[name]
-            rubber = dataclasses.replace(plain.material, **of)
-            changes = dict(self.inside.contact)
-            if (
-                "contact_law" in changes and plain.options.contact_law
-            ):  # what the effects say nothing of stays
-                changes["contact_law"] = dataclasses.replace(
-                    plain.options.contact_law, **changes["contact_law"]
-                )
-            options = dataclasses.replace(plain.options, **changes)
-            modulus = self.inside.model.get("modulus")
-            factors = _product(self._read()[0].modulus, modulus, plain.geometry)
+            rubber, options = self.inside.rubber(plain.material), self.inside.options(plain.options)
+            factors = moduli(self._read()[0].modulus, self.inside.model.get("modulus"), plain.geometry)
             self._models[bubble] = SkinModel(plain.geometry, rubber, options, plain.device, modulus=factors)
         return super().skin_and_film(log_friction, bubble)
-
-
-def _product(given, other, geometry):
-    """Factors on Young's modulus, a skin's own (numbers, function or None) and those of effects (or None)."""
-    if given is None or other is None:
-        return other if given is None else given
-    at = geometry.vert[geometry.elem[:, :4]].mean(1)
-    return (given(at) if callable(given) else given) * other(at)
