@@ -62,7 +62,7 @@ def _gaps(v: Verdict):
         }
         for name, gap in v.gap.items()
     ]
-    closed = [f"    of what is above noise {v.closed:.0%} is closed"] if math.isfinite(v.closed) else []
+    closed = [f"    {v.closed:.0%} of the effects' own part is closed"] if math.isfinite(v.closed) else []
     return [f"  on {v.aside}:", *_table(rows, hidden=set()), *closed]
 
 

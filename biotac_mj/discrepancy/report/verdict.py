@@ -258,7 +258,7 @@ class Verdict:
       effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
       gap: what is compared -> Gap, on data kept aside. lead: which of them the headline is about; empty: the
         one that is most above noise. aside: what these data are, in words.
-      closed: share that all effects close of what is above noise, nan where there is nothing.
+      closed: share that all effects close of their own part of the gap, nan where there is none.
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.

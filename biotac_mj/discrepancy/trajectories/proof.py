@@ -8,6 +8,7 @@ import numpy as np
 
 from .base.nuisance import Nuisance
 from .levels import excess
+from .settings import SETTINGS
 
 if typing.TYPE_CHECKING:
     from .fitting import Fit
@@ -26,8 +27,8 @@ class Proof:
       fit: Fit that they do not contradict: with effects, with the base model's constants alone, or the base
         model as it was given. before, after: of the model without effects and of that one the mean square of
         each trajectory and RMS of groups and channels. residuals: (before, after), of each trajectory
-        (n, width), its pose's most probable error taken out. closed: share of the disagreement's root mean
-        square beyond noise that effects take away (a modulus where there is none of them), nan without both.
+        (n, width), its pose's most probable error taken out. closed: share of the root mean square of
+        what effects act on that they take away (a modulus where there is none of them), nan without both.
     """
 
     fit: "Fit"
@@ -63,7 +64,8 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
         if current.effects
         else [ends[id(start)], end]
     )
-    return Proof(current, before, after, (first, last), _closed(*sides))
+    law = max([SETTINGS.law, *(effect.law for effect, _ in current.effects)])
+    return Proof(current, before, after, (first, last), _closed(comparison, *sides, law, aside))
 
 
 def _measured(comparison, fit, rows):
@@ -79,13 +81,12 @@ def _measured(comparison, fit, rows):
 
 class _Off(typing.NamedTuple):
     """By how much trajectories together are off, as sums over rows of mean squares, less what is expected:
-    channels: beyond noise; resolved: beyond noise and the model's resolution; poses: beyond their scatter.
+    channels: beyond noise; poses: beyond their scatter.
 
     What all poses are off by is as much a disagreement as what is left of the channels: the most probable
     error of a pose counts in units of its repeatability, and each of its three numbers as much as a row."""
 
     channels: float
-    resolved: float
     poses: float
 
     @property
@@ -98,12 +99,9 @@ def _compared(comparison, fit, rows):
     poses; and `_Off`."""
     raw = fit.raw(comparison, exact=rows)
     residual = [comparison.unposed(i, raw[i]) for i in rows]
-    channels, resolved = (
-        sum((((r / sigma) ** 2).mean(1) - 1).sum() for r, sigma in zip(residual, sigmas))
-        for sigmas in ([comparison.noises] * len(rows), comparison.sigmas[rows])
-    )
+    channels = sum((((r / comparison.noises) ** 2).mean(1) - 1).sum() for r in residual)
     poses = sum((comparison.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
-    return raw, residual, _Off(float(channels), float(resolved), float(poses))
+    return raw, residual, _Off(float(channels), float(poses))
 
 
 def _by_chance(comparison, aside):
@@ -127,11 +125,18 @@ def _worse(comparison, before, after, aside) -> bool:
     return bool(0.5 * rows * max(loss) > _NATS)
 
 
-def _closed(before, after):
-    """Share of the root mean square that is taken away of what is beyond noise and resolution, or beyond
-    noise alone where that is all there is."""
-    first, last = before[-1], after[-1]
-    for a, b in ((first.resolved + first.poses, last.resolved + last.poses), (first.off, last.off)):
-        if a > 0:
-            return float(1 - np.sqrt(max(b, 0.0) / a))
-    return 0.0
+def _closed(comparison, before, after, law, aside):
+    """Share of the root mean square of what effects act on that they take away; law: share of what they
+    change by which their laws may be off.
+
+    What they leave beyond noise is what their laws lack and what the base model is off by, each as much as is
+    expected of it: that share, and the model's resolution."""
+    (_, first, begun), (_, last, left) = before, after
+    change = sum((((a - b) / comparison.noises) ** 2).mean(1).sum() for a, b in zip(first, last))
+    base = sum(
+        len(r) * ((comparison.sigmas[i] / comparison.noises) ** 2 - 1).mean() for i, r in zip(aside, last)
+    )
+    remains = max(left.channels, 0.0)
+    lacking = remains * law**2 * change / max(law**2 * change + base, 1e-12)
+    hidden = begun.channels - remains + lacking
+    return float(1 - np.sqrt(lacking / hidden)) if hidden > lacking else 0.0
