@@ -7,6 +7,7 @@ import scipy.spatial
 import warp as wp
 
 from biotac_mj.skin.precondition.block_inverse import DissectedInverse
+from biotac_mj.skin.precondition.block_products import Product
 from biotac_mj.skin.precondition.right_hand_sides import LOW, RAISE
 from biotac_mj.skin.program import Launcher, Program
 
@@ -53,7 +54,7 @@ def test_a_product_is_the_inverse_and_its_own_entries(stiffness, thirds, close):
     b[7, 1] = 1.0  # one force
     b[:, 2] = 0.1
     b /= np.linalg.norm(b, axis=0)
-    product = inverse.product(5)
+    product = Product(inverse, 5)
     rows = written(product, inverse, b)
     Program("cpu", product.run).run()
     z = product.answer.numpy()[rows, :5] / float(RAISE) * inverse.back
@@ -76,7 +77,7 @@ def test_pieces_without_joints(nodes):
     K = scipy.sparse.block_diag([a @ a.T + 3 * np.eye(len(a)) for a in parts]).tocsc()
     inverse = DissectedInverse(K, points, wp.get_device("cpu"), False)
     b = rng.normal(size=(3 * nodes, 2)) / np.sqrt(3 * nodes)
-    product = inverse.product(2)
+    product = Product(inverse, 2)
     rows = written(product, inverse, b)
     Program("cpu", product.run).run()
     z = product.answer.numpy()[rows, :2] / float(RAISE) * inverse.back
@@ -103,7 +104,7 @@ def test_two_right_hand_sides_of_few_worlds_at_once(stiffness, thirds, worlds):
     b /= np.linalg.norm(b, axis=1, keepdims=True)
     exact = np.stack([scipy.sparse.linalg.spsolve(K, side).reshape(side.shape) for side in b])
     rows = (inverse.row[:, None] + np.arange(3)).ravel()
-    product = inverse.product(worlds, two=True)
+    product = Product(inverse, worlds, two=True)
     side = product.side.numpy()
     for at, of in enumerate(b):
         raised = (float(RAISE) * of).astype(np.float32)

@@ -4,7 +4,7 @@ import warp as wp
 
 from .contact.posed import LoadPath
 from .forces import Forces
-from .newton import bodies
+from .newton import bodies, nodes
 from .program import Launcher
 from .types import real, vec3
 
@@ -111,17 +111,14 @@ class CompliantBodies:
     def soften_product(self, program: Launcher) -> None:
         """Subtracts from the product q the contact stiffness that the bodies' compliance takes away."""
         on = self._data.worlds.running
-        self._compute_load(program, self._k.p, on)
-        self._forces.decide(program, bodies.body_motion, [self._load, on, *self._structs, self._data.worlds])
+        self._move_by_load(program, 0, self._k.p, on)
         self._add_body_forces(program, -1.0, on, self._k.q, self._k.partial)
 
     def step(self, program: Launcher) -> None:
         """Takes the bodies' full step for the solution dx."""
         on = self._data.worlds.active
-        self._compute_load(program, self._k.dx, on)
-        st = self._data.worlds
-        self._forces.decide(program, bodies.find_step, [self._load, on, *self._structs, st])
-        self._launch(program, bodies.move_bodies, self._groups, [1, on, st, *self._structs])
+        self._move_by_load(program, 1, self._k.dx, on)
+        self._launch(program, bodies.move_bodies, self._groups, [1, on, self._data.worlds, *self._structs])
 
     def move(self, program: Launcher) -> None:
         """Moves the bodies by the change of the step length, as the nodes in a line search."""
@@ -133,10 +130,11 @@ class CompliantBodies:
         self.compute_wrench(program)
         self._launch(program, bodies.add_slope, self._groups[1], [self._data.worlds, *self._structs, partial])
 
-    def _compute_load(self, program, p, on):
+    def _move_by_load(self, program, ends, p, on):
         d, f = self._data, self._forces
         inputs = [f.wrench_chunk, d.x, f.contact, p, on, d.body_contact]
         self._launch(program, self._kernels.body_load, self._faces, inputs, [self._load])
+        f.decide(program, bodies.body_motion, [ends, self._load, on, *self._structs, d.worlds])
 
     def _add_body_forces(self, program, sign, on, r, square):
         d, f, m = self._data, self._forces, self._forces.m
@@ -145,7 +143,7 @@ class CompliantBodies:
         self._launch(program, self._kernels.add_body_forces, (self._k.nchunk, d.nworld), inputs, [r, square])
 
     def _set(self, program, value, on, out):
-        self._launch(program, bodies.set_where, self._groups, [value, on, out])
+        self._launch(program, nodes.set_where, self._groups, [value, on, out])
 
     def _launch(self, program, kernel, dim, inputs, outputs=()):
         self._forces.launch(program, kernel, dim, inputs, outputs)

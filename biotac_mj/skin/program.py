@@ -34,7 +34,7 @@ class Launcher:
         block_dim: int = 256,
     ) -> None:
         """Launches a kernel over dim."""
-        self._send(wp.launch, kernel, dim, inputs, outputs, block_dim)
+        self._send(kernel, dim, inputs, outputs, block_dim)
 
     def launch_blocks(
         self,
@@ -45,9 +45,10 @@ class Launcher:
         block_dim: int = 128,
     ) -> None:
         """Launches a kernel with a block of threads for each item of dim."""
-        self._send(wp.launch_tiled, kernel, dim, inputs, outputs, block_dim)
+        self._send(kernel, dim, inputs, outputs, block_dim, tiled=True)
 
-    def _send(self, launch, kernel, dim, inputs, outputs, block_dim):
+    def _send(self, kernel, dim, inputs, outputs, block_dim, tiled=False):
+        launch = wp.launch_tiled if tiled else wp.launch
         how = dict(dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device)
         if self._packed is None:
             launch(kernel, **how)
@@ -84,12 +85,9 @@ class _Modules(Launcher):
         super().__init__(device)
         self.found = {}
 
-    def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
+    def _send(self, kernel, dim, inputs, outputs, block_dim, tiled=False):
         if _any(dim):
             self.found[kernel.module, block_dim] = None
-
-    def launch_blocks(self, kernel, dim, inputs, outputs=(), block_dim=128):
-        self.launch(kernel, dim, inputs, outputs, block_dim)
 
     def loop(self, flag, body):
         body()
@@ -220,31 +218,11 @@ class Program(Launcher):
         commands, self._open = in_a_row(self._open), outer
         return commands
 
-    def launch(
-        self,
-        kernel: wp.Kernel,
-        dim: int | Sequence[int],
-        inputs: Sequence,
-        outputs: Sequence = (),
-        block_dim: int = 256,
-    ) -> None:
+    def _send(self, kernel, dim, inputs, outputs, block_dim, tiled=False):
         if self.device.is_cuda:
-            super().launch(kernel, dim, inputs, outputs, block_dim)
+            super()._send(kernel, dim, inputs, outputs, block_dim, tiled)
         elif _any(dim):
-            self._open.append(recorded(kernel, dim, inputs, outputs))
-
-    def launch_blocks(
-        self,
-        kernel: wp.Kernel,
-        dim: int | Sequence[int],
-        inputs: Sequence,
-        outputs: Sequence = (),
-        block_dim: int = 128,
-    ) -> None:
-        if self.device.is_cuda:
-            super().launch_blocks(kernel, dim, inputs, outputs, block_dim)
-        else:
-            self._open.append(recorded(kernel, dim, inputs, outputs, tiled=True))
+            self._open.append(recorded(kernel, dim, inputs, outputs, tiled=tiled))
 
     def loop(self, flag: wp.array, body: Callable[[], None]) -> None:
         if self.device.is_cuda:

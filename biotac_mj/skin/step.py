@@ -405,8 +405,10 @@ class SkinStep:
             self._launcher.branch(self._any_failed, self._restart_untouched)
         bounds, passed = [_LEAST_INCREMENT if g.count else 1.0, m.options.max_work], k.flags[3:5]
         self._launch(load_path.choose_increment, d.nworld, [*bounds, st, passed, self._any_increment])
-        self._launch(load_path.accept_geoms, (g.count, d.nworld), [g.struct, st.accepted])
-        self._launch(nodes.accept_nodes, d.x.shape, [d.x, st.accepted], [k.x_start])
+        # slip of new contact counts from the poses at the end of an accepted increment
+        poses = [(g.struct.pos, g.struct.pos_last), (g.struct.mat, g.struct.mat_last)]
+        for value, out in [*poses, (d.x, k.x_start)]:
+            self._set(value, st.accepted, out)
         self._forces.commit_contacts(self._launcher, st.accepted)
         if self._compliant:
             self._compliant.accept(self._launcher, st.accepted)
@@ -417,7 +419,7 @@ class SkinStep:
         """Starts a try from the reference configuration in worlds where nothing touches it. A skin that all
         geoms left in one step is far from it, and would take many load increments."""
         d, st = self.d, self.st
-        self._launch(nodes.set_to_reference, d.x.shape, [d.rest_vert, st.moving], [d.x])
+        self._set(d.rest_vert, st.moving, d.x)
         if self._compliant:
             self._compliant.release(self._launcher, st.moving)
             self._pose(st.trial_factor, st.moving)
@@ -461,7 +463,7 @@ class SkinStep:
         if self._compliant:
             self._compliant.restore(self._launcher, on)
         self._pose(fraction, on)
-        self._launch(nodes.restore_nodes, self.d.x.shape, [self.k.x_start, on], [self.d.x])
+        self._set(self.k.x_start, on, self.d.x)
 
     def _pose(self, fraction, on):
         """Sets the geoms to a load factor of their path, moved by their compliant bodies."""
@@ -596,6 +598,9 @@ class SkinStep:
 
     def _launch(self, kernel, dim, inputs, outputs=()):
         self._forces.launch(self._launcher, kernel, dim, inputs, outputs)
+
+    def _set(self, value, on, out):
+        self._launch(nodes.set_where, out.shape, [value, on], [out])
 
     def _decide(self, kernel, inputs, outputs=()):
         self._forces.decide(self._launcher, kernel, inputs, outputs)

@@ -12,6 +12,7 @@ from ...coupling.implicit.kinematics import Kinematics
 from ...coupling.implicit.rules import beta_of
 from ...coupling.instance import Instance
 from ...coupling.structs import DataView, ModelView, c_structs
+from ...geometry.rigid import displacement
 
 __all__ = ["Bodies", "Start"]
 
@@ -177,15 +178,7 @@ class Bodies:
                         )
                         for sign in (_EPS, -_EPS)
                     )
-                    turn = m1 @ m0.transpose(0, 2, 1)
-                    turn = 0.5 * np.stack(
-                        [
-                            turn[:, 2, 1] - turn[:, 1, 2],
-                            turn[:, 0, 2] - turn[:, 2, 0],
-                            turn[:, 1, 0] - turn[:, 0, 1],
-                        ],
-                        1,
-                    )
+                    turn = displacement(p1, m1, p0, m0)[:, 3:]
                     columns.append(np.concatenate([p1 - p0, turn], 1).ravel() / (2 * _EPS))
                 slopes[name] = np.array(columns).T if columns else np.zeros((6 * ngeom, 0))
             return slopes

@@ -32,12 +32,10 @@ __all__ = [
     "begin_bodies",
     "bodies_kernels",
     "end_pending",
-    "find_step",
     "measure_stiffness",
     "find_pending",
     "move_bodies",
     "body_motion",
-    "set_where",
     "begin_iteration",
     "copy_flags",
 ]
@@ -122,18 +120,6 @@ def end_pending(st: Worlds, d: BodyContact):
     st.active[w] = st.unfinished[w]
     for g in range(d.pending.shape[0]):
         d.pending[g, w] = vec6()
-
-
-@wp.kernel
-def set_where(
-    value: wp.array2d(dtype=wp.spatial_vectord),
-    on: wp.array(dtype=int),
-    out: wp.array2d(dtype=wp.spatial_vectord),
-):
-    """out = value for body g in the worlds that are on."""
-    g, w = wp.tid()
-    if on[w] == 1:
-        out[g, w] = value[g, w]
 
 
 @wp.kernel
@@ -242,12 +228,6 @@ def _motion_by(w: int, g: int, b: Bodies, wrench: wp.array2d(dtype=wp.spatial_ve
 
 
 @wp.func
-def _compliance_factor(st: Worlds, w: int):
-    """Factor on the bodies' compliance by their artificial viscosity."""
-    return real(1.0) / (real(1.0) + st.viscosity[w])
-
-
-@wp.func
 def _corrected(w: int, g: int, d: BodyContact, wrench: wp.array2d(dtype=wp.spatial_vectord)):
     """(1 + S A)^-1 times wrenches on all bodies, for body g."""
     y = vec6()
@@ -256,6 +236,16 @@ def _corrected(w: int, g: int, d: BodyContact, wrench: wp.array2d(dtype=wp.spati
             for j in range(6):
                 y[i] = y[i] + d.inverse[w, 6 * g + i, 6 * h + j] * wrench[h, w][j]
     return y
+
+
+@wp.func
+def _respond(w: int, b: Bodies, d: BodyContact, st: Worlds):
+    """Changes of the wrenches by the loads `b.wrench`, and the motions of the bodies by these."""
+    factor = real(1.0) / (real(1.0) + st.viscosity[w])  # on the compliance, by the artificial viscosity
+    for g in range(b.motion.shape[0]):
+        d.step[g, w] = factor * _corrected(w, g, d, b.wrench)
+    for g in range(b.motion.shape[0]):
+        b.motion[g, w] = _motion_by(w, g, b, d.step)
 
 
 @wp.kernel
@@ -286,7 +276,7 @@ def begin_iteration(
         if t == 0:
             d.residual[g, w] = d.skin_wrench[g, w] - b.posed[g, w] - S * d.pending[g, w]
             for h in range(groups):
-                M = _compliance_factor(st, w) * S * b.compliance[g, h, w]
+                M = S * b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])
                 for i in range(6):
                     for j in range(6):
                         d.inverse[w, 6 * g + i, 6 * h + j] = M[i, j]
@@ -296,10 +286,10 @@ def begin_iteration(
         return
     _invert(w, 6 * groups, d.inverse, d.pivot)
     for g in range(groups):
-        b.wrench[g, w] = _corrected(w, g, d, d.residual)
+        b.wrench[g, w] = d.residual[g, w]
+    _respond(w, b, d, st)
     body_residual = real(0.0)
     for g in range(groups):
-        b.motion[g, w] = _compliance_factor(st, w) * _motion_by(w, g, b, b.wrench)
         body_residual += wp.dot(b.motion[g, w], d.residual[g, w])
         b.motion[g, w] = b.motion[g, w] + d.pending[g, w]
     st.body_residual[w] = body_residual
@@ -318,9 +308,10 @@ def _load_on(w: int, t: int, g: int, partial: wp.array3d(dtype=vec3)):
 
 @wp.kernel
 def body_motion(
-    partial: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: BodyContact, st: Worlds
+    ends: int, partial: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: BodyContact, st: Worlds
 ):
-    """Motions B R' D p of the bodies of world w. partial: R' D p of each chunk."""
+    """Motions B R' D p of the bodies of world w. partial: R' D p of each chunk. ends: 1: p is the solution
+    dx, and the residual is added: the step dy of the wrenches in an iteration, and its motions."""
     w, t = wp.tid()
     if on[w] == 0:
         return
@@ -328,35 +319,15 @@ def body_motion(
     for g in range(groups):
         load = _load_on(w, t, g, partial)
         if t == 0:
-            d.step[g, w] = load
+            b.wrench[g, w] = load + real(ends) * d.residual[g, w]
     if t > 0:
         return
-    for g in range(groups):
-        b.wrench[g, w] = _corrected(w, g, d, d.step)
-    for g in range(groups):
-        b.motion[g, w] = _compliance_factor(st, w) * _motion_by(w, g, b, b.wrench)
-
-
-@wp.kernel
-def find_step(
-    partial: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, d: BodyContact, st: Worlds
-):
-    """Step dy of the wrenches and of the bodies in an iteration. partial: R' D dx of each chunk."""
-    w, t = wp.tid()
-    if on[w] == 0:
+    _respond(w, b, d, st)
+    if ends == 0:
         return
-    groups = b.motion.shape[0]
-    for g in range(groups):
-        load = _load_on(w, t, g, partial)
-        if t == 0:
-            b.wrench[g, w] = d.residual[g, w] + load
-    if t > 0:
-        return
-    for g in range(groups):
-        d.step[g, w] = _compliance_factor(st, w) * _corrected(w, g, d, b.wrench)
     viscous_work = real(0.0)
     for g in range(groups):
-        d.displacement[g, w] = _motion_by(w, g, b, d.step)
+        d.displacement[g, w] = b.motion[g, w]
         viscous_work += wp.dot(d.displacement[g, w], d.step[g, w])
     st.viscous_work[w] = st.viscous_work[w] + st.viscosity[w] * viscous_work
 

@@ -111,7 +111,9 @@ def choose_beta(partial: wp.array3d(dtype=real), st: Worlds):
 @functools.cache
 def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
     """Kernels of conjugate gradients and of the line search, for one precision of directions."""
-    return types.SimpleNamespace(**_product_kernels(precision), **_search_kernels(precision))
+    return types.SimpleNamespace(
+        **_product_kernels(precision), **_update_kernels(precision), **_search_kernels(precision)
+    )
 
 
 def _product_kernels(precision):
@@ -223,6 +225,13 @@ def _product_kernels(precision):
         partial_out[1, c, w] = gp
         partial_out[2, c, w] = viscous
 
+    return {"assemble_product": assemble_product, "measure_product": measure_product}
+
+
+def _update_kernels(precision):
+    module = f"{__name__}.{precision.name}"
+    scalar, vec, lower = precision.scalar, precision.vec, precision.lower
+
     @wp.kernel(module=module, enable_backward=False)
     def update_solution(
         # In:
@@ -267,12 +276,7 @@ def _product_kernels(precision):
         if st.running[w] == 1:
             p[i, w] = z[i, w] + scalar(st.beta[w]) * p[i, w]
 
-    return {
-        "assemble_product": assemble_product,
-        "measure_product": measure_product,
-        "update_solution": update_solution,
-        "next_direction": next_direction,
-    }
+    return {"update_solution": update_solution, "next_direction": next_direction}
 
 
 def _search_kernels(precision):

@@ -26,7 +26,6 @@ __all__ = [
     "end_try",
     "end_path",
     "choose_increment",
-    "accept_geoms",
     "lag_friction",
     "place_geoms",
     "end_geoms",
@@ -251,15 +250,6 @@ def place_geoms(
         pos, mat = follow_wrench(h, w, b, m, geoms.pos[g, w], geoms.mat[g, w])
         geoms.pos[g, w] = pos
         geoms.mat[g, w] = mat
-
-
-@wp.kernel
-def accept_geoms(geoms: Geoms, accepted: wp.array(dtype=int)):
-    """Stores the poses at the end of an accepted increment: slip of new contact counts from there."""
-    g, w = wp.tid()
-    if accepted[w] == 1:
-        geoms.pos_last[g, w] = geoms.pos[g, w]
-        geoms.mat_last[g, w] = geoms.mat[g, w]
 
 
 @wp.kernel

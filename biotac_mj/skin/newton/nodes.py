@@ -5,10 +5,11 @@ Sums over nodes are made chunk by chunk, so that their order is always the same.
 
 import functools
 import types
+from typing import Any
 
 import warp as wp
 
-from ..types import Precision, mat33, real, sum_of_lanes, vec3
+from ..types import Precision, mat33, real, sum_of_lanes, vec3, vec6
 from .worlds import Worlds
 
 __all__ = [
@@ -21,11 +22,9 @@ __all__ = [
     "end_core",
     "end_nodes",
     "predict_free_flight",
-    "accept_nodes",
-    "set_to_reference",
     "correct_pressure",
     "nodes_kernels",
-    "restore_nodes",
+    "set_where",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -96,41 +95,21 @@ def begin_nodes(
 
 
 @wp.kernel
-def restore_nodes(
+def set_where(
     # In:
-    x_start: wp.array2d(dtype=vec3),
+    value: wp.array2d(dtype=Any),
     on: wp.array(dtype=int),
     # Out:
-    x: wp.array2d(dtype=vec3),
+    out: wp.array2d(dtype=Any),
 ):
-    """Returns node i to the equilibrium of the last accepted load increment."""
+    """out = value [item, 1 or nworld] at item i in the worlds that are on."""
     i, w = wp.tid()
     if on[w] == 1:
-        x[i, w] = x_start[i, w]
+        out[i, w] = value[i, w % value.shape[1]]
 
 
-@wp.kernel
-def set_to_reference(
-    # In:
-    rest: wp.array2d(dtype=vec3),
-    on: wp.array(dtype=int),
-    # Out:
-    x: wp.array2d(dtype=vec3),
-):
-    """Moves node i to the reference configuration, rest [nvert, 1 or nworld]."""
-    i, w = wp.tid()
-    if on[w] == 1:
-        x[i, w] = rest[i, w % rest.shape[1]]
-
-
-@wp.kernel
-def accept_nodes(
-    x: wp.array2d(dtype=vec3), accepted: wp.array(dtype=int), x_start_out: wp.array2d(dtype=vec3)
-):
-    """Stores node i at the end of an accepted load increment."""
-    i, w = wp.tid()
-    if accepted[w] == 1:
-        x_start_out[i, w] = x[i, w]
+for _type in (vec3, mat33, vec6):  # compiled with the others, ahead of a capture
+    wp.overload(set_where, [wp.array2d(dtype=_type), wp.array(dtype=int), wp.array2d(dtype=_type)])
 
 
 @wp.kernel

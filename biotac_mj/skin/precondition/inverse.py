@@ -11,6 +11,7 @@ from ..newton.worlds import Worlds
 from ..program import Launcher
 from ..types import real
 from . import right_hand_sides, woodbury
+from .block_products import Product
 from .pushed_forward import PushForwardMatrices, pushes_forward
 
 __all__ = ["Inverse"]
@@ -30,7 +31,7 @@ class Inverse:
     Attributes:
       pushed: `PushForwardMatrices`, or None if the inverse of the undeformed skin is used.
       node_map: rows, matrices and scales by which kernels read and write the inverse's vectors.
-      needs_torch: see `block_inverse.Product`.
+      needs_torch: see `block_products.Product`.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class Inverse:
             self.pushed = PushForwardMatrices(model.elements, nworld, model.device, lanes)
         self._undeformed = self._node_map(row, none, norm)
         self.node_map = self._node_map(row, self.pushed.matrix, norm) if self.pushed else self._undeformed
-        self._product = self.inverse.product(nworld, two=bool(self._liquid))
+        self._product = Product(self.inverse, nworld, two=bool(self._liquid))
         self.needs_torch = self._product.needs_torch
 
     def _node_map(self, row, matrix, norm):

@@ -1,0 +1,197 @@
+"""Stress, its derivative and dilatation at an integration point of one kind of element, law and rubber."""
+
+import functools
+import types
+from typing import NamedTuple
+
+import warp as wp
+
+from ..types import Precision, mat33, real
+from .law import (
+    LAWS,
+    barrier_derivative,
+    barrier_stress,
+    dilatation,
+    dilatation_gradient,
+    dilatation_hessian,
+    polar,
+    polar_single,
+    polar_upright,
+    stress,
+    stress_derivative,
+)
+from .points import Mesh, Rubber, point_functions
+
+__all__ = ["Kind", "material_functions"]
+
+wp.set_module_options({"enable_backward": False})
+
+# det F below which the line search rejects a step of rubber with friction elements, whose strain is isochoric
+_FLAT = 0.02
+
+
+class Kind(NamedTuple):
+    """One kind of element, law and rubber, which has kernels of its own."""
+
+    corners: int
+    corotational: bool
+    precision: Precision
+    options: tuple
+
+    @property
+    def npoint(self) -> int:
+        return 1 if self.corners == 4 else 4
+
+    @property
+    def averaged(self) -> bool:
+        """Whether the mean dilatation of an element has a stiffness of its own."""
+        return self.corners == 10
+
+    @property
+    def is_single(self) -> bool:
+        return self.precision.name == "single"
+
+    @property
+    def module(self) -> str:
+        law = "corotational" if self.corotational else "laws"
+        return f"{__package__}.elements.{self.corners}_{law}_{self.precision.name}_{'_'.join(self.options)}"
+
+    @property
+    def serial_module(self) -> str:
+        # in a module of their own where CUDA does not use them, since they take longest to compile
+        return f"{self.module}.serial" if self.averaged and self.is_single else self.module
+
+    @property
+    def gradients(self) -> type:
+        """Type of the shape functions' gradients by parent coordinates."""
+        return wp.types.matrix(shape=(self.corners, 3), dtype=real)
+
+
+@functools.cache
+def material_functions(kind: Kind) -> types.SimpleNamespace:
+    """Stress, its derivative and dilatation at an integration point."""
+    corotational, averaged, options, is_single = (
+        kind.corotational,
+        kind.averaged,
+        kind.options,
+        kind.is_single,
+    )
+    scalar, vec, mat = kind.precision.scalar, kind.precision.vec, kind.precision.mat
+    thin, wide = kind.precision.narrow, kind.precision.widen
+    polar_thin = polar_single if is_single else polar
+    # no step ends with an inverted element: on CUDA registers matter more than the digits of its rotation
+    polar_full = polar_upright if is_single else polar
+    beyond = [name for name in options if name != "modulus"]
+    uneven = "modulus" in options
+    at = point_functions(options)
+    beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
+
+    @wp.func
+    def rotation(F: mat33):
+        if wp.static(corotational):
+            return polar_full(F)
+        return mat33()
+
+    @wp.func
+    def rotation_thin(F: mat):
+        if wp.static(corotational):
+            return polar_thin(F)
+        return mat()
+
+    @wp.func
+    def theta(law: int, F: mat33, R: mat33):
+        if wp.static(corotational):
+            return wp.ddot(R, F) - real(3.0)
+        return dilatation(law, F, R)
+
+    @wp.func
+    def stress_of(
+        rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, pressure: real, F: mat33, R: mat33
+    ):
+        """First Piola stress [Pa], with the pressure of the mean dilatation."""
+        if wp.static(corotational):
+            P = (mu + mu) * (F - R) + (lam * (wp.ddot(R, F) - real(3.0)) + pressure) * R
+        else:
+            P = stress(rubber.law, mu, lam, F, R)
+            if wp.static(averaged):
+                P += pressure * dilatation_gradient(rubber.law, F, R)
+        if wp.static(len(beyond) > 0):
+            P += beyond_stress(rubber, e, i, w, mu, lam, F, R)
+        return P + barrier_stress(rubber.law, mu, F)
+
+    @wp.func
+    def direction_of(law: int, F: mat, R: mat):
+        """Derivative of the dilatation by F."""
+        if wp.static(corotational):
+            return R
+        return thin(dilatation_gradient(law, wide(F), wide(R)))
+
+    @wp.func
+    def change_of(
+        rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, pressure: real, F: mat, R: mat, dF: mat
+    ):
+        """Derivative of the stress along dF, at constant pressure of the mean dilatation."""
+        if wp.static(corotational):
+            m = scalar(mu)
+            l = scalar(lam)
+            Rt = wp.transpose(R)
+            S = Rt * F
+            A = Rt * dF
+            trace_s = wp.trace(S)
+            turn = vec(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+            dR = R * wp.skew(wp.inverse(trace_s * wp.identity(n=3, dtype=scalar) - S) * turn)
+            dP = (
+                scalar(2.0) * m * (dF - dR)
+                + l * wp.trace(A) * R
+                + (l * (trace_s - scalar(3.0)) + scalar(pressure)) * dR
+            )
+            if wp.static(len(beyond) > 0):
+                dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
+            return dP + barrier_derivative(rubber.law, m, F, dF)
+        D = wide(dF)
+        Q = wide(R)
+        G = wide(F)
+        total = stress_derivative(rubber.law, mu, lam, G, Q, D)
+        if wp.static(averaged):
+            total += pressure * dilatation_hessian(rubber.law, G, Q, D)
+        if wp.static(len(beyond) > 0):
+            total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
+        return thin(total) + barrier_derivative(rubber.law, scalar(mu), F, dF)
+
+    @wp.func
+    def weighted_volume(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):
+        """Volume of point q times the element's factor on the modulus [m^3]."""
+        if wp.static(uneven):
+            return mesh.weight[e, q] * rubber.modulus[e, w]
+        return mesh.weight[e, q]
+
+    @wp.func
+    def local_lame(mu: real, lam: real, cap: real):
+        if wp.static(averaged):
+            return wp.min(lam, cap * mu)
+        return lam
+
+    @wp.func
+    def flaw(law: int, F: mat33):
+        """Defect of a point: 2 inverted, 1 flatter than the law allows, 3 both. Small strain has none."""
+        found = int(0)
+        if law != wp.static(LAWS["linear"]):
+            volume = wp.determinant(F)
+            if not (volume > real(0.0)):
+                found = 2
+            if wp.static("hysteresis" in options):
+                if law == wp.static(LAWS["neo_hookean"]) and not (volume > real(_FLAT)):
+                    found += 1
+        return found
+
+    return types.SimpleNamespace(
+        rotation=rotation,
+        rotation_thin=rotation_thin,
+        theta=theta,
+        stress_of=stress_of,
+        direction_of=direction_of,
+        change_of=change_of,
+        weighted_volume=weighted_volume,
+        local_lame=local_lame,
+        flaw=flaw,
+    )
