@@ -11,6 +11,7 @@ import warp as wp
 from ..coupling.implicit import energy, rounds
 from ..coupling.implicit.compliance import Response, add_stiffness
 from ..coupling.implicit.marks import Marks
+from ..coupling.implicit.rows import write_rows
 from ..coupling.implicit.rules import LOSS_FREQUENCY
 from ..coupling.loads import core_geom
 from ..coupling.solid_contacts import SolidPairs
@@ -73,6 +74,7 @@ class Batch(Skins):
             self._of_step = r = rounds.make_rounds(*self.groups, limit)
             self._step = wp.full(self.groups, self.dt, dtype=wp.float64)
             self._greedy = wp.zeros(self.nworld, dtype=int)
+            self._no_basis = wp.zeros((0, self.nworld), dtype=wp.spatial_vectord)
         view = ModelView(mjm._address)
         self._core_geom, self.ngeom = core_geom(view, touching.core), len(touching.geom)
         pairs = SolidPairs(view, touching)
@@ -135,11 +137,11 @@ class Batch(Skins):
         self._find_wrenches()
         efc = d.efc
         self._launch(
-            dynamics.write_rows,
+            write_rows,
             (*self._row.shape, self._jacobian.shape[2]),
             [self._of_step.square, self._group_slot, self._row, self._jacobian, self.model.tangent0]
             + [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
-            [efc.J, efc.D, efc.aref, efc.pos],
+            [efc.J, efc.D, efc.aref, efc.pos, self._no_basis],
         )
 
     @property

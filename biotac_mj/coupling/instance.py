@@ -40,7 +40,7 @@ NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
 _TINY = np.finfo(float).tiny
-_RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_RK4, _DISCRETE = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("RK4", "DISCRETE"))
 NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
 
@@ -52,7 +52,8 @@ class Instance:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
       step_gamma: (ngroup,) Newmark's gamma of the bodies in the last step that was solved.
       frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s]; None leaves the stored one.
-      state_address: of its plugin state, which stays where it is.
+      state: (nstate,) view of the plugin state, which stays where it is; parts: its parts, see `Setup.parts`;
+        state_address: where it is.
       kinematics: `Kinematics` of the touching bodies.
       sensed: whether the readings of this step are written.
       number: among the two-way instances; springs: `Springs` of the mjData.
@@ -91,8 +92,8 @@ class Instance:
                 f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: "
                 "compile it again from its XML or MjSpec"
             )
-        self._state = slice(start, start + setup.nstate)
-        self.state_address = self.state.ctypes.data
+        self.state = data.plugin_state[start : start + setup.nstate]
+        self.parts, self.state_address = setup.parts(self.state), self.state.ctypes.data
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved, self.sensed = {}, False
         self._error, self._outcome = False, _ALONE
@@ -102,11 +103,6 @@ class Instance:
         self.skins_met, self.number, self.springs = (), -1, None
         self._stages = []  # of Runge-Kutta: what acted, and where
         self._shown = None
-
-    @property
-    def state(self) -> np.ndarray:
-        """(nstate,) view of the plugin state."""
-        return self.data.plugin_state[self._state]
 
     @property
     def horizon(self) -> float:
@@ -128,7 +124,7 @@ class Instance:
             energy[energy == np.inf] = 0.0
             bad = not np.isfinite(state).all()
         if cause is not None and not bad:
-            turned = self.setup.parts(self.state)[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
+            turned = self.parts[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
             bad = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) > 1e-6
         if bad:
             raise ValueError(
@@ -144,7 +140,7 @@ class Instance:
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         self.sensed = False
         self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
-        if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
+        if self.two_way and self.model.opt.integrator == _DISCRETE:
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
                 "choose implicitfast, implicit or Euler, or coupling='one-way'"
@@ -153,7 +149,7 @@ class Instance:
     def last_model(self) -> tuple:
         """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3),
         (ngroup, 3, 3)."""
-        models = self.setup.parts(self.state)[1]
+        models = self.parts[1]
         return (
             models[:, :6],
             models[:, 6:42].reshape(-1, 6, 6),
@@ -163,11 +159,13 @@ class Instance:
 
     @functools.cached_property
     def _arrays(self):
-        return StepArrays(self.kinematics, self.setup, self.springs, self.inertial)
+        arrays = StepArrays(self.kinematics, self.setup, self.springs, self.inertial)
+        self.metric.record(*arrays.stiffness)
+        return arrays
 
     def begin_arrays(self) -> StepArrays:
         """The arrays of a coupled step that begins: the linear model in force is that of the last step."""
-        arrays, (head, models, *_) = self._arrays, self.setup.parts(self.state)
+        arrays, (head, models, *_) = self._arrays, self.parts
         arrays.record(self.horizon, 0.5 * self.by_stages)
         n = len(models)
         parts = models[:, :6], models[:, 6:42].reshape(n, 6, 6), models[:, 42:45], models[:, 45:54]
@@ -197,7 +195,7 @@ class Instance:
     def is_out_of_reach(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not
         reach it within the step."""
-        stepper, skin = self.setup.skin.stepper, self.setup.parts(self.state)[2]
+        stepper, skin = self.setup.skin.stepper, self.parts[2]
         if not hasattr(stepper, "is_out_of_reach") or not stepper.resting(skin):
             return False
         self._geom_pose = self.touching.geom_pose(pos, mat)
@@ -247,7 +245,7 @@ class Instance:
         result = self._solved.get(key)
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
-            skin, before = self.setup.skin, self.setup.parts(self.state)[2]
+            skin, before = self.setup.skin, self.parts[2]
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
             fraction, path = self.touching.fraction, self.touching.path
@@ -272,7 +270,7 @@ class Instance:
         it does: such contact is wide, and what is not solved goes on until cores meet."""
         if not self.two_way:
             return False
-        head, models, _, _ = self.setup.parts(self.state)
+        head, models, _, _ = self.parts
         if not len(self.dofs):
             return head[CONVERGED] == -1.0
         skins = self.touching.skins
@@ -291,11 +289,11 @@ class Instance:
         stepper = self.setup.skin.stepper
         if result.load_factor > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
             return dataclasses.replace(result, pose=self._came_to(result.state))
-        if not self.setup.parts(self.state)[0][STARTED]:  # the first step
+        if not self.parts[0][STARTED]:  # the first step
             return result
         wrench, tangent, *last = self.last_model()
         state = before.copy()
-        if self.setup.parts(self.state)[0][CONVERGED] <= -PATIENCE:
+        if self.parts[0][CONVERGED] <= -PATIENCE:
             stepper.reset(state)
             if not (hasattr(stepper, "resting") and stepper.resting(state)):  # it has more to lose
                 state[:] = before
@@ -332,24 +330,23 @@ class Instance:
 
     def _key(self):
         """Bytes of all in the plugin state that a solve depends on."""
-        _, models, skin, _ = self.setup.parts(self.state)
+        _, models, skin, _ = self.parts
         stepper = self.setup.skin.stepper
         return models.tobytes(), stepper.key(skin) if hasattr(stepper, "key") else skin.tobytes()
 
     def _counts(self):
         if self._reading is None:
             skin, result = self.setup.skin, self._result
-            state = self.setup.parts(self.state)[3].copy()
+            state, touch, config = self.parts[3].copy(), {}, self.setup.config
             with skin.lock:
-                touch, whole = {}, result.wrench / self.touching.fraction[:, None]
-                felt = dataclasses.replace(result, wrench=whole)  # by the skin itself
-                if self.setup.config.thermal is not None:
+                felt = result.wrench / self.touching.fraction[:, None]  # by the skin itself
+                if config.thermal is not None:
                     after = result.state is not None
                     area = skin.stepper.touched_area(result.state) if after else np.zeros(self.setup.ngroup)
-                    touch = {"area": area, "force": np.linalg.norm(felt.wrench[:, :3], axis=1)}
-                if self.setup.config.textures is not None:
-                    before = self.setup.parts(self.state)[2]
-                    touch["shaking"] = skin.readings.shaking(before, felt, self.model.opt.timestep)
+                    touch = {"area": area, "force": np.linalg.norm(felt[:, :3], axis=1)}
+                if config.textures is not None:
+                    whole = dataclasses.replace(result, wrench=felt)
+                    touch["shaking"] = skin.readings.shaking(self.parts[2], whole, self.model.opt.timestep)
                 counts = skin.readings.advance(
                     state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure, **touch
                 )
@@ -535,7 +532,7 @@ class Instance:
         if self._error or result is None:
             return
         readings, _ = self._counts()
-        head, models, skin, readings_state = self.setup.parts(self.state)
+        head, models, skin, readings_state = self.parts
         _, settled, _, energy, ends, _ = self._outcome
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))

@@ -7,6 +7,7 @@ introspection tables, so that a new release that adds fields needs no change her
 import ctypes
 import math
 import pathlib
+import types
 
 import mujoco
 import numpy as np
@@ -67,9 +68,13 @@ _DTYPES = {
     "uintptr_t": np.uint64,
     "mjtSize": np.int64,
 }
+_ROWS = (
+    *("efc_type", "efc_id", "efc_J", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_pos", "efc_margin"),
+    *("efc_KBIP", "efc_D", "efc_R", "efc_aref", "efc_state", "efc_force"),
+    *("iefc_D", "iefc_R", "map_efc2iefc"),
+)
 _built = {}
 _TINY = np.finfo(float).tiny
-_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 # iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
 _ENOUGH = 99
@@ -205,6 +210,7 @@ class DataView(_View):
     def __init__(self, address: int, model: ModelView):
         super().__init__("mjData", address)
         self.model, self._other = model, model.struct
+        self._where = self._rows = None
 
     def __getattr__(self, name):
         if name not in self._field:
@@ -215,6 +221,16 @@ class DataView(_View):
         ):
             self.__dict__[name] = value
         return value
+
+    def rows(self) -> types.SimpleNamespace:
+        """Arrays of the constraint rows by name. They lie in the arena, and are others once MuJoCo has made
+        constraints again."""
+        struct = self.struct
+        where = [getattr(struct, name) for name in _ROWS]
+        where += [struct.nefc, struct.ne, struct.nJ, struct.nisland]
+        if where != self._where:
+            self._where, self._rows = where, types.SimpleNamespace(**{n: self.array(n) for n in _ROWS})
+        return self._rows
 
     def make_constraints(self) -> None:
         """Makes all constraint rows again, as mj_fwdPosition does: equalities were switched since."""
@@ -235,22 +251,6 @@ class DataView(_View):
         out, force = np.empty(force.shape), np.ascontiguousarray(force)
         LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
         return out
-
-    def springs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Constraint rows that push in proportion to accelerations, as the constraint solver left them: their
-        numbers (k,), Jacobian (k, nv) and stiffness (k,) against accelerations."""
-        rows = np.flatnonzero(self.efc_state[: self.nefc] == _QUADRATIC)
-        jacobian = np.zeros((len(rows), self.model.nv))
-        if self.model.is_sparse:
-            count, start, column, value = (
-                getattr(self, f"efc_J{part}") for part in ("_rownnz", "_rowadr", "_colind", "")
-            )
-            for out, row in zip(jacobian, rows):
-                at = slice(start[row], start[row] + count[row])
-                out[column[at]] = value[at]
-        elif len(rows):
-            jacobian[:] = self.efc_J.reshape(-1, self.model.nv)[rows]
-        return rows, jacobian, self.efc_D[rows]
 
     def find_poses(self) -> None:
         """Makes the poses of bodies, geoms and sites those of the positions of now."""

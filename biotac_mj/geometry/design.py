@@ -110,7 +110,7 @@ class Design:
             raise ValueError(f"design {self.name!r} has no sensor {self.sensor!r}: name one of its sensors")
 
     def __hash__(self):
-        return hash(self.text)
+        return hash(self.name)
 
     @property
     def nelectrode(self) -> int:

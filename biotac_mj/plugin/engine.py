@@ -104,7 +104,7 @@ def _nsensordata(model, index, sensor):
 def _init(model, data, index):
     with _lock:
         world = _worlds.get(data)
-        if world is not None and index == min(world.instances):  # left over from an mjData at this address
+        if world is not None and index == world.begins:  # left over from an mjData at this address
             del _worlds[data]
         _world(model, data, index)
     return 0
@@ -133,9 +133,10 @@ def _reset(model, state, plugin_data, index):
 
 @guarded(raises=lambda model, data, index, capability: _raises(model, index), abandon=_abandon)
 def _compute(model, data, index, capability):
-    watch_interrupts()
     world = _world(model, data, index)
-    last = index == max(world.instances)
+    if index == world.begins:
+        watch_interrupts()
+    last = index == world.last
     if capability == _PASSIVE:
         try:
             world.passive(index)

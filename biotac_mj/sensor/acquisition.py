@@ -39,6 +39,7 @@ from biotac_mj.sensor.acquisition_kernels import (
 from biotac_mj.sensor.presets import SENSORS, Sensor
 
 from ..geometry.design import BIOTAC, Design
+from ..launches import recorded
 from ..short_repr import short_repr
 
 __all__ = [
@@ -274,36 +275,32 @@ class _One:
         )  # fmt: skip
         self.impedance, self.state = self._impedance.numpy()[0], self._state.numpy()[0]
         valid = wp.ones(1, dtype=int, device="cpu")
-        self._still = self._shaken = wp.zeros((1, 0), dtype=real, device="cpu")
-        inputs = [at, 1.0, 0, self._seed, self._due, valid, self._impedance, self._pressure]
-        inputs += [self._temperature, self._liquid, self._still]
-        state = [self._time, self._state]
-        self._sample = wp.launch(kernels.sample_slots, 1, inputs, state, device="cpu", record_cmd=True)
-        self._find = wp.launch(
-            kernels.find_due, 1, [self._time, 1.0, 0, at.nelectrode, at.slots], [self._due], device="cpu",
-            record_cmd=True,
-        )  # fmt: skip
+        self._at, self._still = at, wp.zeros((1, 0), dtype=real, device="cpu")
+        self._signals = [self._seed, self._due, valid, self._impedance, self._pressure, self._temperature]
+        self._signals.append(self._liquid)
+        self._found, self._sampled = {}, {}  # launches by the numbers that they have
 
     def find_due(self, time, dt, every_step):
         self.time[0] = time
-        self._find.set_param_at_index_from_ctype(1, dt)
-        self._find.set_param_at_index_from_ctype(2, int(every_step))
-        self._find.launch()
+        if (dt, every_step) not in self._found:
+            known = [self._time, dt, int(every_step), self._at.nelectrode, self._at.slots]
+            self._found = {(dt, every_step): recorded(kernels.find_due, 1, known, [self._due])}
+        self._found[dt, every_step]()
         return bool(self.due[0])
 
     def sample(self, seed, noise, state, time, dt, impedance, pressure, temperature, liquid, shaken):
         shaken = self._still if shaken is None else shaken
-        if shaken is not self._shaken:
-            self._shaken = shaken
-            self._sample.set_param_at_index(10, shaken)
+        key = dt, noise, id(shaken)
+        if key not in self._sampled:
+            known = [self._at, dt, int(noise), *self._signals, shaken]
+            made = recorded(kernels.sample_slots, 1, known, [self._time, self._state])
+            self._sampled = {key: made}
         self.state[:] = state
         self.seed[0], self.time[0], self.pressure[0], self.temperature[0] = seed, time, pressure, temperature
         self.liquid[0], self.due[0] = liquid, impedance is not None
         if impedance is not None:
             self.impedance[:] = impedance
-        self._sample.set_param_at_index_from_ctype(1, dt)
-        self._sample.set_param_at_index_from_ctype(2, int(noise))
-        self._sample.launch()
+        self._sampled[key]()
         state[:] = self.state
 
 

@@ -14,15 +14,12 @@ __all__ = [
     "acting_wrenches",
     "add_forces",
     "find_rows",
-    "write_rows",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
 
 _EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
-_NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
-_PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
 
 
 @wp.kernel
@@ -84,55 +81,3 @@ def find_rows(
         if row < 0 and efc_type[w, r] == _EQUALITY and efc_id[w, r] == slot[s]:
             row = r
     row_out[s, w] = row
-
-
-@wp.kernel
-def write_rows(
-    # In:
-    square: wp.array2d(dtype=real),
-    group_slot: wp.array(dtype=int),
-    row: wp.array2d(dtype=int),
-    jacobian: wp.array3d(dtype=vec6),
-    tangent: wp.array2d(dtype=mat66),
-    sparse: int,
-    rownnz: wp.array2d(dtype=int),
-    rowadr: wp.array2d(dtype=int),
-    colind: wp.array3d(dtype=int),
-    # Out:
-    J_out: wp.array3d(dtype=float),
-    D_out: wp.array2d(dtype=float),
-    aref_out: wp.array2d(dtype=float),
-    pos_out: wp.array2d(dtype=float),
-):
-    """beta h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L.
-
-    Each thread writes one column of the rows: loads and stores in turn take ten times the sums."""
-    s, w, n = wp.tid()
-    first = row[s, w]
-    if first < 0:
-        return
-    S = mat66()
-    group = int(0)
-    for g in range(tangent.shape[0]):
-        if group_slot[g] == s:  # bodies that are welded together move as one: their stiffnesses add
-            S += square[g, w] * tangent[g, w]
-            group = g
-    whole = wp.get_diag(S)
-    for k in range(6):
-        pivot = wp.float64(0.0)
-        column = vec6()
-        if S[k, k] > _PIVOT * wp.abs(whole[k]):
-            pivot = S[k, k]
-            for i in range(k, 6):
-                column[i] = S[i, k] / pivot
-            S -= pivot * wp.outer(column, column)
-        r = first + k
-        if n == 0:
-            D_out[w, r] = float(wp.max(pivot, _NEGLIGIBLE))
-            aref_out[w, r] = 0.0
-            pos_out[w, r] = 0.0
-        if sparse == 0:
-            J_out[w, r, n] = float(wp.dot(column, jacobian[group, w, n]))
-        elif n < rownnz[w, r]:
-            at = rowadr[w, r] + n
-            J_out[w, 0, at] = float(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))

@@ -153,7 +153,7 @@ class Coupled:
             metric.release()
             return self.forced
         if not self.written:
-            metric.write(self.jacobian, self.tangent, self.square)
+            metric.write(self.touching)
             self.written = True
         self.arrays.find_wrenches()
         return self.correction + self.arrays.wrench
@@ -185,7 +185,7 @@ class Coupled:
         if self.forced is not None:
             return self.forced
         moved = self.square[:, None] * (self._rows @ acceleration).reshape(self.moved.shape)
-        rows = self.instance.metric.excess(self.data, acceleration)
+        rows = self.instance.metric.excess(acceleration)
         rows -= (self.tangent @ moved[:, :, None])[:, :, 0]
         return self.correction + self.arrays.wrench + rows
 

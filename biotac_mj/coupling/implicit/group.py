@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from .coupled import Coupled
-from .integrator import Integrator
 from .springs import Springs
 
 __all__ = ["SkinGroup"]
@@ -28,11 +27,11 @@ class SkinGroup:
             skin.evaluate(acceleration)
         return max(skin.off for skin, _ in self._all)
 
-    def find_compliance(self, skins: Sequence[Coupled], integrator: Integrator | None) -> None:
-        """Finds how the bodies of some skins give way to its wrenches: held by their inertia, by the damping
-        that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the rows of other
-        skins among them, now hold."""
-        self._springs.take(integrator)
+    def find_compliance(self, skins: Sequence[Coupled], inertia: np.ndarray | None) -> None:
+        """Finds how the bodies of some skins give way to its wrenches: held by their inertia, with the
+        damping that the integrator treats implicitly (`Integrator.inertia`; None: M alone), and by what
+        MuJoCo's other constraints, the rows of other skins among them, now hold."""
+        self._springs.take(inertia)
         for skin in skins:
             self._springs.factor(skin.instance.number)
             skin.arrays.find_compliance()

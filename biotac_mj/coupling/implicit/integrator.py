@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from ..structs import LIBRARY, DataView, ModelView
+from .springs import Springs
 
 __all__ = ["Integrator"]
 
@@ -85,7 +86,7 @@ class Integrator:
                 derivative = turning
         if h * np.abs(scale[:, None] * derivative * scale).max(initial=0.0) < _NEGLIGIBLE:
             return False
-        self._inertia, self._step = inertia, np.linalg.solve(inertia - h * derivative, inertia)
+        self._step = np.linalg.solve(inertia - h * derivative, inertia)
         self.inertia = data.M.copy()
         self.inertia[entry] -= 0.5 * h * (derivative[row, column] + derivative[column, row])
         return True
@@ -107,17 +108,16 @@ class Integrator:
         out[..., self.dofs] = acceleration[..., self.dofs] @ self._step.T
         return out
 
-    def slope(
-        self, jacobian: np.ndarray, stiffness: np.ndarray, constrained: np.ndarray, springs: np.ndarray
+    def answer(
+        self, acceleration: np.ndarray, springs: Springs, stiffness: np.ndarray, correction: np.ndarray
     ) -> np.ndarray:
-        """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, which
-        the rows hold.
-
-        Of jacobians (n, 6, nv) and stiffnesses (n, 6, 6), and of other rows that hold (k, nv), (k,).
-        """
-        jacobian = jacobian[:, :, self.dofs]
-        stiff = (stiffness @ jacobian).reshape(-1, len(self.dofs))
-        jacobian, constrained = jacobian.reshape(stiff.shape), constrained[:, self.dofs]
-        whole = self._inertia + jacobian.T @ stiff + constrained.T @ (springs[:, None] * constrained)
-        response = np.linalg.solve(whole, jacobian.T)
-        return np.eye(len(stiff)) - stiff @ (response - self._step @ response)
+        """(nv,) accelerations a of (M + C) a + K a' = f, where MuJoCo's constraint solver has found those of
+        (M + C) a + K a = f + `correction` (nv,), with the stiffness K (nv, nv) of the skins, and C of the
+        other rows that hold: these may be others in each round."""
+        springs.take(None)
+        springs.factor(None)
+        L = springs.L.numpy()[0]
+        held = L @ L.T
+        driven = stiffness.copy()
+        driven[:, self.dofs] = stiffness[:, self.dofs] @ self._step
+        return np.linalg.solve(held + driven, (held + stiffness) @ acceleration - correction)

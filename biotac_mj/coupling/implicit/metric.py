@@ -4,7 +4,7 @@ across kinematic trees.
 The force of the skin is W - beta h^2 S J a, with W its linear model at the pose reached without acceleration,
 S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The
 rest is exactly what a constraint row with regularisation R = 1 / (beta h^2 s) and reference
-acceleration zero gives, one row for each of the six eigenvalues s of S. So MuJoCo's solver finds the
+acceleration zero gives, one row for each of the six pivots s of S = L D L'. So MuJoCo's solver finds the
 accelerations of object and finger together, with every other contact and limit. The rows' forces are equal
 and opposite whatever the masses, and zero at rest, where a = 0. `docs/lab/coupling.md` compares this with the
 alternatives.
@@ -14,9 +14,13 @@ touch gets one."""
 
 import mujoco
 import numpy as np
+import warp as wp
 
+from ...skin.types import real, vec6
 from ..structs import DataView, ModelView
 from ..touching import Touching
+from .kinematics import row
+from .rows import write_rows
 
 __all__ = ["Metric"]
 
@@ -31,6 +35,9 @@ _PLAIN = 1.0, 0.0, 1.0, 0.0  # of a row: stiffness, damping, impedance, its deri
 
 class Metric:
     """The rows between the BioTac's body and the bodies that can touch it.
+
+    Attributes:
+      first: number of the first row of each slot.
 
     Raises:
       ValueError: the model has fewer slots than bodies that can touch.
@@ -49,7 +56,8 @@ class Metric:
                 "adding the objects, or name the geoms that may touch with geoms=[...]"
             )
         self.root = roots
-        self._layout, self._written, self._known = None, {}, {}
+        self._layout, self._filled, self._held = None, False, None
+        self.first, self._numbers = [], np.zeros(0, int)
         self.slot = dict(zip(needed, slots))
         for root, slot in self.slot.items():
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
@@ -80,42 +88,59 @@ class Metric:
         data.eq_active[self._slots] = 1  # switched off with all others, or new to this mjData
         return True
 
+    def record(self, square: wp.array, jacobian: wp.array, tangent: wp.array) -> None:
+        """Makes the launch that finds rows of stiffnesses [group, world] against bodies with these Jacobians,
+        which accelerations move by `square` in the step [m per m/s^2]."""
+        slots, nv = list(self.slot), jacobian.shape[2]
+        self._slot_of = [slots.index(root) if root in self.slot else -1 for root in self.root]
+        n = 6 * len(slots)
+        with wp.ScopedDevice("cpu"):
+            J, D = wp.zeros((1, n, nv), dtype=real), wp.zeros((1, n), dtype=real)
+            basis, unused = wp.zeros((n, 1), dtype=vec6), wp.zeros((1, n), dtype=real)
+            first = wp.array(np.arange(0, n, 6, dtype=np.int32)[:, None], dtype=int)
+            known = [square, wp.array(np.array(self._slot_of, np.int32), dtype=int), first, jacobian, tangent]
+            none = [wp.zeros((1,) * ndim, dtype=int) for ndim in (2, 2, 3)]
+        self._find_stiffness = row(
+            (write_rows, (len(slots), 1, nv), [*known, 0, *none, J, D, unused, unused, basis])
+        )
+        self._J, self._D, self._basis = J.numpy()[0], D.numpy()[0], basis.numpy().reshape(-1, 6, 6)
+
     def find_rows(self, data: DataView) -> None:
         """Finds this step's rows, which MuJoCo has made, and takes their own meaning from them. MuJoCo has to
         make their reference accelerations again before `take_references`.
 
         They lie in the arena: none is made again after this.
         """
-        model = self.model
-        self._rows = {}
         if not self.slot:
             return
-        ids, kinds = data.efc_id[: data.ne], data.efc_type[: data.ne]
+        rows = self._rows = data.rows()
+        ids, kinds = rows.efc_id[: data.ne], rows.efc_type[: data.ne]
         layout = ids.tobytes(), kinds.tobytes()
         if layout != self._layout:  # it rarely changes
-            self._places, self._layout = self._find(ids, kinds), layout
-        islands = data.map_efc2iefc if data.nisland else None
-        for root, here in self._places.items():
-            self._rows[root] = here, None if islands is None else islands[here]
-        data.efc_KBIP[self._all] = _PLAIN
-        data.efc_pos[self._all] = data.efc_margin[self._all]
-        self._stiff, self._weight, self._regular = data.efc_J, data.efc_D, data.efc_R
-        if islands is not None:
-            self._island_weight, self._island_regular = data.iefc_D, data.iefc_R
-        self._columns = None
-        if model.is_sparse:
-            self._columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
-        self._filled = dict.fromkeys(self._rows, True)  # by MuJoCo
-        self._written = {}
+            self._find(ids, kinds)
+            self._layout = layout
+        rows.efc_KBIP[self._all] = _PLAIN
+        rows.efc_pos[self._all] = rows.efc_margin[self._all]
+        self._weights = [(rows.efc_D, rows.efc_R, self._all)]
+        if data.nisland:
+            self._weights.append((rows.iefc_D, rows.iefc_R, rows.map_efc2iefc[self._all]))
+        if self.model.is_sparse:
+            mine, column = self._numbers, rows.efc_J_colind
+            count, start = rows.efc_J_rownnz[mine], rows.efc_J_rowadr[mine]
+            at = np.arange(count.sum()) + np.repeat(start - np.cumsum(count) + count, count)
+            self._entries = rows.efc_J, at, (np.repeat(np.arange(len(mine)), count), column[at])
+        else:
+            self._entries = rows.efc_J.reshape(-1, self.model.nv), self._all, slice(None)
+        self._filled, self._held = True, None  # by MuJoCo
 
-    def take_references(self, data: DataView) -> None:
+    def take_references(self) -> None:
         """Makes the reference accelerations of its rows zero. MuJoCo adds dJ/dt v of the weld that a row was:
         the position takes it off again."""
         if self.slot:
-            data.efc_pos[self._all] += data.efc_aref[self._all]
+            self._rows.efc_pos[self._all] += self._rows.efc_aref[self._all]
 
     def _find(self, ids, kinds):
-        places = {}
+        self.first = []
         for root, slot in self.slot.items():
             index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
             if len(index) != 6:
@@ -124,85 +149,44 @@ class Metric:
                     f"{self.model.name('body', root)!r}: does that body sleep, or was the BioTac's equality "
                     "constraint changed?"
                 )
-            places[root] = slice(int(index[0]), int(index[0]) + 6)
-        rows = np.concatenate([np.arange(here.start, here.stop) for here in places.values()])
+            self.first.append(int(index[0]))
+        self._numbers = rows = (np.array(self.first)[:, None] + np.arange(6)).ravel()
         # neighbours as a rule; a slice is written faster than numbered rows
-        self._all = slice(int(rows.min()), int(rows.max()) + 1) if len(rows) == np.ptp(rows) + 1 else rows
-        return places
-
-    @property
-    def first_rows(self) -> list[int]:
-        """The first row of each slot."""
-        return [here.start for here, _ in self._rows.values()]
+        near = (np.diff(rows) == 1).all()
+        self._all = slice(int(rows[0]), int(rows[-1]) + 1) if near else rows
 
     def numbers(self) -> np.ndarray:
         """Numbers of its rows."""
-        places = [np.arange(here.start, here.stop) for here, _ in self._rows.values()]
-        return np.concatenate([np.zeros(0, int), *places])
+        return self._numbers
 
     def release(self) -> None:
         """Leaves the rows without any stiffness."""
-        for root, filled in self._filled.items() if self.slot else ():
-            if filled:
-                self._fill(root, 0.0, _MINVAL)
-        if self.slot:
-            self._filled, self._written = dict.fromkeys(self._rows, False), {}
+        if self.slot and self._filled:
+            self._fill(0.0, _MINVAL)
+        self._filled, self._held = False, None
 
-    def write(self, jacobian: np.ndarray, tangent: np.ndarray, square: np.ndarray) -> None:
-        """Puts the stiffness of tangents (ngroup, 6, 6) into the rows, of bodies that accelerations move by
-        `square` (ngroup,) [m per m/s^2] in the step."""
+    def write(self, groups: np.ndarray) -> None:
+        """Puts the present stiffness into the rows; groups: those of the bodies that it holds."""
         if not self.slot:
             return
-        total, group_of = {}, {}
-        self._written = {}
-        stiff = square[:, None, None] * tangent
-        for group in np.flatnonzero(stiff.any(axis=(1, 2))):
-            root = self.root[group]
-            if root in self.slot:  # bodies that are welded together move as one: their stiffnesses add
-                total[root] = (jacobian[group], stiff[group] + (total[root][1] if root in total else 0.0))
-                group_of[root] = group
-        for root in self._rows:
-            if root in total:
-                relative, stiff = total[root]
-                stiffness, basis = self._modes(root, stiff)
-                value = np.maximum(stiffness, _MINVAL)
-                rows = basis.T @ relative
-                self._fill(root, rows, value)
-                self._written[root] = group_of[root], basis, value, rows
-            elif self._filled[root]:
-                self._fill(root, 0.0, _MINVAL)
-            self._filled[root] = root in total
+        self._find_stiffness()
+        self._fill(self._J, self._D)
+        held = {self._slot_of[g]: g for g in groups.tolist() if self._slot_of[g] >= 0}
+        self._filled, self._held = True, held
 
-    def _modes(self, root, stiff):
-        """Eigenvalues (6,) and vectors of a stiffness: a step begins with that of the last one's end."""
-        known, key = self._known.get(root), stiff.tobytes()
-        if known is None or known[0] != key:
-            stiffness, basis = np.linalg.eigh(stiff)
-            known = key, stiffness, basis * (stiffness > 1e-12 * stiffness[-1])
-            self._known[root] = known
-        return known[1:]
-
-    def excess(self, data: DataView, acceleration: np.ndarray) -> np.ndarray:
+    def excess(self, acceleration: np.ndarray) -> np.ndarray:
         """(ngroup, 6) what the rows push more than their stiffness does under accelerations (nv,) that
         MuJoCo's solver has just found: nothing but rounding, where it converged."""
         out = np.zeros((len(self.body), 6))
-        for root, (group, basis, value, rows) in self._written.items():
-            out[group] = basis @ (data.efc_force[self._rows[root][0]] + value * (rows @ acceleration))
+        if self._held:  # bodies that are welded together move as one
+            push = self._rows.efc_force[self._all] + self._D * (self._J @ acceleration)
+            wrench = (push.reshape(-1, 1, 6) @ self._basis)[:, 0]
+            out[list(self._held.values())] = wrench[list(self._held)]
         return out
 
-    def _fill(self, root, rows, value):
-        """Rows (6, nv) or one number for all entries; values (6,) or one for all."""
-        here, place = self._rows[root]
-        if self._columns is None:
-            self._stiff[here.start * self.model.nv : here.stop * self.model.nv] = np.ravel(rows)
-        elif np.ndim(rows) == 0:
-            count, start, _ = self._columns
-            self._stiff[start[here.start] : start[here.stop - 1] + count[here.stop - 1]] = rows
-        else:
-            count, start, column = self._columns
-            for k, row in enumerate(rows, start=here.start):
-                a, n = start[k], count[k]
-                self._stiff[a : a + n] = row[column[a : a + n]]
-        self._weight[here], self._regular[here] = value, 1.0 / value
-        if place is not None:
-            self._island_weight[place], self._island_regular[place] = value, 1.0 / value
+    def _fill(self, rows, weight):
+        """Rows (n, nv) and their weights (n,), or one number for all."""
+        jacobian, at, part = self._entries
+        jacobian[at] = rows[part] if np.ndim(rows) else rows
+        for weights, regular, where in self._weights:
+            weights[where], regular[where] = weight, 1.0 / weight

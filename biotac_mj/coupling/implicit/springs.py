@@ -9,7 +9,6 @@ import warp as wp
 from ...skin.types import real
 from ..structs import DataView, ModelView
 from .compliance import factor
-from .integrator import Integrator
 from .kinematics import row
 
 __all__ = ["Springs"]
@@ -40,6 +39,7 @@ class Springs:
             self._own, self._one = wp.full((ends[-1], 1), -1, dtype=int), wp.ones(1, dtype=int)
             self.L, self.stiffness = (wp.zeros((1, model.nv, model.nv), dtype=real) for _ in range(2))
         self.own = [self._own.numpy()[part, 0] for part in self._parts]
+        self._here = {"inertia": self._inertia.numpy(), "rows": self._rows.numpy()}
         self._make_room(1, 1)
 
     def _make_room(self, rows, entries):
@@ -57,15 +57,16 @@ class Springs:
         self._arrays = [arrays["state"], arrays["J"], arrays["D"], int(sparse)]
         self._arrays += [arrays.get(name, other) for name, other in zip(_INTEGER[1:], none)]
 
-    def take(self, integrator: Integrator | None) -> None:
-        """Takes the rows as they are, and the inertia with the damping that an `Integrator` has."""
-        data, needed = self._data, (self._data.nefc, self._data.efc_J.size)
-        if any(n > room for n, room in zip(needed, self._room)):
+    def take(self, inertia: np.ndarray | None) -> None:
+        """Takes the rows as they are, and an inertia (nM,) laid out as MuJoCo's M; None: that."""
+        rows, here = self._data.rows(), self._here
+        needed = rows.efc_state.size, rows.efc_J.size
+        if needed[0] > self._room[0] or needed[1] > self._room[1]:
             self._make_room(*(2 * n for n in needed))
-        self._inertia.numpy()[0] = data.M if integrator is None else integrator.inertia
-        self._rows.numpy()[0] = data.nefc
+        here["inertia"][0] = self._data.M if inertia is None else inertia
+        here["rows"][0] = needed[0]
         for name, copy in self._copies.items():
-            given = getattr(data, name)
+            given = getattr(rows, name)
             copy[: given.size] = given
 
     def factor(self, skin: int | None) -> None:

@@ -50,6 +50,7 @@ class StepArrays:
     Attributes:
       qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
+      stiffness: of the rows, see `Metric.record`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
       last: views by name of the linear model of the last step.
     """
@@ -85,7 +86,7 @@ class StepArrays:
     def _respond(self, springs):
         """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
         one, jacobian, r, L = self._one, self._kinematics.jacobian, self._rounds, springs.L
-        response = Response(jacobian)
+        self.stiffness, response = (r.square, jacobian, self._model.tangent0), Response(jacobian)
         respond, stiffness = response.find(one, L), springs.stiffness
         self.find_compliance = row(respond, response.compliance(one, r.square, self._compliance))
         dim = 1, jacobian.shape[2]

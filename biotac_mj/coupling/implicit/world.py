@@ -50,11 +50,13 @@ class World:
 
     Attributes:
       tolerance: [m] how far bodies may go from where the skins were solved for them.
+      begins, last: instances that MuJoCo asks for first and last.
     """
 
     def __init__(self, model: ModelView, data: DataView, indices: list[int]):
         self.model, self.data, self.tolerance = model, data, TOLERANCE
         self.instances = {i: Instance(model, data, i) for i in indices}
+        self.begins, self.last = min(indices), max(indices)
         self.coupled = [t for t in self.instances.values() if t.two_way]
         for t in self.coupled:
             t.skins_met = [
@@ -83,7 +85,7 @@ class World:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
         asked."""
         instance = self.instances[index]
-        if index == min(self.instances):
+        if index == self.begins:
             self._amend_contacts()
             self._stage = self._next_stage() if instance.by_stages else 1
         if self._stage == 1:
@@ -162,7 +164,7 @@ class World:
                 )
 
     def _solve(self, instance):
-        if instance.index == min(self.instances):
+        if instance.index == self.begins:
             self._refuse_reset()
         if not instance.two_way:
             instance.forget_last_solve()
@@ -188,8 +190,8 @@ class World:
             t.metric.find_rows(self.data)
         self.data.reference_constraints()  # of all rows
         for t, own in zip(self.coupled, self._springs.own):
-            t.metric.take_references(self.data)
-            own[:] = t.metric.first_rows
+            t.metric.take_references()
+            own[:] = t.metric.first
 
     def _step(self):
         self._acting = ()
@@ -288,7 +290,7 @@ class World:
             going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_act]
             if rounds == most or not going:
                 break
-            self._group.find_compliance(going, self.integrator if self._damped else None)
+            self._group.find_compliance(going, self._inertia)
             self._solve_all({skin: skin.solve for skin in going})
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
@@ -336,7 +338,7 @@ class World:
             return 0
         for skin in greedy:
             skin.use_euler()
-        self._group.find_compliance(skins, self.integrator if self._damped else None)
+        self._group.find_compliance(skins, self._inertia)
         rounds = self._find_balance(skins, outside)
         for skin in skins:
             skin.arrays.find_energy()
@@ -404,7 +406,7 @@ class World:
         found, moved = self._corrected(skins, outside)
         self._found = found
         for skin in skins:
-            skin.excess = skin.instance.metric.excess(self.data, found)
+            skin.excess = skin.instance.metric.excess(found)
         return moved
 
     def _corrected(self, skins, outside):
@@ -413,6 +415,7 @@ class World:
         found = self.data.acceleration()
         if self._damped is None:  # known only after the actuation stage
             self._damped = self.integrator.take_matrices(self.data)
+            self._inertia = self.integrator.inertia if self._damped else None
         if not self._damped:
             return found, found
         if not any(len(s.touching) for s in skins):
@@ -425,7 +428,7 @@ class World:
         )
         largest = max(np.abs(_SCALE * s.arrays.wrench0).max(initial=0.0) for s in skins)
         stiffness = np.concatenate([s.square[s.touching] for s in skins])[:, None, None] * tangent
-        own = np.concatenate([skin.instance.metric.numbers() for skin in skins])
+        rows, held = jacobian.reshape(-1, self.model.nv), (stiffness @ jacobian).reshape(-1, self.model.nv)
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
             excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
@@ -434,10 +437,10 @@ class World:
             if not (poorly_corrected(*sizes, largest, CORRECTED) and last):
                 _hand_out(-wrong, skins, "amiss")
                 return found, moved
-            rows, constrained, springs = self.data.springs()  # those that hold may be others in each round
-            others = ~np.isin(rows, own)
-            slope = self.integrator.slope(jacobian, stiffness, constrained[others], springs[others])
-            correction = correction + np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
+            # what the constraint solver would find if the rows answered to the integrator
+            found = self.integrator.answer(found, self._springs, rows.T @ held, correction.ravel() @ rows)
+            change = held @ (found - self.integrator.integrated(found))
+            correction = change.reshape(-1, 6)
             _hand_out(correction, skins, "correction")
             self._forces(skins, outside)
             found = self.data.acceleration()

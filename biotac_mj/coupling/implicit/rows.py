@@ -1,0 +1,72 @@
+"""The skin's stiffness as rows of MuJoCo's constraints, see `metric`: written to an engine's own arrays, or
+to others of the same layout."""
+
+from typing import Any
+
+import warp as wp
+
+from ...skin.types import mat66, real, vec6
+
+__all__ = ["write_rows"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+_NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
+_PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
+
+
+@wp.kernel
+def write_rows(
+    # In:
+    square: wp.array2d(dtype=real),
+    group_slot: wp.array(dtype=int),
+    row: wp.array2d(dtype=int),
+    jacobian: wp.array3d(dtype=vec6),
+    tangent: wp.array2d(dtype=mat66),
+    sparse: int,
+    rownnz: wp.array2d(dtype=int),
+    rowadr: wp.array2d(dtype=int),
+    colind: wp.array3d(dtype=int),
+    # Out:
+    J_out: wp.array3d(dtype=Any),
+    D_out: wp.array2d(dtype=Any),
+    aref_out: wp.array2d(dtype=Any),
+    pos_out: wp.array2d(dtype=Any),
+    basis_out: wp.array2d(dtype=vec6),
+):
+    """beta h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L,
+    which is written to basis [row, world] where that has room.
+
+    Each thread writes one column of the rows: loads and stores in turn take ten times the sums."""
+    s, w, n = wp.tid()
+    first = row[s, w]
+    if first < 0:
+        return
+    S = mat66()
+    group = int(0)
+    for g in range(tangent.shape[0]):
+        if group_slot[g] == s:  # bodies that are welded together move as one: their stiffnesses add
+            S += square[g, w] * tangent[g, w]
+            group = g
+    whole = wp.get_diag(S)
+    for k in range(6):
+        pivot = wp.float64(0.0)
+        column = vec6()
+        if S[k, k] > _PIVOT * wp.abs(whole[k]):
+            pivot = S[k, k]
+            for i in range(k, 6):
+                column[i] = S[i, k] / pivot
+            S -= pivot * wp.outer(column, column)
+        r = first + k
+        if n == 0:
+            D_out[w, r] = type(D_out[w, r])(wp.max(pivot, _NEGLIGIBLE))
+            aref_out[w, r] = type(aref_out[w, r])(0.0)
+            pos_out[w, r] = type(pos_out[w, r])(0.0)
+            if r < basis_out.shape[0]:
+                basis_out[r, w] = column
+        if sparse == 0:
+            J_out[w, r, n] = type(J_out[w, r, n])(wp.dot(column, jacobian[group, w, n]))
+        elif n < rownnz[w, r]:
+            at = rowadr[w, r] + n
+            J_out[w, 0, at] = type(J_out[w, 0, at])(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
