@@ -20,7 +20,8 @@ from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.generation.synthetic_sensor import SyntheticSensor
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.electrodes import electrode_positions
-from biotac_mj.matching.match import log_changes, rows_of
+from biotac_mj.matching.fit import rows_of
+from biotac_mj.matching.response import log_changes
 from biotac_mj.matching.states import PlateGrid, plate_states
 from biotac_mj.recordings import load_one
 from biotac_mj.resimulation.fitted import PLATE, plate_path

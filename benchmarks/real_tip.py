@@ -13,6 +13,7 @@ import json
 import pathlib
 
 import numpy as np
+from real_match import HELD_OUT
 from records import write_json
 
 from biotac_mj.discrepancy.evidence import sign_flip
@@ -22,7 +23,6 @@ from biotac_mj.discrepancy.recordings.recording import read_recording
 from biotac_mj.effects.plate import PLATE
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Setup, fit_constants, fit_states
-from biotac_mj.matching.match import HELD_OUT
 from biotac_mj.quality.noise import noise_level
 
 TIP = [6, 7, 8, 9]

@@ -409,7 +409,7 @@ def test_example(repo, tmp_path):
     [
         (dict(count=0), "count is 0"),
         (dict(measured_batch=0), "measured_batch is 0"),
-        (dict(labelled=9), "labelled is 9: it must lie between 0 and the count, 3"),
+        (dict(labelled=9), "labelled is 9: give a whole number from 0 to 3"),
         (dict(recordings=-1), "recordings is -1"),
         (dict(rate=0.0), "rate is 0.0 Hz"),
         (dict(seed=-1), "seed is -1"),

@@ -24,8 +24,7 @@ from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.discrepancy.verbs import diagnose_verb, diagnose_with_states
 from biotac_mj.effects.plate import PLATE, bonded, moved
 from biotac_mj.geometry.skins import load_skin
-from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants
-from biotac_mj.matching.match import SIGNS
+from biotac_mj.matching.fit import SIGNS, Constants, Rows, Setup, fit_constants
 from biotac_mj.matching.response import Response
 from biotac_mj.press.path import PressOptions
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance

@@ -24,6 +24,7 @@ from biotac_mj.geometry import (
 from biotac_mj.geometry.card import skin_numbers
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.importing import read_obj
+from biotac_mj.geometry.surface import face_areas, node_areas, node_normals
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
@@ -125,6 +126,20 @@ def test_bad_shapes():
         TetMesh(np.zeros((3, 2)), [[0, 1, 2, 3]])
     with pytest.raises(ValueError, match=r"elem has shape \(0, 4\)"):
         TetMesh(REGULAR, np.zeros((0, 4)))
+
+
+def test_areas_and_normals_of_a_box():
+    """A node on no face has neither."""
+    box = trimesh.creation.box(extents=[2.0, 2.0, 2.0])
+    vert, face = np.concatenate([box.vertices, [[5.0, 5.0, 5.0]]]), np.asarray(box.faces)
+    area = face_areas(vert, face)
+    np.testing.assert_allclose(area.sum(0), 0, atol=1e-12)  # it is closed
+    shares = node_areas(face, np.linalg.norm(area, axis=1), len(vert))
+    np.testing.assert_allclose(shares, np.bincount(face.ravel(), minlength=9) * 2 / 3)
+    assert shares.sum() == pytest.approx(24.0)
+    normal = node_normals(vert, face)
+    np.testing.assert_allclose(np.linalg.norm(normal[:-1], axis=1), 1)
+    assert (normal[:-1] * box.vertices > 0).all() and not normal[-1].any()
 
 
 def test_open_surface():

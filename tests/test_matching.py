@@ -11,8 +11,7 @@ from made_up_plate import MIRROR, made_up_states
 
 from biotac_mj.geometry.design import read_design
 from biotac_mj.geometry.skins import load_skin
-from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants, fit_states
-from biotac_mj.matching.match import SIGNS, match, rows_of
+from biotac_mj.matching.fit import SIGNS, Constants, Rows, Setup, fit_constants, fit_states, rows_of
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import PlateGrid, frame, plate_states
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
@@ -73,8 +72,8 @@ def test_constants_and_states_come_back(response, truth):
 
 
 @pytest.mark.slow
-def test_rows_kept_aside_are_predicted_to_the_noise(response, truth):
-    found, _ = match(response, truth[2])
+def test_rows_kept_aside_are_predicted_to_the_noise(real_match, response, truth):
+    found, _ = real_match.match(response, truth[2])
     assert found["rows"] == 72 and found["free_per_row"] == 4
     assert found["correlation_median"] > 0.999 and found["rms_counts"] < 4
     assert found["held_out"]["rms_counts"] < 10
@@ -83,11 +82,11 @@ def test_rows_kept_aside_are_predicted_to_the_noise(response, truth):
 
 
 @pytest.mark.slow
-def test_a_sensor_that_is_not_the_models_is_not_matched(response, truth):
+def test_a_sensor_that_is_not_the_models_is_not_matched(real_match, response, truth):
     """Electrodes in another order: the fit's freedom does not explain them."""
     rows = truth[2]
     order = np.random.default_rng(3).permutation(19)
-    found, _ = match(response, Rows(rows.counts[:, order], rows.force, rows.time))
+    found, _ = real_match.match(response, Rows(rows.counts[:, order], rows.force, rows.time))
     assert found["rms_rel_mean"] > 0.3
 
 

@@ -17,7 +17,7 @@ from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix, quaternion
 from biotac_mj.geometry.skins import skin_reference
-from biotac_mj.matching.match import SIGNS
+from biotac_mj.matching.fit import SIGNS
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import frame
 from biotac_mj.recordings import Recording, write

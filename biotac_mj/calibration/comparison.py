@@ -29,7 +29,7 @@ PAPER = {
 }
 _ANGLES = 50.0  # [deg] range of the random locations about the pad's midline
 _ALONG = (-0.0155, -0.0045)  # [m] range of the locations along the finger
-_DEPTH = (0.6e-3, 1.6e-3)  # [m]
+_DEPTH, _SAMPLES = (0.6e-3, 1.6e-3), 10  # [m], rows of an indentation
 
 
 @dataclasses.dataclass
@@ -66,9 +66,7 @@ def plan_indentations(
     count: int,
     indenters: list | tuple | None = INDENTERS,
     seed: int = 0,
-    samples: int = 10,
     skin: str = "coarse",
-    progress: Callable | None = None,
 ) -> list:
     """`count` random indentations for each indenter: location on the pad, depth, direction up to 25 degrees
     off the normal, and a slide.
@@ -89,12 +87,10 @@ def plan_indentations(
                 depth,
                 slide,
                 (math.cos(turn), 0.3 * math.sin(turn), math.sin(turn)),
-                samples=samples,
+                samples=_SAMPLES,
                 skin=skin,
             )
             plans.append(dataclasses.replace(plan, name=f"{name} {number}"))
-            if progress:
-                progress()
     return plans
 
 

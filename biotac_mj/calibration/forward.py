@@ -8,6 +8,7 @@ import numpy as np
 
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.surface import face_areas, node_areas
 from ..press.indenter import make_indenter
 from ..skin import GeomSet, SkinModel, SkinOptions, bake_distance_grid, step
 from ..skin.per_world import make_worlds
@@ -121,13 +122,9 @@ def displacement_norms(displacement: np.ndarray, weight: np.ndarray) -> np.ndarr
 
 def _outer_weights(geometry):
     """Area per node of the outer surface, a third of that of its faces (m,) [m^2], and the nodes (m,)."""
-    face = geometry.outer_face
-    edge = geometry.vert[face[:, 1:]] - geometry.vert[face[:, :1]]
-    area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
-    nodes, index = np.unique(face, return_inverse=True)
-    weight = np.zeros(len(nodes))
-    np.add.at(weight, index.reshape(-1, 3), (area / 3)[:, None])
-    return weight, nodes
+    face, nodes = geometry.outer_face, np.unique(geometry.outer_face)
+    area = np.linalg.norm(face_areas(geometry.vert, face), axis=1)
+    return node_areas(face, area, geometry.nvert)[nodes], nodes
 
 
 @functools.lru_cache(maxsize=8)

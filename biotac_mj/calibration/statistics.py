@@ -45,23 +45,18 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
     return white, n / (n - p) * inverse @ total @ inverse, lags
 
 
-def ljung_box(residual: np.ndarray, lags: int | None = None) -> dict:
+def ljung_box(residual: np.ndarray) -> dict:
     """Ljung-Box test (Biometrika 65, 1978) of the whiteness of a residual (n, m), per component.
 
-    Args:
-      lags: None takes min(10, n // 5).
-
     Returns:
-      lags; statistic (m,) and p_value (m,), nan for a component that is zero; white: whether no component's
-      p-value is below 0.05 / m (Bonferroni).
+      lags, a fifth of n but 10 at most; statistic (m,) and p_value (m,), nan for a component that is zero;
+      white: whether no component's p-value is below 0.05 / m (Bonferroni).
     """
     residual = np.asarray(residual, float)
     n, m = residual.shape
-    lags = min(10, n // 5) if lags is None else lags
-    if not 1 <= lags < n:
-        raise ValueError(
-            f"{n} samples are too few for {lags} lags of the whiteness test: record at least 5 samples"
-        )
+    lags = min(10, n // 5)
+    if not lags:
+        raise ValueError(f"{n} samples are too few for the whiteness test: record at least 5 samples")
     from scipy.special import chdtrc  # scipy.stats takes a second to import
 
     centred = residual - residual.mean(0)

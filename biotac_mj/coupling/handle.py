@@ -11,6 +11,7 @@ from ..effects.sensors import take_sensor
 from ..fields import as_whole
 from ..geometry.design import BIOTAC, Design
 from ..geometry.skins import design_of
+from ..geometry.surface import face_areas, node_areas
 from ..sensor.presets import Sensor
 from ..short_repr import short_repr
 from .config import Config
@@ -189,12 +190,10 @@ class Handle:
             return None
         with setup.skin.lock:
             force = push(state)
-        corner = stepper.vert_xpos(state)[face]
-        across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
+        across = face_areas(stepper.vert_xpos(state), face)
         if of == "faces":
             return force / np.linalg.norm(across, axis=1)
-        area = np.zeros_like(force)
-        np.add.at(area, face, across[:, None] / 3)
+        area = node_areas(face, across, len(force))
         return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.surface import node_normals
 from .schema import nodes_of
 
 __all__ = ["contact_labels"]
@@ -29,12 +30,12 @@ def contact_labels(
     touches = total > _TOUCH
     weight = size / np.where(touches, total, 1.0)[:, None]
     at_rest = geometry.vert if rest is None else geometry.vert + rest
-    facing = _normals(at_rest, geometry.outer_face)[outer]
+    facing = node_normals(at_rest, geometry.outer_face)[outer]
     pos, normal, depth = np.full((len(size), 3), np.nan), np.full((len(size), 3), np.nan), np.zeros(len(size))
     for i in np.flatnonzero(touches):
         vert = geometry.vert + np.asarray(displacement[i], float)
         pos[i] = weight[i] @ vert[outer]
-        normal[i] = weight[i] @ _normals(vert, geometry.outer_face)[outer]
+        normal[i] = weight[i] @ node_normals(vert, geometry.outer_face)[outer]
         moved = (vert - at_rest)[outer][weight[i] > 0]
         depth[i] = max(0.0, -(moved * facing[weight[i] > 0]).sum(1).min())
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -44,14 +45,3 @@ def contact_labels(
         "contact_depth": depth,
         "contact_area": np.where(touches, area, 0.0),
     }
-
-
-def _normals(vert, face):
-    """(nvert, 3) unit outward normals of a surface at its nodes, by the areas of their faces."""
-    corner = vert[face]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    out = np.zeros_like(vert)
-    for k in range(3):
-        np.add.at(out, face[:, k], cross)
-    length = np.linalg.norm(out, axis=1, keepdims=True)
-    return out / np.where(length > 0, length, 1.0)

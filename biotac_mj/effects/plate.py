@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.design import Design
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.surface import node_normals
 from ..sensor.core_surface import CoreSurface
 from ..sensor.film import excitation_places
 from ..skin import Material, SkinOptions
@@ -31,11 +32,8 @@ def moved(geometry: SkinGeometry, outer: float, inner: float, tip: bool = False)
       ValueError: the shift inverts a tetrahedron.
     """
     vert, faces = geometry.vert, geometry.outer_face
-    a, b, c = vert[faces].transpose(1, 0, 2)
-    normal = np.zeros_like(vert)
-    np.add.at(normal, faces, np.cross(b - a, c - a)[:, None])
     outside, inside = np.unique(faces), np.unique(geometry.inner_face)
-    normal = normal[outside] / np.linalg.norm(normal[outside], axis=1, keepdims=True)
+    normal = node_normals(vert, faces)[outside]
     to_outside, nearest = cKDTree(vert[outside]).query(vert)
     to_inside = cKDTree(vert[inside]).query(vert)[0]
     to_surface = to_inside / (to_inside + to_outside)

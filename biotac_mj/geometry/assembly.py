@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.geometry.surface import face_areas
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_faces, enclosed_volume
 
 __all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
@@ -104,11 +105,9 @@ def electrodes_on(
         return np.zeros((0, 3)), np.zeros((0, 3))
     point = design.in_biotac_frame(electrode_positions(design)) * 1e-3
     position, _, _ = _closest(core_vert, core_face, point)
-    corner = core_vert[core_face]
-    area_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
-    centre = corner.mean(axis=1)
+    centre = core_vert[core_face].mean(axis=1)
     weight = np.exp(-0.5 * (np.linalg.norm(position[:, None] - centre, axis=-1) / 2.5e-4) ** 2) + 1e-12
-    normal = weight @ area_normal
+    normal = weight @ face_areas(core_vert, core_face)
     return position, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 

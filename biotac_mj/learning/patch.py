@@ -9,6 +9,7 @@ import torch
 
 from ..files import save_figure, write_json
 from ..geometry import load_skin
+from ..geometry.surface import face_areas, node_areas
 from ..recordings import load_one
 from .predictor import PointsModel
 from .training.inverse import PATCH, contact_centre, log_change_of
@@ -167,10 +168,9 @@ def _drift(tdc, change, force):
 
 
 def _node_area(geometry, outer):
-    """(nouter,) area per node [m2]: a third of each adjacent face."""
-    corner = geometry.vert[geometry.outer_face]
-    third = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 6
-    return np.bincount(np.searchsorted(outer, geometry.outer_face).ravel(), np.repeat(third, 3), len(outer))
+    """(nouter,) area per node [m2]."""
+    area = np.linalg.norm(face_areas(geometry.vert, geometry.outer_face), axis=1)
+    return node_areas(geometry.outer_face, area, geometry.nvert)[outer]
 
 
 def draw_skin(
@@ -195,7 +195,7 @@ def draw_skin(
     from matplotlib.collections import PolyCollection
 
     corner = vert[face]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = face_areas(vert, face)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
     seen = normal[:, 1] < 0
     order = np.flatnonzero(seen)[np.argsort(-corner[seen][:, :, 1].mean(1))]

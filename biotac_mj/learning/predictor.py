@@ -6,11 +6,13 @@ import numpy as np
 import torch
 from torch import nn
 
+from ..geometry.surface import node_normals
 from ..sensor.channels import NELECTRODE
 from .networks.graph import SparseMatrix
 from .networks.heads import FromRest, LocalHead, PodHead, next_average
 from .training.features import FilmFeatures, Pod
 from .training.local import counts_change
+from .training.paper import network_change
 
 if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
@@ -77,7 +79,9 @@ class PointsModel(_Served):
             self.field, self.to_nodes = FromRest(net, "inverse"), SparseMatrix(points.spreading(geometry))
             outer = np.unique(geometry.outer_face)
             self.register_buffer("outer", torch.as_tensor(outer), persistent=False)
-            inward = torch.as_tensor(-_normals(geometry)[outer], dtype=torch.float32)
+            inward = torch.as_tensor(
+                -node_normals(geometry.vert, geometry.outer_face)[outer], dtype=torch.float32
+            )
             self.register_buffer("inward", inward, persistent=False)
 
     @torch.no_grad()
@@ -92,17 +96,10 @@ class PointsModel(_Served):
         self._check(displacement)
         return self.electrodes(self.unit * _between(self.to_points, displacement)), None
 
-    def target(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) the network's target in rows of a set."""
-        return arrays.log_change(rows) if self.config.logarithm else arrays.change(rows) / self.config.scale
-
-    def change_of(self, output: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
-        """(k, 19) change of counts from the network's output, for counts `tare` (k, 19) at rest."""
-        return counts_change(output, tare) if self.config.logarithm else self.config.scale * output
-
     def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
         """(k, 19) predicted change of counts in rows of a set."""
-        return self.change_of(self.log_change(arrays.field[rows].float())[0], arrays.tare[rows])
+        output = self.log_change(arrays.field[rows].float())[0]
+        return network_change(output, arrays.tare[rows], self.config)
 
     @torch.no_grad()
     def through_code(self, displacement: torch.Tensor) -> torch.Tensor:
@@ -121,16 +118,6 @@ class PointsModel(_Served):
 def _between(matrix, field):
     """Interpolates a field (n, m, 3) to k points, (n, k, 3); matrix: SparseMatrix (k, m) of the weights."""
     return matrix(field.float().transpose(0, 1).contiguous()).transpose(0, 1)
-
-
-def _normals(geometry):
-    """(nvert, 3) unit normals of the outer surface, zero elsewhere."""
-    corner = geometry.vert[geometry.outer_face]
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    out = np.zeros_like(geometry.vert)
-    for k in range(3):
-        np.add.at(out, geometry.outer_face[:, k], face)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-30)
 
 
 class ForwardModel(_Served):

@@ -8,8 +8,11 @@ import numpy as np
 from ..sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
 from .response import Loaded, Response
 
-__all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
+__all__ = ["SIGNS", "Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states", "rows_of"]
 
+# Fx, Fy, Fz of a recording as along, across, pressing
+SIGNS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_LOADED, _FEWEST = 0.5, 40  # [N] least force of a loaded row; least number of these
 _COUNTS = 20.0  # [counts] error of an electrode that weighs as much as one sigma of a force or a prior
 _CORRELATED = 25  # rows per independent one, relative to the priors: model errors hardly change between rows
 _STEPS, _LEAST = 40, 16  # most and fewest joint steps
@@ -72,6 +75,30 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.counts)
+
+
+def rows_of(counts: np.ndarray, force: np.ndarray | None, every: int = 10) -> Rows:
+    """Every tenth loaded row of raw counts (n, nelectrode) and force (n, 3) (across, along, away from the
+    plate) [N].
+
+    Raises:
+      ValueError: no force, or too few loaded rows.
+    """
+    if force is None:
+        raise ValueError("a match needs the force: give a file of Fx Fy Fz [N], as many rows")
+    loaded = np.flatnonzero(np.linalg.norm(force, axis=1) > _LOADED)
+    pushing = np.median(force[loaded, 2]) if len(loaded) else 0.0
+    if pushing >= 0:
+        raise ValueError(
+            f"Fz is {pushing:.2g} N in the median of {len(loaded)} rows above {_LOADED} N: a press "
+            "has it negative; give Fx Fy Fz [N] of the plate, z out of the sensor"
+        )
+    taken = loaded[::every]
+    if len(taken) < _FEWEST:
+        raise ValueError(
+            f"{len(loaded)} rows have more than {_LOADED} N of force: {every * _FEWEST} are needed"
+        )
+    return Rows(counts[taken], force[taken] @ SIGNS, taken / len(counts))
 
 
 class _Places(typing.NamedTuple):

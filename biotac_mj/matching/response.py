@@ -6,9 +6,27 @@ import dataclasses
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from ..sensor.film import FilmConduction
 from .states import PlateStates
 
-__all__ = ["Loaded", "Response"]
+__all__ = ["Loaded", "Response", "log_changes"]
+
+
+def log_changes(states: PlateStates, film: FilmConduction) -> np.ndarray:
+    """(npitch, nroll, npath, nload, nelectrode) change of ln Z from rest in the states, by a film of their
+    skin."""
+    vert = film.geometry.vert.copy()
+    places = states.xpos.reshape(-1, *states.xpos.shape[-2:])
+    out = np.empty((len(places), film.design.nelectrode))
+    rest = np.log(film.impedance(_with(vert, states.node, states.rest)))
+    for i, place in enumerate(places):
+        out[i] = np.log(film.impedance(_with(vert, states.node, place))) - rest
+    return out.reshape(*states.xpos.shape[:-2], -1)
+
+
+def _with(vert, node, place):
+    vert[node] = place
+    return vert
 
 
 class Response:

@@ -9,9 +9,8 @@ from ..data.generation.plan import Motion
 from ..data.importers import measured
 from ..geometry.design import SINGLES
 from ..geometry.skin_geometry import SkinGeometry
-from ..matching.fit import Rows, Setup, fit_constants, fit_states
-from ..matching.match import SIGNS, log_changes, rows_of
-from ..matching.response import Response
+from ..matching.fit import SIGNS, Rows, Setup, fit_constants, fit_states, rows_of
+from ..matching.response import Response, log_changes
 from ..matching.states import PlateGrid, PlateStates, frame, plate_states
 from ..recordings import Recording
 from ..sensor.channels import counts_from_log_impedance

@@ -1,5 +1,4 @@
-"""Controllers that solve the tasks from touch, the machine's own position and the observed target; and a
-random one.
+"""Controllers that solve the tasks from touch, the machine's own position and the observed target.
 
 A controller never uses the simulation's hidden state. Its estimates of force, position and load come from
 `touch.Estimator`, a regression calibrated on other episodes (`calibrate`), or, during the calibration, from
@@ -16,9 +15,8 @@ from .touch import Touch, check_fitted_on, load_calibration, load_estimator
 
 if typing.TYPE_CHECKING:
     from dm_control import composer
-    from dm_env import specs
 
-__all__ = ["SCRIPTED", "Random", "make_controller"]
+__all__ = ["SCRIPTED", "make_controller"]
 
 _FRICTION = Config().friction  # of the skin, known to the gripper
 
@@ -213,20 +211,6 @@ class Lift(Hold):
         return np.array(
             [min(speed * (not self.slipping), 20 * (self.goal - height) / 0.03) if self.ready else 0.0, grip]
         )
-
-
-class Random:
-    """Uniform over the action's bounds."""
-
-    def __init__(self, spec: "specs.BoundedArray", seed: int = 0):
-        self.spec, self.rng = spec, np.random.RandomState(seed)
-
-    def reset(self) -> None:
-        """Nothing to forget."""
-
-    def act(self, observation: dict) -> np.ndarray:
-        """A random action, independent of the observation."""
-        return self.rng.uniform(self.spec.minimum, self.spec.maximum, size=self.spec.shape)
 
 
 SCRIPTED = {c.task: c for c in (Press, FollowEdge, RollBall, Explore, Hold, Lift)}

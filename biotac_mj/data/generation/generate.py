@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from ...effects.sensors import take_sensor
-from ...fields import check_types, either
+from ...fields import as_whole, check_types, either
 from ...files import write_json
 from ...geometry import load_skin
 from ...geometry.design import designs
@@ -128,30 +128,20 @@ class GenerateOptions:
             raise ValueError(
                 "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
             )
-        if not 8 <= self.steps <= _MOST_STEPS:
-            raise ValueError(f"steps is {self.steps}: take from 8 to {_MOST_STEPS} for an interaction")
-        if self.count < 1 or self.batch < 1 or self.measured_batch < 1:
-            raise ValueError(
-                f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: "
-                "all must be at least 1"
-            )
+        as_whole("steps", self.steps, 8, _MOST_STEPS)
+        for name in ("count", "batch", "measured_batch"):
+            as_whole(name, getattr(self, name), 1)
+        for name in ("recordings", "seed", "measured_seed"):
+            as_whole(name, getattr(self, name), 0)
+        as_whole("labelled", self.labelled, 0, self.count)
         kinds = {name.split(":")[0] for name in self.devices}
         if len(kinds) != 1 or not kinds <= {"cpu", "cuda"} or len(set(self.devices)) < len(self.devices):
             raise ValueError(
                 f"device is {self.device!r}: "
                 "choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1"
             )
-        if not 0 <= self.labelled <= self.count:
-            raise ValueError(
-                f"labelled is {self.labelled}: it must lie between 0 and the count, {self.count}"
-            )
-        if self.recordings < 0:
-            raise ValueError(f"recordings is {self.recordings}: it must not be negative")
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise ValueError(f"rate is {self.rate} Hz: it must be a positive number")
-        for name in ("seed", "measured_seed"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if self.tier not in ("full", "condensed"):
             raise ValueError(f"unknown tier {self.tier!r}: choose full or condensed")
         if not self.objects:

@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from ...geometry.pads import column_tetrahedra
 from ...geometry.rigid import across
 from ...geometry.skin_geometry import SkinGeometry
+from ...geometry.surface import node_normals
 from ...sensor.core_surface import CoreSurface
 from ...sensor.film import excitation_places
 
@@ -229,11 +230,7 @@ def _triangulate(point, core):
 
 def _smooth_normals(point, triangle):
     """Unit directions (n, 3) that vary smoothly over the core's edges."""
-    a, b, c = np.moveaxis(point[triangle], 1, 0)
-    normal = np.zeros_like(point)
-    np.add.at(normal, triangle, np.cross(b - a, c - a)[:, None])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    tree = cKDTree(point)
+    normal, tree = node_normals(point, triangle), cKDTree(point)
     within = tree.query_ball_point(point, 1.2e-3)
     smooth = np.array([normal[l].sum(0) for l in within])
     return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)

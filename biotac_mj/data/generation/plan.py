@@ -2,7 +2,6 @@
 the core."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -69,7 +68,6 @@ def plan_motions(
     steps: int,
     kinds: tuple | list = KINDS,
     device: str = "cpu",
-    progress: Callable | None = None,
 ) -> list[Motion]:
     """One motion for each seed, independent of the others.
 

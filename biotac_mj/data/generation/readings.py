@@ -124,19 +124,22 @@ def sample(
     state = np.zeros(acquisition.nstate)
     heat = {} if temperature is None else {"temperature": temperature[0]}
     acquisition.reset(state, impedance[0], pressure[0], time=time[0], **heat)
-    counts, pac = [], []
-    for i, (before, dt) in enumerate(_steps(time, design)):
+
+    def advance(i, before, dt):
         heat = None if temperature is None else temperature[i]
         acquisition.advance(state, before, dt, impedance[i], pressure[i], heat)
-        for rows, row in zip((counts, pac), _row(acquisition.readings(state), time[i])):
-            rows.append(row)
-    return np.array(counts, np.float32), np.array(pac, np.float32)
+        return acquisition.readings(state)
+
+    return _rows(time, design, advance)
 
 
-def _steps(time, design):
-    """Start and length of the step to each row; one frame before row 0 gives it noise."""
+def _rows(time, design, advance):
+    """Counts (n, nchannel) and PAC (n, 22) at times (n,), from the readings after `advance(row, start,
+    length)` of each step; one frame before row 0 gives it noise."""
     frame = round(design.slots / SLOT_RATE + 1e-3, 6)  # [s], plus one sample
-    return [(time[0] - frame, frame), *zip(time[:-1], np.diff(time))]
+    steps = [(time[0] - frame, frame), *zip(time[:-1], np.diff(time))]
+    rows = [_row(advance(i, *one), time[i]) for i, one in enumerate(steps)]
+    return tuple(np.array(part, np.float32) for part in zip(*rows))
 
 
 def read_motion(
@@ -175,8 +178,8 @@ def read_motion(
     physics = PhysicsReadings(film.geometry, seed, sensor=sensor, bodies=bodies, **more)
     state = np.zeros(physics.nstate)
     physics.reset(state, pressure=pressure[0], time=time[0], impedance=impedance[0])
-    counts, pac = [], []
-    for i, (before, dt) in enumerate(_steps(time, design)):
+
+    def advance(i, before, dt):
         felt = {}
         if bodies is not None:
             felt = {"area": touch.area[i : i + 1], "force": touch.force[i : i + 1]}
@@ -184,9 +187,9 @@ def read_motion(
             one = slice(i, i + 1)
             felt["shaking"] = touch.drive[i], touch.gain[one], touch.slip[one], touch.area[one]
         physics.advance(state, before, dt, None, pressure[i], impedance=impedance[i], **felt)
-        for rows, row in zip((counts, pac), _row(physics.readings(state), time[i])):
-            rows.append(row)
-    return Readings(impedance, np.array(counts, np.float32), np.array(pac, np.float32), failed)
+        return physics.readings(state)
+
+    return Readings(impedance, *_rows(time, design, advance), failed)
 
 
 _here = {}  # a worker's state: the film of the set's skin

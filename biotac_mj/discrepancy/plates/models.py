@@ -8,8 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ...effects.plate import PlateEffect
-from ...matching.fit import Constants, Rows, Setup, fit_constants, fit_states
-from ...matching.match import rows_of
+from ...matching.fit import Constants, Rows, Setup, fit_constants, fit_states, rows_of
 from ...matching.response import Response
 from ...sensor.channels import counts_from_log_impedance
 from ...skin import Material

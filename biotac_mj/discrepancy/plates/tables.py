@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from ...cache import cached
 from ...effects.plate import PLATE, RADIUS, PlateEffect
 from ...geometry.skin_geometry import SkinGeometry
-from ...matching.match import log_changes
-from ...matching.response import Response
+from ...matching.response import Response, log_changes
 from ...matching.states import PlateGrid, PlateStates, plate_states
 from ...sensor.film import FilmConduction
 from ...skin import Material

@@ -121,8 +121,11 @@ class Reader:
 
     @property
     def _kinds(self):
-        names = [field.name for field in dataclasses.fields(Terms)]
-        return [Terms(*(self.tensors[f"terms.{k}.{name}"] for name in names)) for k in range(len(KINDS))]
+        return [self._restored(Terms, f"terms.{k}") for k in range(len(KINDS))]
+
+    def _restored(self, kind, name):
+        """A dataclass of arrays from the tensors of `_stored`."""
+        return kind(*(self.tensors[f"{name}.{field.name}"] for field in dataclasses.fields(kind)))
 
     def _code(self, x):
         t = self.tensors
@@ -130,17 +133,12 @@ class Reader:
 
     @property
     def _stuck_detector(self):
-        return StuckDetector(
-            *(self.tensors[f"moving.{field.name}"] for field in dataclasses.fields(StuckDetector))
-        )
+        return self._restored(StuckDetector, "moving")
 
     @functools.cached_property
     def _novelty_detector(self):
-        names = [field.name for field in dataclasses.fields(NoveltyDetector)]
         spaces = [space for space in _SPACES if f"{space}.rows" in self.tensors]
-        return {
-            space: NoveltyDetector(*(self.tensors[f"{space}.{name}"] for name in names)) for space in spaces
-        }
+        return {space: self._restored(NoveltyDetector, space) for space in spaces}
 
     def _novelty(self, x, pdc):
         """(n,) novelty of rows, without that of their baseline."""
@@ -200,6 +198,11 @@ def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type])
         )
 
 
+def _stored(name, one):
+    """Tensors of a dataclass of arrays."""
+    return {f"{name}.{field.name}": getattr(one, field.name) for field in dataclasses.fields(one)}
+
+
 def _scale(strange):
     """Factor on intervals: it grows with novelty and hardly varies among ordinary rows."""
     return 1 + strange
@@ -232,7 +235,7 @@ def fit_reader(
     mean, axes, _ = principal_components(x[fit])
     tensors = {"mean": mean, "axes": axes}
     moving = StuckDetector.fit(x[fit | aside], fit[fit | aside])
-    tensors |= {f"moving.{f.name}": getattr(moving, f.name) for f in dataclasses.fields(StuckDetector)}
+    tensors |= _stored("moving", moving)
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
     features, pressed = compressed(x - tensors["centre"]), data.pdc is not None
     known = {
@@ -247,11 +250,11 @@ def fit_reader(
         known["level"] = NoveltyDetector.fit(rest[fit & first], data.owner[fit & first], seed=seed)
         usual["level"] = max(known["level"](rest[aside & first]).max(), 1.0)
     for name, one in known.items():
-        tensors |= {f"{name}.{f.name}": getattr(one, f.name) for f in dataclasses.fields(NoveltyDetector)}
+        tensors |= _stored(name, one)
     tensors |= {f"{name}.usual": np.array(value) for name, value in usual.items()}
     kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in KINDS]
     for k, terms in enumerate(kinds):
-        tensors |= {f"terms.{k}.{f.name}": getattr(terms, f.name) for f in dataclasses.fields(Terms)}
+        tensors |= _stored(f"terms.{k}", terms)
         columns = terms(x)
         for name, y in data.targets.items():
             rows = np.flatnonzero(fit & np.isfinite(y).all(1))

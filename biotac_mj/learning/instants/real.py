@@ -201,12 +201,9 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
 
     def loss(row):
         y = x[row] + _GAIN * torch.randn(len(row), 1) * common[row]
-        code, log_variance = net.encode(y)
-        sample = code + torch.randn_like(code) * torch.exp(0.5 * log_variance) if vae else code
-        value = ((read(net.decode(sample)) - read(y)) ** 2).sum(1).mean()
         if vae:
-            value = value + _KL * 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
-        return value
+            return net.loss(y, _KL)
+        return ((read(net.decode(net.encode(y)[0])) - read(y)) ** 2).sum(1).mean()
 
     options = TrainingOptions(_BATCH, steps, 1e-3, seed=seed)
     train(net, loss, torch.arange(ntrain), options, checkpoints=Checkpoints(say=bar.update))

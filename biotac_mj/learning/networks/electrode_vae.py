@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from ...sensor.channels import NELECTRODE
+from .vae import VAE
 
 __all__ = ["ElectrodeVAE", "mlp"]
 
@@ -23,7 +24,7 @@ def mlp(widths: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-class ElectrodeVAE(nn.Module):
+class ElectrodeVAE(VAE):
     """Code of the 19 electrodes. The paper's "64, 8" is read as a hidden layer of 64 and heads of 8 for mean
     and log variance.
 
@@ -71,10 +72,3 @@ class ElectrodeVAE(nn.Module):
     def decode(self, z: torch.Tensor) -> torch.Tensor:
         """(n, channels) of codes z (n, latent)."""
         return self.decoder(z) if self.skip_out is None else self.decoder(z) + self.skip_out(z)
-
-    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log
-        variance."""
-        mean, log_variance = self.encode(x)
-        z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
-        return self.decode(z), mean, log_variance

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from .graph import ChebConv, SparseMatrix
+from .vae import VAE
 
 if typing.TYPE_CHECKING:
     from .hierarchy import Level
@@ -15,7 +16,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["MeshVAE"]
 
 
-class MeshVAE(nn.Module):
+class MeshVAE(VAE):
     """Code of a displacement field.
 
     Encoder: convolution to `channels[0]` ("conv 128"), a convolution and a selection of nodes for each
@@ -90,10 +91,3 @@ class MeshVAE(nn.Module):
         for conv in self.decode_convs[:-1]:
             x = nn.functional.elu(conv(x))
         return self.decode_convs[-1](x).transpose(0, 1)
-
-    def forward(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log
-        variance."""
-        mean, log_variance = self.encode(u)
-        z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
-        return self.decode(z), mean, log_variance

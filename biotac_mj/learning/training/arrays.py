@@ -82,10 +82,15 @@ class Arrays:
 
     def log_change(self, rows: torch.Tensor) -> torch.Tensor:
         """(k, 19) d ln Z of rows relative to their tare."""
-        value = log_impedance(self.counts[rows].double().cpu().numpy()) - log_impedance(
-            self.tare[rows].double().cpu().numpy()
-        )
-        return torch.as_tensor(value, dtype=torch.float32, device=self.device)
+        return self._log_impedance(self.counts[rows], self.tare[rows])
+
+    def film_change(self) -> torch.Tensor:
+        """(n, 19) d ln Z of all rows relative to their interaction's first, by the simulation's own film."""
+        return self._log_impedance(self.simulated, self.simulated[self.first])
+
+    def _log_impedance(self, counts, rest):
+        value, before = (log_impedance(x.double().cpu().numpy()) for x in (counts, rest))
+        return torch.as_tensor(value - before, dtype=torch.float32, device=self.device)
 
     @torch.no_grad()
     def at_points(self, points: "SkinPoints") -> "Arrays":

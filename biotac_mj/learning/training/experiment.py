@@ -29,7 +29,7 @@ from .features import Pod
 from .fitting import Checkpoints
 from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_inverse
 from .local import Features, film_with_gains, train_head
-from .paper import train_latent_projection, train_pointnet
+from .paper import network_change, network_target, train_latent_projection, train_pointnet
 
 __all__ = ["FORWARD", "division_of", "train_all", "train_split"]
 
@@ -316,14 +316,11 @@ def train_split(
         }
         for name, one in served.items():
             predictions[name] = _in_batches(lambda r, one=one: one.change(arrays, r), both)
-        signal = served["latent_projection"].target(arrays, both)
-        predictions["electrode_vae"] = served["latent_projection"].change_of(
-            lp.electrode(signal)[0].detach(), arrays.tare[both]
-        )
+        signal = network_target(arrays, both, config)
+        through = lp.electrode(signal)[0].detach()
+        predictions["electrode_vae"] = network_change(through, arrays.tare[both], config)
         codes["mesh_vae"] = served["latent_projection"].through_code
-        back["latent_inverse"] = lambda r: served["latent_projection"](
-            served["latent_projection"].target(arrays, r)
-        )
+        back["latent_inverse"] = lambda r: served["latent_projection"](network_target(arrays, r, config))
         fit_patch = fit[torch.linspace(0, len(fit) - 1, min(2000, len(fit)), device=device).long()]
         patches["latent_inverse"] = patch_of_push(
             _in_batches(lambda r: back["latent_inverse"](r)[1], fit_patch).cpu().numpy(),

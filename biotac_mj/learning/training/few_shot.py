@@ -9,7 +9,7 @@ import torch
 
 from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...files import write_json
-from ...sensor.channels import FULL_SCALE, NELECTRODE, log_impedance
+from ...sensor.channels import FULL_SCALE, NELECTRODE
 from ..protocol import interaction_errors
 from ..weights import load_forward
 from .arrays import load_arrays
@@ -84,8 +84,6 @@ def evaluate_new_sensor(
     out: pathlib.Path | str,
     touches: Sequence[int] = (0, 5, 20),
     draws: int = 10,
-    seed: int = 0,
-    device: torch.device | str = "cpu",
     sensor: pathlib.Path | str | None = None,
 ) -> dict:
     """Median RMS error [counts] on touches of an unseen sensor, after gains or a mixing were fitted to k of
@@ -103,8 +101,8 @@ def evaluate_new_sensor(
     Raises:
       ValueError: fewer than 10 labelled touches.
     """
-    arrays = load_arrays(path, device)
-    model = load_forward(weights, arrays.geometry).to(device)
+    arrays = load_arrays(path)
+    model = load_forward(weights, arrays.geometry)
     labelled = np.flatnonzero(arrays.labelled)
     if len(labelled) < 10:
         raise ValueError(
@@ -117,16 +115,15 @@ def evaluate_new_sensor(
         arrays.change(rows).cpu().numpy(),
         arrays.owner[rows].cpu().numpy(),
     )
-    film = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=device)
-    film, network = film - film[arrays.first], _log_changes(model, arrays)
-    film, network = (counts_change(z[rows], tare).cpu().numpy() for z in (film, network))
+    changes = arrays.film_change(), _log_changes(model, arrays)
+    film, network = (counts_change(z[rows], tare).cpu().numpy() for z in changes)
     inputs = {"film": film, "weights": network, "film and weights": np.concatenate([film, network], 1)}
 
     def rms(predicted, keep):
         whole = np.clip(tare.cpu().numpy() + predicted, 0, FULL_SCALE) - tare.cpu().numpy()
         return float(np.median(interaction_errors(whole[keep], truth[keep], owner[keep])[1]))
 
-    rng, table = np.random.default_rng(seed), {}
+    rng, table = np.random.default_rng(0), {}
     for k in touches:
         if k > len(labelled) - 5:
             continue

@@ -112,10 +112,7 @@ def train_inverse(
         return value if flip else value + 0.3 * root_mean_square(f - forces[r])
 
     if teach:
-        film = torch.as_tensor(
-            log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device
-        )
-        film = film - film[arrays.first]
+        film = arrays.film_change()
 
         def symmetric(r):
             return error(r, source=film) + (0.5 * error(r, True, film) if then is not None else 0)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ...sensor.channels import FULL_SCALE, log_impedance
+from ...sensor.channels import FULL_SCALE
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead, PodHead, averages
 from . import fitting
@@ -27,9 +27,7 @@ __all__ = ["Features", "counts_change", "film_with_gains", "train_head"]
 def film_with_gains(arrays: "Arrays", fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
     """Change of counts (n, 19) of the simulation's own film in rows (n,), with one gain of d ln Z for each
     electrode fitted to labelled rows `fit`."""
-    counts = arrays.simulated.cpu().numpy()
-    z = torch.as_tensor(log_impedance(counts), dtype=torch.float32, device=arrays.device)
-    z = z - z[arrays.first]
+    z = arrays.film_change()
     gain = (z[fit] * arrays.log_change(fit)).sum(0) / z[fit].square().sum(0).clamp(min=1e-9)
     return counts_change(gain * z[rows], arrays.tare[rows])
 
@@ -153,10 +151,7 @@ def train_head(
 
     labelled, check = a.rows(train, labelled=True), a.rows(validation, labelled=True)
     if teach and log:
-        target = torch.as_tensor(
-            log_impedance(a.simulated.cpu().numpy()), dtype=torch.float32, device=a.device
-        )
-        target = target - target[a.first]
+        target = a.film_change()
 
         def teacher_loss(rows):
             value = root_mean_square(output(rows) - target[rows])

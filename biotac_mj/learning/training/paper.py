@@ -20,7 +20,14 @@ if typing.TYPE_CHECKING:
     from .arrays import Arrays
     from .config import LearningConfig
 
-__all__ = ["LatentProjection", "make_pointnet", "train_latent_projection", "train_pointnet"]
+__all__ = [
+    "LatentProjection",
+    "make_pointnet",
+    "network_change",
+    "network_target",
+    "train_latent_projection",
+    "train_pointnet",
+]
 
 
 class LatentProjection(nn.Module):
@@ -61,20 +68,20 @@ def make_pointnet(points: "SkinPoints", config: "LearningConfig") -> PointNet:
     return PointNet(points.place, np.arange(len(points.place)), dropout=config.dropout)
 
 
-class _Target:
-    """Target of the networks, and its conversion to counts."""
+def network_target(arrays: "Arrays", rows: torch.Tensor, config: "LearningConfig") -> torch.Tensor:
+    """(k, 19) target of the networks in rows of a set."""
+    return arrays.log_change(rows) if config.logarithm else arrays.change(rows) / config.scale
 
-    def __init__(self, arrays, rows, config):
-        self.arrays, self.config = arrays, config
-        self.value = torch.zeros_like(arrays.counts)
-        change = arrays.log_change(rows) if config.logarithm else arrays.change(rows) / config.scale
-        self.value[rows] = change
 
-    def wrong(self, output, rows):
-        """Loss of outputs: RMS of counts / scale."""
-        a, scale = self.arrays, self.config.scale
-        got = counts_change(output, a.tare[rows]) if self.config.logarithm else scale * output
-        return root_mean_square(got - a.change(rows)) / scale
+def network_change(output: torch.Tensor, tare: torch.Tensor, config: "LearningConfig") -> torch.Tensor:
+    """(k, 19) change of counts from a network's output, for counts `tare` (k, 19) at rest."""
+    return counts_change(output, tare) if config.logarithm else config.scale * output
+
+
+def _wrong(output, arrays, rows, config):
+    """Loss of outputs: RMS of counts / scale."""
+    got = network_change(output, arrays.tare[rows], config)
+    return root_mean_square(got - arrays.change(rows)) / config.scale
 
 
 @fast_products()
@@ -109,8 +116,7 @@ def train_latent_projection(
         return sum(float((vae(field(r))[0] - field(r)).square().sum()) for r in mesh_check.split(64))
 
     def mesh_loss(rows):
-        u = field(rows)
-        return _vae_loss(u, *vae(u), config.mesh_kl, config.reconstruction)
+        return vae.loss(field(rows), config.mesh_kl, config.reconstruction)
 
     options = TrainingOptions(config.mesh_batch, config.mesh_steps, config.learning_rate, decay=config.decay,
                               seed=seed, graph=False)  # fmt: skip
@@ -118,13 +124,13 @@ def train_latent_projection(
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     both = torch.cat([rows, check])
-    target = _Target(arrays, both, config)
-    y = target.value
+    y = torch.zeros_like(arrays.counts)
+    y[both] = network_target(arrays, both, config)
     options = TrainingOptions(config.batch, config.paper_steps, config.learning_rate, decay=config.decay,
                               seed=seed, graph=config.graphs)  # fmt: skip
 
     def electrode_loss(r):
-        return _vae_loss(y[r], *electrode(y[r]), config.electrode_kl, config.reconstruction)
+        return electrode.loss(y[r], config.electrode_kl, config.reconstruction)
 
     error = lambda: (electrode(y[check])[0] - y[check]).square().mean()  # noqa: E731
     fitting.train(electrode, electrode_loss, rows, options, error, checkpoints, curves["electrode"])
@@ -151,7 +157,7 @@ def train_latent_projection(
         if config.projection_loss == "latent":
             return root_mean_square(model.to_electrode(a) - b)
         got = electrode.decode(model.to_electrode(torch.cat([a, rest])))
-        return target.wrong(got[:-1] - got[-1:], r)
+        return _wrong(got[:-1] - got[-1:], arrays, r, config)
 
     def inverse_loss(r):
         a, b = codes_of(r)
@@ -179,10 +185,10 @@ def train_pointnet(
     unit = 1e-3 / config.mesh_scale
     net = make_pointnet(points, config).to(arrays.device)
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
-    target, from_rest = _Target(arrays, torch.cat([rows, check]), config), FromRest(net)
+    from_rest = FromRest(net)
 
     def loss(r):
-        return target.wrong(from_rest(unit * arrays.field[r].float()), r)
+        return _wrong(from_rest(unit * arrays.field[r].float()), arrays, r, config)
 
     def validate():
         return sum(float(loss(r)) * len(r) for r in check.split(1024)) / len(check)
@@ -196,9 +202,3 @@ def train_pointnet(
 def _spread(rows, count):
     """At most `count` rows, evenly spaced."""
     return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows)), device=rows.device).long()]
-
-
-def _vae_loss(x, got, mean, log_variance, weight, kind):
-    error = (got - x).abs() if kind == "l1" else (got - x).square()
-    divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1)
-    return error.flatten(1).sum(1).mean() + weight * divergence.mean()

@@ -22,6 +22,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ...fields import as_numbers, check_types, refuse_unknown
+from ...geometry.surface import node_areas
 from ...short_repr import short_repr
 from ..types import real
 from .faces import Laws
@@ -132,8 +133,7 @@ class WorldLaws:
         face, vert = model.outer.face_np, model.geometry.vert
         self.edge = float(np.linalg.norm(vert[face] - vert[np.roll(face, 1, 1)], axis=2).mean())
         self.modulus = np.array([m.youngs_modulus / (1 - m.poissons_ratio**2) for m in materials])
-        area = np.bincount(face.ravel(), np.repeat(model.outer.area.numpy() / 3, 3), nvert)
-        self.struct.node_area.assign(area)
+        self.struct.node_area.assign(node_areas(face, model.outer.area.numpy(), nvert))
         self._values = {}
         law = self.law
         self.set(law.friction_exponent, law.adhesion, law.friction_pressure, law.adhesion_hysteresis)

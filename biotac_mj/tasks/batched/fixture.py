@@ -1,12 +1,14 @@
 """What holds a free body while fingers close on it: a spring that lets go."""
 
+import dataclasses
 import functools
-from collections.abc import Callable
 
-import mujoco
+import torch
 import warp as wp
 
-__all__ = ["hold"]
+from .task import BatchTask, TaskSettings
+
+__all__ = ["HeldSettings", "HeldTask"]
 
 
 @wp.struct
@@ -46,30 +48,67 @@ def _hold(
     xfrc_applied[w, f.body] = wp.spatial_vector(force, -share * f.twist * spin)
 
 
-def hold(
-    mjm: mujoco.MjModel,
-    m: object,
-    d: object,
-    name: str,
-    place: wp.array,
-    until: tuple[float, float],
-    stiffness: float,
-    damping: float,
-    twist: float,
-) -> Callable:
-    """A function that launches the fixture of a step.
+@dataclasses.dataclass(frozen=True)
+class HeldSettings(TaskSettings):
+    """Numbers of a task whose fingers hold a free body; see `TaskSettings` too.
 
-    Args:
-      mjm, m, d: the MjModel, mujoco_warp's Model with a mass of the body in each world, and its Data.
-      name: of the body and of its free joint. place: (nworld,) vec3 where it is held [m].
-      until: when it begins to let go and when it is gone [s].
+    Attributes:
+      mass: of the body, between these [kg].
+      close, hold, release: [s] fingers close until `close`; a soft fixture holds the body until `hold` and
+        lets it go until `release`.
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
+      lost: how far the body may go from where it is held before it is lost [m].
     """
-    joint = mjm.joint(name)
-    fixture = _Fixture()
-    fixture.body, fixture.qpos, fixture.qvel = mjm.body(name).id, joint.qposadr[0], joint.dofadr[0]
-    fixture.hold, fixture.release = until
-    fixture.stiffness, fixture.damping, fixture.twist = stiffness, damping, twist
-    fixture.gravity = wp.vec3(*mjm.opt.gravity)
-    inputs = [fixture, d.time, m.body_mass, place, d.qpos, d.qvel, d.xfrc_applied]
-    return functools.partial(wp.launch, _hold, d.nworld, inputs)
+
+    mass: tuple = (10e-3, 30e-3)
+    close: float = 0.3
+    hold: float = 0.4
+    release: float = 0.55
+    stiffness: float = 60.0
+    damping: float = 1.0
+    twist: float = 2e-5
+    lost: float = 12e-3
+
+
+class HeldTask(BatchTask):
+    """A task whose fingers close on a free body, which a fixture holds until then. Its mass differs between
+    worlds."""
+
+    body: str  # name of it and of its joint
+
+    def _vary(self):
+        return self._give_mass(self.body, self._uniform(*self.cfg.mass, self.num_envs).cpu().numpy())
+
+    def _read(self, mjm, prefixes):
+        s, joint = self.cfg, mjm.joint(self.body)
+        self._at = int(joint.qposadr[0])  # of the body's pose
+        self._held_at = torch.zeros(self.num_envs, 3, device=self.device)
+        place = wp.from_torch(self._held_at, dtype=wp.vec3)
+        fixture = _Fixture()
+        fixture.body, fixture.qpos, fixture.qvel = mjm.body(self.body).id, self._at, joint.dofadr[0]
+        for name in ("hold", "release", "stiffness", "damping", "twist"):
+            setattr(fixture, name, getattr(s, name))
+        fixture.gravity = wp.vec3(*mjm.opt.gravity)
+        d = self._d
+        inputs = [fixture, d.time, self._m.body_mass, place, d.qpos, d.qvel, d.xfrc_applied]
+        self._act = functools.partial(wp.launch, _hold, d.nworld, inputs)
+
+    @property
+    def pos(self) -> torch.Tensor:
+        """(num_envs, 3) of the body [m], a view."""
+        return self._qpos[:, self._at : self._at + 3]
+
+    @property
+    def quat(self) -> torch.Tensor:
+        """(num_envs, 4) of the body, w x y z, a view."""
+        return self._qpos[:, self._at + 3 : self._at + 7]
+
+    def _closing(self):
+        """(num_envs, 1) how far the fingers have closed, 0 to 1."""
+        s = self.cfg
+        return (self._age * s.substeps * s.timestep / s.close).clamp(0, 1)[:, None]
+
+    def _put(self, some, pos):
+        """Puts the body of worlds, (num_envs, 1) of bool, to pos (num_envs, 3) [m], and holds it there."""
+        self.pos[:] = pos.where(some, self.pos)
+        self._held_at[:] = pos.where(some, self._held_at)

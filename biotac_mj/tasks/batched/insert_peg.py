@@ -6,9 +6,8 @@ import mujoco
 import torch
 import warp as wp
 
-from . import fixture
+from .fixture import HeldSettings, HeldTask
 from .machine import carriage, new_spec, servo
-from .task import BatchTask, TaskSettings
 
 __all__ = ["InsertPeg", "Settings"]
 
@@ -24,21 +23,17 @@ _TIP_DOWN = {  # w x y z: tip along -z, pads that face each other
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings(TaskSettings):
-    """The task's numbers; see `TaskSettings` too.
+class Settings(HeldSettings):
+    """The task's numbers; see `HeldSettings` too.
 
     Attributes:
       tilt: of the peg in the grip [rad], and shift: along the pads' breadth [m], either way. Where the hole
         is: across by `off` [m] either way, its edge below the peg's tip by `gap` [m].
-      mass: of the peg, between these [kg]. clearance: between peg and hole on each side [m].
+      clearance: between peg and hole on each side [m].
       depth: of the tip in the hole that is a success [m].
       rate, reach: how far a decision moves the goals of x, z [m] and pitch [rad], and in all.
       squeeze: how much farther than to the peg the fingers want to close [m].
       near: how far across from the hole it still pays to be [m].
-      close, hold, release: [s] fingers close until `close`; a soft fixture holds the peg until `hold` and
-        lets it go until `release`.
-      stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
-      lost: how far the peg may go in the grip before it is lost [m].
     """
 
     decisions: int = 45
@@ -49,23 +44,15 @@ class Settings(TaskSettings):
     shift: float = 1e-3
     off: float = 0.5e-3
     gap: tuple = (3e-3, 5e-3)
-    mass: tuple = (10e-3, 30e-3)
     clearance: float = 0.6e-3
     depth: float = 7e-3
     rate: tuple = (0.5e-3, 0.8e-3, 0.025)
     reach: tuple = (12e-3, 20e-3, 0.5)
     squeeze: float = 4e-3
     near: float = 2e-3
-    close: float = 0.3
-    hold: float = 0.4
-    release: float = 0.55
-    stiffness: float = 60.0
-    damping: float = 1.0
-    twist: float = 2e-5
-    lost: float = 12e-3
 
 
-class InsertPeg(BatchTask):
+class InsertPeg(HeldTask):
     """Two fingers hold a peg over a hole, tilted and off their middle by what is not told: they are to put it
     upright and into the hole. Its mass, its friction, the place and the height of the hole differ too.
 
@@ -76,7 +63,7 @@ class InsertPeg(BatchTask):
     axis, and up to 0.6 more the lower it is. A success: `depth` by the end.
     """
 
-    num_actions = 3
+    num_actions, body = 3, "peg"
     settings = Settings()
     camera = ((0.0, 0.0, 0.028), 0.16, 60.0, -15.0)
 
@@ -106,33 +93,25 @@ class InsertPeg(BatchTask):
             prefixes[finger] = batch.add(spec, body=finger, **more, **touching)
         return spec, prefixes, touching
 
-    def _vary(self):
-        return self._give_mass("peg", self._uniform(*self.cfg.mass, self.num_envs).cpu().numpy())
-
     def _read(self, mjm, prefixes):
-        s, n = self.cfg, self.num_envs
-        self._peg = int(mjm.joint("peg").qposadr[0])
+        super()._read(mjm, prefixes)
         names = ("x", "z", "pitch")
         self._joints = torch.tensor([int(mjm.joint(k).qposadr[0]) for k in names], device=self.device)
         self._dofs = torch.tensor([int(mjm.joint(k).dofadr[0]) for k in names], device=self.device)
         self._moving = torch.tensor([mjm.actuator(k).id for k in names], device=self.device)
-        self._closing = torch.tensor([mjm.actuator(k).id for k in prefixes], device=self.device)
+        self._fingers = torch.tensor([mjm.actuator(k).id for k in prefixes], device=self.device)
         self._plate = wp.to_torch(self._d.mocap_pos)[:, 0]
-        self._held_at = torch.zeros(n, 3, device=self.device)
-        where = wp.from_torch(self._held_at, dtype=wp.vec3)
-        until, of_fixture = (s.hold, s.release), (s.stiffness, s.damping, s.twist)
-        self._act = fixture.hold(mjm, self._m, self._d, "peg", where, until, *of_fixture)
 
     @property
     def axis(self) -> torch.Tensor:
         """(num_envs, 3) the peg's, upwards."""
-        w, x, y, z = self._qpos[:, self._peg + 3 : self._peg + 7].unbind(1)
+        w, x, y, z = self.quat.unbind(1)
         return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1)
 
     @property
     def tip(self) -> torch.Tensor:
         """(num_envs, 3) middle of the peg's lower end, from the hole's [m]."""
-        return self._qpos[:, self._peg : self._peg + 3] - _HALF * self.axis - self._plate
+        return self.pos - _HALF * self.axis - self._plate
 
     @property
     def depth(self) -> torch.Tensor:
@@ -144,7 +123,7 @@ class InsertPeg(BatchTask):
         """(num_envs,) whether the peg is still between the fingers."""
         joints = self._qpos[:, self._joints]
         grip = torch.stack([joints[:, 0], 0 * joints[:, 0], joints[:, 1] + self._grip_height], dim=1)
-        away = self._qpos[:, self._peg : self._peg + 3] + _ABOVE * self.axis - grip
+        away = self.pos + _ABOVE * self.axis - grip
         return away.norm(dim=1) < self.cfg.lost
 
     _grip_height = _HALF + _RADIUS + _ABOVE  # [m]
@@ -166,10 +145,8 @@ class InsertPeg(BatchTask):
         return paid, self.held, depth >= s.depth, (s.depth - depth).clamp(min=0.0)
 
     def _command(self):
-        s = self.cfg
-        closing = (self._age * s.substeps * s.timestep / s.close).clamp(0, 1)[:, None]
         self._ctrl[:, self._moving] = self._moved
-        self._ctrl[:, self._closing] = (closing * (_GAP + s.squeeze)).expand(-1, 2)
+        self._ctrl[:, self._fingers] = (self._closing() * (_GAP + self.cfg.squeeze)).expand(-1, 2)
 
     def _sense_body(self, off, speed_off):
         place, speed = self._qpos[:, self._joints] + off, self._qvel[:, self._dofs] + speed_off
@@ -196,6 +173,5 @@ class InsertPeg(BatchTask):
         zero = torch.zeros_like(tilt)
         pos = torch.stack([shift - _ABOVE * tilt.sin(), zero, self._grip_height - _ABOVE * tilt.cos()], dim=1)
         turn = torch.stack([(tilt / 2).cos(), zero, (tilt / 2).sin(), zero], dim=1)
-        peg = slice(self._peg, self._peg + 7)
-        self._qpos[:, peg] = torch.cat([pos, turn], dim=1).where(some, self._qpos[:, peg])
-        self._held_at[:] = pos.where(some, self._held_at)
+        self._put(some, pos)
+        self.quat[:] = turn.where(some, self.quat)

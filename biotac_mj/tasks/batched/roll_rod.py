@@ -10,9 +10,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from . import fixture
+from .fixture import HeldSettings, HeldTask
 from .hand import _PAD, Rod, build, find_pinch
-from .task import BatchTask, TaskSettings
 
 __all__ = ["PLACE", "RollRod", "Settings", "rolled"]
 
@@ -20,22 +19,17 @@ _CHOICES = {"goal": ("angle", "place"), "actions": ("servos", "pads")}
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings(TaskSettings):
-    """The task's numbers; see `TaskSettings` too. Where `prepare` is not 0 the fingers close in so many
+class Settings(HeldSettings):
+    """The task's numbers; see `HeldSettings` too. Where `prepare` is not 0 the fingers close in so many
     decisions, and episodes begin with the rod held.
 
     Attributes:
       target: the rod is to be rolled by an angle between these [rad]; fingers that only
         close roll it by -0.25.
       rate: how far a decision moves a servo's goal at most [rad]; reach: from where it began [rad].
-      close, hold, release: [s] fingers close until `close`; a soft fixture holds the rod until `hold` and
-        lets it go until `release`.
       offset: how far off the rod begins, across and along the pads [m].
-      mass: of the rod, between these [kg].
       tolerance: within which of its target the rod is where it should be [rad].
       held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
-      stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
-      lost: how far the rod's middle may go before it is lost [m].
       goal: "angle", or "place": the rod is to lie a told distance along the fingers, toward their tips, from
         the middle of their pads [m]; `target`, `tolerance` and `near` are then in metres.
       actions: "servos", eleven that move; or "pads": six, of the pads of two fingers and the thumb across the
@@ -55,8 +49,6 @@ class Settings(TaskSettings):
     tolerance: float = 0.06
     held: float = 0.2
     near: float = 0.1
-    stiffness: float = 60.0
-    damping: float = 1.0
     twist: float = 1e-4
     lost: float = 20e-3
     goal: str = "angle"
@@ -97,7 +89,7 @@ def rolled(begun: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
     return torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
 
 
-class RollRod(BatchTask):
+class RollRod(HeldTask):
     """A Shadow Hand holds a rod between its thumb and two fingers and rolls it by a told angle, or to a told
     place on the pads (`PLACE`). Where the rod lies, what it weighs and how it rubs differ between worlds and
     are not told.
@@ -118,6 +110,7 @@ class RollRod(BatchTask):
       FileNotFoundError: no such hand. ValueError: another hand, or a number that cannot be.
     """
 
+    body = "rod"
     gamma = 0.9  # a decision is paid at once; with 0.97 noise hides what it gave
     settings = Settings()
 
@@ -149,10 +142,8 @@ class RollRod(BatchTask):
         self.camera = self.pinch.centre, 0.1, math.degrees(math.atan2(y, x)) + 20.0, -15.0
         return self.pinch.qpos
 
-    def _vary(self):
-        return self._give_mass("rod", self._uniform(*self.cfg.mass, self.num_envs).cpu().numpy())
-
     def _read(self, mjm, prefixes):
+        super()._read(mjm, prefixes)
         p, s, d = self.pinch, self.cfg, self._d
         tensor = functools.partial(torch.as_tensor, device=self.device)
         self._joints, self._actuators = tensor(p.joints), tensor(p.actuators)
@@ -161,7 +152,6 @@ class RollRod(BatchTask):
         self._opened, self._closed = (tensor(c, dtype=torch.float32) for c in (p.opened, p.closed))
         self._closed += tensor(p.pads @ (s.lead * np.array([-1, -1, 1, 0, 0, 0])), dtype=torch.float32)
         self._limits = tensor(mjm.actuator_ctrlrange[p.actuators].T, dtype=torch.float32)
-        self._rod = int(mjm.joint("rod").qposadr[0])
         self._axes = [tensor(x, dtype=torch.float32) for x in (np.cross(p.normal, p.axis), p.axis, p.centre)]
         self._cores = tensor(np.array([mjm.body(f"{q}core").id for q in prefixes.values()]))
         self._xpos, self._xmat = wp.to_torch(d.xpos), wp.to_torch(d.xmat)
@@ -169,10 +159,6 @@ class RollRod(BatchTask):
         self._target = torch.zeros(self.num_envs, device=self.device)
         # at the last decision of a script; none in an episode that begins
         self._place_before = torch.full((self.num_envs,), torch.nan, device=self.device)
-        self._held_at = torch.zeros(self.num_envs, 3, device=self.device)
-        where = wp.from_torch(self._held_at, dtype=wp.vec3)
-        until, of_fixture = (s.hold, s.release), (s.stiffness, s.damping, s.twist)
-        self._act = fixture.hold(mjm, self._m, d, "rod", where, until, *of_fixture)
 
     @property
     def target(self) -> torch.Tensor:
@@ -182,22 +168,19 @@ class RollRod(BatchTask):
     @property
     def angle(self) -> torch.Tensor:
         """(num_envs,) by which the rod is rolled about its axis [rad]."""
-        place = slice(self._rod + 3, self._rod + 7)
-        return rolled(self._start[place], self._qpos[:, place])
+        return rolled(self._start[self._at + 3 : self._at + 7], self.quat)
 
     @property
     def held(self) -> torch.Tensor:
         """(num_envs,) whether the rod is still between the fingers."""
-        away = self._qpos[:, self._rod : self._rod + 3] - self._axes[2]
-        return away.norm(dim=1) < self.cfg.lost
+        return (self.pos - self._axes[2]).norm(dim=1) < self.cfg.lost
 
     @property
     def place(self) -> torch.Tensor:
         """(num_envs,) how far the rod's middle is from the middle of the fingers' pads, toward their tips
         [m], when the last step began."""
-        rod = self._qpos[:, None, self._rod : self._rod + 3]
         fingers = self._cores[:2]  # of the thumb it is another
-        off = rod - self._xpos[:, fingers]
+        off = self.pos[:, None] - self._xpos[:, fingers]
         return (off[..., None] * self._xmat[:, fingers]).sum(-2)[..., 0].mean(1).neg() + _PAD[0]
 
     @property
@@ -228,10 +211,8 @@ class RollRod(BatchTask):
         return s.held + free * paid, self.held, error < s.tolerance, error
 
     def _command(self):
-        s = self.cfg
-        closing = (self._age * s.substeps * s.timestep / s.close).clamp(0, 1)[:, None]
         moved = self._moved if self._pads is None else self._moved @ self._pads
-        goal = self._opened + closing * (self._closed - self._opened) + moved
+        goal = self._opened + self._closing() * (self._closed - self._opened) + moved
         self._ctrl[:, self._actuators] = goal.clamp(self._limits[0], self._limits[1])
 
     def _sense_body(self, off, speed_off):
@@ -256,6 +237,4 @@ class RollRod(BatchTask):
         across, along, centre = self._axes
         off = self._uniform(-1, 1, n, 2)
         place = centre + s.offset[0] * off[:, :1] * across + s.offset[1] * off[:, 1:] * along
-        rod = slice(self._rod, self._rod + 3)
-        self._qpos[:, rod] = place.where(some, self._qpos[:, rod])
-        self._held_at[:] = place.where(some, self._held_at)
+        self._put(some, place)
