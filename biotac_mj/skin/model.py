@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ..fields import check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.surface import face_areas
 from ..geometry.tet_mesh import enclosed_volume
 from ..quiet import announce_compilation
 from . import liquid
@@ -190,7 +191,7 @@ class Surface:
         start, slot = incidence(len(vert), face)
         return cls(
             wp.array(face, dtype=wp.vec3i, device=device),
-            wp.array(_areas(vert, face), dtype=real, device=device),
+            wp.array(np.linalg.norm(face_areas(vert, face), axis=1), dtype=real, device=device),
             wp.array(np.unique(face), dtype=int, device=device),
             wp.array(start, dtype=int, device=device),
             wp.array(slot, dtype=int, device=device),
@@ -199,12 +200,7 @@ class Surface:
 
     def rest_at(self, vert: np.ndarray) -> None:
         """Sets other reference positions (nvert, 3) [m]."""
-        self.area.assign(_areas(vert, self.face_np))
-
-
-def _areas(vert, face):
-    edge = vert[face[:, 1:]] - vert[face[:, :1]]
-    return np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
+        self.area.assign(np.linalg.norm(face_areas(vert, self.face_np), axis=1))
 
 
 _STIFF_IN_VOLUME = 0.45  # Poisson's ratio above which half precision loses the compliance to volume change
