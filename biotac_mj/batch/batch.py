@@ -112,7 +112,7 @@ class Batch(Skins):
             self._correction_force.zero_()
             r.amiss.zero_()
             self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
-            self._look_inside(m)
+            self._put_bodies(m)
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
@@ -186,13 +186,14 @@ class Batch(Skins):
         self._qacc = qacc
         self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, self._of_step))
 
-    def _look_inside(self, m):
-        """Whether bodies that were put somewhere were put into the skin."""
+    def _put_bodies(self, m):
+        """Tells the skins which bodies were put somewhere; finds whether these were put into the skin."""
         r, skin, clearance = self._of_step, self.skin, self._clearance
         laws, geoms = skin.data.laws.struct, skin.geoms.struct
         self.place_geoms(r.here_pos, r.here_mat, m.geom_pos, m.geom_quat)
         clearance.found.fill_(wp.vec2d(math.inf, math.inf))
         wp.copy(clearance.close, r.inside)
+        skin.put_bodies(r.placed, self.began, clearance.close)
         clearance.measure(geoms, laws, skin.data.rest_vert)
         self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
 

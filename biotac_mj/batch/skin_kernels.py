@@ -10,6 +10,8 @@ __all__ = [
     "begin_at_rest",
     "begin_frames",
     "come_from_outside",
+    "forget_contacts",
+    "forget_poses",
     "read_outputs",
     "scale_tangents",
 ]
@@ -86,6 +88,35 @@ def begin_frames(
     fresh_out[w] = 0
     pos_out[w] = pos[w]
     mat_out[w] = mat[w]
+
+
+@wp.kernel
+def forget_poses(
+    # In:
+    placed: wp.array2d(dtype=int),
+    began: wp.array(dtype=int),
+    led: wp.array(dtype=bool),
+    # In and out:
+    geoms: Geoms,
+):
+    """Of geoms on bodies [group, world] that were put where they are nothing is known. What a mocap body
+    leads went that way, after the first step."""
+    g, w = wp.tid()
+    h = geoms.group[g]
+    if placed[h, w] == 1 and not (led[h] and began[w] == 1):
+        geoms.pos_last[g, w] = vec3(real(wp.nan), real(wp.nan), real(wp.nan))
+
+
+@wp.kernel
+def forget_contacts(on: wp.array(dtype=int), nsample: int, geoms: Geoms, anchor_geom: wp.array2d(dtype=int)):
+    """Geoms of which nothing is known had no contact with the samples of face f."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    for i in range(f * nsample, (f + 1) * nsample):
+        g = anchor_geom[i, w]
+        if g >= 0 and not wp.isfinite(geoms.pos_last[g, w][0]):
+            anchor_geom[i, w] = -1
 
 
 @wp.kernel

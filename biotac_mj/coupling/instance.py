@@ -57,6 +57,7 @@ class Instance:
       kinematics: `Kinematics` of the touching bodies.
       sensed: whether the readings of this step are written.
       number: among the two-way instances; springs: `Springs` of the mjData.
+      put: the skin's state after bodies were put somewhere before this step; None: none was.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
 
@@ -95,7 +96,7 @@ class Instance:
         self.state = data.plugin_state[start : start + setup.nstate]
         self.parts, self.state_address = setup.parts(self.state), self.state.ctypes.data
         self._result = self._reading = self._pose = self._geom_pose = None
-        self._solved, self.sensed = {}, False
+        self.put, self._solved, self.sensed = None, {}, False
         self._error, self._outcome = False, _ALONE
         self.step_gamma, self.frequency = np.full(setup.ngroup, EULER), None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
@@ -138,7 +139,7 @@ class Instance:
         self.refuse_foreign_state()
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
-        self.sensed = False
+        self.put, self.sensed = None, False
         self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
         if self.two_way and self.model.opt.integrator == _DISCRETE:
             raise ValueError(
@@ -176,7 +177,17 @@ class Instance:
         arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
         arrays.begin()
         self.touching.check(arrays.start_pos, arrays.start_mat)
+        placed = (arrays.placed > 0) & ~(self.touching.led & (head[STARTED] != 0.0))
+        if placed.any() and hasattr(self.setup.skin.stepper, "put"):
+            here = self.touching.geom_pose(arrays.here_pos, arrays.here_mat)
+            with self.setup.skin.lock:
+                self.put = self.setup.skin.stepper.put(self._skin, placed[self.touching.group], *here)
         return arrays
+
+    @property
+    def _skin(self):
+        """The skin's state when the step begins, after who put bodies elsewhere."""
+        return self.parts[2] if self.put is None else self.put
 
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
         """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
@@ -245,7 +256,7 @@ class Instance:
         result = self._solved.get(key)
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
-            skin, before = self.setup.skin, self.parts[2]
+            skin, before = self.setup.skin, self._skin
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
             fraction, path = self.touching.fraction, self.touching.path
@@ -330,8 +341,7 @@ class Instance:
 
     def _key(self):
         """Bytes of all in the plugin state that a solve depends on."""
-        _, models, skin, _ = self.parts
-        stepper = self.setup.skin.stepper
+        models, skin, stepper = self.parts[1], self._skin, self.setup.skin.stepper
         return models.tobytes(), stepper.key(skin) if hasattr(stepper, "key") else skin.tobytes()
 
     def _counts(self):
@@ -346,7 +356,7 @@ class Instance:
                     touch = {"area": area, "force": np.linalg.norm(felt[:, :3], axis=1)}
                 if config.textures is not None:
                     whole = dataclasses.replace(result, wrench=felt)
-                    touch["shaking"] = skin.readings.shaking(self.parts[2], whole, self.model.opt.timestep)
+                    touch["shaking"] = skin.readings.shaking(self._skin, whole, self.model.opt.timestep)
                 counts = skin.readings.advance(
                     state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure, **touch
                 )

@@ -142,6 +142,19 @@ class FemStepper:
             return self._met_at(state, geom_pos, geom_mat)
         return self.came_to(state) if self._part(state, "started")[0] else None
 
+    def put(
+        self, state: np.ndarray, placed: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
+    ) -> np.ndarray:
+        saved, (pos, mat) = self._layout.read(state), (a.copy() for a in self.came_to(state))
+        if not self._model.device.is_cuda and self._overlaps(geom_pos, geom_mat):
+            geom_pos = self._proximity.outside(geom_pos, geom_mat, self._reach)
+        pos[placed], mat[placed] = geom_pos[placed], geom_mat[placed]
+        stays = ~placed[saved.contacts[:, 1].astype(int)]
+        out = state.copy()
+        known = {"geom_pos": pos, "geom_mat": mat, "started": 1.0}
+        self._layout.write(saved.replace(contacts=saved.contacts[stays], **known), out)
+        return out
+
     @property
     def model(self) -> SkinModel:
         """What of the skin does not change."""
@@ -340,6 +353,10 @@ class FemStepper:
                 return last
             return self._proximity.last_clear(*last, geom_pos, geom_mat, self._reach)
         return self._proximity.outside(geom_pos, geom_mat, self._reach), geom_mat
+
+    def _overlaps(self, geom_pos, geom_mat):
+        near = not self._proximity.clear(geom_pos, geom_mat, self._reach)
+        return near and self._proximity.overlaps(geom_pos, geom_mat)
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:

@@ -144,6 +144,7 @@ class LoopSkin:
 
     def keep(self, before: np.ndarray) -> SavedStep:
         """Data after a step from a state (nstate,)."""
+        before = before if self.instance.put is None else self.instance.put
         head, models, now, _ = self.instance.setup.parts(self.instance.state)
         ends, begun, whole = self.stepper.came_to(now), None, False
         resting = self.stepper.resting(now)

@@ -209,10 +209,6 @@ class CondensedSkin:
         core."""
         return self.proximity.clear(pos, mat, 0.0)
 
-    def overlaps(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether geoms at these poses contain a sample of the undeformed skin."""
-        return not self.untouched(pos, mat) and self.proximity.overlaps(pos, mat)
-
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the undeformed skin is further than `margin` [m] from geoms at these poses."""
         return self.proximity.clear(geom_pos, geom_mat, margin)
