@@ -45,7 +45,6 @@ LEFT_OUT = {
     ("ros.md", "from biotac_mj.neighbours.ros"): "ROS; test_ros.py has doubles of rclpy and rospy",
     ("your_hand.md", "spec = mujoco.MjSpec.from_file"): "MuJoCo Menagerie; test_menagerie.py",
     ("your_hand.md", "left = "): "MuJoCo Menagerie; test_menagerie.py",
-    ("verdict.md", "from biotac_mj.discrepancy"): "minutes; test_samples.py runs the verb of it",
     ("discrepancy.md", "from biotac_mj.discrepancy"): "data of the reader's; test_discrepancy_poses.py",
 }
 

@@ -233,7 +233,7 @@ def learn_a_line(learner, updates, lessons=None):
     """Paid is an action that is minus half of what is seen, and next to it nothing; a teacher says so. How
     far the policy is from that line in the end."""
     draw = torch.Generator().manual_seed(0)
-    learner.watch(*2 * [torch.randn(512, 1, generator=draw)])
+    learner.update_statistics(*2 * [torch.randn(512, 1, generator=draw)])
     for _ in range(updates):
         for _ in range(4):
             seen = torch.randn(128, 1, generator=draw)
@@ -280,7 +280,7 @@ def test_only_the_newest_lessons_are_remembered():
 def test_a_policy_comes_back_from_its_file(tmp_path):
     torch.manual_seed(0)
     policy, path = Policy(3, 2), tmp_path / "policy.safetensors"
-    policy.watch(torch.randn(50, 3) * torch.tensor([1.0, 10.0, 100.0]))
+    policy.update_statistics(torch.randn(50, 3) * torch.tensor([1.0, 10.0, 100.0]))
     policy.layers.half().float()  # weights as a file has them
     save_policy(path, policy, {"task": "insert_peg", "success": 0.5})
     other, card = load_policy(path)

@@ -77,7 +77,7 @@ class Rows:
         ]
 
     def read(self) -> None:
-        """Gives the batches the states in `row`. Launches only."""
+        """Copies the states in `row` into the batches. Launches only."""
         self._read.launch_where(self._all)
 
     def write(self) -> None:

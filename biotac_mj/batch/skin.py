@@ -208,7 +208,7 @@ class BatchSkin:
         self.release.end()
 
     def come_to_rest(self) -> None:
-        """After `solve_skins`: puts those to rest that nothing touches, or that begin anew. Launches only."""
+        """After `solve_skins`: resets skins without contact, and of worlds that were reset. Launches only."""
         if self.release.possible:
             wp.capture_if(self.release.any, self._put_to_rest)
 

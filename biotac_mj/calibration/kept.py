@@ -36,26 +36,26 @@ class Kept:
     """
 
     def __init__(self, path: pathlib.Path | str, inputs: Iterable):
-        self._path, self._parts = pathlib.Path(path), {}
+        self._path, self._results = pathlib.Path(path), {}
         self._key = key_of("comparison", inputs, ("geometry", "skin", "calibration"))
         try:
             content = read_json(self._path, "kept comparison", "leave it out")
             if content["key"] == self._key:
-                self._parts = {name: _made(part) for name, part in content["parts"].items()}
+                self._results = {name: _made(part) for name, part in content["parts"].items()}
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             pass  # missing, truncated, or of another version of this package
 
     @property
     def names(self) -> list:
-        return list(self._parts)
+        return list(self._results)
 
     def get(self, name: str, kind: type, make: Callable) -> object:
         """The result of this name and type, computed by `make()` unless it is saved."""
-        if not isinstance(self._parts.get(name), kind):
-            self._parts[name] = make()
-            content = {"key": self._key, "parts": _plain(self._parts)}
+        if not isinstance(self._results.get(name), kind):
+            self._results[name] = make()
+            content = {"key": self._key, "parts": _plain(self._results)}
             write_json(self._path, content, None)
-        return self._parts[name]
+        return self._results[name]
 
 
 def _plain(value):

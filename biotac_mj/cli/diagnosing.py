@@ -11,7 +11,7 @@ __all__ = ["add_checkup", "add_diagnose", "add_next"]
 
 
 def add_diagnose(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     from ..recordings.verbs import add_which
 
     verb = add_verb(
@@ -116,7 +116,7 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
 
 
 def add_next(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "next",
@@ -151,7 +151,7 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
 
 
 def add_checkup(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "checkup",

@@ -11,7 +11,7 @@ __all__ = ["add_calibrate", "add_compare", "add_estimate"]
 
 
 def add_calibrate(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "calibrate",
@@ -125,7 +125,7 @@ def _forces_of(*given):
 
 
 def add_compare(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "compare",
@@ -191,7 +191,7 @@ def _compare(args):
 
 
 def add_estimate(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "estimate",

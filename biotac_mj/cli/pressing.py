@@ -15,7 +15,7 @@ _LONG_HOLD = 5.0  # [s] a longer one is more likely of milliseconds, and needs i
 
 
 def add_press(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "press",
@@ -174,7 +174,7 @@ def _press(args):
 
 
 def add_samples(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "samples",
@@ -204,7 +204,7 @@ def _samples(args):
 
 
 def add_view(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "view",
@@ -252,7 +252,7 @@ def _displayed_skin(args):
 
 
 def add_play(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "play",
@@ -315,7 +315,7 @@ def _play(args):
 
 
 def add_hands(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     add_verb(verbs, "list", _hands, "List the known hands of attach_to_hand, and their fingers.")
 
 
@@ -328,7 +328,7 @@ def _hands(args):
 
 
 def add_mount(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "mount",
@@ -362,7 +362,7 @@ def _mount(args):
 
 
 def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(verbs, "mesh", _import_mesh, "Import a skin, check it, and store it for --skin.")
     verb.add_argument(
         "path", metavar="PATH", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file"

@@ -10,7 +10,7 @@ __all__ = ["add_generate", "add_data"]
 
 
 def add_generate(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     verb = add_verb(
         verbs,
         "generate",
@@ -101,7 +101,7 @@ def _generate(args):
 
 
 def add_data(verbs: argparse._SubParsersAction) -> None:
-    """Adds it to the command line."""
+    """Adds the verb to the command line."""
     from ..recordings.verbs import add_load_arguments
 
     verb = add_verb(

@@ -139,7 +139,7 @@ class SensorSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What a BioTac is made with, by stage; None is nothing said.
+    """All settings of a BioTac, by stage; None leaves the default.
 
         soft = Settings(skin=SkinSettings(mesh="coarse", material="rubber"), seed=3)
         biotac_mj.attach(spec, site="fingertip", settings=soft)

@@ -139,10 +139,10 @@ def import_recordings(
         titles = " and of ".join(sorted(one.title for one in kinds))
         raise ValueError(f"the files hold sensors of {titles}: make a set of each")
     design = kinds.pop()
-    part = iter(assign(sum(len(group) for group in groups), seed))
+    subset = iter(assign(sum(len(group) for group in groups), seed))
     for number, group in enumerate(groups):
         for one in group:
-            one.split = str(next(part))
+            one.split = str(next(subset))
         # a column exists in all interactions of a shard or in none
         for name in ("contact_pos", "indenter_pos", "indenter_quat", "measured_pac", "measured_wrench"):
             if any(getattr(one, name) is None for one in group):

@@ -168,8 +168,8 @@ class _Export:
                 "give it with --rate, frames hold the nearest rows"
             )
         own = 1 / (step.mean() if even else np.median(step)) if len(step) else wanted
-        near = 1e-2 if self.recorded else 1e-3  # tolerance for a real clock
-        own = int(round(own)) if abs(own - round(own)) < near * own else float(own)
+        tolerance = 1e-2 if self.recorded else 1e-3  # tolerance for a real clock
+        own = int(round(own)) if abs(own - round(own)) < tolerance * own else float(own)
         if wanted is None:
             return own, even
         return int(wanted) if wanted == int(wanted) else wanted, even and wanted == own
@@ -212,8 +212,8 @@ class _Export:
         data = self.data
         rows = self._rows(i)
         n = len(rows)
-        parts = [self._column(f"indenter_{name}", rows, k) for name, k in (("pos", 3), ("quat", 4))]
-        pose = np.concatenate(parts, axis=1)
+        columns = [self._column(f"indenter_{name}", rows, k) for name, k in (("pos", 3), ("quat", 4))]
+        pose = np.concatenate(columns, axis=1)
         pose = pose.astype(np.float32)
         wrench = "measured_wrench" if self.recorded else "wrench"
         counts = data[self.counts][rows].astype(np.float32)
@@ -371,18 +371,19 @@ def _statistics(value):
     }
 
 
-def _merge(parts):
+def _merge(moments):
     """Statistics of all episodes; mean and standard deviation are exact, quantiles are means of the episodes'
     (as in lerobot)."""
-    count = np.array([p["count"][0] for p in parts], float)[:, None]
-    mean = np.array([p["mean"] for p in parts])
+    count = np.array([p["count"][0] for p in moments], float)[:, None]
+    mean = np.array([p["mean"] for p in moments])
     total = (count * mean).sum(0) / count.sum()
-    variance = (count * (np.array([p["std"] for p in parts]) ** 2 + (mean - total) ** 2)).sum(0) / count.sum()
+    square = np.array([p["std"] for p in moments]) ** 2 + (mean - total) ** 2
+    variance = (count * square).sum(0) / count.sum()
     out = {
-        "min": np.min([p["min"] for p in parts], 0),
-        "max": np.max([p["max"] for p in parts], 0),
+        "min": np.min([p["min"] for p in moments], 0),
+        "max": np.max([p["max"] for p in moments], 0),
         "mean": total,
         "std": np.sqrt(variance),
     }
-    out |= {key: (count * np.array([p[key] for p in parts])).sum(0) / count.sum() for key in _STATS[5:]}
+    out |= {key: (count * np.array([p[key] for p in moments])).sum(0) / count.sum() for key in _STATS[5:]}
     return {key: value.tolist() for key, value in out.items()} | {"count": [int(count.sum())]}

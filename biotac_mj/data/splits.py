@@ -50,8 +50,8 @@ def least_count(train: int = 1, validation: int = 1, test: int = 1) -> int:
     """Smallest number of interactions of which `assign` gives each part so many."""
     needed = dict(zip(SPLITS, (train, validation, test)))
     for count in itertools.count(1):
-        part = assign(count)
-        if all((part == name).sum() >= least for name, least in needed.items()):
+        subset = assign(count)
+        if all((subset == name).sum() >= least for name, least in needed.items()):
             return count
 
 

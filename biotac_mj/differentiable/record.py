@@ -53,8 +53,8 @@ class Record:
     Attributes:
       geoms: in contact: the skin's, or none.
       x, x_last: (nvert, nworld, 3) nodes at its end and start [m].
-      begun: initial state of a single world on the CPU; in the step to equilibrium of a filling its largest
-        energy is below any in the step, so that the rubber is virgin. Else None.
+      begun: initial state of a single world on the CPU, else None. In the step that fills a skin its largest
+        energy is lower than any in the step, so that the rubber has not softened yet.
       anchors: at its start.
       poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, nworld, ...).
       numbers: of the worlds, (nworld,).

@@ -73,7 +73,7 @@ class Relaxation(Effect):
         return _relaxing(inside, theta["g"], theta["tau"])
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        """In a sensor alone, PDC relaxes."""
+        """Relaxation of PDC, for a sensor without a skin."""
         return {"relaxation": (theta["g"], theta["tau"])}
 
     def apply(self, run: Run, theta: dict) -> None:

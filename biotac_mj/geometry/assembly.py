@@ -30,19 +30,18 @@ def split_surfaces(
     Raises:
       ValueError: the boundary is neither.
     """
-    parts = mesh.boundary_components()
-    if len(parts) == 1 and fixed is not None:
-        return _open_surfaces(mesh, parts[0], fixed, core_vert)
-    if len(parts) != 2:
+    surfaces = mesh.boundary_components()
+    if len(surfaces) == 1 and fixed is not None:
+        return _open_surfaces(mesh, surfaces[0], fixed, core_vert)
+    if len(surfaces) != 2:
         raise ValueError(
-            f"the skin's boundary has {len(parts)} closed part{'s' * (len(parts) != 1)}, not an outer and "
-            "an inner surface: "
-            "mesh the skin as one shell around one cavity"
+            f"the skin's boundary has {len(surfaces)} closed part{'s' * (len(surfaces) != 1)}, "
+            "not an outer and an inner surface: mesh the skin as one shell around one cavity"
         )
-    outer, inner = parts
-    for part, name in ((outer, "outer surface"), (inner, "inner surface")):
-        check_closed(part, name)
-    box = [(mesh.vert[part].min(axis=(0, 1)), mesh.vert[part].max(axis=(0, 1))) for part in parts]
+    outer, inner = surfaces
+    for surface, name in ((outer, "outer surface"), (inner, "inner surface")):
+        check_closed(surface, name)
+    box = [(mesh.vert[surface].min(axis=(0, 1)), mesh.vert[surface].max(axis=(0, 1))) for surface in surfaces]
     if (
         enclosed_volume(mesh.vert, outer) <= 0
         or enclosed_volume(mesh.vert, inner) >= 0
@@ -63,17 +62,17 @@ def _open_surfaces(mesh, face, fixed, core_vert):
             "the skin's boundary has 1 closed part and no face of it is held: mesh the skin as one shell "
             "around one cavity, or let the rim of a dome or the back of a block lie on the backing"
         )
-    parts = connected_faces(free)
-    if len(parts) > 2:
+    surfaces = connected_faces(free)
+    if len(surfaces) > 2:
         raise ValueError(
-            f"held faces cut the skin's surface into {len(parts)} parts: a solid pad has one, a dome "
+            f"held faces cut the skin's surface into {len(surfaces)} parts: a solid pad has one, a dome "
             "an outer and an inner one"
         )
-    if len(parts) == 1:
-        return parts[0], np.zeros((0, 3), np.int32)
-    distance = [cKDTree(core_vert).query(mesh.vert[np.unique(part)])[0].mean() for part in parts]
+    if len(surfaces) == 1:
+        return surfaces[0], np.zeros((0, 3), np.int32)
+    distance = [cKDTree(core_vert).query(mesh.vert[np.unique(surface)])[0].mean() for surface in surfaces]
     inner = int(np.argmin(distance))
-    return parts[1 - inner], parts[inner]
+    return surfaces[1 - inner], surfaces[inner]
 
 
 def fixed_nodes(vert: np.ndarray, bodies: object, tolerance: float = FIXED_WITHIN) -> np.ndarray:

@@ -249,8 +249,8 @@ def pseudonormals(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
     # corners with different indices may be at the same place
     places, of_vert = np.unique(vert, axis=0, return_inverse=True)
     pairs = cKDTree(places).query_pairs(1e-8, output_type="ndarray")
-    near = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(places),) * 2)
-    corner = connected_components(near, directed=False)[1][of_vert.reshape(-1)][face]
+    joined = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(places),) * 2)
+    corner = connected_components(joined, directed=False)[1][of_vert.reshape(-1)][face]
     to_next, to_last = (vert[np.roll(face, n, 1)] - vert[face] for n in (-1, 1))
     normal = np.cross(to_next[:, 0], to_last[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)

@@ -58,9 +58,9 @@ def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> 
     vert = np.concatenate([geometry.vert, geometry.vert[edge].mean(1)])
     if project is not None:
         target = vert.copy()
-        shared = np.intersect1d(on_outer, on_inner)
+        common = np.intersect1d(on_outer, on_inner)
         for name, new in (("outer", on_outer), ("inner", on_inner)):
-            new = np.setdiff1d(new, shared)
+            new = np.setdiff1d(new, common)
             target[new] = project(vert[new], name)
         vert = _unfolded(vert, target, elem)
     return dataclasses.replace(

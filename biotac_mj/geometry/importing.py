@@ -164,8 +164,8 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
     )
     _, label = sparse.csgraph.connected_components(graph, directed=False)
     bodies = []
-    for part in np.unique(label[face[:, 0]]):
-        used, local = np.unique(face[label[face[:, 0]] == part], return_inverse=True)
+    for component in np.unique(label[face[:, 0]]):
+        used, local = np.unique(face[label[face[:, 0]] == component], return_inverse=True)
         bodies.append((vert[used], local.reshape(-1, 3).astype(np.int32)))
     return bodies
 

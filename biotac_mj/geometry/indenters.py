@@ -106,11 +106,11 @@ def _rounded_rectangle(inner, outer, low, high, edge, arc=9):
     def corner(r, y, start):
         return np.stack([r + edge * np.cos(start + quarter), y + edge * np.sin(start + quarter)], axis=1)
 
-    parts = [corner(outer - edge, low + edge, -np.pi / 2), corner(outer - edge, high - edge, 0.0)]
+    corners = [corner(outer - edge, low + edge, -np.pi / 2), corner(outer - edge, high - edge, 0.0)]
     if inner == 0.0:
-        return np.concatenate([[[0.0, low]], *parts, [[0.0, high]]])[::-1]
-    parts += [corner(inner + edge, high - edge, np.pi / 2), corner(inner + edge, low + edge, np.pi)]
-    return np.concatenate(parts)[::-1]
+        return np.concatenate([[[0.0, low]], *corners, [[0.0, high]]])[::-1]
+    corners += [corner(inner + edge, high - edge, np.pi / 2), corner(inner + edge, low + edge, np.pi)]
+    return np.concatenate(corners)[::-1]
 
 
 def _revolve(profile, closed, count=96):

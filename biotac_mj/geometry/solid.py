@@ -55,14 +55,14 @@ def convex_hull(vert: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         hull = ConvexHull(vert)
     except (QhullError, ValueError):  # flat, or fewer than four points
         return None
-    inward = np.einsum("ij,ij->i", hull.equations[:, :3], np.cross(*_sides(vert, hull.simplices))) < 0
+    inward = np.einsum("ij,ij->i", hull.equations[:, :3], np.cross(*_edges(vert, hull.simplices))) < 0
     face = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
     used, face = np.unique(face, return_inverse=True)
     vert, face = vert[used], face.reshape(-1, 3).astype(np.int32)
     return (vert, face) if bounds_solid(vert, face) else None
 
 
-def _sides(vert, face):
+def _edges(vert, face):
     corner = vert[face]
     return corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
 
@@ -91,15 +91,15 @@ def spread_points(vert: np.ndarray, face: np.ndarray, spacing: float, most: floa
     """Points (k, 3) on a mesh (n, 3) [m], (m, 3) with about this spacing [m], vertices first; the spacing is
     wider if there would be more than about `most` points."""
     corner = vert[face]
-    first, second = _sides(vert, face)
+    first, second = _edges(vert, face)
     area = np.linalg.norm(np.cross(first, second), axis=1).sum() / 2
     spacing = max(spacing, float(np.sqrt(area / most)))
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
-    parts, out = np.maximum(np.ceil(longest / spacing), 1).astype(int), [vert[np.unique(face)]]
-    for n in np.unique(parts[parts > 1]).tolist():
+    pieces, out = np.maximum(np.ceil(longest / spacing), 1).astype(int), [vert[np.unique(face)]]
+    for n in np.unique(pieces[pieces > 1]).tolist():
         a, b = (x.ravel() / n for x in np.meshgrid(*[np.arange(n + 1)] * 2))
         weight = np.stack([a, b, 1 - a - b], axis=1)[a + b < 1 + 1e-9]
-        out.append((weight @ corner[parts == n]).reshape(-1, 3))
+        out.append((weight @ corner[pieces == n]).reshape(-1, 3))
     points = np.concatenate(out)
     return points[np.sort(np.unique(np.floor(points / spacing), axis=0, return_index=True)[1])]
 

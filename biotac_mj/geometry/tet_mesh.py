@@ -90,8 +90,8 @@ class TetMesh:
 
         A component with positive `enclosed_volume` is an outer surface, one with negative volume a cavity.
         """
-        parts = connected_faces(self.boundary)
-        return sorted(parts, key=lambda part: -abs(enclosed_volume(self.vert, part)))
+        surfaces = connected_faces(self.boundary)
+        return sorted(surfaces, key=lambda face: -abs(enclosed_volume(self.vert, face)))
 
     def check(self) -> "TetMesh":
         """Returns itself if it can be simulated.

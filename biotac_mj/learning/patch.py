@@ -60,8 +60,8 @@ def estimate(
     change = log_change_of(counts, tare)
     head = load_inverse(find_weights(weights, "inverse"), geometry)
     with torch.no_grad():
-        parts = [head(x) for x in torch.as_tensor(change, dtype=torch.float32).split(256)]
-    field, contact = (torch.cat(part).double().numpy() for part in zip(*parts))
+        outputs = [head(x) for x in torch.as_tensor(change, dtype=torch.float32).split(256)]
+    field, contact = (torch.cat(output).double().numpy() for output in zip(*outputs))
     if isinstance(head, PointsModel):
         return Estimate(1e-3 * field, 1e-3 * contact, False, float(head.meta.get("patch", PATCH)))
     return Estimate(1e-3 * field, contact, True, PATCH)

@@ -172,12 +172,12 @@ class ForwardModel(_Served):
         pod, local = self.pod(displacement), None
         if self.local:
             now = self.film(displacement)
-            parts = [now]
+            features = [now]
             if self.window:
                 if average is None:
                     average = now[:, None].expand(-1, len(self.window), -1, -1)
                 else:
                     average = next_average(average.transpose(0, 1), now, dt, self.window).transpose(0, 1)
-                parts += [now - average[:, k] for k in range(len(self.window))]
-            local = torch.cat(parts, -1)
+                features += [now - average[:, k] for k in range(len(self.window))]
+            local = torch.cat(features, -1)
         return torch.stack([m(local, pod) for m in self.members]).mean(0), average

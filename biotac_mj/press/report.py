@@ -114,7 +114,7 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
     moved = np.linalg.norm(xpos - geometry.vert, axis=1)
     # lighter where the displacement is larger, to show dimple and bulge
     glow = (moved / max(moved.max(), 1e-9))[geometry.outer_face].mean(1)[:, None]
-    parts = [
+    meshes = [
         (
             xpos,
             geometry.outer_face,
@@ -125,8 +125,8 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
         (indenter, record.indenter_face, np.tile([*OBJECT, 0.35], (len(record.indenter_face), 1))),
     ]
     # one collection, so that matplotlib sorts all triangles by depth together
-    tri = 1e3 * np.concatenate([vert[face].reshape(-1, 3, 3) for vert, face, _ in parts]) @ _TO_PAD_UP.T
-    color = np.concatenate([c for _, _, c in parts])
+    tri = 1e3 * np.concatenate([vert[face].reshape(-1, 3, 3) for vert, face, _ in meshes]) @ _TO_PAD_UP.T
+    color = np.concatenate([c for _, _, c in meshes])
     normal = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     azimuth, elevation = np.radians(-115), np.radians(30)

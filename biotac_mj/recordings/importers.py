@@ -79,7 +79,7 @@ def load(
     if not paths:
         raise ValueError("no file was given: give the sensor's own, and others with it")
     roles = {pathlib.Path(p): role for p, role in ((force, "force"), (tdc, "tdc")) if p is not None}
-    done, groups, shared = [], [], []
+    done, groups, without_sensor = [], [], []
     companion_files = [path for path in paths if len(paths) > 1 and is_companion(path)]
     read_with = {other for path in paths for other in companions(path)}
     for path in [*(path for path in paths if path not in {*companion_files, *read_with}), *roles]:
@@ -96,16 +96,16 @@ def load(
             of_companions = [stream for one in companions(path) for stream in _read(one, None, rate, None)]
             groups.append([*found, *of_companions])
         else:
-            shared += found
-    if not groups and shared and done:
+            without_sensor += found
+    if not groups and without_sensor and done:
         raise ValueError(
-            f"{shared[0].source} cannot be put beside {done[0].name}, which is complete: import the log that "
-            "it was made from together with this file (`biotac recording import LOG FILE --out REC.h5`)"
+            f"{without_sensor[0].source} cannot be put beside {done[0].name}, which is complete: import the "
+            "log that it was made from with this file (`biotac recording import LOG FILE --out REC.h5`)"
         )
     if not groups and not done:
         groups.append([])
     for group in _merge_row_by_row(_with_electrodes(groups)):
-        done += join([*group, *shared], rate, object_name, scale)
+        done += join([*group, *without_sensor], rate, object_name, scale)
     if companion_files:
         names = ", ".join(path.name for path in companion_files[:4]) + (
             " ..." if len(companion_files) > 4 else ""

@@ -70,12 +70,12 @@ def _ros1(topics, seconds):
     import rospy
 
     rospy.init_node("biotac_record", anonymous=True, disable_signals=True)
-    held = [
+    waiting = [
         rospy.Subscriber(name, rospy.AnyMsg, _Typed(topic).add, queue_size=1000)
         for name, topic in topics.items()
     ]
     clock.sleep(seconds)
-    for one in held:
+    for one in waiting:
         one.unregister()
 
 

@@ -132,8 +132,8 @@ class Acquisition:
         )
         state[at.impedance : at.impedance + n] = z
         state[at.pressure], state[at.temperature] = self._check_scalars(pressure, temperature)
-        state[at.given_pressure : at.lag] = pressure, temperature
-        state[at.lag] = 0.0
+        state[at.given_pressure : at.relaxed] = pressure, temperature
+        state[at.relaxed] = 0.0
         state[at.impedance_time] = time
         state[at.filter : at.sampled] = pressure, pressure, 0.0, 0.0
         base = state[at.base : at.noise]

@@ -32,7 +32,7 @@ SLOT_RATE = 4400.0  # [Hz]
 # relaxation [Pa]; per electrode the state of its low-pass and its last frames; the sensor's own constants, so
 # that a reset may change them.
 _HEAD = ("pressure", "temperature", "impedance_time", "filter", "hiss")
-_BEGAN = ("began", "given_pressure", "given_temperature", "lag")
+_BEGAN = ("began", "given_pressure", "given_temperature", "relaxed")
 
 
 @wp.struct
@@ -56,7 +56,7 @@ class Place:
     began: int
     given_pressure: int
     given_temperature: int
-    lag: int
+    relaxed: int
     past: int
     own: int
     scale: int
@@ -280,10 +280,10 @@ def _late(at: Place, state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int
         frame = wp.int32((slot - wp.int64(1)) / wp.int64(at.slots)) % at.frames + at.frames
         state[w, past + (1 + frame % at.frames) * at.nelectrode] = value
         whole = wp.int32(behind)
-        part = behind - real(whole)
+        fraction = behind - real(whole)
         newer = state[w, past + (1 + (frame - whole) % at.frames) * at.nelectrode]
         older = state[w, past + (1 + (frame - whole - 1) % at.frames) * at.nelectrode]
-        value = newer + part * (older - newer)
+        value = newer + fraction * (older - newer)
     return value
 
 
@@ -312,10 +312,10 @@ def sample_slots(
     # no extrapolation if the clock was set back
     span = now + dt - wp.min(state[w, at.impedance_time], now)
     keep = wp.exp(-dt / state[w, at.relax_time])
-    lag = keep * state[w, at.lag] + (real(1.0) - keep) * state[w, at.relax_time] / dt * (
+    relaxed = keep * state[w, at.relaxed] + (real(1.0) - keep) * state[w, at.relax_time] / dt * (
         pressure[w] - state[w, at.given_pressure]
     )
-    felt = pressure[w] + state[w, at.relax_fraction] * lag
+    felt = pressure[w] + state[w, at.relax_fraction] * relaxed
     old = state[w, at.pressure]
     rise = (felt - old) / dt
     warmed = _warmed(at, state, w, now + dt)
@@ -357,8 +357,8 @@ def sample_slots(
                             new = _warm_impedance(at, state, impedance, w, e, liquid[w], warmed, remaining)
                             other = _electrode(at, state, w, e, fresh, new, weight)
                             change += state[w, row + e] * (other - state[w, at.base + e])
-                shown = _saturated(change, state[w, at.saturated], state[w, at.knee])
-                value = _late(at, state, w, channel, slot, base + shown)
+                saturated = _saturated(change, state[w, at.saturated], state[w, at.knee])
+                value = _late(at, state, w, channel, slot, base + saturated)
                 value += state[w, at.drift + channel] * wp.max(now + since - state[w, at.began], real(0.0))
                 deviation = state[w, at.noise + channel] * _electrode_noise(value)
             elif address == at.pdc:
@@ -388,7 +388,7 @@ def sample_slots(
     state[w, at.temperature] = temperature[w] + warmed
     state[w, at.given_pressure] = pressure[w]
     state[w, at.given_temperature] = temperature[w]
-    state[w, at.lag] = lag
+    state[w, at.relaxed] = relaxed
     if fresh == 1:
         for e in range(at.nelectrode):
             state[w, at.impedance + e] = _warm_impedance(

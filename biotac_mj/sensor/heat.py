@@ -112,9 +112,10 @@ class HeatParameters:
 
     def __post_init__(self):
         bad = [f.name for f in dataclasses.fields(self) if not math.isfinite(getattr(self, f.name))]
-        small = [f.name for f in dataclasses.fields(self)[2:] if getattr(self, f.name) <= 0]
-        if bad or small or self.near >= self.core:
-            what = f"{', '.join(bad + small)} cannot be" if bad or small else "near is more than the core has"
+        not_positive = [f.name for f in dataclasses.fields(self)[2:] if getattr(self, f.name) <= 0]
+        wrong = bad + not_positive
+        if wrong or self.near >= self.core:
+            what = f"{', '.join(wrong)} cannot be" if wrong else "near is more than the core has"
             raise ValueError(f"heat parameters: {what}; capacities, conductances and lengths are positive")
 
     def loss(self) -> float:
@@ -164,8 +165,8 @@ def begin_heat(
 _FIELDS = [field.name for field in dataclasses.fields(HeatParameters)]
 Parameters = wp.types.vector(len(_FIELDS), real)
 (
-    _, _AMBIENT, _C_CORE, _C_LIQUID, _C_NEAR, _MOUNT, _INSIDE, _SPREAD, _AREA, _THICKNESS, _CONDUCTIVITY,
-    _CAPACITY, _GAP, _FILM, _AIR, _CONTACT,
+    _, _AMBIENT, _C_CORE, _C_LIQUID, _C_THERMISTOR, _MOUNT, _INSIDE, _SPREAD, _AREA, _THICKNESS,
+    _CONDUCTIVITY, _CAPACITY, _GAP, _FILM, _AIR, _CONTACT,
 ) = range(len(_FIELDS))  # fmt: skip
 
 
@@ -354,33 +355,33 @@ def step_heat(
     liquid_known = free * known
     liquid_pull = free * pull
 
-    near_known = real(0.0)
-    near_pull = real(0.0)
+    thermistor_known = real(0.0)
+    thermistor_pull = real(0.0)
     for g in range(ngroup):
         b = BODIES + BODY * g
         patch = state[w, b]
         if patch > real(0.0):
             touched = fit * wp.max(area[w, g], real(0.0))
             known, pull = _eliminate_column(q, dt, b, touched, force[w, g], state, scratch, w)
-            near_known += patch * known
-            near_pull += patch * pull
+            thermistor_known += patch * known
+            thermistor_pull += patch * pull
 
-    near_cell, near_passed, known, pull = _formulas.eliminate(
-        q[_C_NEAR] / dt, state[w, THERMISTOR], near_known, near_pull, q[_SPREAD]
+    thermistor_own, thermistor_passed, known, pull = _formulas.eliminate(
+        q[_C_THERMISTOR] / dt, state[w, THERMISTOR], thermistor_known, thermistor_pull, q[_SPREAD]
     )
     liquid_cell, liquid_passed, liquid_known, liquid_pull = _formulas.eliminate(
         q[_C_LIQUID] / dt, state[w, LIQUID], liquid_known, liquid_pull, q[_INSIDE]
     )
     core = _formulas.core_temperature(
-        (q[_C_CORE] - q[_C_NEAR]) / dt, state[w, CORE], state[w, POWER], q[_MOUNT], q[_AMBIENT],
+        (q[_C_CORE] - q[_C_THERMISTOR]) / dt, state[w, CORE], state[w, POWER], q[_MOUNT], q[_AMBIENT],
         known, pull, liquid_known, liquid_pull,
     )  # fmt: skip
 
     # back-substitution outwards
-    near = near_cell + near_passed * core
+    thermistor = thermistor_own + thermistor_passed * core
     liquid = liquid_cell + liquid_passed * core
     state[w, CORE] = core
-    state[w, THERMISTOR] = near
+    state[w, THERMISTOR] = thermistor
     state[w, LIQUID] = liquid
     state[w, ABOVE] = liquid - state[w, REFERENCE]
     t = liquid
@@ -393,7 +394,7 @@ def step_heat(
         b = BODIES + BODY * g
         patch = state[w, b]
         if patch > real(0.0):
-            t = near
+            t = thermistor
             for i in range(1, _SURFACE + 1):
                 inside = t
                 state[w, b + i] += scratch[w, b + i] * t

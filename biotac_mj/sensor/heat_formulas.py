@@ -107,13 +107,13 @@ def core_temperature(
     power: Number,
     mount: Number,
     ambient: Number,
-    near_known: Number,
-    near_pull: Number,
+    thermistor_known: Number,
+    thermistor_pull: Number,
     liquid_known: Number,
     liquid_pull: Number,
 ) -> Number:
     """Temperature of the core after its two neighbours, the part near the thermistor and the liquid, were
     eliminated into it."""
-    return (store * core + power + mount * ambient + near_known + liquid_known) / (
-        store + mount + near_pull + liquid_pull
+    return (store * core + power + mount * ambient + thermistor_known + liquid_known) / (
+        store + mount + thermistor_pull + liquid_pull
     )

@@ -73,7 +73,7 @@ class Forces:
 
     Attributes:
       ball: centre [m] and radius [m] of a ball around the skin.
-      in_parallel: launches functions that do not need each other's results.
+      in_parallel: launches independent functions.
       wrench_chunk, wrench_chunks: faces whose forces one thread sums, and the number of such chunks.
       node_forces: `SurfaceForces` of the outer surface and of the core's, and `LiquidForces`.
     """

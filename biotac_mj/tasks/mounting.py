@@ -72,16 +72,16 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
         towards = frame.T @ _towards(model, data, here, [find_link(spec, o).name for o in others])
         across = towards - towards @ tip * tip
         if _hinge(model, here.id) is None and np.linalg.norm(across) > 1e-6:
-            looks = across
+            pad = across
         else:
-            looks = np.cross(frame.T @ _axis(model, data, here.id), tip)
-            if np.linalg.norm(looks) < 0.5:
+            pad = np.cross(frame.T @ _axis(model, data, here.id), tip)
+            if np.linalg.norm(pad) < 0.5:
                 raise ValueError(
                     f"link {link.name!r} turns about its own length: say where its pad looks, --pad X Y Z"
                 )
-            if _faces_away(looks, towards):  # for a jaw the joint's range shows how it opens
-                looks = -looks
-        given["pad"] = _plain((looks / np.linalg.norm(looks)).round(9))
+            if _points_away(pad, towards):  # for a jaw the joint's range shows how it opens
+                pad = -pad
+        given["pad"] = _plain((pad / np.linalg.norm(pad)).round(9))
     if "pos" not in given:
         along = points @ tip
         end = points[along > along.max() - _END]
@@ -174,8 +174,8 @@ def _towards(model, data, here, others):
     return np.mean(places, axis=0) - here.xipos if places else np.zeros(3)
 
 
-def _faces_away(looks, towards):
-    return np.dot(looks, towards) < -_FACING * np.linalg.norm(looks) * np.linalg.norm(towards)
+def _points_away(pad, towards):
+    return np.dot(pad, towards) < -_FACING * np.linalg.norm(pad) * np.linalg.norm(towards)
 
 
 def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool:
@@ -186,7 +186,7 @@ def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool
     here = data.body(model.body(mount.body).id)
     names = [find_link(spec, o).name for o in others]
     towards = here.xmat.reshape(3, 3).T @ _towards(model, data, here, names)
-    return bool(_faces_away(mount.pad, towards))
+    return bool(_points_away(mount.pad, towards))
 
 
 def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:
@@ -217,10 +217,10 @@ def side_view(
       pos, mat: (3,) [m], (3, 3) of the BioTac frame. eye: viewing direction in it. distance: [m] of the
         camera.
     """
-    camera, look = mujoco.MjvCamera(), -mat @ np.asarray(eye) / np.linalg.norm(eye)
+    camera, view = mujoco.MjvCamera(), -mat @ np.asarray(eye) / np.linalg.norm(eye)
     camera.lookat[:], camera.distance = pos - 5e-3 * mat[:, 0], distance
-    camera.azimuth = np.degrees(np.arctan2(look[1], look[0]))
-    camera.elevation = np.degrees(np.arcsin(look[2]))
+    camera.azimuth = np.degrees(np.arctan2(view[1], view[0]))
+    camera.elevation = np.degrees(np.arcsin(view[2]))
     return camera
 
 
@@ -274,11 +274,11 @@ def _fade_others(spec, link):
 
 
 def _add_axes(body):
-    ahead = [-TIP - 0.015, 0, 0, -TIP - 2e-3, 0, 0]  # before the tip, as the link would hide it
+    tip_capsule = [-TIP - 0.015, 0, 0, -TIP - 2e-3, 0, 0]  # before the tip, as the link would hide it
     for k, (axis, colour) in enumerate(zip(np.eye(3), np.eye(3))):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=[0, 0, 0, *(0.02 * axis)] if k else ahead,
+            fromto=[0, 0, 0, *(0.02 * axis)] if k else tip_capsule,
             size=[6e-4, 0, 0],
             rgba=[*colour, 1],
             contype=0,

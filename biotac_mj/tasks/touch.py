@@ -118,18 +118,18 @@ class Estimator:
         feature = _features(touch)
         scale = np.sqrt((feature**2).mean(0)) + 1e-9
         spread = hidden.std(0) + 1e-12
-        held = np.isin(episode, np.unique(episode)[::4])
+        test = np.isin(episode, np.unique(episode)[::4])
 
         def solve(rows, ridge):
             a = feature[rows] / scale
             return np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ hidden[rows])
 
         def error(weight):
-            return np.sqrt((((feature[held] / scale) @ weight - hidden[held]) ** 2).mean(0))
+            return np.sqrt((((feature[test] / scale) @ weight - hidden[test]) ** 2).mean(0))
 
-        errors = [error(solve(~held, ridge)) for ridge in ridges]
+        errors = [error(solve(~test, ridge)) for ridge in ridges]
         best = int(np.argmin([(e / spread).sum() for e in errors]))
-        return cls(scale, solve(np.ones(len(held), bool), ridges[best]), errors[best])
+        return cls(scale, solve(np.ones(len(test), bool), ridges[best]), errors[best])
 
 
 class CalibrationWarning(UserWarning):

@@ -81,17 +81,17 @@ def play_model(
             },
         )
 
-    shown = -np.inf
+    drawn_at = -np.inf
     while data.time < seconds:
         begin = clock.perf_counter()
         if control is not None:
             control(data)
         mujoco.mj_step(model, data)
         plugin.check()
-        if data.time - shown > _FRAME - 1e-9:
-            shown = data.time
+        if data.time - drawn_at > _FRAME - 1e-9:
+            drawn_at = data.time
             scene.update(data)
-            page.update(shown, {name: moment(name, h) for name, h in handles.items()})
+            page.update(drawn_at, {name: moment(name, h) for name, h in handles.items()})
         clock.sleep(max(0.0, model.opt.timestep - (clock.perf_counter() - begin)))
     return page
 
@@ -106,7 +106,7 @@ def _served(fingers, **server):
 def _under(geometry):
     """Function (vert (nvert, 3), node) -> thickness (nnode,) [m] of the film under nodes of the outer
     surface, at the nearest inner node of the undeformed skin."""
-    film, near = [], []
+    film, nearest = [], []
 
     def thickness(vert, node):
         if not film:  # made at the first call
@@ -115,8 +115,8 @@ def _under(geometry):
             from ..sensor.film import FilmConduction
 
             film.append(FilmConduction(geometry))
-            near.append(cKDTree(geometry.vert[film[0].node]).query(geometry.vert[node])[1])
-        return film[0].film(vert)[1][near[0]]
+            nearest.append(cKDTree(geometry.vert[film[0].node]).query(geometry.vert[node])[1])
+        return film[0].film(vert)[1][nearest[0]]
 
     return thickness
 

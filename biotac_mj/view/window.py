@@ -271,9 +271,9 @@ def _point_at_hand(spec, handles, model, data, camera):
     common = set.intersection(*map(set, chains))
     # bodies come after their parents; fingers on the world body have no common ancestor
     tops = {max(common)} if common else {chain[-1] for chain in chains}
-    shown = [b for b in range(model.nbody) if tops.intersection(_ancestors(model, b))]
-    shown.append(model.body(_BALL).id)
-    frame_bodies(model, data, shown, camera)
+    framed = [b for b in range(model.nbody) if tops.intersection(_ancestors(model, b))]
+    framed.append(model.body(_BALL).id)
+    frame_bodies(model, data, framed, camera)
 
 
 def _ancestors(model, body):

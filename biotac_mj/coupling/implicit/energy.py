@@ -1,8 +1,8 @@
-"""What energy skins may give in a step, and what is withheld of their push so that they give no more: one
-thread for each world.
+"""Limits the energy that skins give to bodies in a step, by withholding a fraction of their force: one thread
+for each world.
 
-The account is made after the rounds. What acts on a body is linear in the accelerations, as MuJoCo takes it:
-`Rounds.acting`."""
+The energy account is updated after the rounds. Forces on a body are linear in the accelerations, as in
+MuJoCo: `Rounds.acting`."""
 
 import warp as wp
 

@@ -217,10 +217,10 @@ def batches(options: GenerateOptions) -> list[Batch]:
         size = options.measured_batch if measured else options.batch
         for k in range(1 if measured else len(names)):
             members = np.arange(first + k, end, 1 if measured else len(names))
-            for part in np.array_split(members, -(-len(members) // size)) if len(members) else ():
+            for chunk in np.array_split(members, -(-len(members) // size)) if len(members) else ():
                 path = shard_path("" if simulated else RECORDINGS, number[simulated])
-                objects = [names[(i - first) % len(names)] for i in part]
-                out.append(Batch(objects, part.tolist(), simulated, measured, path.as_posix()))
+                objects = [names[(i - first) % len(names)] for i in chunk]
+                out.append(Batch(objects, chunk.tolist(), simulated, measured, path.as_posix()))
                 number[simulated] += 1
     return out
 

@@ -158,10 +158,10 @@ class Maker:
             self.few = Modes(self.modes.rate, self.modes.static_pressure)
         self.time = np.arange(options.steps) / options.rate
         ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
-        parts = [
+        subsets = [
             assign(end - first, [options.seed, k]) for k, (first, end) in enumerate(zip([0, *ends], ends))
         ]
-        self.split = np.concatenate(parts)
+        self.split = np.concatenate(subsets)
         self.measured = None
         if options.labelled or options.recordings:
             from .synthetic_sensor import SyntheticSensor

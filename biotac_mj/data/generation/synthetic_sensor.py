@@ -104,7 +104,7 @@ class SensorVariation:
         youngs_modulus = rng.uniform(0.47e6, 1.36e6)
         place = electrode_positions(design)  # [mm]
         far = np.linalg.norm(place[:, None] - place, axis=2)
-        near = rng.uniform(0, 0.2) * np.exp(-far / rng.uniform(2, 6)) * (far > 0)
+        cross_talk = rng.uniform(0, 0.2) * np.exp(-far / rng.uniform(2, 6)) * (far > 0)
         gain = np.diag(np.exp(rng.normal(0, 0.27, n)))
         return cls(
             youngs_modulus=youngs_modulus,
@@ -119,7 +119,7 @@ class SensorVariation:
             texture_length=rng.uniform(1.5e-3, 4e-3),
             excitation=_shifted_excitation(design, rng),
             electrode_shift=rng.uniform(-1e-3, 1e-3, 3) * [1, 0, 1] + rng.normal(0, 0.3e-3, (n, 3)),
-            mixing=gain @ (np.eye(n) + near + rng.uniform(-0.6, 0.6) / n),
+            mixing=gain @ (np.eye(n) + cross_talk + rng.uniform(-0.6, 0.6) / n),
             sensor=draw_sensor(rng, design),
             ambient=0.3,
             ambient_time=600.0,
@@ -272,13 +272,13 @@ def relax(time: np.ndarray, value: np.ndarray, fraction: float, tau: float) -> n
     """
     value = np.asarray(value, float)
     out = value.copy()
-    for part, tau_ in zip(fraction, tau):
+    for amplitude, tau_ in zip(fraction, tau):
         low = value[0]
         for i in range(1, len(time)):
             dt = time[i] - time[i - 1]
             rise = (value[i] - value[i - 1]) / dt
             low = value[i] - rise * tau_ + (low - value[i - 1] + rise * tau_) * np.exp(-dt / tau_)
-            out[i] += part * (value[i] - low)
+            out[i] += amplitude * (value[i] - low)
     return out
 
 

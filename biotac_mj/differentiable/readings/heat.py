@@ -132,17 +132,17 @@ def _step(q, state, area, force, dt):
         skin.T, store, [layer] * (n - 1) + [press], fraction * touch * surface,
         fraction * touch * (1 - surface_fraction),
     )  # fmt: skip
-    near_known, near_pull = (patch * known).sum(), (patch * pull).sum()
+    thermistor_known, thermistor_pull = (patch * known).sum(), (patch * pull).sum()
 
-    near, near_fraction, near_known, near_pull = _formulas.eliminate(
-        q["near"] / dt, state[own.THERMISTOR], near_known, near_pull, q["spread"]
+    near, near_fraction, thermistor_known, thermistor_pull = _formulas.eliminate(
+        q["near"] / dt, state[own.THERMISTOR], thermistor_known, thermistor_pull, q["spread"]
     )
     liquid, liquid_fraction, liquid_known, liquid_pull = _formulas.eliminate(
         q["liquid"] / dt, state[own.LIQUID], liquid_known, liquid_pull, q["inside"]
     )
     core = _formulas.core_temperature(
         (q["core"] - q["near"]) / dt, state[own.CORE], state[own.POWER], q["mount"], q["ambient"],
-        near_known, near_pull, liquid_known, liquid_pull,
+        thermistor_known, thermistor_pull, liquid_known, liquid_pull,
     )  # fmt: skip
 
     # back-substitution outwards

@@ -113,7 +113,7 @@ class Judged:
 
     @property
     def uncertainty(self) -> np.ndarray:
-        """(n, 19) standard deviation of a prediction: how far constants of both halves part on the same
+        """(n, 19) standard deviation of a prediction: the constants of both halves, compared on the same
         rows."""
         return np.abs(self.error - self.own) / np.sqrt(2)
 

@@ -48,8 +48,8 @@ def amended_sensor(session: Session) -> SensorFile:
 
 
 def running(session: Session) -> tuple[list, list[str]]:
-    """[(Effect, theta)] of the effects found that act in a running sensor, beside its rest and its trend; and
-    ids of those that do not: of the logger, of the force beside it, or of the moment."""
+    """[(Effect, theta)] of the effects found that act in a running sensor, without its baseline and trend;
+    and ids of the others: faults of the logger or of the force sensor, and single events."""
     design, effects, left = designed(session.recording.electrodes), [], []
     for finding in session.findings:
         if finding.kind.drifts or finding.kind.silent:

@@ -125,10 +125,11 @@ class Beliefs:
     """Explanations of some data, the likeliest first.
 
     Attributes:
-      explanations; unseen: the likeliest with one more effect of the catalogue each, of which the data show
-      little. repeatability: of poses [m]. noise: as `measurement_noise` has it. end: of the session's
-        clock [s]. doubts: why a diagnosis is not sure of the likeliest one. beside: probability that
-      one of the unseen is there, but for those that no data of this kind show.
+      explanations: see above. unseen: the likeliest explanation with one more effect each, for effects that
+        the data hardly show. beside: probability that one of these effects is present, without those that no
+        data of this kind show.
+      repeatability: of poses [m]. noise: of `measurement_noise`. end: of the session's clock [s].
+      doubts: why the diagnosis is not sure of the likeliest explanation.
     """
 
     explanations: list[Explanation]

@@ -298,8 +298,8 @@ def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
             f"the set has {len(names)} interactions: a model with intervals of {100 * _LEVEL:.0f} % needs "
             f"{needed}, of which {aside} calibrate them; make more with `biotac data generate --count`"
         )
-    part = assign(len(names), seed)
-    train, kept, test = (names[part == name] for name in SPLITS)
+    subset = assign(len(names), seed)
+    train, kept, test = (names[subset == name] for name in SPLITS)
     reader = fit_reader(data, train, kept, seed=seed)
     return reader, _scores(reader, data, test, train)
 

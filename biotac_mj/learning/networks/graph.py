@@ -127,12 +127,12 @@ class ChebConv(nn.Module):
         if self._dense is None or self._dense.device != x.device:
             eye = torch.eye(self.laplacian.shape[0], device=x.device)
             now = eye if self.up is None else self.up(torch.eye(self.up.shape[1], device=x.device))
-            before, parts = None, [self._at_kept(now)]
+            before, blocks = None, [self._at_kept(now)]
             for _ in range(1, len(self.weight)):
                 new = self.laplacian(now) if before is None else 2 * self.laplacian(now) - before
                 before, now = now, new
-                parts.append(self._at_kept(now))
-            self._dense = torch.cat(parts, 0 if self.up is None else 1)
+                blocks.append(self._at_kept(now))
+            self._dense = torch.cat(blocks, 0 if self.up is None else 1)
         return self._dense
 
     def _at_kept(self, v):

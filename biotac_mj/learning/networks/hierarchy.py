@@ -124,10 +124,10 @@ def _interpolation(graph, vert, keep):
     n, m = len(vert), len(keep)
     k = min(_NEIGHBOURS, m)
     distance = dijkstra(graph, indices=keep)  # (m, n)
-    near = np.argpartition(distance, k - 1, axis=0)[:k].T  # (n, k)
-    d = np.take_along_axis(distance.T, near, axis=1)
+    neighbours = np.argpartition(distance, k - 1, axis=0)[:k].T  # (n, k)
+    d = np.take_along_axis(distance.T, neighbours, axis=1)
     weight = 1 / (d + 1e-3 * d.max(1, keepdims=True)) ** 2
-    offset = vert[keep[near]] - vert[:, None]  # (n, k, 3)
+    offset = vert[keep[neighbours]] - vert[:, None]  # (n, k, 3)
     scale = np.sqrt((offset**2).sum(2).mean(1))[:, None, None]
     p = np.concatenate([np.ones((n, k, 1)), offset / scale], axis=2)
     # Minimise sum |c|^2 / w subject to P^T c = e1: c = W P (P^T W P)^-1 e1. The small ridge matters for
@@ -140,6 +140,6 @@ def _interpolation(graph, vert, keep):
     row_of[keep] = np.arange(m)
     kept = row_of >= 0
     rows = np.repeat(np.arange(n)[~kept], k)
-    up = coo_matrix((value[~kept].ravel(), (rows, near[~kept].ravel())), shape=(n, m)).tocsr()
+    up = coo_matrix((value[~kept].ravel(), (rows, neighbours[~kept].ravel())), shape=(n, m)).tocsr()
     up = up + identity(n, format="csr")[:, keep]
     return csr_matrix(up.multiply(1 / np.asarray(up.sum(1))))

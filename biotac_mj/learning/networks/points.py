@@ -27,13 +27,13 @@ def shape_values(vert: np.ndarray, tets: np.ndarray, target: np.ndarray) -> csr_
     (nelem, 4); for targets outside of them by clipped ones of a near tetrahedron."""
     corner = vert[tets]
     inverse = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
-    near = cKDTree(corner.mean(1)).query(target, min(24, len(tets)))[1]  # (n, k)
-    b = np.einsum("nkab,nkb->nka", inverse[near], target[:, None] - corner[near, 0])
+    candidates = cKDTree(corner.mean(1)).query(target, min(24, len(tets)))[1]  # (n, k)
+    b = np.einsum("nkab,nkb->nka", inverse[candidates], target[:, None] - corner[candidates, 0])
     b = np.concatenate([1 - b.sum(2, keepdims=True), b], 2)
     best = np.argmax(b.min(2), axis=1)
     chosen = np.clip(b[np.arange(len(b)), best], 0, None)
     chosen /= chosen.sum(1, keepdims=True)
-    node = tets[near[np.arange(len(b)), best]]
+    node = tets[candidates[np.arange(len(b)), best]]
     rows = np.repeat(np.arange(len(target)), 4)
     return coo_matrix((chosen.ravel(), (rows, node.ravel())), shape=(len(target), len(vert))).tocsr()
 

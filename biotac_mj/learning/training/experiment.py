@@ -359,7 +359,7 @@ def division_of(path: pathlib.Path | str, split: str, seed: int, count: int) -> 
             if split == "trajectory"
             else split_by_object(data, split.split("+"), seed)
         )
-    return Split(*(part[part < count] for part in (whole.train, whole.validation, whole.test))).check()
+    return Split(*(subset[subset < count] for subset in (whole.train, whole.validation, whole.test))).check()
 
 
 def _linear(arrays, now, fit, check, both):

@@ -165,11 +165,11 @@ def _log_changes(model, arrays):
     for k in range(int(position.max()) + 1):
         row = (position == k).nonzero()[:, 0]
         who = arrays.owner[row]
-        for part, mine in zip(row.split(512), who.split(512)):
-            u = arrays.field[part].float()
+        for chunk, mine in zip(row.split(512), who.split(512)):
+            u = arrays.field[chunk].float()
             if average is None:
-                out[part] = model.log_change(u)[0]
+                out[chunk] = model.log_change(u)[0]
             else:
-                dt = (arrays.time[part] - arrays.time[part - 1 if k else part]).view(-1, 1, 1)
-                out[part], average[mine] = model.log_change(u, average[mine], dt)
+                dt = (arrays.time[chunk] - arrays.time[chunk - 1 if k else chunk]).view(-1, 1, 1)
+                out[chunk], average[mine] = model.log_change(u, average[mine], dt)
     return out

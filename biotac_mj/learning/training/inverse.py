@@ -100,8 +100,8 @@ def train_inverse(
     head.scale.copy_(log_change[rows].square().mean(0).sqrt() + 1e-3)
     every = arrays.rows(train) if teach else rows
     forces = torch.zeros(len(log_change), modes, device=arrays.device)
-    for part in torch.cat([every, check]).split(4096):
-        forces[part] = arrays.force[part].float() @ head.force_basis / head.force_scale[0]
+    for chunk in torch.cat([every, check]).split(4096):
+        forces[chunk] = arrays.force[chunk].float() @ head.force_basis / head.force_scale[0]
     size = basis.scale / basis.scale[0]
     order = torch.as_tensor(ELECTRODE_MIRROR, device=arrays.device)
 

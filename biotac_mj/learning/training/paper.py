@@ -135,8 +135,8 @@ def train_latent_projection(
     error = lambda: (electrode(y[check])[0] - y[check]).square().mean()  # noqa: E731
     fitting.train(electrode, electrode_loss, rows, options, error, checkpoints, curves["electrode"])
 
-    for part in (vae, electrode):
-        part.requires_grad_(False)
+    for network in (vae, electrode):
+        network.requires_grad_(False)
     with torch.no_grad():
         codes = [vae.encode(field(r)) for r in both.split(256)]
         z_m, s_m = torch.cat([c[0] for c in codes]), torch.cat([(0.5 * c[1]).exp() for c in codes])

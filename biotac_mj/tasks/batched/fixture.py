@@ -38,14 +38,14 @@ def _hold(
 ):
     w = wp.tid()
     f = fixture
-    share = wp.clamp((f.release - time[w]) / (f.release - f.hold), 0.0, 1.0)
+    fraction = wp.clamp((f.release - time[w]) / (f.release - f.hold), 0.0, 1.0)
     pos = wp.vec3(qpos[w, f.qpos], qpos[w, f.qpos + 1], qpos[w, f.qpos + 2])
     vel = wp.vec3(qvel[w, f.qvel], qvel[w, f.qvel + 1], qvel[w, f.qvel + 2])
     turn = wp.quat(qpos[w, f.qpos + 4], qpos[w, f.qpos + 5], qpos[w, f.qpos + 6], qpos[w, f.qpos + 3])
     spin = wp.quat_rotate(turn, wp.vec3(qvel[w, f.qvel + 3], qvel[w, f.qvel + 4], qvel[w, f.qvel + 5]))
     weight = body_mass[w, f.body] * f.gravity
-    force = share * (f.stiffness * (place[w] - pos) - f.damping * vel - weight)
-    xfrc_applied[w, f.body] = wp.spatial_vector(force, -share * f.twist * spin)
+    force = fraction * (f.stiffness * (place[w] - pos) - f.damping * vel - weight)
+    xfrc_applied[w, f.body] = wp.spatial_vector(force, -fraction * f.twist * spin)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -83,9 +83,9 @@ class FollowEdge(BatchTask):
         self._along, self._last = (torch.zeros(self.num_envs, *k, device=self.device) for k in ((), (2,)))
 
     def _moves(self, actions):
-        ahead, left, up, turn = (self._rate * actions).unbind(1)
+        forward, lateral, up, turn = (self._rate * actions).unbind(1)
         c, s = self._moved[:, 3].cos(), self._moved[:, 3].sin()
-        return torch.stack([-c * ahead - s * left, c * left - s * ahead, up, turn], dim=1)
+        return torch.stack([-c * forward - s * lateral, c * lateral - s * forward, up, turn], dim=1)
 
     def _pad(self):
         """(num_envs, 2) place of the pad's point [m]."""
@@ -94,14 +94,14 @@ class FollowEdge(BatchTask):
 
     def _pose(self):
         """(num_envs,) distance outside the rim [m], turn of the finger against it [rad], and (num_envs, 2)
-        the way along it, tip first."""
+        the tangent of the rim, tip first."""
         away = self._pad() - self._plate[:, :2]
         distance = away.norm(dim=1)
-        way = torch.stack([away[:, 1], -away[:, 0]], dim=1) / distance[:, None]
+        tangent = torch.stack([away[:, 1], -away[:, 0]], dim=1) / distance[:, None]
         yaw = self._qpos[:, 3]
         c, s = yaw.cos(), yaw.sin()
-        turn = torch.atan2(way[:, 1] * c - way[:, 0] * s, -way[:, 0] * c - way[:, 1] * s)
-        return distance - self.cfg.radius, turn, way
+        turn = torch.atan2(tangent[:, 1] * c - tangent[:, 0] * s, -tangent[:, 0] * c - tangent[:, 1] * s)
+        return distance - self.cfg.radius, turn, tangent
 
     @property
     def held(self) -> torch.Tensor:
@@ -110,21 +110,21 @@ class FollowEdge(BatchTask):
     def script(self) -> torch.Tensor:
         s, (off, turn, _), force = self.cfg, self._pose(), self.force[:, 0]
         touching = force > 0.05
-        ahead = (off.abs() < 1e-3).float() * 0.8
-        left = (off / s.rate[1]).clamp(-1, 1)
+        forward = (off.abs() < 1e-3).float() * 0.8
+        lateral = (off / s.rate[1]).clamp(-1, 1)
         up = torch.where(touching, (force - 0.8).clamp(-0.5, 0.5), -1.0)
-        actions = torch.stack([ahead, left, up, (-turn / s.rate[3]).clamp(-1, 1)], dim=1)
+        actions = torch.stack([forward, lateral, up, (-turn / s.rate[3]).clamp(-1, 1)], dim=1)
         return actions * torch.stack([touching, touching, force > -1, touching], dim=1)
 
     def _judge(self):
-        s, (off, _, way), force = self.cfg, self._pose(), self.force[:, 0]
+        s, (off, _, tangent), force = self.cfg, self._pose(), self.force[:, 0]
         pad = self._pad()
-        gone = ((pad - self._last) * way).sum(1)
+        travel = ((pad - self._last) * tangent).sum(1)
         self._last[:] = pad
         pressing = ((force > s.forces[0]) & (force < s.forces[1])).float()
         on = pressing * (off.abs() < s.on_rim)
-        self._along += on * gone
-        speed = (gone / (s.substeps * s.timestep * s.speed)).clamp(0, 1)
+        self._along += on * travel
+        speed = (travel / (s.substeps * s.timestep * s.speed)).clamp(0, 1)
         paid = pressing * (0.1 + 0.3 / (1 + (off / s.on_rim) ** 2)) + 0.6 * on * speed
         return paid, self.held, self._along >= s.way, (s.way - self._along).clamp(min=0.0)
 

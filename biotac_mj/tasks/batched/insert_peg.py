@@ -160,7 +160,7 @@ class InsertPeg(HeldTask):
         columns = [tilt, 1e3 * tip[:, 0], 1e3 * self.depth, pitch - tilt]
         return [torch.stack(columns, dim=1), self.force]
 
-    def _tell(self, which):
+    def _draw_goals(self, which):
         """The hole is elsewhere in each episode."""
         s, n = self.cfg, self.num_envs
         aside, gap = self._uniform(-s.off, s.off, n), self._uniform(*s.gap, n)

@@ -119,7 +119,7 @@ def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
         def step(self, actions):
             given = torch.as_tensor(np.asarray(actions, np.float32), device=env.device)
             observations, *rest, extras = env.step(given)
-            told = {name: extras[name].cpu().numpy() for name in ("success", "error")}
-            return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in rest), told)
+            info = {name: extras[name].cpu().numpy() for name in ("success", "error")}
+            return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in rest), info)
 
     return Worlds()

@@ -46,12 +46,12 @@ def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
     Args:
       card: of the policy; of a task alone {"task": name}. changes: of the keywords of `make`.
     """
-    told = {"biotac": {"sensor": "random"}} | card
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in told.get("settings", {}).items()}
+    full_card = {"biotac": {"sensor": "random"}} | card
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in full_card.get("settings", {}).items()}
     if settings:
         changes = {"settings": type(TASKS[card["task"]].settings)(**settings)} | changes
     own = {name: card[name] for name in ("observe", "history") if name in card}
-    return make(card["task"], num_envs, **own | told["biotac"] | changes)
+    return make(card["task"], num_envs, **own | full_card["biotac"] | changes)
 
 
 def acting(task: str, policy: pathlib.Path | str | None, device: str) -> tuple[str, Callable, dict]:

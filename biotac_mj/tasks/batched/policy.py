@@ -35,12 +35,12 @@ class Network(torch.nn.Module):
             layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
         self.layers = torch.nn.Sequential(*layers, torch.nn.Linear(widths[-1], nout))
 
-    def watch(self, seen: torch.Tensor) -> None:
-        """Takes (n, nseen) into mean and spread."""
+    def update_statistics(self, seen: torch.Tensor) -> None:
+        """Adds observations (n, nseen) to the mean and variance that normalise them."""
         self.count += len(seen)
-        part = len(seen) / self.count
-        self.mean += part * (seen.mean(0) - self.mean)
-        self.square += part * (seen.square().mean(0) - self.square)
+        weight = len(seen) / self.count
+        self.mean += weight * (seen.mean(0) - self.mean)
+        self.square += weight * (seen.square().mean(0) - self.square)
 
     def forward(self, seen: torch.Tensor) -> torch.Tensor:
         deviation = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()

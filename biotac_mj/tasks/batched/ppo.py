@@ -94,11 +94,11 @@ class Learner:
         )
         self._kept = []
 
-    def watch(self, seen: torch.Tensor, known: torch.Tensor) -> None:
-        """Takes (n, nseen) and (n, nknown) into mean and spread of what is seen and known. Later policies see
-        by them, so that learning changes no policy behind its back."""
-        self.policy.watch(seen)
-        self.critic.watch(known)
+    def update_statistics(self, seen: torch.Tensor, known: torch.Tensor) -> None:
+        """Adds observations (n, nseen) and states (n, nknown) to the mean and variance that normalise them,
+        which stay as they are while the policy learns."""
+        self.policy.update_statistics(seen)
+        self.critic.update_statistics(known)
 
     @torch.no_grad()
     def act(self, seen: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
@@ -125,14 +125,14 @@ class Learner:
             group["lr"] = s.rate * max(s.least, 1 - progress)
         self._descend(-_log_density(self.policy(seen), self.policy.explore, taught).mean())
 
-    def update(self, known: torch.Tensor, alone: bool = True) -> None:
+    def update(self, known: torch.Tensor, train_policy: bool = True) -> None:
         """Learns from what was recorded.
 
         Args:
-          known: (n, nknown) after the last decision. alone: the policy too, else the critic only.
+          known: (n, nknown) after the last decision. train_policy: the policy too, else the critic only.
         """
         s = self.numbers
-        seen, knew, actions, log, mean, explore, value, reward, done = (
+        seen, known_before, actions, log, mean, explore, value, reward, done = (
             torch.stack(column) for column in zip(*self._kept, strict=True)
         )
         self._kept = []
@@ -144,17 +144,17 @@ class Learner:
                 last = advantage[k] = gain[k] + s.gamma * s.lam * (1 - done[k]) * last
             wanted = advantage + value
             advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        columns = (seen, knew, actions, log, mean, explore, wanted, advantage)
+        columns = (seen, known_before, actions, log, mean, explore, wanted, advantage)
         rows = [column.flatten(0, 1) for column in columns]
         for _ in range(s.epochs):
             order = torch.randperm(len(rows[0]), generator=self._draw, device=self._device)
-            for part in order.chunk(s.parts):
-                self._improve(alone, *(row[part] for row in rows))
+            for batch in order.chunk(s.parts):
+                self._improve(train_policy, *(row[batch] for row in rows))
 
-    def _improve(self, alone, seen, known, actions, log, mean, explore, wanted, advantage):
+    def _improve(self, train_policy, seen, known, actions, log, mean, explore, wanted, advantage):
         s = self.numbers
         loss = (self.critic(known)[:, 0] - wanted).square().mean()
-        if alone:
+        if train_policy:
             new_mean, new_explore = self.policy(seen), self.policy.explore
             with torch.no_grad():
                 ratio = explore / new_explore

@@ -200,8 +200,8 @@ class RollRod(HeldTask):
         place = self.place
         coming = place + _LATE * torch.nan_to_num(place - self._place_before)
         self._place_before[:] = place
-        way = ((self._target - coming) / self.cfg.rate).clamp(-1, 1)[:, None]
-        return way * torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0], device=self.device)
+        move = ((self._target - coming) / self.cfg.rate).clamp(-1, 1)[:, None]
+        return move * torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0], device=self.device)
 
     def _judge(self):
         s, error = self.cfg, self.error
@@ -221,14 +221,14 @@ class RollRod(HeldTask):
         velocities = self._qvel[:, self._dofs] + speed_off
         time = self.episode_length_buf[:, None] / s.decisions
         moved = self._moved / s.reach if self._pads is not None else self._moved
-        told = self._target if s.goal == "angle" else 1e3 * self._target
-        return [angles, velocities / 10.0, moved, told[:, None], time]
+        goal = self._target if s.goal == "angle" else 1e3 * self._target
+        return [angles, velocities / 10.0, moved, goal[:, None], time]
 
     def _state(self):
         error = self.error[:, None] / self.cfg.near
         return [self.angle[:, None], 1e3 * self.place[:, None], error, self.force]
 
-    def _tell(self, which):
+    def _draw_goals(self, which):
         self._target = self._target.where(~which, self._uniform(*self.cfg.target, self.num_envs))
         self._place_before.masked_fill_(which, torch.nan)
 

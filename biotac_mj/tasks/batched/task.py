@@ -189,8 +189,8 @@ class BatchTask(abc.ABC):
     def _place(self, some):
         """Puts worlds, (num_envs, 1) of bool, where an episode or its preparation begins; draws."""
 
-    def _tell(self, which):  # noqa: B027 - most are told nothing
-        """Draws what worlds (num_envs,) of bool are told."""
+    def _draw_goals(self, which):  # noqa: B027 - most have no goal
+        """Draws the goals of worlds (num_envs,) of bool."""
 
     def _act(self):  # noqa: B027 - in most nothing else acts
         """Before a substep; launches only."""
@@ -432,7 +432,7 @@ class BatchTask(abc.ABC):
             worlds = which.nonzero()[:, 0]
             self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])
             self._touch.reseed(worlds, self._integers(2**31))
-            self._tell(which)
+            self._draw_goals(which)
             return
         mask, some = wp.from_torch(which), which[:, None]
         for one in self.batches.values():
@@ -440,7 +440,7 @@ class BatchTask(abc.ABC):
         mjw.reset_data(self._m, self._d, mask)
         self._qpos[:] = torch.where(some, self._start, self._qpos)
         self._place(some)
-        self._tell(which)
+        self._draw_goals(which)
         self._moved[:] = torch.where(some, 0.0, self._moved)
         self._age[:] = torch.where(which, 0, self._age)
         self._command()

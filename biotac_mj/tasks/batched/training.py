@@ -80,9 +80,9 @@ class Run:
         self._ended[0] += int(done[w].sum())
         self._ended[1] += int(extras["success"][w].sum())
 
-    def learn(self, alone: bool) -> None:
+    def learn(self, train_policy: bool) -> None:
         """Updates after `steps` decisions, see `Learner.update`."""
-        self.learner.update(self.known(), alone)
+        self.learner.update(self.known(), train_policy)
         if self._ended[0]:
             row = dict(zip(("ended", "success"), self._ended, strict=True))
             self.rows.append(row | {"decisions": self.decisions, "seconds": self.seconds})
@@ -179,7 +179,7 @@ def train(
             if first > 0:
                 first -= 1
                 for run in learners:
-                    run.learner.watch(seen_by(env, run.observe), run.known(slice(None)))
+                    run.learner.update_statistics(seen_by(env, run.observe), run.known(slice(None)))
                 if learns:
                     actions = right + _STRAY * torch.randn_like(right)
             _, reward, terminated, truncated, extras = env.step(actions)
@@ -204,8 +204,8 @@ def train(
             for run in learners:
                 run.keep(out, task, about)
             rates = ", ".join(f"{r.observe} {r.seed}: {r.rate():.2f} ({r.off:.2f})" for r in learners)
-            told = f"{last - begin:5.0f} s, {learners[0].decisions} decisions each"
-            print(f"{told}{', taught' if learns else ''}, {rates}", flush=True)
+            status = f"{last - begin:5.0f} s, {learners[0].decisions} decisions each"
+            print(f"{status}{', taught' if learns else ''}, {rates}", flush=True)
     for run in learners:
         run.keep(out, task, about)
     env.model_error = (0.0, 0.0, 0.0)
