@@ -67,10 +67,10 @@ PARAMETERS = {
 }
 _SHORT = {"E": "youngs_modulus", "nu": "poissons_ratio", "mu": "friction"}
 _MATERIAL = [f.name for f in dataclasses.fields(Material) if f.type in (float, "float")]
-_OPTIONS = [
+_OPTIONS = [  # physical ones: a tolerance of the solver is no parameter of the skin
     f.name
     for f in dataclasses.fields(SkinOptions)
-    if f.type in (float, "float", float | None, "float | None")
+    if f.type in (float, "float", float | None, "float | None") and f.name != "tolerance"
 ]
 
 
@@ -84,9 +84,8 @@ def parameter(text: str) -> FitParameter:
     name, *bounds = text.split(":")
     name = _SHORT.get(name, name)
     if name not in (*_MATERIAL, *_OPTIONS):
-        raise ValueError(
-            f"cannot fit {name!r}: choose E, nu, mu or one of {', '.join((*_MATERIAL, *_OPTIONS))}"
-        )
+        known = ", ".join(dict.fromkeys((*_MATERIAL, *_OPTIONS)))
+        raise ValueError(f"cannot fit {name!r}: choose E, nu, mu or one of {known}")
     if not bounds:
         if name not in PARAMETERS:
             raise ValueError(f"no bounds are known for {name}: give them as {name}:LOWER:UPPER")

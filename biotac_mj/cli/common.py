@@ -84,14 +84,18 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         metavar="FILE.yaml",
         help="sensor file of `biotac diagnose`, with base model and effects (sensor_amended.yaml)",
     )
-    for names, example in ((["--thermal"], "steel"), (["--texture", "--textures"], "cork")):
+    for names, what, example in (
+        (["--thermal"], "for heat: what {} made of", "steel"),
+        (["--texture", "--textures"], "for texture: what {} made of", "cork"),
+    ):
         verb.add_argument(
             *names,
             action=_Drawn,
             nargs="+",
             type=choice,
             metavar="MATERIAL",
-            help=f"of {touched}, such as {example}, or JSON; of several one is drawn (default: none)",
+            help=f"{what.format(touched)}, such as {example}, or JSON; of several one is drawn at random "
+            "(default: none)",
         )
 
 

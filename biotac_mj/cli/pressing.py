@@ -257,8 +257,8 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "play",
         _play,
-        "A page in the browser with skin, electrodes and traces: of recorded presses, of a press whose depth "
-        "and place sliders say, or of a policy that does a task by touch (extra web).",
+        "A page in the browser with skin, electrodes and traces: of recorded presses, of a press with "
+        "sliders for depth and place, or of a policy that does a task by touch (extra web).",
     )
     verb.add_argument(
         "recording",
@@ -278,8 +278,8 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--policy",
         metavar="FILE",
-        help="of a task: what acts (default: the policy that comes with the package); script knows the "
-        "truth, random does not care",
+        help="of a task: what acts (default: the policy that comes with the package); script uses "
+        "the true state, random draws actions",
     )
     verb.add_argument("--episodes", type=whole(1, 100000), help="of a task: score so many, show nothing")
     verb.add_argument("--json", action="store_true", help="with --episodes: scores as JSON, with the card")

@@ -196,7 +196,7 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
     """
     from safetensors import safe_open
 
-    remedy = "give a *.safetensors that `biotac learn train` wrote, or copy it again"
+    remedy = f"give a *.safetensors that `biotac learn train` wrote, or a name: {', '.join(SHIPPED)}"
     with reading(path, "file of weights", remedy), safe_open(str(path), framework="pt") as file:
         meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
         tensors = {k: file.get_tensor(k) for k in (file.keys() if names is None else names)}
