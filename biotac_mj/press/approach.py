@@ -98,10 +98,10 @@ def is_inside(vert: np.ndarray, face: np.ndarray, point: np.ndarray) -> bool:
     a, b, c = np.moveaxis(vert[face] - np.asarray(point, float), 1, 0)
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    rest = la * lb * lc + sum(
+    denominator = la * lb * lc + sum(
         np.einsum("ij,ij->i", p, q) * length for p, q, length in ((a, b, lc), (b, c, la), (c, a, lb))
     )
-    return bool(abs(np.arctan2(volume, rest).sum()) > np.pi)
+    return bool(abs(np.arctan2(volume, denominator).sum()) > np.pi)
 
 
 def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> float:

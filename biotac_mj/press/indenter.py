@@ -133,11 +133,11 @@ def make_indenter(text: str) -> Indenter:
         metres.
       FileNotFoundError: no such mesh.
     """
-    kind, _, rest = text.partition(":")
+    kind, _, description = text.partition(":")
     if kind == "geom":
-        return _from_geom(rest)
+        return _from_geom(description)
     if kind == "mesh":
-        return _from_file(rest)
+        return _from_file(description)
     if text not in INDENTERS:
         raise ValueError(
             f"unknown indenter {text!r}: "

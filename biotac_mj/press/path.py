@@ -247,17 +247,17 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
         count = int(np.ceil(length / step - 1e-9))
         return length * np.arange(1, count + 1) / max(count, 1)
 
-    rest = np.zeros(int(round(options.hold / options.timestep)))
+    hold = np.zeros(int(round(options.hold / options.timestep)))
     down, along = ramp(options.depth), ramp(options.slide)
     depth = np.concatenate(
         [
             [-LEAD],
             down,
-            rest + options.depth,
+            hold + options.depth,
             0 * along + options.depth,
-            (rest if options.slide else rest[:0]) + options.depth,
+            (hold if options.slide else hold[:0]) + options.depth,
         ]
     )
-    slid = np.concatenate([[0], 0 * down, rest, along, (rest if options.slide else rest[:0]) + options.slide])
+    slid = np.concatenate([[0], 0 * down, hold, along, (hold if options.slide else hold[:0]) + options.slide])
     room = approach.room(geometry, point, direction)
     return Path(start, quat, direction, across, depth, slid, room)

@@ -98,8 +98,8 @@ def _discriminant(presses, label, shrink=0.05):
     """Weights (100, 17) and bias (17,) of Fisher's linear discriminant, with the classes' common covariance
     shrunk to its diagonal."""
     mean = np.stack([presses[label == k].mean(0) for k in range(len(OBJECTS))])
-    rest = presses - mean[label]
-    covariance = rest.T @ rest / len(rest)
+    residual = presses - mean[label]
+    covariance = residual.T @ residual / len(residual)
     diagonal = np.diag(np.diag(covariance) + 1e-3)
     weight = np.linalg.solve((1 - shrink) * covariance + shrink * diagonal, mean.T)
     return weight, -0.5 * np.einsum("kf,fk->k", mean, weight)

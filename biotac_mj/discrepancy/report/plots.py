@@ -165,7 +165,7 @@ def ranking(names: Sequence[str], evidence: Sequence[float], named: Sequence[boo
     ax.barh(y, evidence, color=[_AMENDED if one else "0.7" for one in named])
     ax.set_yticks(y, names, fontsize=8)
     ax.axvline(asked, color="k", lw=0.7, ls=":")
-    ax.set_xlabel("evidence of each cause alone [nats]; dotted: asked for", fontsize=8)
+    ax.set_xlabel("evidence of each cause alone [nats]; dotted: threshold", fontsize=8)
     return figure
 
 
@@ -177,7 +177,7 @@ def isolability(ids: Sequence[str], share: np.ndarray, evidence: Sequence[float]
     image = ax.imshow(share, vmin=0, vmax=1, cmap="viridis")
     ax.set_xticks(np.arange(len(ids)), ids, rotation=90, fontsize=7)
     ax.set_yticks(np.arange(len(ids)), [f"{i} ({n:.2g} nats)" for i, n in zip(ids, evidence)], fontsize=7)
-    ax.set_title("share of the row's signature that the column cannot mimic", fontsize=9)
+    ax.set_title("fraction of the row's signature that the column cannot mimic", fontsize=9)
     figure.colorbar(image)
     return figure
 

@@ -85,8 +85,8 @@ def skrl_env(env: BatchTask) -> object:
             return {"policy": _policy(observations)}, extras
 
         def step(self, actions):
-            observations, *rest = env.step(actions)
-            return ({"policy": _policy(observations)}, *rest)
+            observations, *others = env.step(actions)
+            return ({"policy": _policy(observations)}, *others)
 
         def close(self):
             env.close()
@@ -118,8 +118,8 @@ def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
 
         def step(self, actions):
             given = torch.as_tensor(np.asarray(actions, np.float32), device=env.device)
-            observations, *rest, extras = env.step(given)
+            observations, *others, extras = env.step(given)
             info = {name: extras[name].cpu().numpy() for name in ("success", "error")}
-            return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in rest), info)
+            return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in others), info)
 
     return Worlds()

@@ -103,9 +103,9 @@ class Run:
         own = {"observe": self.observe, "seed": self.seed, "decisions": self.decisions}
         learned = {"minutes": round(self.seconds / 60, 2), "success_in_learning": round(self.rate(), 3)}
         card = {"task": task, **own, **learned, **about}
-        policy, rest = self.files(folder, task)
+        policy, resume = self.files(folder, task)
         save_policy(policy, self.learner.policy, card)
-        with replacing(rest) as temporary:
+        with replacing(resume) as temporary:
             more = {"decisions": self.decisions, "seconds": self.seconds, "rows": self.rows}
             torch.save(self.learner.state() | more, temporary)
         return card
