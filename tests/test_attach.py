@@ -365,7 +365,7 @@ def test_a_prefix_serves_one_biotac():
 
 def test_unknown_channel():
     handle = springs(spec_of())
-    with pytest.raises(ValueError, match="a BioTac has no channel 'e20': choose one of electrodes, pdc"):
+    with pytest.raises(ValueError, match="has no channel 'e20': choose one of electrodes, pdc"):
         handle.sensor_name("e20")
 
 

@@ -76,7 +76,9 @@ def test_a_flat_pad_without_electrodes_gives_force_and_depth(tmp_path, capsys):
     # of a ball on a half space; this one lies on a stiff backing, which makes it stiffer
     hertz = 4 / 3 * 1.55e6 / (1 - 0.316**2) * np.sqrt(4e-3) * 1e-3**1.5
     assert hertz < force < 1.8 * hertz
-    assert "electrodes" not in pad.read(data)
+    assert "electrodes" not in pad.read(data) and biotac_mj.load_skin(tmp_path / "flat").name == skin.name
+    with pytest.raises(ValueError, match="a pad flat .0 electrodes. has no channel 'electrodes': choose one"):
+        pad.read(data, "electrodes")
 
 
 def written(path, vert, elem):

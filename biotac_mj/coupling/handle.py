@@ -56,9 +56,10 @@ class Handle:
         Raises:
           ValueError: no such channel.
         """
-        if not isinstance(channel, str) or channel not in SENSORS:
+        own = [name for name, n in sensor_widths(self.design).items() if n]
+        if not isinstance(channel, str) or channel not in own:
             raise ValueError(
-                f"a BioTac has no channel {short_repr(channel)}: choose one of {', '.join(SENSORS)}"
+                f"a {self.design.title} has no channel {short_repr(channel)}: choose one of {', '.join(own)}"
             )
         return self.prefix + channel + self.suffix
 

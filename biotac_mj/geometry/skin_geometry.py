@@ -187,7 +187,7 @@ class SkinGeometry:
           FileNotFoundError: no such file.
           ValueError: the file is not a stored skin.
         """
-        remedy = "pass 'coarse', 'default', 'fine' or a file made by `biotac lab mesh`"
+        remedy = "pass 'coarse', 'default', 'fine', a design's folder or a file made by `biotac lab mesh`"
         found = read_npz(path, "skin", remedy, STORED, {"design": Array((), "text")})
         try:
             design = read_design(str(found.get("design", "biotac")))

@@ -26,7 +26,7 @@ _SHIPPED = (*SKINS, *(f"{design}/{name}" for design in DESIGNS[1:] for name in S
 
 def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
     """A shipped skin by name ("coarse", "default", "fine"; of another design "biotac_sp/coarse"), or one
-    stored as .npz by path.
+    stored as .npz by path, that of a design by its folder.
 
     Raises:
       FileNotFoundError: no such skin.
@@ -38,7 +38,13 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
         )
     if name_or_path in _SHIPPED:
         return copy.deepcopy(_shipped(name_or_path))  # callers may change their copy
-    return SkinGeometry.load(name_or_path)
+    return SkinGeometry.load(_file(name_or_path))
+
+
+def _file(path):
+    """The stored skin's file, of a folder made by `biotac design new` the one in it."""
+    path = pathlib.Path(path)
+    return path / "default.npz" if (path / "design.json").is_file() else path
 
 
 @functools.lru_cache(maxsize=len(_SHIPPED))
@@ -97,8 +103,8 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
         )
     if not isinstance(skin, SkinGeometry):
         text = os.fspath(skin)
-        if text.endswith(".npz"):
-            text = str(pathlib.Path(text).resolve())
+        if text not in _SHIPPED and _file(text).suffix == ".npz":
+            text = str(_file(text).resolve())
         return text, load_skin(text)
     skin.check(repr(skin.name))
     return str(_stored(skin)), skin
