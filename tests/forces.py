@@ -1,12 +1,17 @@
 """Forces of the elements alone, as nodes feel them, and what their points remember, without a step."""
 
+import functools
+
 import numpy as np
 import warp as wp
 
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.types import vec3
+from biotac_mj.skin.rubber.element_points import Kind, material_functions
+from biotac_mj.skin.rubber.law import barrier_energy, energy_density
+from biotac_mj.skin.rubber.points import Mesh, Rubber, deformation_of
+from biotac_mj.skin.types import DOUBLE, real, vec3
 
-__all__ = ["Elements", "begin", "commit", "gradients"]
+__all__ = ["Elements", "begin", "commit", "energy_of", "gradients"]
 
 
 class Elements:
@@ -25,6 +30,7 @@ class Elements:
             self.precision = precision
         else:
             self.elements, self.precision = data.element_forces(), data.precision
+        self._model, self._rubber, self._options = data.model, data.rubber, data.options
         self.nvert, self.nworld = data.model.nvert, data.nworld
         self.device = data.model.device
         self._launcher = Launcher(self.device)
@@ -47,7 +53,7 @@ class Elements:
 
     def energy(self, x) -> float:
         """Of all elements of a single world by their law [J]."""
-        return self.elements.energy(self._array(x, vec3)).sum()
+        return energy_of(self._model.elements, self._rubber, self._options, self._array(x, vec3)).sum()
 
     def upright(self, x) -> np.ndarray:
         """Whether no element of a world (nworld,) is inverted at x."""
@@ -66,6 +72,46 @@ class Elements:
         out = np.zeros((self.nvert, self.nworld, 3))
         np.add.at(out, np.repeat(np.arange(self.nvert), np.diff(start)), corner.numpy()[slot])
         return out
+
+
+@functools.cache
+def _energy_kernel(kind):
+    f, deformation, npoint = material_functions(kind), deformation_of(kind.corners), kind.npoint
+    rotation, theta, weighted_volume, local_lame = f.rotation, f.theta, f.weighted_volume, f.local_lame
+
+    @wp.kernel(module=f"{__name__}.{kind.module}", enable_backward=False)
+    def energy(
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        energy_out: wp.array2d(dtype=real),
+    ):
+        e, w = wp.tid()
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = local_lame(mu, lam, cap)
+        mean = real(0.0)
+        total = real(0.0)
+        for q in range(wp.static(npoint)):
+            F = deformation(mesh, e, q, x, w)
+            R = rotation(F)
+            mean += mesh.weight[e, q] * theta(rubber.law, F, R)
+            density = energy_density(rubber.law, mu, local, F, R) + barrier_energy(rubber.law, mu, F)
+            total += weighted_volume(rubber, mesh, e, q, w) * density
+        factor = weighted_volume(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
+        energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
+
+    return energy
+
+
+def energy_of(elements, rubber, options, x) -> np.ndarray:
+    """Elastic energy (nelem, nworld) of each of `Tetrahedra` by its law [J], at x [nvert, nworld]."""
+    kind = Kind(elements.corners, elements.law == 0, DOUBLE, options)
+    out = wp.zeros((elements.nelem, x.shape[1]), dtype=real, device=x.device)
+    inputs = [elements.cap, rubber, elements.mesh, x]
+    wp.launch(_energy_kernel(kind), out.shape, inputs, [out], device=x.device)
+    return out.numpy()
 
 
 def gradients(elements, x) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from blocks import box, place, skin
+from forces import energy_of
 from scipy.linalg import polar as scipy_polar
 from scipy.optimize import brentq
 
@@ -34,15 +35,15 @@ class Law:
     def __init__(self, name):
         self.law = LAWS[name]
 
-    def _elements(self, n):
-        """Unit tetrahedra, each with nodes of its own, and their forces."""
+    def _parts(self, n):
+        """Unit tetrahedra, each with nodes of its own, and their rubber."""
         vert = np.tile(np.concatenate([np.zeros((1, 3)), np.eye(3)]), (n, 1))
         elem = np.arange(4 * n, dtype=np.int32).reshape(n, 4)
         tetrahedra = Tetrahedra(vert, elem, self.law, wp.get_device("cpu"))
         rubber = Rubber()
         rubber.law = self.law
         rubber.mu, rubber.lam = wp.array([MU], dtype=real), wp.array([LAM], dtype=real)
-        return ElementForces(tetrahedra, rubber, (), DOUBLE)
+        return tetrahedra, rubber
 
     @staticmethod
     def _array(F):
@@ -51,10 +52,11 @@ class Law:
         return wp.array(x.reshape(-1, 1, 3), dtype=vec3, ndim=2)
 
     def energy(self, F):
-        return 6 * self._elements(len(F)).energy(self._array(F))[:, 0]  # of a volume of 1 / 6
+        tetrahedra, rubber = self._parts(len(F))
+        return 6 * energy_of(tetrahedra, rubber, (), self._array(F))[:, 0]  # of a volume of 1 / 6
 
     def stress(self, F, dF=None):
-        elements, n, launcher = self._elements(len(F)), len(F), Launcher("cpu")
+        elements, n, launcher = ElementForces(*self._parts(len(F)), (), DOUBLE), len(F), Launcher("cpu")
         on, inverted = (wp.full(1, k, dtype=int) for k in (1, 0))
         elements.evaluate_corners(launcher, self._array(F), on, inverted)
         corner = -6 * elements.corner_force.numpy()

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import warp as wp
 
-__all__ = ["Number", "for_kernels", "formulas_by_name", "with_names"]
+__all__ = ["Number", "for_kernels", "with_globals", "with_names"]
 
 Number = TypeVar("Number")  # float64 in a kernel, an array or a tensor; the same for all arguments
 
@@ -28,6 +28,11 @@ def with_names(formula: Callable, names: types.SimpleNamespace) -> Callable:
     return types.FunctionType(formula.__code__, formula.__globals__ | {"np": names}, formula.__name__)
 
 
-def formulas_by_name(module: types.ModuleType, make: Callable) -> types.SimpleNamespace:
-    """Namespace of make(formula) for all formulas that the module exports, under their names."""
-    return types.SimpleNamespace(**{name: make(getattr(module, name)) for name in module.__all__})
+def with_globals(module: types.ModuleType, names: dict) -> dict:
+    """Globals of a module of kernels with other values of some names, in which its kernels and functions are
+    plain ones: their text can run on something else than Warp's numbers, unless it assigns in place (+=)."""
+    given = vars(module) | names
+    for name, value in vars(module).items():
+        if isinstance(value, (wp.Function, wp.Kernel)):
+            given[name] = types.FunctionType(value.func.__code__, given, name)
+    return given

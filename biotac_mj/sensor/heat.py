@@ -26,8 +26,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from biotac_mj.sensor import heat_formulas
-from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 from biotac_mj.sensor.materials import Material
 
 __all__ = [
@@ -68,6 +66,8 @@ _SLOWEST = 1e-5  # [1/s]
 
 real = wp.float64
 _CELL = 1.0 / NCELL
+_LEAST = 1e-12  # [m^2] area that is divided by
+_FOUR_PI = 4 * math.pi
 
 
 def state_size(ngroup: int) -> int:
@@ -194,25 +194,63 @@ _RATE, _BRANCH, _FAST, _SLOW = half_space()
 _rates, _branches = (wp.constant(wp.types.vector(NBRANCH, real)(*row)) for row in (_RATE, _BRANCH))
 
 
-# equations shared with the gradients
-_formulas = formulas_by_name(heat_formulas, for_kernels)
+# The text of the kernel and its functions also runs on tensors, for gradients
+# (`differentiable.temperatures`): it does not assign in place.
+
+
+@wp.func
+def _between_cells(layer: real, other: real):
+    """Conductance from the middle of an outermost cell, whose neighbours are `layer` away, through a
+    conductance `other` in series."""
+    return real(1.0) / (real(0.5) / layer + real(1.0) / other)
 
 
 @wp.func
 def _touch(q: Parameters, area: real, force: real, body: real):
-    """Conductance from the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)]."""
-    pressure = force / wp.max(area, real(1.0e-12))
-    h = _formulas.contact_conductance(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
-    return _formulas.between_cells(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
+    """Conductance from the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)].
+
+    The contact's is h = a k (p / 10 kPa)^0.95 with the harmonic mean k of both conductivities: conforming
+    rough surfaces (Yovanovich, 1981; Cooper, Mikic and Yovanovich, 1969, with the exponent 0.985). The slope
+    of the asperities over their height and the hardness are one fitted coefficient a [1/m]."""
+    pressure = wp.max(force / wp.max(area, real(_LEAST)), real(1.0))
+    mean = real(2.0) * q[_CONDUCTIVITY] * body / (q[_CONDUCTIVITY] + body)
+    h = q[_CONTACT] * mean * wp.pow(pressure / real(1.0e4), real(0.95))
+    return _between_cells(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
 
 
 @wp.func
 def _fit(q: Parameters, area: wp.array2d(dtype=real), w: int):
-    """Fraction of the bodies' contact area that fits on the skin."""
+    """Fraction of the bodies' contact area that fits on the skin: the nail's side stays free."""
     wanted = real(0.0)
     for g in range(area.shape[1]):
-        wanted += wp.max(area[w, g], real(0.0))
-    return _formulas.fitting(q[_AREA], wanted)
+        wanted = wanted + wp.max(area[w, g], real(0.0))
+    return wp.min(real(0.5) * q[_AREA] / wp.max(wanted, real(_LEAST)), real(1.0))
+
+
+@wp.func
+def _mixed(old: real, area: real, new: real, added: real):
+    """Temperature of an area after another one is added."""
+    return (old * area + new * added) / (area + added)
+
+
+@wp.func
+def _spread_sideways(taken: real, touched: real, effusivity: real, conductivity: real, dt: real):
+    """Area of a body that is or was recently touched: a spot of radius r spreads over a disc twice as large
+    in r^2 / 4 D, D = (k / e)^2."""
+    ratio = effusivity / conductivity
+    time = taken * ratio * ratio / real(_FOUR_PI)
+    return touched + (taken - touched) * time / (time + dt)
+
+
+@wp.func
+def _eliminate(store: real, cell: real, known: real, pull: real, inner: real):
+    """Eliminates a cell into the one inside it, at a conductance `inner`. `store` is the cell's heat capacity
+    over the time step, `known` and `pull` the constant term and coefficient from outside. Returns the cell's
+    constant term, its factor on the inner cell, and the inner cell's `known` and `pull`."""
+    total = store + pull + inner
+    fraction = inner / total
+    mean = (store * cell + known) / total
+    return mean, fraction, inner * mean, inner - inner * fraction
 
 
 @wp.func
@@ -225,31 +263,35 @@ def _exchange_areas(
     one = real(1.0)
 
     # separated areas stay for a while, as far as the pad has room for them
-    late = _formulas.lingering(q[_CAPACITY], q[_THICKNESS], q[_GAP], q[_CONDUCTIVITY], dt)
+    warming = q[_CAPACITY] * q[_THICKNESS]
+    warming = warming * (one / q[_GAP] + real(0.5) * q[_THICKNESS] / q[_CONDUCTIVITY])
+    late = warming / (warming + dt)
     parted = real(0.0)
     wanted = real(0.0)
     for g in range(ngroup):
-        wanted += wp.max(area[w, g], real(0.0))
-        parted += late * wp.max(state[w, BODIES + BODY * g] - fit * wp.max(area[w, g], real(0.0)), real(0.0))
+        wanted = wanted + wp.max(area[w, g], real(0.0))
+        parted = parted + late * wp.max(
+            state[w, BODIES + BODY * g] - fit * wp.max(area[w, g], real(0.0)), real(0.0)
+        )
     room = wp.max(real(0.5) * q[_AREA] - fit * wanted, real(0.0))
-    late = _formulas.roomed(late, room, parted)
+    late = late * wp.min(room / wp.max(parted, real(_LEAST)), one)
 
     # areas change columns: first what leaves, then what enters
     free = q[_AREA]
     for g in range(ngroup):
-        free -= state[w, BODIES + BODY * g]
+        free = free - state[w, BODIES + BODY * g]
     for g in range(ngroup):
         b = BODIES + BODY * g
         touched = fit * wp.max(area[w, g], real(0.0))
         released = (one - late) * (state[w, b] - touched)
         if released > real(0.0):
             for i in range(NCELL):
-                state[w, FREE + i] = _formulas.mixed(state[w, FREE + i], free, state[w, b + 1 + i], released)
-            free += released
-            state[w, b] -= released
+                state[w, FREE + i] = _mixed(state[w, FREE + i], free, state[w, b + 1 + i], released)
+            free = free + released
+            state[w, b] = state[w, b] - released
         taken = state[w, b + _TAKEN]
         if taken > touched:
-            state[w, b + _TAKEN] = _formulas.spread_sideways(
+            state[w, b + _TAKEN] = _spread_sideways(
                 taken, touched, state[w, b + _EFFUSIVITY], state[w, b + _BODY_CONDUCTIVITY], dt
             )
     for g in range(ngroup):
@@ -259,16 +301,14 @@ def _exchange_areas(
         added = touched - had
         if added > real(0.0):
             for i in range(NCELL):
-                state[w, b + 1 + i] = _formulas.mixed(state[w, b + 1 + i], had, state[w, FREE + i], added)
-            free -= added
+                state[w, b + 1 + i] = _mixed(state[w, b + 1 + i], had, state[w, FREE + i], added)
+            free = free - added
             state[w, b] = touched
         had = state[w, b + _TAKEN]
         added = touched - had
         if added > real(0.0):
             for i in range(_SURFACE, MADE):
-                state[w, b + i] = _formulas.mixed(
-                    state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added
-                )
+                state[w, b + i] = _mixed(state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added)
             state[w, b + _TAKEN] = touched
     return free
 
@@ -290,7 +330,7 @@ def _eliminate_column(
     dx = q[_THICKNESS] * real(_CELL)
     layer = q[_CONDUCTIVITY] / dx
     store = q[_CAPACITY] * dx / dt
-    press = _formulas.between_cells(layer, q[_FILM])
+    press = _between_cells(layer, q[_FILM])
     effusivity = state[w, b + _EFFUSIVITY]
     coverage = wp.min(touched / state[w, b], one)
     touch = _touch(q, touched, force, state[w, b + _BODY_CONDUCTIVITY])
@@ -298,12 +338,12 @@ def _eliminate_column(
     known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
     pull = effusivity * real(_SLOW)
     for i in range(NBRANCH):
-        c = _formulas.branch_conductance(effusivity, _branches[i], _rates[i], dt)
-        known += c * state[w, b + _STORE + i]
-        pull += c
+        c = effusivity * _branches[i] / (one + dt * _rates[i])
+        known = known + c * state[w, b + _STORE + i]
+        pull = pull + c
     at = b + _SURFACE
     hold = effusivity * real(_FAST) / dt
-    cell, passed, known, pull = _formulas.eliminate(hold, state[w, at], known, pull, onto)
+    cell, passed, known, pull = _eliminate(hold, state[w, at], known, pull, onto)
     state[w, at] = cell
     scratch[w, at] = passed
     known = coverage * touch * cell
@@ -311,7 +351,7 @@ def _eliminate_column(
     for k in range(NCELL):
         i = b + NCELL - k
         inner = wp.where(k == NCELL - 1, coverage * press, layer)
-        cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
+        cell, passed, known, pull = _eliminate(store, state[w, i], known, pull, inner)
         state[w, i] = cell
         scratch[w, i] = passed
     return known, pull
@@ -342,14 +382,14 @@ def step_heat(
     free = _exchange_areas(q, dt, fit, area, state, w)
 
     # free skin, from the air inwards
-    outside = _formulas.between_cells(layer, q[_AIR])
-    inlet = _formulas.between_cells(layer, q[_GAP])
+    outside = _between_cells(layer, q[_AIR])
+    inlet = _between_cells(layer, q[_GAP])
     known = outside * q[_AMBIENT]
     pull = outside
     for k in range(NCELL):
         i = FREE + NCELL - 1 - k
         inner = wp.where(k == NCELL - 1, inlet, layer)
-        cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
+        cell, passed, known, pull = _eliminate(store, state[w, i], known, pull, inner)
         state[w, i] = cell
         scratch[w, i] = passed
     liquid_known = free * known
@@ -363,19 +403,18 @@ def step_heat(
         if patch > real(0.0):
             touched = fit * wp.max(area[w, g], real(0.0))
             known, pull = _eliminate_column(q, dt, b, touched, force[w, g], state, scratch, w)
-            thermistor_known += patch * known
-            thermistor_pull += patch * pull
+            thermistor_known = thermistor_known + patch * known
+            thermistor_pull = thermistor_pull + patch * pull
 
-    thermistor_own, thermistor_passed, known, pull = _formulas.eliminate(
+    thermistor_own, thermistor_passed, known, pull = _eliminate(
         q[_C_THERMISTOR] / dt, state[w, THERMISTOR], thermistor_known, thermistor_pull, q[_SPREAD]
     )
-    liquid_cell, liquid_passed, liquid_known, liquid_pull = _formulas.eliminate(
+    liquid_cell, liquid_passed, liquid_known, liquid_pull = _eliminate(
         q[_C_LIQUID] / dt, state[w, LIQUID], liquid_known, liquid_pull, q[_INSIDE]
     )
-    core = _formulas.core_temperature(
-        (q[_C_CORE] - q[_C_THERMISTOR]) / dt, state[w, CORE], state[w, POWER], q[_MOUNT], q[_AMBIENT],
-        known, pull, liquid_known, liquid_pull,
-    )  # fmt: skip
+    stored = (q[_C_CORE] - q[_C_THERMISTOR]) / dt
+    core = stored * state[w, CORE] + state[w, POWER] + q[_MOUNT] * q[_AMBIENT] + known + liquid_known
+    core = core / (stored + q[_MOUNT] + pull + liquid_pull)
 
     # back-substitution outwards
     thermistor = thermistor_own + thermistor_passed * core
@@ -386,7 +425,7 @@ def step_heat(
     state[w, ABOVE] = liquid - state[w, REFERENCE]
     t = liquid
     for k in range(NCELL):
-        state[w, FREE + k] += scratch[w, FREE + k] * t
+        state[w, FREE + k] = state[w, FREE + k] + scratch[w, FREE + k] * t
         t = state[w, FREE + k]
     lost = q[_MOUNT] * (core - q[_AMBIENT]) + free * outside * (t - q[_AMBIENT])
     given = real(0.0)
@@ -397,16 +436,17 @@ def step_heat(
             t = thermistor
             for i in range(1, _SURFACE + 1):
                 inside = t
-                state[w, b + i] += scratch[w, b + i] * t
+                state[w, b + i] = state[w, b + i] + scratch[w, b + i] * t
                 t = state[w, b + i]
             for i in range(NBRANCH):
                 at = b + _STORE + i
-                state[w, at] = _formulas.relaxed(state[w, at], t, _rates[i], dt)
+                a = dt * _rates[i]
+                state[w, at] = (state[w, at] + a * t) / (real(1.0) + a)
             touched = fit * wp.max(area[w, g], real(0.0))
             touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
-            given += touched * touch * (inside - t)
-    state[w, LOST] += dt * lost
-    state[w, GIVEN] += dt * given
+            given = given + touched * touch * (inside - t)
+    state[w, LOST] = state[w, LOST] + dt * lost
+    state[w, GIVEN] = state[w, GIVEN] + dt * given
 
 
 class Heat:
@@ -441,7 +481,6 @@ class Heat:
                 f"{len(parameters)} sets of heat parameters for {nworld} sensors: pass one, or one for each"
             )
         self.ngroup, self.nworld, self.device = len(bodies), nworld, wp.get_device(device)
-        self._parameters = parameters
         rest = np.array([p.rest(bodies) for p in parameters])
         self.nstate = rest.shape[1]
         numbers = np.array([dataclasses.astuple(p) for p in parameters], float)
@@ -467,16 +506,3 @@ class Heat:
         """Steps by dt [s] with `area` and `force`. A launch only: may be captured in a CUDA graph."""
         self._step.set_param_at_index_from_ctype(0, dt)
         self._step.launch()
-
-    def energy(self) -> np.ndarray:
-        """(nworld,) heat in the sensors above 0 C [J]. Plus `LOST` and `GIVEN` it grows by the heater's."""
-        out = []
-        for p, s in zip(self._parameters, self.state.numpy(), strict=True):
-            patches = s[BODIES:].reshape(self.ngroup, BODY)
-            cells = p.capacity * p.thickness / NCELL
-            skin = (p.area - patches[:, 0].sum()) * s[FREE:BODIES].sum()
-            skin += (patches[:, 0] * patches[:, 1 : 1 + NCELL].sum(1)).sum()
-            out.append(
-                p.near * s[THERMISTOR] + (p.core - p.near) * s[CORE] + p.liquid * s[LIQUID] + cells * skin
-            )
-        return np.array(out)

@@ -1,5 +1,4 @@
-"""Counts of a BioTac from the deformed skin: film conduction and acquisition combined, for a step and for
-stored motions."""
+"""Counts of a BioTac from the deformed skin: film conduction and acquisition combined."""
 
 import contextlib
 
@@ -16,7 +15,7 @@ from biotac_mj.sensor.materials import Material
 from biotac_mj.sensor.presets import Sensor, read_sensor
 from biotac_mj.sensor.vibration import Texture, Vibration
 
-__all__ = ["PhysicsReadings", "check_settings", "record"]
+__all__ = ["PhysicsReadings", "check_settings"]
 
 _SETTINGS = {
     "noise": bool,
@@ -230,38 +229,3 @@ def check_settings(
     hottest = float(temperature_from_counts(FULL_SCALE))
     check_temperature("temperature", given.get("temperature", 0.0), hottest, "TDC shows no more")
     return given
-
-
-def record(readings: PhysicsReadings, time: np.ndarray, vert_xpos: np.ndarray, pressure: np.ndarray) -> dict:
-    """Counts over a stored motion; impedance and pressure are linear between its samples.
-
-    Args:
-      readings: PhysicsReadings.
-      time: (nt,) increasing [s]; vert_xpos: (nt, nvert, 3) [m]; pressure: (nt,) above rest [Pa].
-
-    Returns:
-      dict of int arrays, row i the bus report at time[i]: electrodes (nt, n), pdc (nt,), pac (nt, npac), tac
-      (nt,),
-        tdc (nt,).
-
-    Raises:
-      ValueError: lengths that differ, or time that does not increase.
-    """
-    time, pressure = np.asarray(time, dtype=float), np.asarray(pressure, dtype=float)
-    if time.ndim != 1 or not len(time) or len(vert_xpos) != len(time) or pressure.shape != time.shape:
-        raise ValueError(
-            f"time has shape {time.shape}, vert_xpos {len(vert_xpos)} samples, pressure {pressure.shape}: "
-            "pass one of each per sample"
-        )
-    if not np.all(np.diff(time) > 0):
-        raise ValueError(
-            f"time does not increase after sample {int(np.argmax(~(np.diff(time) > 0)))}: sort the samples "
-            "and drop repeated ones"
-        )
-    state = np.zeros(readings.nstate)
-    readings.reset(state, vert_xpos[0], pressure[0], time[0])
-    rows = [readings.readings(state)]
-    for i in range(1, len(time)):
-        readings.advance(state, time[i - 1], time[i] - time[i - 1], vert_xpos[i], pressure[i])
-        rows.append(readings.readings(state))
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}

@@ -3,20 +3,22 @@
 The film itself finds the core triangle nearest to a node and the faces over a disc. Impedances are smooth
 between changes of these."""
 
-import functools
+import types
 
 import numpy as np
 import torch
 
-from ...sensor.film import FilmConduction, NoFilmError, spreading_table
-from ...sensor.film import formulas as film_formulas
-from ...sensor.formulas import formulas_by_name, with_names
-from ..tensors import TORCH, real_tensor
+from ...sensor.film import FilmConduction, NoFilmError, kernels, spreading_table
+from ...sensor.formulas import with_globals
+from ..tensors import real_tensor
 
 __all__ = ["impedance"]
 
 _INSIDE = 1e-9  # barycentric coordinate below which a point is on a triangle's edge
-_formulas = formulas_by_name(film_formulas, functools.partial(with_names, names=TORCH))
+# Warp's names in the film's formulas
+_WARP = types.SimpleNamespace(pi=np.pi, log=torch.log, pow=torch.pow, min=lambda a, most: a.clamp(max=most))
+_names = {"wp": _WARP, "real": lambda value: value, "int": lambda value: value.detach().long()}
+_formulas = types.SimpleNamespace(**with_globals(kernels, _names))
 _ON_EDGE = 1e-9  # as in `sensor.film.kernels`: both faces accept a sample on their edge
 
 
@@ -89,7 +91,9 @@ def _solve(film, middle, thickness, sigma, radius):
     system = _laplacian(middle, thickness, face, sigma)
     weights, local = _cover(film, middle, thickness, face)
     resistance = weights.T @ torch.linalg.solve(system, weights)
-    own = resistance.diagonal() + _near(film, local, radius, sigma)
+    step, table = spreading_table()
+    near = _formulas.near_resistance(local, torch.from_numpy(table), step, radius, film._footprint, sigma)
+    own = resistance.diagonal() + near
     n = film.design.nelectrode
     ground, among = slice(n, None), resistance[n:, n:]
     one = torch.ones(len(among), 1, dtype=torch.float64)
@@ -176,14 +180,3 @@ def _cover(film, middle, thickness, face):
     weights = torch.zeros(n * m, dtype=torch.float64).index_add(0, number.ravel(), weight.ravel())
     weights = weights.reshape(n, m)
     return weights, weights.T @ thickness
-
-
-def _near(film, local, radius, sigma):
-    """Resistance near a disc that the mesh does not resolve."""
-    step, table = spreading_table()
-    ratio = local / radius
-    s = ratio / (1 + ratio) / step
-    i = s.detach().long().clamp(max=len(table) - 2)
-    table, f = torch.from_numpy(table), (s - i).clamp(max=1.0)
-    slab = table[i] * (1 - f) + table[i + 1] * f
-    return _formulas.near_resistance(local, slab, radius, film._footprint, sigma)

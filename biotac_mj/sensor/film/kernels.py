@@ -8,8 +8,6 @@ import warp as wp
 
 from biotac_mj.geometry.design import MOST_DISCS, MOST_EXCITATION
 from biotac_mj.sensor.core_surface import Core, NearestTriangles, nearest_listed_on_core
-from biotac_mj.sensor.film import formulas as film_formulas
-from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 
 __all__ = [
     "NSAMPLE",
@@ -33,7 +31,44 @@ vec3 = wp.vec3d
 vec4 = wp.vec4d
 samples = wp.types.vector(NSAMPLE, int)
 grounded = wp.types.vector(MOST_EXCITATION, wp.float64)
-_formulas = formulas_by_name(film_formulas, for_kernels)
+
+# `rough_thickness`, `sheet_scale` and `near_resistance` also run on tensors, for gradients
+# (`differentiable.impedance`).
+
+
+@wp.func
+def rough_thickness(thickness: real, rest: real, power: real):
+    """Thickness [m] of a smooth film with the conductance of a rough one, which is a power of its
+    thickness."""
+    return rest * wp.pow(thickness / rest, power)
+
+
+@wp.func
+def sheet_scale(conductivity: real, thickness: real, area: real):
+    """Conductance of a face of the sheet over its area [S/m^2]; products of its edges with it are
+    conductances between corners. thickness: sum over its corners, area: of the parallelogram."""
+    sheet = conductivity * thickness / real(3.0)
+    return real(0.5) * sheet / area
+
+
+@wp.func
+def near_resistance(
+    thickness: real,
+    spreading: wp.array(dtype=real),
+    step: real,
+    radius: real,
+    footprint: real,
+    conductivity: real,
+):
+    """Resistance [ohm] near a disc that the mesh does not resolve: the logarithm within the footprint, and
+    the slab's addition to the sheet, from the table `spreading` (`conduction.spreading_table`)."""
+    ratio = thickness / radius
+    s = ratio / (real(1.0) + ratio) / step
+    i = wp.min(int(s), spreading.shape[0] - 2)
+    f = wp.min(s - real(i), real(1.0))  # beyond the table: its last value
+    slab = spreading[i] * (real(1.0) - f) + spreading[i + 1] * f
+    within = wp.log(footprint / radius) / (real(2.0) * real(wp.pi) * thickness)
+    return (within + slab / radius) / conductivity
 
 
 @wp.kernel
@@ -60,7 +95,7 @@ def film_surface(
     gap, distance, _face = nearest_listed_on_core(core, nearest, i, p)
     thickness = wp.where(distance < residual_film, residual_film, distance)  # keeps nan
     if power != real(1.0):
-        thickness = _formulas.rough_thickness(thickness, rest[i], power)
+        thickness = rough_thickness(thickness, rest[i], power)
     middle_out[i, w] = p - real(0.5) * gap
     thickness_out[i, w] = thickness
 
@@ -87,9 +122,7 @@ def face_conductance(
     area = wp.length(wp.cross(e0, e1))
     # keeps a degenerate face finite
     area = wp.max(area, real(1.0e-6) * (wp.length_sq(e0) + wp.length_sq(e1) + wp.length_sq(e2)))
-    scale = _formulas.sheet_scale(
-        conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area
-    )
+    scale = sheet_scale(conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area)
     edge_out[3 * f, w] = -scale * wp.dot(e1, e2)
     edge_out[3 * f + 1, w] = -scale * wp.dot(e2, e0)
     edge_out[3 * f + 2, w] = -scale * wp.dot(e0, e1)
@@ -240,14 +273,14 @@ def driving_point(
     for i in range(m):
         for j in range(m):
             among[i, j] = resistance[w, n + i, n + j]
-        near = _near(local[n + i, w], spreading, spreading_step, radius, footprint, conductivity)
+        near = near_resistance(local[n + i, w], spreading, spreading_step, radius, footprint, conductivity)
         among[i, i] = among[i, i] + near
         one[i] = real(1.0)
     inverse = wp.inverse(among)
     equal = inverse * one  # currents of equal potentials
     for sweep in range(2):  # check all, then write
         for e in range(n):
-            z = resistance[w, e, e] + _near(
+            z = resistance[w, e, e] + near_resistance(
                 local[e, w], spreading, spreading_step, radius, footprint, conductivity
             )
             into = grounded()
@@ -264,20 +297,3 @@ def driving_point(
             else:
                 impedance_out[w, e] = z
     valid_out[w] = 1
-
-
-@wp.func
-def _near(
-    thickness: real,
-    spreading: wp.array(dtype=real),
-    step: real,
-    radius: real,
-    footprint: real,
-    conductivity: real,
-):
-    ratio = thickness / radius
-    s = ratio / (real(1.0) + ratio) / step
-    i = wp.min(int(s), spreading.shape[0] - 2)
-    f = wp.min(s - real(i), real(1.0))  # beyond the table: its last value
-    slab = spreading[i] * (real(1.0) - f) + spreading[i + 1] * f
-    return _formulas.near_resistance(thickness, slab, radius, footprint, conductivity)

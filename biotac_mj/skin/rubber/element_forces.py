@@ -87,13 +87,6 @@ class ElementForces:
         wp.launch(self._kernels.cauchy, dim, inputs, outputs, device=self.device)
         return outputs[0], outputs[1]
 
-    def energy(self, x: wp.array) -> np.ndarray:
-        """Elastic energy (nelem, nworld) of each element by its law [J]."""
-        out = wp.zeros((self._count, self._nworld), dtype=real, device=self.device)
-        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]
-        wp.launch(self._kernels.energy, out.shape, inputs, [out], device=self.device)
-        return out.numpy()
-
     def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, ...]:
         """Stress, dilatation and their derivatives at each integration point of a single world, for
         derivatives by reference positions.

@@ -1,4 +1,4 @@
-"""Forces of the elements' corners, their tangent times a direction, stress and energy.
+"""Forces of the elements' corners, their tangent times a direction, and stress.
 
 Positions and forces are in double precision: a filled skin under light contact balances forces far larger
 than its load, and their rounding errors would show. Tangents have the precision of directions. In double
@@ -16,7 +16,6 @@ import warp as wp
 
 from ..types import Precision, mat33, real, vec3
 from .element_points import Kind, material_functions
-from .law import barrier_energy, energy_density
 from .point_lanes import (
     THREADS,
     any_lane,
@@ -330,7 +329,7 @@ def _serial_product(kind: Kind) -> wp.Kernel:
 
 
 def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
-    """Stress, energy, and slopes at the integration points."""
+    """Stress, and slopes at the integration points."""
     npoint, module, deformation = kind.npoint, kind.module, deformation_of(kind.corners)
     thin, wide = kind.precision.narrow, kind.precision.widen
     f = material_functions(kind)
@@ -374,32 +373,6 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
         cauchy_out[e, w] = sigma
         von_mises_out[e, w] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
 
-    @wp.kernel(module=f"{module}.read", enable_backward=False)
-    def energy(
-        # In:
-        cap: real,
-        rubber: Rubber,
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
-        # Out:
-        energy_out: wp.array2d(dtype=real),
-    ):
-        """Elastic energy of element e [J]."""
-        e, w = wp.tid()
-        mu = rubber.mu[w]
-        lam = rubber.lam[w]
-        local = local_lame(mu, lam, cap)
-        mean = real(0.0)
-        total = real(0.0)
-        for q in range(wp.static(npoint)):
-            F = deformation(mesh, e, q, x, w)
-            R = rotation(F)
-            mean += mesh.weight[e, q] * theta(rubber.law, F, R)
-            density = energy_density(rubber.law, mu, local, F, R) + barrier_energy(rubber.law, mu, F)
-            total += weighted_volume(rubber, mesh, e, q, w) * density
-        factor = weighted_volume(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
-        energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
-
     @wp.kernel(module=f"{module}.points", enable_backward=False)
     def point_slopes(
         # In:
@@ -430,4 +403,4 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
             dilatation_out[i, w] = theta(rubber.law, F, R)
             direction_out[i, w] = wide(direction_of(rubber.law, thin(F), thin(R)))
 
-    return {"cauchy": cauchy, "energy": energy, "point_slopes": point_slopes}
+    return {"cauchy": cauchy, "point_slopes": point_slopes}
