@@ -155,7 +155,7 @@ class Batch(Skins):
         """Has its own groups in a correction of all skins, from number `first` on, and its own of the rows of
         all."""
         self._row = rows[first_row : first_row + self.nslot]
-        self._response, self._factor = Response(self._jacobian), Factor(m, self.nworld)
+        self._response, self._factor = Response(self._jacobian, self.model), Factor(m, self.nworld)
         own = slice(first, first + self.groups[0])
         self._correction, self._first_group = correction, first
         self._correction_force, self._of_step.amiss = correction.force[own], correction.amiss[own]
@@ -207,9 +207,9 @@ class Batch(Skins):
         """Finds how the bodies give way in worlds that are going (nworld,), after mujoco_warp's constraint
         solver; inertia: see `Integrator`. Launches only."""
         self._factor.find(m, d, going, inertia, own=self._row)
-        self._launch(*self._response.find(going, self._factor.L))
-        square, compliance = self._of_step.square, self.skin.bodies.compliance
-        self._launch(*self._response.compliance(going, square, compliance))
+        out = self._of_step.square, self.skin.bodies.compliance
+        for launch in self._response.compliance(going, self._factor.L, *out):
+            self._launch(*launch)
 
     def begin_solve(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Begins to solve the wanted skins where the bodies go; those that move no bodies it solves, where
@@ -298,8 +298,7 @@ class Batch(Skins):
         """Finds the frequencies and settles the account of energy, after `evaluate`; stiffness, L: see
         `Response.frequencies`."""
         r, worlds = self._of_step, taking_part.world
-        self._launch(*self._response.find(worlds, L))
-        for launch in self._response.frequencies(worlds, stiffness, L, self.model, r.frequency):
+        for launch in self._response.frequencies(worlds, stiffness, L, r.frequency):
             self._launch(*launch)
         self._find_wrenches()
         known = [taking_part.world, self.skin.reason, r]

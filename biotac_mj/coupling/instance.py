@@ -4,6 +4,7 @@ What must outlive a step is in `mjData.plugin_state`. All else that an `Instance
 from it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own
 state."""
 
+import copy
 import dataclasses
 import functools
 import math
@@ -170,8 +171,8 @@ class Instance:
         arrays.record(self.horizon, 0.5 * self.by_stages)
         n = len(models)
         parts = models[:, :6], models[:, 6:42].reshape(n, 6, 6), models[:, 42:45], models[:, 45:54]
-        for name, part in zip(arrays.last, parts):
-            arrays.last[name][:] = getattr(arrays, name)[:] = part.reshape(getattr(arrays, name).shape)
+        for (last, now), part in zip(arrays.models, parts):
+            last[:] = now[:] = part.reshape(now.shape)
         arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(n, 3, 3)
         arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
         arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
@@ -260,12 +261,10 @@ class Instance:
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
             fraction, path = self.touching.fraction, self.touching.path
-            result = dataclasses.replace(
-                result,
-                pose=(pos, mat) if bodies is None else self._came_to(result.state),
-                wrench=fraction[:, None] * result.wrench,
-                tangent=(fraction * path)[:, None, None] * result.tangent,
-            )
+            result = copy.copy(result)  # a stepper may keep it
+            result.pose = (pos, mat) if bodies is None else self._came_to(result.state)
+            result.wrench = fraction[:, None] * result.wrench
+            result.tangent = (fraction * path)[:, None, None] * result.tangent
             if not result.converged:
                 result = self._as_far_as_known(result, before)
             if len(self._solved) > 8:
@@ -426,35 +425,34 @@ class Instance:
         return self._result.wrench if acting is None else acting
 
     def touches(self, wrench: np.ndarray, by_place: bool) -> list:
-        """What the geoms get of wrenches (ngroup, 6) on the touching bodies: [(number of the geom, centre of
-        pressure (3,) [m], normal (3,) out of the skin there, force (3,), torque (3,) about the centre)].
+        """What the geoms get of wrenches (ngroup, 6) on the touching bodies: [(number of the geom, (4, 3) of
+        centre of pressure [m], normal out of the skin there, force, torque about the centre)].
 
         A body's wrench is shared by its geoms as the skin pushes on them. Where no push is known, or not
         asked for, the first gets all, on the axis of the wrench."""
-        load, moment, outward = self._pushes(by_place)
-        out = []
-        for k in wrench.any(axis=1).nonzero()[0]:
-            force, torque = wrench[k : k + 1, :3], wrench[k : k + 1, 3:]
+        out, known = [], self._pushes() if by_place else None
+        for k in wrench.any(axis=1).nonzero()[0].tolist():
+            force, torque = wrench[k, :3], wrench[k, 3:]
             geoms = (self.touching.group == k).nonzero()[0]
-            pushed = geoms[load[geoms] > 0.0]
+            pushed = geoms[known[0][geoms] > 0.0] if known else ()
             if len(pushed):
-                part, pos = load[pushed] / load[pushed].sum(), moment[pushed] / load[pushed, None]
-                normal = outward[pushed]
+                load, moment, outward = (of_geoms[pushed] for of_geoms in known)
+                part, pos, normal = load / load.sum(), moment / load[:, None], outward
             else:
-                square = max((force * force).sum(), _TINY)
-                pushed, part, pos, normal = geoms[:1], np.array([1.0]), cross(force, torque) / square, force
-            normal = normal / np.sqrt(np.maximum((normal * normal).sum(axis=1), _TINY))[:, None]
-            turn = (torque - cross((part @ pos)[None], force))[0]
-            for g, x, n, a in zip(pushed.tolist(), pos, normal, part):
-                out.append((g, x, n, a * force[0], a * turn))
+                axis = cross(wrench[k : k + 1, :3], wrench[k : k + 1, 3:]) / max(force @ force, _TINY)
+                pushed, part, pos, normal = geoms[:1], np.ones(1), axis, force[None]
+            turn = torque - cross((part @ pos)[None], force[None])[0]
+            for g, a, x, n in zip(pushed.tolist(), part.tolist(), pos, normal):
+                n = n / math.sqrt(max(n @ n, _TINY))
+                out.append((g, np.array([x, n, a * force, a * turn])))
         return out
 
-    def _pushes(self, wanted):
+    def _pushes(self):
         """Of the skin's normal push on each geom: its size (ngeom,) [N], size times place and size times
-        normal (ngeom, 3)."""
+        normal (ngeom, 3); zeros where it is not known."""
         skin, ngeom = self.setup.skin, len(self.touching.geoms)
         load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
-        known = wanted and self._result is not None and self._result.state is not None
+        known = self._result is not None and self._result.state is not None
         if not known or not hasattr(skin.stepper, "touched_faces"):
             return load, moment, outward
         with skin.lock:

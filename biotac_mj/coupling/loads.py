@@ -26,7 +26,6 @@ _FORCE, _TORQUE, _TOUCH, _CONTACT = (
 )
 _ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
 _PYRAMIDAL = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
-_ONE_CONTACT = ctypes.c_char * CONTACT.itemsize
 PYRAMID = 10  # edges of a contact's friction pyramid with six components
 
 
@@ -54,6 +53,10 @@ class Loads:
         self._touch_sensors = np.flatnonzero(now & (kind == _TOUCH)).tolist()
         # others feel what a body gets, whatever the places are at which it gets it
         self._by_place = bool((now & np.isin(kind, (_TOUCH, _CONTACT))).any())
+        self._touch = np.zeros((), CONTACT)  # what all touches have in common
+        self._touch["friction"], self._touch["dim"] = 1.0, 6
+        for name in ("flex", "elem", "vert"):
+            self._touch[name] = -1
         self._core_geom = {t.touching.core: core_geom(model, t.touching.core) for t in coupled}
 
     def write(self, acting: dict) -> None:
@@ -64,13 +67,14 @@ class Loads:
             return
         data = self.data.struct
         kept = data.contact, data.ncon, data.efc_force
-        contacts, forces = self._listed(touches)
-        data.contact, data.ncon = ctypes.addressof(contacts), len(contacts)
-        data.efc_force = ctypes.addressof(forces)
+        contact, force = self._listed(touches)
+        data.contact, data.ncon = contact.ctypes.data, len(contact)
+        data.efc_force = force.ctypes.data
         try:
             LIBRARY.mj_rnePostConstraint(self.model.address, self.data.address)
-            self._again.opt = self.model.struct.opt
-            LIBRARY.mj_sensorAcc(ctypes.addressof(self._again), self.data.address)
+            if self._again.nsensor:
+                self._again.opt = self.model.struct.opt
+                LIBRARY.mj_sensorAcc(ctypes.addressof(self._again), self.data.address)
         finally:
             data.contact, data.ncon, data.efc_force = kept
         for i in self._touch_sensors:
@@ -78,35 +82,33 @@ class Loads:
 
     def _touches(self, instance, wrench):
         core = instance.touching.core
-        frame, origin = self.data.xmat[core].reshape(3, 3), self.data.xpos[core]
-        for k, pos, normal, force, torque in instance.touches(wrench, self._by_place):
-            geom = int(instance.touching.geom[k])
-            yield _Touch(core, geom, origin + frame @ pos, frame @ normal, frame @ force, frame @ torque)
+        turned = self.data.xmat[core].reshape(3, 3).T
+        for k, vectors in instance.touches(wrench, self._by_place):
+            pos, normal, *load = vectors @ turned
+            yield _Touch(core, int(instance.touching.geom[k]), self.data.xpos[core] + pos, normal, *load)
 
     def _listed(self, touches):
         """MuJoCo's contacts with the touches behind them, and the forces of all rows: none of the skins' own,
         and those of the touches."""
         data = self.data.struct
-        contacts = (_ONE_CONTACT * (data.ncon + len(touches)))()
-        forces = (ctypes.c_double * (data.nefc + PYRAMID * len(touches)))()
-        ctypes.memmove(contacts, data.contact, data.ncon * CONTACT.itemsize)
-        ctypes.memmove(forces, data.efc_force, data.nefc * 8)
-        contact, force = np.frombuffer(contacts, CONTACT), np.frombuffer(forces)
+        contact = np.zeros(data.ncon + len(touches), CONTACT)
+        force = np.zeros(data.nefc + PYRAMID * len(touches))
+        ctypes.memmove(contact.ctypes.data, data.contact, data.ncon * CONTACT.itemsize)
+        ctypes.memmove(force.ctypes.data, data.efc_force, data.nefc * 8)
+        contact[data.ncon :] = self._touch
         for one in self.coupled:
             force[one.metric.numbers()] = 0.0
         pyramidal = self.model.opt.cone == _PYRAMIDAL
         for k, t in enumerate(touches):
             row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]
             frame = contact_frame(t.normal)
-            one["pos"], one["frame"], one["friction"], one["dim"] = t.pos, frame.ravel(), 1.0, 6
+            one["pos"], one["frame"], one["efc_address"] = t.pos, frame.ravel(), row
             one["geom"] = one["geom1"], one["geom2"] = self._core_geom[t.core], t.geom
-            one["flex"] = one["elem"] = one["vert"] = -1
-            one["efc_address"] = row
             value = np.concatenate([frame @ t.force, frame @ t.torque])
             if pyramidal:  # two edges: their sum is a fifth of the normal force, their difference a component
                 value = (value[0] / 5 + value[1:, None] * np.array([1.0, -1.0])).ravel() / 2
             force[row : row + len(value)] = value
-        return contacts, forces
+        return contact, force
 
     def _add_touch(self, sensor, touches):
         """Adds the touches whose ray out of the sensor's body meets the site, as MuJoCo does with its own.

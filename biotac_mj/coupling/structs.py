@@ -264,20 +264,26 @@ class DataView(_View):
         )
         return out
 
-    def acceleration(self) -> np.ndarray:
+    def acceleration(self, again: bool = False) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
         rows as they are now.
 
         Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of
         mj_inverse, warm start) is put back. Where the solver stops at its last iteration it goes on from
         there, and so will MuJoCo's own run: Euler moves bodies by accelerations of CG and Newton, which no
-        force explains before they have finished, and what PGS leaves unsolved may throw a light body off."""
+        force explains before they have finished, and what PGS leaves unsolved may throw a light body off.
+
+        Args:
+          again: whether nothing but passive forces, Jacobians and regularisation of rows has changed since it
+            was last called.
+        """
         model, data = self.model.address, self.address
         qacc, warmstart = self.qacc, self.qacc_warmstart
         kept = qacc.copy(), warmstart.copy()
-        LIBRARY.mj_rne(model, data, 0, self.qfrc_bias.ctypes.data)
-        LIBRARY.mj_referenceConstraint(model, data)
-        LIBRARY.mj_fwdActuation(model, data)
+        if not again:
+            LIBRARY.mj_rne(model, data, 0, self.qfrc_bias.ctypes.data)
+            LIBRARY.mj_referenceConstraint(model, data)
+            LIBRARY.mj_fwdActuation(model, data)
         LIBRARY.mj_fwdAcceleration(model, data)
         LIBRARY.mj_fwdConstraint(model, data)
         for _ in range(self._rounds_left()):

@@ -91,7 +91,7 @@ class Touching:
             self.fraction[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
         led = model.body_mocapid[model.body_rootid] >= 0
         self.led = led[self.body] | led[core]
-        self._geom_pos, self._geom_mat = model.geom_pos[ids], matrix(model.geom_quat[ids])
+        self._geom_pos, self._geom_mat = model.geom_pos[ids][:, :, None], matrix(model.geom_quat[ids])
 
     def warn(self, model: ModelView | None = None) -> None:
         """Warns of the notes, each once a model where MuJoCo tells when one is made (`forget_notes`)."""
@@ -118,23 +118,29 @@ class Touching:
         """
         self.check(pos, mat)
         owner = mat[self.group]
-        geom_pos = pos[self.group] + (owner @ self._geom_pos[:, :, None])[:, :, 0]
-        geom_mat = owner @ self._geom_mat
-        return geom_pos - self._apart(geom_mat), geom_mat
+        geom_pos, geom_mat = pos[self.group] + (owner @ self._geom_pos)[:, :, 0], owner @ self._geom_mat
+        if self.parted:
+            geom_pos -= self._apart(geom_mat)
+        return geom_pos, geom_mat
 
     def _apart(self, geom_mat):
         """How far geoms are seen from where they are: out of the pad, planes against their normals. MuJoCo's
         compiler, too, makes its one step without contact."""
-        if not self.parted:
-            return 0.0
         plane = np.array([[g.type == "plane"] for g in self.geoms], bool).reshape(-1, 1)
         return _APART * np.where(plane, geom_mat[:, :, 2], (0.0, 1.0, 0.0))
 
     def body_pose(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> tuple:
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies whose geoms are at (ngeom, 3), (ngeom, 3, 3)."""
-        first, geom_pos = self._first, geom_pos + self._apart(geom_mat)
-        mat = geom_mat[first] @ self._geom_mat[first].transpose(0, 2, 1)
-        return geom_pos[first] - (mat @ self._geom_pos[first, :, None])[:, :, 0], mat
+        if self.parted:
+            geom_pos = geom_pos + self._apart(geom_mat)
+        pos, turned = self._first_geom
+        mat = geom_mat[self._first] @ turned
+        return geom_pos[self._first] - (mat @ pos)[:, :, 0], mat
+
+    @functools.cached_property
+    def _first_geom(self):
+        """Of the first geom of each body: its place, and the rotation from it to the body."""
+        return self._geom_pos[self._first], self._geom_mat[self._first].transpose(0, 2, 1)
 
     def check(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Raises ValueError for poses (ngroup, 3), (ngroup, 3, 3) that are not finite, or huge."""

@@ -29,7 +29,7 @@ _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])  # positions of a cross
 _SKEW = np.zeros((3, 9))
 for _i, (_j, _k) in enumerate(zip(_NEXT, _AFTER)):
     _SKEW[_i, 3 * _k + _j], _SKEW[_i, 3 * _j + _k] = 1.0, -1.0
-_EYE, _DIAGONAL = np.eye(3), np.array([0, 4, 8])
+_EYE, _DIAGONAL, _TINY = np.eye(3), np.array([0, 4, 8]), np.finfo(float).tiny
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -51,9 +51,9 @@ def rotation(vector: np.ndarray) -> np.ndarray:
     k = skew(vector)
     if angle2.max(initial=0.0) < 1e-8:  # the series to the fourth order: exact to rounding
         return _EYE + (1.0 - angle2 / 6) * k + (0.5 - angle2 / 24) * (k @ k)
-    angle = np.sqrt(angle2)
-    half = np.sinc(angle / (2 * np.pi))
-    return _EYE + np.sinc(angle / np.pi) * k + 0.5 * half * half * (k @ k)
+    angle = np.sqrt(np.maximum(angle2, _TINY))
+    half = np.sin(0.5 * angle) / angle
+    return _EYE + np.sin(angle) / angle * k + 2.0 * half * half * (k @ k)
 
 
 def matrix(quat: ArrayLike) -> np.ndarray:

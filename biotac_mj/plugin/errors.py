@@ -13,6 +13,7 @@ import sys
 import threading
 import traceback
 import warnings
+from _signal import getsignal  # that of `signal` takes 20 us to name the handler, in every step
 from collections.abc import Callable, Iterator
 
 import mujoco
@@ -189,7 +190,7 @@ def interrupt(number: int, frame: object) -> None:
 def watch_interrupts() -> None:
     """Makes Ctrl-C end the loop that steps, unless the user has a handler of his own."""
     if (
-        signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        getsignal(signal.SIGINT) is signal.default_int_handler
         and threading.get_ident() == threading.main_thread().ident
     ):
         signal.signal(signal.SIGINT, interrupt)

@@ -12,7 +12,7 @@ from ..geometry import rigid_warp
 from ..geometry.rigid import cross, rotation
 from .types import mat33, vec3
 
-__all__ = ["Bodies", "BodyMotion", "follow_wrench", "make_bodies"]
+__all__ = ["Bodies", "BodyMotion", "follow_wrench", "make_bodies", "uncoupled_geoms"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,6 +56,28 @@ def follow_wrench(h: int, w: int, b: Bodies, m: wp.spatial_vectord, pos: vec3, m
     origin = b.origin[h, w]
     translation = vec3(m[0], m[1], m[2]) + wp.cross(more, b.arm[h, w])
     return origin + translation + turn * (pos - origin), turn * mat
+
+
+@wp.kernel
+def uncoupled_geoms(
+    # In:
+    b: Bodies,
+    group: wp.array(dtype=int),
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+    mat_out: wp.array2d(dtype=mat33),
+):
+    """Poses of geoms without the skin's wrenches on their bodies, from the predicted poses."""
+    g, w = wp.tid()
+    h = group[g]
+    m = wp.spatial_vectord()
+    for k in range(b.compliance.shape[1]):
+        m -= b.compliance[h, k, w] * b.predicted[k, w]
+    p, R = follow_wrench(h, w, b, m, pos[g, w], mat[g, w])
+    pos_out[g, w] = p
+    mat_out[g, w] = R
 
 
 @dataclasses.dataclass(frozen=True)

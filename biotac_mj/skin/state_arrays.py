@@ -99,12 +99,11 @@ class StateArrays:
         """State of the first world, without the variables of the host."""
         host = self._host()
         saved = {name: value(host[name]) for name, value in self._values}
-        for name, blocks in self._rows.items():
-            tables = [_rows(block, host) for block in blocks]
-            begin = 0
+        for name, blocks in self._blocks.items():
+            tables, begin = [_rows(block) for block in blocks], 0
             for table, block in zip(tables, blocks, strict=True):
                 table[:, 0] += begin
-                begin += host[block[0].name].size
+                begin += len(block[0][1])
             saved[name] = tables[0] if len(tables) == 1 else np.concatenate(tables)
         return kind(**saved)
 
@@ -126,8 +125,8 @@ class StateArrays:
                 value = value[..., _WHOLE].reshape(host[v.name].shape)
             if value is not None and not isinstance(value, str):
                 host[v.name][...] = value
-        for name, blocks in self._rows.items():
-            _put_rows(values.get(name, np.zeros((0, 2))), blocks, host)
+        for name, blocks in self._blocks.items():
+            _put_rows(values.get(name, np.zeros((0, 2))), blocks)
         if self._tier == FULL:
             host["x_last"][:] = host["x"]
         contacts = values.get("contacts", np.zeros((0, 2))).astype(int)
@@ -152,6 +151,7 @@ class StateArrays:
         """Arrays of the first world that `save` and `load` use."""
         if self._views is None or self._device.is_cuda:
             self._views = {name: self.view(name) for name in self._loaded}
+            self._blocks = {name: _tables(blocks, self._views) for name, blocks in self._rows.items()}
         return self._views
 
 
@@ -182,30 +182,33 @@ def _blocks(variables, arrays):
     return blocks
 
 
-def _rows(block, host):
+def _tables(blocks, host):
+    """Of each variable of each block its reset and its array in one world, a row for each item."""
+    sizes = (host[block[0].name].size for block in blocks)
+    return [[(v.reset, host[v.name].reshape(n, -1)) for v in block] for n, block in zip(sizes, blocks)]
+
+
+def _rows(block):
     """Rows of a block: indices of its items, and their values."""
-    column = host[block[0].name].reshape(-1)
-    at = np.flatnonzero(column != block[0].reset)
-    parts = [host[v.name].reshape(len(column), -1)[at] for v in block]
-    return np.concatenate([at[:, None], *parts], axis=1, dtype=float)
+    reset, column = block[0]
+    at = (column[:, 0] != reset).nonzero()[0]
+    return np.concatenate([at[:, None], *(items[at] for _, items in block)], axis=1, dtype=float)
 
 
-def _put_rows(table, blocks, host):
+def _put_rows(table, blocks):
     """Inverse of `_rows` for all blocks; items without a row are reset."""
     begin, number = 0, table[:, 0]
-    for first, *others in blocks:
-        column = host[first.name].reshape(-1)
+    for (reset, column), *others in blocks:
         end = begin + len(column)
         rows = table
         if len(blocks) > 1:
             rows = table[np.searchsorted(number, begin) : np.searchsorted(number, end)]
         at, done = rows[:, 0].astype(int) - begin, 2
-        column[:] = first.reset
-        column[at] = rows[:, 1]
-        for v in others:
-            items = host[v.name].reshape(len(column), -1)
-            if v.reset is not None:
-                items[:] = v.reset
+        column[:] = reset
+        column[at, 0] = rows[:, 1]
+        for reset, items in others:
+            if reset is not None:
+                items[:] = reset
             if len(at):
                 items[at] = rows[:, done : done + items.shape[1]]
             done += items.shape[1]

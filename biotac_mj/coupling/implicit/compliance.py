@@ -130,12 +130,15 @@ def give(
     going: wp.array(dtype=int),
     L: wp.array3d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
+    model: Model,
+    held: int,
     # Out:
     response_out: wp.array3d(dtype=real),
 ):
-    """Accelerations of the degrees of freedom by a unit of the wrench on one body."""
+    """Accelerations of the degrees of freedom by a unit of the wrench on one body. held: of those alone that
+    the skin holds."""
     w, c = wp.tid()
-    if going[w] == 0:
+    if going[w] == 0 or (held == 1 and not holds(model, c / 6, w)):
         return
     for i in range(L.shape[1]):
         response_out[w, c, i] = jacobian[c / 6, w, i][c % 6]
@@ -265,39 +268,38 @@ class Response:
     """Of the bodies that one skin meets to wrenches on them, as launches (kernel, dim, arguments).
 
     Args:
-      jacobian: (group, world, dof) of the bodies.
-
-    Attributes:
-      found: (nworld, 6 groups, nv) accelerations of the degrees of freedom by a unit of each component.
+      jacobian: (group, world, dof) of the bodies. model: of the skin.
     """
 
-    def __init__(self, jacobian: wp.array):
-        (groups, nworld, nv), self._jacobian = jacobian.shape, jacobian
+    def __init__(self, jacobian: wp.array, model: Model):
+        (groups, nworld, nv), self._jacobian, self._model = jacobian.shape, jacobian, model
         self._columns = nworld, 6 * groups
         with wp.ScopedDevice(jacobian.device):
-            self.found, self._driven = (wp.zeros((*self._columns, nv), dtype=real) for _ in range(2))
+            self._found, self._driven = (wp.zeros((*self._columns, nv), dtype=real) for _ in range(2))
             self._power = wp.zeros(self._columns, dtype=wp.vec2d)
 
-    def find(self, going: wp.array, L: wp.array) -> tuple:
-        """With factors of `factor`, in worlds that are going (nworld,)."""
-        return give, self._columns, [going, L, self._jacobian, self.found]
-
-    def compliance(self, going: wp.array, square: wp.array, out: wp.array) -> tuple:
-        """Writes the compliance [group, group, world] of what was found. square: [group, world] by which an
-        acceleration moves bodies to where the skin is solved [m per m/s^2]."""
+    def compliance(self, going: wp.array, L: wp.array, square: wp.array, out: wp.array) -> list[tuple]:
+        """Finds the compliance [group, group, world] with factors of `factor`, in worlds that are going
+        (nworld,). square: [group, world] by which an acceleration moves bodies to where the skin is solved [m
+        per m/s^2]."""
         groups, _, nworld = out.shape
         shape, where = (groups * groups, nworld, 6, 6), out.device
         entries = wp.array(ptr=out.ptr, shape=shape, dtype=real, device=where, copy=False)
-        return move, self._columns, [going, square, self._jacobian, self.found, entries]
+        return [
+            (give, self._columns, [going, L, self._jacobian, self._model, 0, self._found]),
+            (move, self._columns, [going, square, self._jacobian, self._found, entries]),
+        ]
 
     def frequencies(
-        self, taking_part: wp.array, stiffness: wp.array, L: wp.array, model: Model, out: wp.array
+        self, taking_part: wp.array, stiffness: wp.array, L: wp.array, out: wp.array
     ) -> list[tuple]:
-        """Writes the frequency of each body [group, world]: after `find` with factors L, in which no skin
-        holds anything; stiffness: of all skins (nworld, nv, nv)."""
-        known, held = [taking_part, stiffness], [self.found, self._driven, model, self._power]
+        """Finds the frequency of each body [group, world], with factors in which no skin holds anything;
+        stiffness: of all skins (nworld, nv, nv)."""
+        known, model = [taking_part, stiffness], self._model
+        held = [self._found, self._driven, model, self._power]
         return [
-            (drive, self._columns, [*known, L, self.found, model, self._driven]),
+            (give, self._columns, [taking_part, L, self._jacobian, model, 1, self._found]),
+            (drive, self._columns, [*known, L, self._found, model, self._driven]),
             (add_powers, self._columns, [*known, *held]),
             (find_frequencies, out.shape, [taking_part, self._power, out]),
         ]

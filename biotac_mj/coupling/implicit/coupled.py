@@ -55,7 +55,6 @@ class Coupled:
         self._rows = self.jacobian.reshape(6 * len(self.jacobian), self.jacobian.shape[2])
         self.square, self.tangent, self.moved = arrays.square, arrays.tangent0, arrays.moved
         self.compliance = arrays.compliance
-        self.correction, self.amiss, self.excess = np.zeros((3, *arrays.wrench.shape))
         if arrays.inside[0] and instance.is_clear(arrays.here_pos, arrays.here_mat):
             arrays.inside[0] = 0
 
@@ -134,9 +133,8 @@ class Coupled:
             shares = np.array([share_that_pushes(*each, LEVER) for each in zip(*model)])
             arrays.tangent0 *= shares[:, None, None]
         self.written = False
-        self.touching, correction = _touching(arrays.tangent0), np.zeros_like(self.correction)
-        correction[self.touching] = self.correction[self.touching]
-        self.correction = correction
+        held = arrays.tangent0.any(axis=(1, 2))
+        self.touching, self.correction[~held] = held.nonzero()[0], 0.0
 
     def _core_motion(self):
         if not self.instance.inertial:

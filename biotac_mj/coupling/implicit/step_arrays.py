@@ -52,7 +52,7 @@ class StepArrays:
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
       stiffness: of the rows, see `Metric.record`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
-      last: views by name of the linear model of the last step.
+      models: views of wrench0, tangent0, pos0 and mat0, in the last step and in this one.
     """
 
     def __init__(self, kinematics: Kinematics, setup: Setup, springs: Springs, inertial: bool):
@@ -81,18 +81,16 @@ class StepArrays:
                 array = getattr(part, name)
                 if isinstance(array, wp.array):
                     setattr(self, name, _seen(array))
-        self.last = {name: _seen(getattr(self._last, name)) for name in Model.vars}
+        self.models = [(_seen(getattr(self._last, name)), getattr(self, name)) for name in Model.vars]
 
     def _respond(self, springs):
         """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
         one, jacobian, r, L = self._one, self._kinematics.jacobian, self._rounds, springs.L
-        self.stiffness, response = (r.square, jacobian, self._model.tangent0), Response(jacobian)
-        respond, stiffness = response.find(one, L), springs.stiffness
-        self.find_compliance = row(respond, response.compliance(one, r.square, self._compliance))
-        dim = 1, jacobian.shape[2]
+        self.stiffness, response = (r.square, jacobian, self._model.tangent0), Response(jacobian, self._model)
+        self.find_compliance = row(*response.compliance(one, L, r.square, self._compliance))
+        dim, stiffness = (1, jacobian.shape[2]), springs.stiffness
         self.add_stiffness = row((add_stiffness, dim, [jacobian, self._model, stiffness]))
-        known = one, stiffness, L, self._model, r.frequency
-        self.find_frequencies = row(respond, *response.frequencies(*known))
+        self.find_frequencies = row(*response.frequencies(one, stiffness, L, r.frequency))
 
     def record(self, step: float, ahead: float) -> None:
         """Makes the launches for a time step [s]; ahead: see `rounds.choose_gamma`."""

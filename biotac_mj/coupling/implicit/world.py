@@ -406,44 +406,40 @@ class World:
         found, moved = self._corrected(skins, outside)
         self._found = found
         for skin in skins:
-            skin.excess = skin.instance.metric.excess(found)
+            skin.excess[:] = skin.instance.metric.excess(found)
         return moved
 
     def _corrected(self, skins, outside):
         """Accelerations a and a'."""
         self._forces(skins, outside)
-        found = self.data.acceleration()
+        found = self.data.acceleration(again=self._damped is not None)
         if self._damped is None:  # known only after the actuation stage
             self._damped = self.integrator.take_matrices(self.data)
             self._inertia = self.integrator.inertia if self._damped else None
         if not self._damped:
             return found, found
-        if not any(len(s.touching) for s in skins):
-            for skin in skins:
-                skin.amiss = np.zeros_like(skin.correction)
+        group, touching = self._group, self._group.touching
+        group.amiss[:] = 0.0
+        if not len(touching):
             return found, self.integrator.integrated(found)
-        jacobian, tangent, correction = (
-            np.concatenate([getattr(s, name)[s.touching] for s in skins])
-            for name in ("jacobian", "tangent", "correction")
-        )
+        jacobian, held = group.held(touching)
+        correction = group.correction[touching].ravel()
         largest = max(np.abs(_SCALE * s.arrays.wrench0).max(initial=0.0) for s in skins)
-        stiffness = np.concatenate([s.square[s.touching] for s in skins])[:, None, None] * tangent
-        rows, held = jacobian.reshape(-1, self.model.nv), (stiffness @ jacobian).reshape(-1, self.model.nv)
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
-            excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
+            excess = held @ (found - moved)
             wrong = excess - correction
-            sizes = (np.abs(_SCALE * w).max() for w in (wrong, excess))
+            sizes = (np.abs(_SCALE * w.reshape(-1, 6)).max() for w in (wrong, excess))
             if not (poorly_corrected(*sizes, largest, CORRECTED) and last):
-                _hand_out(-wrong, skins, "amiss")
+                group.amiss[touching] = -wrong.reshape(-1, 6)
                 return found, moved
             # what the constraint solver would find if the rows answered to the integrator
-            found = self.integrator.answer(found, self._springs, rows.T @ held, correction.ravel() @ rows)
-            change = held @ (found - self.integrator.integrated(found))
-            correction = change.reshape(-1, 6)
-            _hand_out(correction, skins, "correction")
+            known = self._springs, jacobian.T @ held, correction @ jacobian
+            found = self.integrator.answer(found, *known)
+            correction = held @ (found - self.integrator.integrated(found))
+            group.correction[touching] = correction.reshape(-1, 6)
             self._forces(skins, outside)
-            found = self.data.acceleration()
+            found = self.data.acceleration(again=True)
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
@@ -454,12 +450,3 @@ class World:
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
-
-
-def _hand_out(wrenches, skins, name):
-    """Gives each skin its wrenches (k, 6) on the bodies that it holds as attribute `name`; none on others."""
-    begin = 0
-    for skin in skins:
-        own, end = np.zeros_like(skin.correction), begin + len(skin.touching)
-        own[skin.touching], begin = wrenches[begin:end], end
-        setattr(skin, name, own)

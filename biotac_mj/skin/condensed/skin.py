@@ -11,7 +11,7 @@ import typing
 import numpy as np
 import warp as wp
 
-from ..bodies import BodyMotion
+from ..bodies import BodyMotion, uncoupled_geoms
 from ..contact.faces import NormalForces
 from ..contact.proximity import ProximityQuery
 from ..data import SkinData
@@ -68,6 +68,11 @@ class CondensedSkin:
         self._recall = Program("cpu", step.recall).run
         self._state = StateArrays(self._data, geoms, CONDENSED, **step.holders)
         self._nodes, self._views = {}, self._view()
+        g = geoms.struct
+        free = [wp.zeros_like(g.pos), wp.zeros_like(g.mat)]
+        known = [step.bodies, g.group, g.pos, g.mat]
+        self._uncouple = Program("cpu", lambda p: p.launch(uncoupled_geoms, g.pos.shape, known, free)).run
+        self._uncoupled = [array.numpy()[:, 0] for array in free]
 
     def _view(self):
         """Numpy views of the world's arrays that a solve reads and writes besides its state."""
@@ -131,14 +136,16 @@ class CondensedSkin:
             out = self._follow(known, shallow, mat, effort)
             out = dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
         spent = allowed * self._first - effort[0]
-        return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
+        out.cost = spent / ((1 + _ANOTHER) * self._first)
+        return out
 
     def _follow(self, memory, pos, mat, effort, bodies=None):
         """Solves for poses that are not too deep. effort: [limit of the cost], from which it subtracts its
         cost."""
         far, let_go = np.inf, (pos, mat)
         if bodies is not None:  # where the bodies go without the skin
-            let_go = bodies.without(self.geoms.struct.group.numpy(), pos, mat)
+            self._uncouple()
+            let_go = tuple(view.copy() for view in self._uncoupled)
         if memory.started:
             motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
             far = np.abs(motion).max(initial=0.0) + _LEVER * turned
