@@ -46,8 +46,8 @@ from records import write_json
 from biotac_mj.coupling import setup
 from biotac_mj.coupling.steppers import fem
 from biotac_mj.coupling.steppers.condensed import CondensedStepper
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.press import PressOptions, press
-from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.skin import PRESETS
 from biotac_mj.skin.condensed import correction
 

@@ -10,9 +10,9 @@ import trimesh
 import warp as wp
 from scipy.sparse import coo_matrix
 
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance
-from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction, kernels, spreading_resistance, spreading_table
 from biotac_mj.sensor.film.systems import edges
 

@@ -18,11 +18,11 @@ from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.coupling.steppers.fem import geom_set, shared_model, skin_settings
 from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.rigid import rotation
 from biotac_mj.press.approach import nearest_point, surface_point
 from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
-from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, prepare_step, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory

@@ -12,7 +12,7 @@ from grids import covering
 from test_skin_step import finger
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.sensor.core_surface import CoreSurface
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.skin import (
     ContactLaw,
     GeomSet,

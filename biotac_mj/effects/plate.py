@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..geometry.core_surface import CoreSurface
 from ..geometry.design import Design
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import node_normals
-from ..sensor.core_surface import CoreSurface
 from ..sensor.film import excitation_places
 from ..skin import Material, SkinOptions
 from ..skin.rubber.material import CALIBRATED_FILL, PRESETS

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
@@ -77,17 +78,14 @@ def _open_surfaces(mesh, face, fixed, core_vert):
 
 def fixed_nodes(vert: np.ndarray, bodies: object, tolerance: float = FIXED_WITHIN) -> np.ndarray:
     """Sorted nodes within `tolerance` [m] of the surface of any of `bodies` = [(vert (n, 3) [m], face (m,
-    3)), ...].
-
-    Distances are computed in millimetres: trimesh drops small triangles of a mesh in metres.
-    """
+    3)), ...]."""
     fixed = np.zeros(len(vert), dtype=bool)
     for body_vert, body_face in bodies:
         low, high = body_vert.min(axis=0) - 2 * tolerance, body_vert.max(axis=0) + 2 * tolerance
         candidate = np.flatnonzero(((vert > low) & (vert < high)).all(axis=1))
         if len(candidate):
-            _, distance, _ = _closest(body_vert, body_face, vert[candidate])
-            fixed[candidate] |= distance < tolerance
+            distance = CoreSurface(body_vert, body_face).closest(vert[candidate])[0]
+            fixed[candidate] |= np.abs(distance) < tolerance
     return np.flatnonzero(fixed).astype(np.int32)
 
 
@@ -103,7 +101,7 @@ def electrodes_on(
     if not design.nelectrode:
         return np.zeros((0, 3)), np.zeros((0, 3))
     point = design.in_biotac_frame(electrode_positions(design)) * 1e-3
-    position, _, _ = _closest(core_vert, core_face, point)
+    position = CoreSurface(core_vert, core_face).closest(point)[1]
     centre = core_vert[core_face].mean(axis=1)
     weight = np.exp(-0.5 * (np.linalg.norm(position[:, None] - centre, axis=-1) / 2.5e-4) ** 2) + 1e-12
     normal = weight @ face_areas(core_vert, core_face)
@@ -163,12 +161,3 @@ def assemble(
         electrode_normal=normal,
         design=design,
     )
-
-
-def _closest(vert, face, point):
-    """Closest points (n, 3) [m], distances (n,) [m] and faces (n,) of `point` (n, 3) [m] on a mesh."""
-    from ..triangles import trimesh
-
-    body = trimesh.Trimesh(np.asarray(vert) * 1e3, face, process=False)
-    nearest, distance, index = trimesh.proximity.closest_point(body, np.asarray(point) * 1e3)
-    return nearest * 1e-3, distance * 1e-3, index

@@ -3,6 +3,7 @@
 import numpy as np
 
 from biotac_mj.geometry.closest import ray_hits
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
 
@@ -16,12 +17,10 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     A ten-node tetrahedron counts as eight four-node ones. The thickness is the distance of each inner node
     from the outer surface, the fluid volume is that of the cavity minus that of the core, and a gap is the
     distance of an electrode from the inner surface along its normal."""
-    from ..triangles import trimesh
-
     mesh = TetMesh(skin.vert, skin.tets)
-    vert = skin.vert * 1e3  # trimesh drops small triangles of a mesh in metres
-    outer = trimesh.Trimesh(vert, skin.outer_face, process=False)
-    _, thickness, _ = trimesh.proximity.closest_point(outer, vert[np.unique(skin.inner_face)])
+    vert = skin.vert * 1e3
+    inner = skin.vert[np.unique(skin.inner_face)]
+    thickness = 1e3 * np.abs(CoreSurface(skin.vert, skin.outer_face).closest(inner)[0])
     cavity, core = (
         -enclosed_volume(vert, skin.inner_face),
         enclosed_volume(skin.core_vert * 1e3, skin.core_face),

@@ -12,6 +12,7 @@ from scipy.spatial.distance import pdist, squareform
 
 from ..files import write_json
 from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
+from ..geometry.core_surface import CoreSurface
 from ..geometry.design import Design
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.importing import read_obj, read_tet_mesh
@@ -19,7 +20,6 @@ from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.tet_mesh import TetMesh, enclosed_volume
 from .channels import counts_from_impedance
-from .core_surface import CoreSurface
 from .film import FilmConduction
 from .film.conduction import ELECTRODE_RADIUS
 

@@ -23,6 +23,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..fields import as_numbers
+from ..geometry.surface import face_areas, node_areas
 from ..short_repr import short_repr
 from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
@@ -44,12 +45,7 @@ WATER = 2.2e9  # [Pa]
 def volume_gradient(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
     """dV/dx (nvert, 3) [m^2] of the cavity in inner faces (n, 3), whose normals point into it; vert: (nvert,
     3) [m]."""
-    a, b, c = np.moveaxis(vert[face], 1, 0)
-    third = -np.cross(b - a, c - a) / 6
-    out = np.zeros((len(vert), 3))
-    for corner in face.T:
-        np.add.at(out, corner, third)
-    return out
+    return -node_areas(face, face_areas(vert, face), len(vert))
 
 
 @wp.func

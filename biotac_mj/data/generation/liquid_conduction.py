@@ -13,11 +13,11 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ...geometry.core_surface import CoreSurface
 from ...geometry.pads import column_tetrahedra
 from ...geometry.rigid import across
 from ...geometry.skin_geometry import SkinGeometry
 from ...geometry.surface import node_normals
-from ...sensor.core_surface import CoreSurface
 from ...sensor.film import excitation_places
 
 __all__ = ["LiquidConduction"]

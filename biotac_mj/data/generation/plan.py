@@ -6,10 +6,10 @@ import dataclasses
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...geometry.core_surface import CoreSurface
 from ...geometry.rigid import matrix, quaternion_from_y, rotation
 from ...geometry.skin_geometry import SkinGeometry
 from ...press.approach import nearest_point
-from ...sensor.core_surface import CoreSurface
 from ..objects import OBJECTS, make_object
 from .clearance import Placed, first_touch, surface_samples
 

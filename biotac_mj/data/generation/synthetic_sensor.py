@@ -16,10 +16,10 @@ import numpy as np
 
 from ...effects.rubber import modulus_of
 from ...geometry import load_skin
+from ...geometry.core_surface import CoreSurface
 from ...geometry.design import BIOTAC, Design
 from ...geometry.electrodes import electrode_positions
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.core_surface import CoreSurface
 from ...sensor.film import excitation_places
 from ...sensor.presets import Sensor, draw_sensor
 from ..schema import DISPLACEMENT_SCALE

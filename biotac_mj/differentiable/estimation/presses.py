@@ -20,10 +20,10 @@ from ...calibration import plan_indentation
 from ...calibration.forward import Steps, steps_of
 from ...calibration.indentation import Indentation
 from ...data.generation.clearance import Placed, surface_samples
+from ...geometry.core_surface import CoreSurface
 from ...geometry.rigid import matrix
 from ...geometry.skin_geometry import SkinGeometry
 from ...press.indenter import make_indenter
-from ...sensor.core_surface import CoreSurface
 from ...sensor.film import FilmConduction, NoFilmError
 from ..record import Trajectory, follow
 from ..skin import Skin

@@ -90,7 +90,7 @@ class FilmFeatures(nn.Module):
 
     def __init__(self, geometry: "SkinGeometry"):
         super().__init__()
-        from ...sensor.core_surface import CoreSurface
+        from ...geometry.core_surface import CoreSurface
         from ...sensor.film import excitation_places
 
         node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)

@@ -32,13 +32,13 @@ from scipy.spatial.distance import pdist
 from scipy.special import j1
 
 from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
+from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.launches import recorded
 from biotac_mj.sensor.channels import impedance_from_counts
-from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import kernels
 from biotac_mj.sensor.film.kernels import TILE, real, vec3, vec4
 from biotac_mj.sensor.film.systems import BandLayout, SparseLayout, edges

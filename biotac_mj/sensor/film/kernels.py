@@ -6,8 +6,8 @@ the right-hand sides, one column for each disc."""
 
 import warp as wp
 
+from biotac_mj.geometry.core_surface import Core, NearestTriangles, nearest_listed_on_core
 from biotac_mj.geometry.design import MOST_DISCS, MOST_EXCITATION
-from biotac_mj.sensor.core_surface import Core, NearestTriangles, nearest_listed_on_core
 
 __all__ = [
     "NSAMPLE",

@@ -1,11 +1,12 @@
-"""Closest points on the rigid core, which give the thickness of the liquid film under every node of the
-skin."""
+"""Closest points on closed surfaces: on the rigid core they give the thickness of the liquid film under every
+node of the skin."""
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from biotac_mj.geometry.closest import (
+from ..quiet import quiet_warp
+from .closest import (
     FACE,
     Lists,
     TriangleLists,
@@ -15,7 +16,6 @@ from biotac_mj.geometry.closest import (
     pack_lists,
     pseudonormals,
 )
-from biotac_mj.quiet import quiet_warp
 
 quiet_warp()
 
