@@ -96,8 +96,8 @@ def test_correction_takes_the_mesh_out_of_the_fit(shell):
     finer = configuration("shell_with_core", "default")
     data = dataclasses.replace(short, force=simulate(finer.geometry, shell.options, [TRUTH], short).force[0])
     start = dataclasses.replace(TRUTH, youngs_modulus=1.5e6)
-    alone = calibrate(shell, start, data, ["E"], max_iterations=2)
-    corrected = calibrate(shell, start, data, ["E"], max_iterations=2, finer=finer.geometry)
+    alone = calibrate(shell, start, data, ["E"], max_iterations=4)
+    corrected = calibrate(shell, start, data, ["E"], max_iterations=4, finer=finer.geometry)
     assert alone.value[0] < 0.95 * TRUTH.youngs_modulus
     assert corrected.value == pytest.approx([TRUTH.youngs_modulus], rel=0.002)
     assert corrected.rms < 0.2 * alone.rms and "corrected by" in corrected.skin

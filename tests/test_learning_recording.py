@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from biotac_mj.cli import main
-from biotac_mj.learning.instants.force import causal_average, fit_force, shared_gain, walk_forward
+from biotac_mj.learning.instants.force import causal_average, fit_force
 from biotac_mj.learning.instants.linear import best_ridge, ridge, ridges
 from biotac_mj.learning.instants.real import evaluate_recording
 from biotac_mj.learning.instants.transfer import label, touches_of_force, transfer_force
@@ -60,20 +60,10 @@ def test_ridge_is_least_squares_and_ignores_constant_features():
     assert (w[4] == 0).all()
 
 
-def test_shared_gain_is_found_beside_the_force():
-    counts, force = synthetic_log(drift=-0.2)
-    assert shared_gain(log_impedance(counts), force, len(counts)) == pytest.approx(-0.2, abs=0.01)
-
-
-def test_walk_forward_never_looks_ahead():
-    for train, test in walk_forward(1000):
-        assert train.start == 0 and train.stop == test.start < test.stop <= 1000
-
-
 @pytest.mark.slow  # quick: the evaluation of a log
 def test_drift_is_handled_where_plain_regression_fails():
     counts, force = synthetic_log()
-    model = fit_force(counts, force, 2100, network=False)
+    model = fit_force(counts, force, 2100)
     w, b = ridge(counts[:2100], force[:2100], 1e-4)
     plain = np.sqrt(((counts @ w + b - force)[2100:] ** 2).mean(0))
     ours = np.sqrt(((model.prediction - force)[2100:] ** 2).mean(0))
@@ -107,10 +97,10 @@ def test_the_best_ridge_is_that_of_groups_left_out():
 
 def test_nothing_of_the_test_part_and_nothing_later_is_used():
     counts, force = synthetic_log(1200)
-    whole = fit_force(counts, force, 800, network=False).prediction
+    whole = fit_force(counts, force, 800).prediction
     changed = force.copy()
     changed[800:] = 99  # its answers
-    fewer = fit_force(counts[:1000], changed[:1000], 800, network=False)
+    fewer = fit_force(counts[:1000], changed[:1000], 800)
     np.testing.assert_allclose(fewer.prediction, whole[:1000], atol=1e-12)
 
 

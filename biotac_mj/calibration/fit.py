@@ -1,8 +1,8 @@
 """Fits material and solver parameters to the forces of one indentation, as Narang et al. (ICRA 2021) did.
 
-The cost is the root mean square over time of the norm of the force error. Sequential least squares (scipy's
-SLSQP) minimises its square, which has the same minimum and is smooth there; a trust-region Gauss-Newton
-method (scipy's least_squares) finishes. The model's value and all finite-difference columns of its Jacobian
+The cost is the root mean square over time of the norm of the force error. A trust-region Gauss-Newton method
+(scipy's least_squares) minimises its square, which has the same minimum and is smooth there. The model's
+value and all finite-difference columns of its Jacobian
 are the worlds of one batch; each solver option, which a batch shares, needs a separate batch."""
 
 import dataclasses
@@ -237,8 +237,7 @@ def calibrate(
       finer: a finer mesh of the same body, or None. The fit on the configuration's mesh is then corrected by
         the difference of both meshes' forces at the fitted values and repeated, `corrections` times (space
         mapping). The result fits the data on the finer mesh, at the cost of `corrections` indentations of it.
-      forces: function that returns forces and their Jacobian, like `forces_and_jacobian`. With another one
-        the fit is Gauss-Newton from the start.
+      forces: function that returns forces and their Jacobian, like `forces_and_jacobian`.
       starts: number of starting points for the final fit: further ones are drawn from the error of the best
         fit and skipped if the slopes predict no improvement. If a step of the press has two equilibria, the
         forces jump as a function of the parameters, and a fit stays on its side of the jump; several starts
@@ -264,7 +263,7 @@ def calibrate(
     def finish(at, correction=0.0):
         return problem.least_squares(at, correction, tolerance, max_iterations)
 
-    found, correction = finish(problem.descend(start, max_iterations) if forces is None else start), 0.0
+    found, correction = finish(start), 0.0
     draw = np.random.default_rng(0)
     for _ in range(starts - 1):
         at = problem.draw_start(found.x, draw)
@@ -385,36 +384,6 @@ class _Problem:
                     "leave it out, or load the skin so that it matters"
                 )
 
-    def descend(self, start, max_iterations):
-        """Result of SLSQP from `start`, in variables u in which the Gauss-Newton matrix at the start is the
-        identity: this removes the correlation of E and nu."""
-        from scipy.optimize import minimize
-
-        there = self.evaluate(start)[2]
-        metric = np.einsum("tip,tiq->pq", there, there) / self._scale**2 / len(self._indentation.time)
-        metric += 1e-6 * np.diag(np.diag(metric))
-        back = np.linalg.inv(np.linalg.cholesky(metric)).T  # scaled = start + back u
-
-        def cost(u):
-            _, force, jacobian, _ = self.evaluate(start + back @ u)
-            residual = (force - self._indentation.force) / self._scale
-            gradient = back.T @ np.einsum("tip,ti->p", jacobian / self._scale, residual) / len(residual)
-            return (residual**2).sum(1).mean() / 2, gradient
-
-        inside = [
-            dict(type="ineq", fun=lambda u: start + back @ u - self.lower, jac=lambda u: back),
-            dict(type="ineq", fun=lambda u: self.upper - start - back @ u, jac=lambda u: -back),
-        ]
-        rough = minimize(
-            cost,
-            np.zeros(len(start)),
-            jac=True,
-            method="SLSQP",
-            constraints=inside,
-            options=dict(ftol=1e-5, maxiter=max_iterations),
-        )
-        return start + back @ rough.x
-
     def within(self, at):
         """The nearest point within the bounds."""
         return np.clip(at, self.lower + 1e-9, self.upper - 1e-9)
@@ -426,8 +395,8 @@ class _Problem:
         return self.evaluate(s)[2].reshape(-1, len(s)) / self._scale
 
     def least_squares(self, at, correction, tolerance, max_iterations):
-        """Gauss-Newton fit from a point: changes of contact make kinks in the cost that mislead SLSQP's
-        curvature. tolerance: of cost and of step."""
+        """Gauss-Newton fit from a point: changes of contact make kinks in the cost that would mislead an
+        estimate of its curvature. tolerance: of cost and of step."""
         from scipy.optimize import least_squares
 
         return least_squares(

@@ -1,6 +1,7 @@
 """Runs `biotac data generate`, `biotac data import` and `biotac data export`."""
 
 import argparse
+import dataclasses
 
 __all__ = ["export_verb", "generate_verb", "import_verb"]
 
@@ -10,33 +11,10 @@ def generate_verb(args: argparse.Namespace) -> None:
     from ..effects.amended import amend_settings
     from .generation.generate import GenerateOptions, generate
 
-    settings = dict(
-        count=args.count,
-        labelled=min(359, args.count) if args.labelled is None else args.labelled,
-        recordings=args.recordings,
-        steps=args.steps,
-        rate=args.rate,
-        seed=args.seed,
-        objects=tuple(args.objects),
-        kinds=tuple(args.kinds),
-        skin=args.skin,
-        tier=args.tier,
-        material=args.material,
-        element=args.element,
-        liquid=args.liquid,
-        batch=args.batch,
-        measured_batch=args.measured_batch,
-        measured_seed=args.measured_seed,
-        measured_skin=args.measured_skin,
-        device=args.device,
-        options=args.options,
-        vary=args.vary,
-        sensor=args.sensor,
-        randomise=tuple(args.randomise or ()),
-        signal=args.signal,
-        thermal=args.thermal,
-        texture=args.texture,
-    )
+    settings = {field.name: getattr(args, field.name) for field in dataclasses.fields(GenerateOptions)}
+    settings |= {"randomise": tuple(args.randomise or ())}
+    if args.labelled is None:
+        settings["labelled"] = min(359, args.count)
     if args.effects:
         settings = amend_settings(settings, GenerateOptions, args.effects)
     options = GenerateOptions(**settings)

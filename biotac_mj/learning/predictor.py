@@ -94,7 +94,7 @@ class PointsModel(_Served):
         """d ln Z (n, 19) relative to rest, for displacements (n, nvert, 3) [mm]; average and dt: unused, for
         compatibility with `ForwardModel`."""
         self._check(displacement)
-        return self.electrodes(self.unit * _between(self.to_points, displacement)), None
+        return self.electrodes(self.unit * self.to_points.fields(displacement)), None
 
     def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
         """(k, 19) predicted change of counts in rows of a set."""
@@ -104,20 +104,15 @@ class PointsModel(_Served):
     @torch.no_grad()
     def through_code(self, displacement: torch.Tensor) -> torch.Tensor:
         """Displacements (n, nvert, 3) [mm] reconstructed from the points and the mesh VAE's code."""
-        u = self.unit * _between(self.to_points, displacement)
-        return _between(self.to_nodes, self.net.mesh.decode(self.net.mesh.encode(u)[0])) / self.unit
+        u = self.unit * self.to_points.fields(displacement)
+        return self.to_nodes.fields(self.net.mesh.decode(self.net.mesh.encode(u)[0])) / self.unit
 
     @torch.no_grad()
     def forward(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Displacements (n, nvert, 3) [mm] for d ln Z (n, 19), and indentation of the outer nodes (n, nouter)
         [mm], at least 0."""
-        field = _between(self.to_nodes, self.field(log_change)) / self.unit
+        field = self.to_nodes.fields(self.field(log_change)) / self.unit
         return field, (field[:, self.outer] * self.inward).sum(2).clamp(min=0)
-
-
-def _between(matrix, field):
-    """Interpolates a field (n, m, 3) to k points, (n, k, 3); matrix: SparseMatrix (k, m) of the weights."""
-    return matrix(field.float().transpose(0, 1).contiguous()).transpose(0, 1)
 
 
 class ForwardModel(_Served):

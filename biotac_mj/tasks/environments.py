@@ -17,6 +17,7 @@ from ..fields import as_whole
 from ..short_repr import short_repr
 from ..view.offscreen import Offscreen, find_gl
 from . import copying, suite
+from .biotac import TACTILE
 
 __all__ = ["BioTacEnv", "IDS", "register"]
 
@@ -65,11 +66,10 @@ class BioTacEnv(gymnasium.Env, EzPickle):
             self._screen = self._make_screen()
         action = self.suite.action_spec()  # all of them in [-1, 1]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, action.shape, np.float32)
-        counts = ("electrodes", "pac", "pdc", "tac", "tdc")
         self.observation_space = gymnasium.spaces.Dict(
             {
                 name: gymnasium.spaces.Box(
-                    *((0, 4095) if name.split("/")[-1] in counts else (-np.inf, np.inf)),
+                    *((0, 4095) if name.split("/")[-1] in TACTILE else (-np.inf, np.inf)),
                     spec.shape,
                     np.float32,
                 )

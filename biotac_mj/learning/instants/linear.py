@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["best_ridge", "held_out_errors", "principal_components", "ridge", "ridges"]
+__all__ = ["best_ridge", "held_out_errors", "of_strengths", "principal_components", "ridge", "ridges"]
 
 # scikit-learn is imported only for fitting: it takes two seconds, and saved models do not need it
 
@@ -66,7 +66,13 @@ def best_ridge(
     x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weights (k, m) and offset (m,), with the strength that minimises `held_out_errors` for each target."""
-    best = held_out_errors(x, y, groups, strengths, folds).argmin(0)
+    return of_strengths(x, y, strengths, held_out_errors(x, y, groups, strengths, folds).argmin(0))
+
+
+def of_strengths(
+    x: np.ndarray, y: np.ndarray, strengths: Sequence[float], chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (k, m) and offset (m,) of `ridges`, by the strength of number `chosen` (m,) for each target."""
     fits, column = ridges(x, y, strengths), np.arange(y.shape[1])
     weights, offsets = (np.array(part) for part in zip(*fits))
-    return weights[best, :, column].T, offsets[best, column]
+    return weights[chosen, :, column].T, offsets[chosen, column]

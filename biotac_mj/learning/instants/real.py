@@ -9,6 +9,7 @@ import numpy as np
 from ...files import save_figure, write_json
 from ...recordings.recording import Recording
 from ...sensor.channels import FULL_SCALE, log_impedance
+from ..protocol import quartiles
 from .force import TRIALS, fit_force
 from .linear import principal_components, ridge
 from .transfer import TOUCHES, label, touches_of_force, transfer_force
@@ -39,7 +40,7 @@ def evaluate_recording(
       recording: without force only the reconstruction is evaluated.
       fraction: of the rows, in time, for training; everything is fitted on them only.
       seed: of the networks.
-      network: False: PCA and ridge only (seconds, for tests).
+      network: False: PCA in place of networks (seconds, for tests).
       known: another sensor with force: its transfer, adapted with `touches` of this sensor's training rows,
         is compared with a model of all these rows.
 
@@ -74,7 +75,7 @@ def evaluate_recording(
     with tqdm(total=2 * steps, desc="evaluate: codes", disable=not progress or None, leave=False) as bar:
         reconstruction, traces = _reconstruction(counts, ntrain, seed, steps, bar)
     result = {
-        "schema": "biotac_mj.learning.recording/3",
+        "schema": "biotac_mj.learning.recording/4",
         "recording": recording.name,
         "source": recording.source,
         "rows": n,
@@ -88,9 +89,7 @@ def evaluate_recording(
     if recording.force is not None:
         # separate progress bar: steps of networks and trials take different times
         with tqdm(total=TRIALS, desc="evaluate: force", disable=not progress or None, leave=False) as bar:
-            result["force_regression"], predicted = _force(
-                counts, recording.force, ntrain, seed, network, bar
-            )
+            result["force_regression"], predicted = _force(counts, recording.force, ntrain, bar)
         if known is not None:
             errors, notes = _transferred(known, counts, recording.force, ntrain, touches)
             result["force_regression"]["models"]["transferred"] = errors
@@ -137,11 +136,11 @@ def _usable(recording):
 
 def _rms(error):
     row = np.sqrt((error**2).mean(1))
-    q25, q50, q75 = np.percentile(row, [25, 50, 75])
+    median, *others = quartiles(row)
     return {
         "rms": float(np.sqrt((error**2).mean())),
-        "median_row": float(q50),
-        "quartiles_row": [float(q25), float(q75)],
+        "median_row": median,
+        "quartiles_row": others,
         "per_channel": np.sqrt((error**2).mean(0)).tolist(),
     }
 
@@ -211,8 +210,8 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
         return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
 
 
-def _force(counts, force, ntrain, seed, network, bar):
-    model = fit_force(counts, force, ntrain, seed, network, bar.update)
+def _force(counts, force, ntrain, bar):
+    model = fit_force(counts, force, ntrain, bar.update)
     w, b = ridge(counts[:ntrain], force[:ntrain], 1e-4)
     rows = {
         "predict_mean": np.broadcast_to(force[:ntrain].mean(0), force.shape),
@@ -220,19 +219,12 @@ def _force(counts, force, ntrain, seed, network, bar):
         "drift_aware": model.prediction,
     }
     table = {name: _errors(y[ntrain:], force[ntrain:]) for name, y in rows.items()}
-    details = {
-        "features": dict(zip("xyz", model.chosen)),
-        "trust": model.trust.tolist(),
-        "network_kept": model.network,
-        "walk_forward": model.trials,
-    }
     return {
         "unit": "N",
         "components": ["Fx", "Fy", "Fz"],
         "models": table,
         "best": min(table, key=lambda name: np.sum(np.square(table[name]["rmse"]))),
-        "shared_gain_of_ln_z_at_end": model.gain,
-        "details": details,
+        "details": {"left_out": model.trials},
     }, rows["drift_aware"]
 
 

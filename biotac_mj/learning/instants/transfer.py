@@ -5,15 +5,14 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from ...sensor.channels import log_impedance
-from .force import causal_average
-from .linear import held_out_errors, ridge
+from .force import columns_of
+from .linear import held_out_errors, of_strengths, ridge
 from .terms import KINDS, Terms
 
 __all__ = ["TOUCHES", "label", "touches_of_force", "transfer_force"]
 
 TOUCHES = 20  # labelled touches of a new sensor
 _SMOOTH, _RELEASE = 10, 0.5  # [rows], [N]: a touch ends when the smoothed force has fallen by this much
-_WINDOW = 10  # time constant of the causal average [rows]
 _KNOWN_RIDGE = 1e-3  # of the other sensor's regressions
 _RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the new sensor's difference
 _FOLDS = 5
@@ -71,26 +70,19 @@ def transfer_force(
     out, total = 0.0, 0.0
     for kind in KINDS:
         terms = Terms.fit(from_known, **kind)
-        weight, offset = ridge(_columns(terms, from_known), known_force, _KNOWN_RIDGE)
-        columns = _columns(terms, log_z)
+        weight, offset = ridge(columns_of(terms, from_known), known_force, _KNOWN_RIDGE)
+        columns = columns_of(terms, log_z)
         prediction, error = _amended(columns, columns @ weight + offset, force[rows], rows, touch[rows])
         out, total = out + prediction / error, total + 1 / error
     return out / total
 
 
-def _columns(terms, log_z):
-    now = terms(log_z)
-    return np.hstack([now, causal_average(now[:, : log_z.shape[1]], _WINDOW)])
-
-
 def _amended(columns, believed, force, rows, touch):
     """Prediction for all rows (n, 3), and its mean square on held-out touches (3,)."""
-    starts = (np.zeros_like(believed), believed)
-    residuals = [force - start[rows] for start in starts]
+    starts = np.stack([np.zeros_like(believed), believed])
+    residuals, component = force - starts[:, rows], np.arange(believed.shape[1])
     error = np.concatenate([held_out_errors(columns[rows], y, touch, _RIDGE, _FOLDS) for y in residuals])
-    out = np.empty_like(believed)
-    for c, which in enumerate(error.argmin(0)):
-        start, strength = divmod(which, len(_RIDGE))
-        weight, offset = ridge(columns[rows], residuals[start][:, [c]], _RIDGE[strength])
-        out[:, c] = starts[start][:, c] + (columns @ weight + offset)[:, 0]
-    return out, error.min(0) + 1e-12
+    start, strength = np.divmod(error.argmin(0), len(_RIDGE))
+    target = residuals[start, :, component].T
+    weight, offset = of_strengths(columns[rows], target, _RIDGE, strength)
+    return starts[start, :, component].T + columns @ weight + offset, error.min(0) + 1e-12

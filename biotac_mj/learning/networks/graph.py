@@ -59,6 +59,10 @@ class SparseMatrix(nn.Module):
         """(n, ...) = matrix @ x (m, ...)."""
         return sparse_product(self._matrices(), x)
 
+    def fields(self, u: torch.Tensor) -> torch.Tensor:
+        """(k, n, 3) of fields u (k, m, 3), each times the matrix."""
+        return self(u.float().transpose(0, 1).contiguous()).transpose(0, 1)
+
 
 def sparse_product(pair: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
     """matrix @ x for pair = (matrix, its transpose), x (m, ...); the first axis is that of the graph."""

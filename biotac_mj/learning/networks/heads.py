@@ -129,14 +129,9 @@ def averages(
       first: (n,) first row of each row's interaction. time: (n,) [s] within it. tau: time constants [s].
     """
     position = torch.arange(len(value), device=value.device) - first
-    out = []
-    for t in tau:
-        average = torch.zeros_like(value)
-        for k in range(1, int(position.max()) + 1):
-            row = (position == k).nonzero()[:, 0]
-            weight = 1 - torch.exp(-(time[row] - time[row - 1]) / t)
-            average[row] = average[row - 1] + weight.view(-1, *[1] * (value.ndim - 1)) * (
-                value[row] - average[row - 1]
-            )
-        out.append(value - average)
-    return torch.cat(out, -1)
+    average = torch.zeros(len(tau), *value.shape, dtype=value.dtype, device=value.device)
+    for k in range(1, int(position.max()) + 1):
+        row = (position == k).nonzero()[:, 0]
+        dt = (time[row] - time[row - 1]).view(-1, *[1] * (value.ndim - 1))
+        average[:, row] = next_average(average[:, row - 1], value[row], dt, tau)
+    return torch.cat(list(value - average), -1)

@@ -96,8 +96,8 @@ class Arrays:
     def at_points(self, points: "SkinPoints") -> "Arrays":
         """The set with displacements at the points."""
         matrix = SparseMatrix(points.reading(self.geometry)).to(self.device)
-        shifted = [matrix(u.float().transpose(0, 1).contiguous()) for u in self.field.split(512)]
-        return dataclasses.replace(self, field=torch.cat([u.transpose(0, 1).half() for u in shifted]))
+        parts = [matrix.fields(u).half() for u in self.field.split(512)]
+        return dataclasses.replace(self, field=torch.cat(parts))
 
 
 def join(sets: list[Arrays]) -> Arrays:

@@ -21,7 +21,7 @@ from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
 from ..instants.linear import ridges
 from ..predictor import PointsModel
-from ..protocol import interaction_errors
+from ..protocol import interaction_errors, quartiles
 from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays
 from .config import LearningConfig, without_obsolete
@@ -402,10 +402,10 @@ def _inverse_summary(errors):
     out = {k: float(np.mean(errors[k])) for k in ("mean", "moved", "largest")}
     known = np.isfinite(errors["centre"])
     if known.any():
-        q25, q50, q75 = np.percentile(errors["centre"][known], [25, 50, 75])
+        median, *others = quartiles(errors["centre"][known])
         out |= {
-            "centre_median": float(q50),
-            "centre_quartiles": [float(q25), float(q75)],
+            "centre_median": median,
+            "centre_quartiles": others,
             "overlap_mean": float(errors["overlap"][known].mean()),
         }
     return out

@@ -60,9 +60,7 @@ class Features:
 
     def mirror(self, u: torch.Tensor) -> torch.Tensor:
         """Fields (n, nvert, 3) of the touches mirrored in the plane z = 0."""
-        return self.matrix(u.float().transpose(0, 1).contiguous()).transpose(0, 1) * torch.tensor(
-            [1.0, 1.0, -1.0], device=u.device
-        )
+        return self.matrix.fields(u) * torch.tensor([1.0, 1.0, -1.0], device=u.device)
 
     @torch.no_grad()
     def _local(self, change):

@@ -138,7 +138,7 @@ class Messages:
                 values=self._array(np.atleast_1d(one[channel]), np.float32),
             )
             for one in sensors
-            for channel in ("electrodes", "pac", "pdc", "tac", "tdc")
+            for channel in _CHANNELS
         ]
         return self._of(name, header=header, sensors=channels)
 

@@ -4,6 +4,8 @@ import functools
 import re
 import typing
 
+from ..recording import CHANNELS
+
 __all__ = ["Place", "is_part_of_stamp", "is_stamp", "is_time", "place_of", "unit_named", "unit_of"]
 
 
@@ -62,7 +64,6 @@ _CLOCK = re.compile(
     r"(?:(?:ros|rosbag|bag|system|host|unix|epoch|elapsed|log|date)_?)?(?:time_?stamp|times?|stamp)"
     r"(?:_?(?:s|secs?|seconds|ms|msecs?|us|usecs?|ns|nsecs?))?|t(?:_(?:s|ms|us|ns))?|secs?|seconds"
 )
-_CHANNELS = ("electrodes", "pac", "pdc", "tdc", "tac")
 
 
 def is_time(name: str) -> bool:
@@ -94,7 +95,7 @@ def place_of(name: str) -> Place | None:
             continue
         parts = found.groupdict()
         prefix = (parts["who"] or "").strip("_")
-        if field in _CHANNELS:
+        if field in CHANNELS:
             number = parts.get("n")
             whole = parts.get("whole")
             if whole:
