@@ -6,7 +6,7 @@ from collections.abc import Callable
 from ..arguments import SEED, device
 from .names import MATERIALS, SKINS, TIERS
 
-__all__ = ["add_options", "add_sensor", "add_skin", "add_verb", "choice"]
+__all__ = ["add_device", "add_options", "add_sensor", "add_skin", "add_verb", "choice"]
 
 
 class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -52,10 +52,14 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
         help="liquid under the skin (default: by the material)",
     )
     verb.add_argument("--seed", type=SEED, default=0, help=seed)
-    verb.add_argument(
-        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
-    )
+    add_device(verb)
     add_options(verb)
+
+
+def add_device(verb: argparse.ArgumentParser) -> None:
+    """Adds the device of the skin."""
+    text = "where the skin is solved: cpu, cuda:0 ..."
+    verb.add_argument("--device", type=device, default="cpu", help=text)
 
 
 def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:

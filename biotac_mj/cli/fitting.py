@@ -2,9 +2,9 @@
 
 import argparse
 
-from ..arguments import SEED, check_device, device, output_file, output_folder, real, whole
+from ..arguments import SEED, check_device, output_file, output_folder, real, whole
 from ..recordings.verbs import add_load_arguments
-from .common import add_options, add_verb
+from .common import add_device, add_options, add_verb
 from .names import CONFIGURATIONS, INDENTER_HELP, INDENTERS, MATERIALS, SKINS
 
 __all__ = ["add_calibrate", "add_compare", "add_estimate"]
@@ -96,9 +96,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         default=1,
         help="number of starting points, used if they may improve the fit: forces may jump in the parameters",
     )
-    verb.add_argument(
-        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
-    )
+    add_device(verb)
     verb.add_argument(
         "--out",
         type=output_folder("calibration.json", "calibration.png"),
@@ -173,9 +171,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
     )
-    verb.add_argument(
-        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
-    )
+    add_device(verb)
     files = output_folder("compare.json", "compare.kept")
     verb.add_argument(
         "--out", type=files, default="out/compare", metavar="DIR", help="folder of compare.json"

@@ -31,48 +31,23 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         metavar=("X", "ANGLE | Y Z"),
         help=LOCATION_HELP,
     )
-    verb.add_argument(
-        "--direction",
-        type=real(-1e9, 1e9),
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="of the press (default: inward normal of the skin there)",
-    )
-    verb.add_argument(
-        "--depth", type=quantity("length"), default="2.4mm", metavar="LENGTH", help="from first touch"
-    )
-    verb.add_argument(
-        "--slide",
-        type=quantity("length"),
-        default="0mm",
-        metavar="LENGTH",
-        help="along the skin after the press",
-    )
-    verb.add_argument(
-        "--slide-direction",
-        type=real(-1e9, 1e9),
-        nargs=3,
-        default=[1.0, 0.0, 0.0],
-        metavar=("X", "Y", "Z"),
-        help="of the slide",
-    )
-    verb.add_argument(
-        "--speed", type=quantity("speed"), default="10mm/s", metavar="SPEED", help="of press and slide"
-    )
-    verb.add_argument(
-        "--hold",
-        type=quantity("time", plain=_LONG_HOLD),
-        default="20ms",
-        metavar="TIME",
-        help="rest at the end of press and slide",
-    )
-    verb.add_argument(
-        "--timestep",
-        type=quantity("time", _LONGEST_STEP, 0.0),
-        default="4ms",
-        metavar="TIME",
-        help="of MuJoCo; the sensor reads a frame every 10 ms",
-    )
+    for name, default, text in (
+        ("direction", None, "of the press (default: inward normal of the skin there)"),
+        ("slide-direction", [1.0, 0.0, 0.0], "of the slide"),
+    ):
+        number = real(-1e9, 1e9)
+        verb.add_argument(
+            f"--{name}", type=number, nargs=3, default=default, metavar=("X", "Y", "Z"), help=text
+        )
+    hold, step = quantity("time", plain=_LONG_HOLD), quantity("time", _LONGEST_STEP, 0.0)
+    for name, kind, default, metavar, text in (
+        ("depth", quantity("length"), "2.4mm", "LENGTH", "from first touch"),
+        ("slide", quantity("length"), "0mm", "LENGTH", "along the skin after the press"),
+        ("speed", quantity("speed"), "10mm/s", "SPEED", "of press and slide"),
+        ("hold", hold, "20ms", "TIME", "rest at the end of press and slide"),
+        ("timestep", step, "4ms", "TIME", "of MuJoCo; the sensor reads a frame every 10 ms"),
+    ):
+        verb.add_argument(f"--{name}", type=kind, default=default, metavar=metavar, help=text)
     coupling = verb.add_mutually_exclusive_group()
     coupling.add_argument(
         "--one-way",
@@ -121,31 +96,19 @@ def _press(args):
             f"--location has {len(args.location)} numbers: give X, X and ANGLE, or X Y Z, as in -12mm 30deg"
         )
     location = args.location if len(args.location) > 1 else [*args.location, 0.0]
+    same = (
+        "indenter depth slide tier liquid timestep speed hold two_way friction seed device options sensor "
+        "randomise thermal texture"
+    )
     options = PressOptions(
-        indenter=args.indenter,
+        **{name: getattr(args, name) for name in same.split()},
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
-        depth=args.depth,
-        slide=args.slide,
         slide_direction=tuple(args.slide_direction),
         # defaults are taken from the effects' file
         material=None if args.material == "default" else args.material,
-        liquid=args.liquid,
         skin=None if args.skin == "default" else args.skin,
-        tier=args.tier,
-        timestep=args.timestep,
-        speed=args.speed,
-        hold=args.hold,
-        two_way=args.two_way,
-        friction=args.friction,
-        seed=args.seed,
-        device=args.device,
-        options=args.options,
-        sensor=args.sensor,
         signal=None if args.signal == "physics" else args.signal,
-        randomise=args.randomise,
-        thermal=args.thermal,
-        texture=args.texture,
         effects=args.effects or None,
     )
     check_device(args.device)
