@@ -143,7 +143,7 @@ def test_help_is_light():
         (["press", "--indenter", "mesh:nowhere.obj"], "no indenter mesh at nowhere.obj"),
         (
             ["press", "--skin", "nowhere.npz"],
-            "no skin at nowhere.npz: pass 'coarse', 'default', 'fine' or a file made by",
+            "no skin at nowhere.npz: pass 'coarse', 'default', 'fine', a design's folder or a file made",
         ),
         (["press", "--skin", "coarse", "--location", "40mm"], "no skin at x = 40 mm"),
         (
