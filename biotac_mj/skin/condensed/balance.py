@@ -24,7 +24,8 @@ wp.set_module_options({"enable_backward": False})
 
 TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps would cause chatter
 # at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
-# where a search along a step has caught the jump so closely, as a fraction of the tolerance
+# where a search along a step has caught the jump so closely, as a fraction of the tolerance. Viscosity makes
+# a step shorter by what makes its error larger, and the piece of it that encloses the jump stays as it is
 _ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
 CUT = wp.constant(2)
 _MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (200, 8, 10))
@@ -332,7 +333,7 @@ def take_step(
             d.error = (real(1.0) + d.viscosity) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
             if not wp.isfinite(d.error):
                 good = 0
-            elif d.error < _ROUGH and d.error * d.caught < _CAUGHT * TOLERANCE and d.viscosity == real(0.0):
+            elif d.error < _ROUGH and d.error * d.caught < _CAUGHT * TOLERANCE:
                 d.found = 1
                 good = 0
             elif d.error < d.tolerance and d.viscosity == real(0.0):

@@ -12,6 +12,7 @@ __all__ = [
     "block_sum",
     "add_row",
     "add_rows",
+    "begin_row",
     "dot_column",
     "dot_columns",
     "eliminate",
@@ -19,7 +20,6 @@ __all__ = [
     "keep_rows",
     "sum_rows",
     "sync",
-    "take_columns",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -373,8 +373,8 @@ def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
 
 
 # By one thread the compliance between the candidates is kept, contiguous: B has rows of length m, one for
-# each candidate's coordinate, which are gathered when they are first used. So a processor's vectors do many
-# columns at a time.
+# each candidate's coordinate, which are gathered when they are first used, and P what they have in the
+# columns of a matrix. So a processor's vectors do many columns at a time.
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
@@ -398,19 +398,24 @@ def keep_rows(
     ...
 
 
-@wp.func_native("""
+_ROWS = """
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
     int* __restrict there = known.data + (long long)world * known.shape[1];
-    for (int i = row; i < row + count; ++i) {
-        if (there[i]) continue;
-        there[i] = 1;
+    for (int i = row; i < row + count; ++i) {{
         float* __restrict b = B.data + (long long)world * B.shape[1] + (long long)i * m;
         const float* __restrict c = C.data + at[i] * (long long)C.shape[1];
-        for (int j = 0; j < m; ++j) b[j] = c[at[j]];
-    }
+        if (there[i] == 0) {{
+            there[i] = 1;
+            for (int j = 0; j < m; ++j) b[j] = c[at[j]];
+        }}
+        {columns}
+    }}
 #endif
-""")
+"""
+
+
+@wp.func_native(_ROWS.format(columns=""))
 def gather_rows(
     C: wp.array2d(dtype=float),
     world: int,
@@ -425,52 +430,31 @@ def gather_rows(
     ...
 
 
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-    float* __restrict a = sum.data + (long long)world * sum.shape[1];
-    float *__restrict b = a + m, *__restrict d = b + m;
-    const float* __restrict c = B.data + (long long)world * B.shape[1] + (long long)row * m;
-    const float x0 = x.data[0][0], x1 = x.data[0][1], x2 = x.data[0][2];
-    const float y0 = x.data[1][0], y1 = x.data[1][1], y2 = x.data[1][2];
-    const float z0 = x.data[2][0], z1 = x.data[2][1], z2 = x.data[2][2];
-    for (int j = 0; j < m; ++j) {
-        const float u = c[j], v = c[m + j], w = c[2 * m + j];
-        a[j] = (first ? 0.0f : a[j]) + (x0 * u + x1 * v + x2 * w);
-        b[j] = (first ? 0.0f : b[j]) + (y0 * u + y1 * v + y2 * w);
-        d[j] = (first ? 0.0f : d[j]) + (z0 * u + z1 * v + z2 * w);
-    }
-#endif
-""")
-def add_rows(
+@wp.func_native(
+    _ROWS.format(
+        columns="""
+        if (there[i] == 2) continue;
+        there[i] = 2;
+        const int* __restrict take = place.data + (long long)world * place.shape[1];
+        float* __restrict p = P.data + (long long)world * P.shape[1] + (long long)i * n;
+        for (int j = 0; j < n; ++j) p[j] = b[take[j]];
+"""
+    )
+)
+def gather_rows(  # noqa: F811
+    C: wp.array2d(dtype=float),
     world: int,
     m: int,
-    first: int,
-    x: wp.mat33,
-    B: wp.array2d(dtype=float),
+    coordinate: wp.array2d(dtype=int),
     row: int,
-    sum: wp.array2d(dtype=float),
-):
-    """Adds x times three rows of B to three rows of length m, which the first makes."""
-    ...
-
-
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-    float* __restrict a = sum.data + (long long)world * sum.shape[1];
-    const float* __restrict c = B.data + (long long)world * B.shape[1] + (long long)row * m;
-    for (int j = 0; j < m; ++j) a[j] = (first ? 0.0f : a[j]) + x * c[j];
-#endif
-""")
-def add_row(
-    world: int,
-    m: int,
-    first: int,
-    x: float,
+    count: int,
+    known: wp.array2d(dtype=int),
     B: wp.array2d(dtype=float),
-    row: int,
-    sum: wp.array2d(dtype=float),
+    n: int,
+    place: wp.array2d(dtype=int),
+    P: wp.array2d(dtype=float),
 ):
-    """Adds x times a row of B to a row of length m."""
+    """The same, and of P what these rows have at n listed places, unless `known` says 2."""
     ...
 
 
@@ -478,13 +462,11 @@ def add_row(
 #if !defined(__CUDA_ARCH__)
     float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
     const float* __restrict b = push.data + (long long)world * push.shape[1];
-    const int* __restrict at = place.data + (long long)world * place.shape[1];
-    const float* __restrict c = sum.data + (long long)world * sum.shape[1] + begin;
-    for (int j = 0; j < n; ++j) a[j] = (empty ? 0.0f : c[at[j]]) - held * b[j];
+    for (int j = 0; j < n; ++j) a[j] = -held * b[j];
     a[row] += 1.0f;
 #endif
 """)
-def take_columns(
+def begin_row(
     A: wp.array2d(dtype=float),
     world: int,
     n: int,
@@ -492,13 +474,60 @@ def take_columns(
     row: int,
     held: float,
     push: wp.array2d(dtype=float),
-    place: wp.array2d(dtype=int),
-    sum: wp.array2d(dtype=float),
-    begin: int,
-    empty: int,
 ):
-    """Makes n entries of a row of A, of length `wide`, those of sum[world] from `begin` on at listed places,
-    or nothing, less held times push[world], and adds one on the diagonal."""
+    """Makes n entries of a row of A, whose length is `wide`, those of the identity less held times
+    push[world]."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
+    float *__restrict b = a + wide, *__restrict d = b + wide;
+    const float* __restrict c = P.data + (long long)world * P.shape[1] + (long long)at * n;
+    const float x0 = x.data[0][0], x1 = x.data[0][1], x2 = x.data[0][2];
+    const float y0 = x.data[1][0], y1 = x.data[1][1], y2 = x.data[1][2];
+    const float z0 = x.data[2][0], z1 = x.data[2][1], z2 = x.data[2][2];
+    for (int j = 0; j < n; ++j) {
+        const float u = c[j], v = c[n + j], w = c[2 * n + j];
+        a[j] += x0 * u + x1 * v + x2 * w;
+        b[j] += y0 * u + y1 * v + y2 * w;
+        d[j] += z0 * u + z1 * v + z2 * w;
+    }
+#endif
+""")
+def add_rows(
+    A: wp.array2d(dtype=float),
+    world: int,
+    n: int,
+    wide: int,
+    row: int,
+    x: wp.mat33,
+    P: wp.array2d(dtype=float),
+    at: int,
+):
+    """Adds x times three rows of P to three rows of A, whose length is `wide`, in n columns."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    float* __restrict a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
+    const float* __restrict c = P.data + (long long)world * P.shape[1] + (long long)at * n;
+    for (int j = 0; j < n; ++j) a[j] += x * c[j];
+#endif
+""")
+def add_row(
+    A: wp.array2d(dtype=float),
+    world: int,
+    n: int,
+    wide: int,
+    row: int,
+    x: float,
+    P: wp.array2d(dtype=float),
+    at: int,
+):
+    """Adds x times a row of P to a row of A in n columns."""
     ...
 
 

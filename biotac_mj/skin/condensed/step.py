@@ -210,6 +210,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     alone = 0 if model.device.is_cuda else n  # by one thread; memory of rows that are never used is not taken
     s.sum = wp.zeros((nworld, 3 * max(alone, len(model.free))), dtype=float)
     s.between = wp.empty((nworld, alone * alone), dtype=float)
+    s.columns = wp.empty((nworld, alone * min(alone, 3 * touched)), dtype=float)
     s.known, s.last = wp.zeros((nworld, alone), dtype=int), wp.zeros((nworld, alone + 1), dtype=int)
     s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
     s.stiff = wp.zeros((nworld, core_nodes), dtype=real)

@@ -116,9 +116,11 @@ class Scratch:
     matrix: wp.array2d(dtype=float)
     column: wp.array2d(dtype=int)  # contact coordinates of the equations
     column_place: wp.array2d(dtype=int)  # and their places among the candidates'
-    # by one thread, see `lanes.gather_rows`: compliance between candidates, its rows that are known, and the
-    # number of the candidates' coordinates and these; sums of rows
+    # by one thread, see `lanes.gather_rows`: compliance between candidates, and in the columns of the
+    # equations; which rows of both are known, the number of the candidates' coordinates and these; sums of
+    # rows
     between: wp.array2d(dtype=float)
+    columns: wp.array2d(dtype=float)
     known: wp.array2d(dtype=int)
     last: wp.array2d(dtype=int)
     sum: wp.array2d(dtype=float)

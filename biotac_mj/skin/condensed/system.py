@@ -9,6 +9,7 @@ from .bodies import move_nodes, number_bodies, rigid_column
 from .lanes import (
     add_row,
     add_rows,
+    begin_row,
     block_rank,
     block_sum,
     dot_column,
@@ -16,7 +17,6 @@ from .lanes import (
     gather_rows,
     sum_rows,
     sync,
-    take_columns,
 )
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
@@ -198,36 +198,34 @@ def _fill_by_rows(
     """The matrix of `fill_contact` by one thread."""
     n = 3 * outer + inner
     m = 3 * nnode + nin
+    for j in range(m):
+        s.known[w, j] = wp.min(s.known[w, j], 1)  # the columns are others now
+    for i in range(n):
+        begin_row(s.matrix, w, n, wide, i, soft * s.held[w, i], s.push)
     for k in range(outer):
         p = s.node[w, s.touched[w, k]]
-        empty = int(1)
         for e in range(c.ring_start[p], wp.where(lumped == 1, c.ring_start[p] + 1, c.ring_start[p + 1])):
             block = s.block[w, k, e - c.ring_start[p]]
             if wp.ddot(block, block) > 0.0:
                 row = 3 * wp.where(lumped == 1, s.touched[w, k], s.place[w, c.ring[e]])
-                gather_rows(c.compliance, w, m, s.coordinate, row, 3, s.known, s.between)
-                add_rows(w, m, empty, scale * block, s.between, row, s.sum)
-                empty = 0
-        for a in range(3):
-            i = 3 * k + a
-            held = soft * s.held[w, i]
-            take_columns(s.matrix, w, n, wide, i, held, s.push, s.column_place, s.sum, a * m, empty)
+                gather_rows(
+                    c.compliance, w, m, s.coordinate, row, 3, s.known, s.between, n, s.column_place, s.columns
+                )
+                add_rows(s.matrix, w, n, wide, 3 * k, scale * block, s.columns, row)
     for k in range(inner):
         i = 3 * outer + k
         place = s.column_place[w, i]
         p = s.core_node[w, place - 3 * nnode]
-        empty = int(1)
         for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
             one = s.core_block[w, k, e - c.inner_ring_start[p]]
             row = 3 * nnode + s.core_place[w, c.inner_ring[e]]
             if lumped == 1:
                 one = wp.where(row == place, float(s.stiff[w, place - 3 * nnode]), 0.0)
             if one != 0.0:
-                gather_rows(c.compliance, w, m, s.coordinate, row, 1, s.known, s.between)
-                add_row(w, m, empty, scale * one, s.between, row, s.sum)
-                empty = 0
-        held = soft * s.held[w, i]
-        take_columns(s.matrix, w, n, wide, i, held, s.push, s.column_place, s.sum, 0, empty)
+                gather_rows(
+                    c.compliance, w, m, s.coordinate, row, 1, s.known, s.between, n, s.column_place, s.columns
+                )
+                add_row(s.matrix, w, n, wide, i, scale * one, s.columns, row)
 
 
 @wp.func
