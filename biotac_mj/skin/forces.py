@@ -228,10 +228,8 @@ class Forces:
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s, on_cuda = self.m, self.d, self.k, state.surface, self.m.device.is_cuda
         cache, contact = self._surfaces[surface]
-        laws, shapes = contact.laws, geoms.shapes
-        if shapes == touch.SOLIDS and not on_cuda:  # the core needs those kernels anyway
-            shapes = touch.MESHES
-        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), shapes)
+        laws = contact.laws
+        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), geoms.shapes)
         dim, nsample = state.touching.shape, len(m.sample)
         threads = min(_LISTED, dim[0] * dim[1]) if on_cuda else 1
         self.launch(program, broadphase.track_geoms, d.nworld, [self._mark, geoms.struct, on], [cache])

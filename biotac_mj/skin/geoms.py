@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from .contact.meshes import DistanceGrid, pack_grids
 from .contact.posed import WINDOW, Geoms
 from .contact.shapes import GEOM_TYPES
-from .contact.touch import MESHES, SKINS, SOLIDS
+from .contact.touch import CORE, MESHES, SKINS, SOLIDS
 from .state import allocate
 from .types import mat33, real, vec3
 
@@ -124,6 +124,8 @@ class GeomSet:
     @property
     def shapes(self) -> str:
         """Kind of their shapes, see `contact.touch.contact_kernels`."""
+        if len(self.types) == 1 and len(self._grids) == 1 and self._grids[0].coefficient is not None:
+            return CORE
         return shapes_of(self.types)
 
     def single_world(self) -> "GeomSet":

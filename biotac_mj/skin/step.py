@@ -30,7 +30,7 @@ from .bodies import make_bodies
 from .compliant_bodies import CompliantBodies
 from .contact import broadphase, faces, penetration
 from .contact.posed import LoadPath
-from .contact.touch import BLOCK, contact_kernels
+from .contact.touch import BLOCK, CORE, contact_kernels
 from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet
@@ -129,7 +129,7 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
 def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
     """Modules of a step's kernels on CUDA that take long to compile, with their block sizes, for
     `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
-    found = [(contact_kernels(False, False, shapes).by_sample.module, BLOCK)]
+    found = [(contact_kernels(False, False, kind).by_sample.module, BLOCK) for kind in (CORE, shapes)]
     found += [(kernel.module, threads) for kernel, threads in kernels_up_to()]
     return [*found, (penetration, 256), (faces, 256), (broadphase, 256)]
 

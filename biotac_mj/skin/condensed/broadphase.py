@@ -11,7 +11,7 @@ from ..contact.broadphase import (
     motion_bound,
     sample_within,
 )
-from ..contact.meshes import TRILINEAR, spline_distance
+from ..contact.meshes import TRILINEAR, smooth_distance
 from ..contact.penetration import core_clearance
 from ..contact.posed import SKIN, Geoms, face_radius
 from ..contact.shapes import GEOM_TYPES
@@ -175,7 +175,7 @@ def _meets_core(f: int, i: int, w: int, fraction: real, x: wp.array2d(dtype=vec3
     if c.inner_gap[f, i] - nearer >= reach + _NEARLY:
         return False
     p = b[0] * x0 + b[1] * x1 + b[2] * x2
-    return spline_distance(c.core.grids, c.core.grid[0], p) - c.inner_rest[f, i] < reach
+    return smooth_distance(c.core.grids, c.core.grid[0], p)[3] - c.inner_rest[f, i] < reach
 
 
 @wp.func
@@ -383,7 +383,7 @@ def measure_core(
         face = c.inner_face[f]
         b = c.sample[i]
         p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
-        s.gap[w, at, i] = spline_distance(c.core.grids, k, p) - c.inner_rest[f, i]
+        s.gap[w, at, i] = smooth_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i]
     sync()
 
 

@@ -32,7 +32,8 @@ __all__ = [
     "mesh_distance",
     "mesh_field",
     "pack_grids",
-    "spline_distance",
+    "smooth_distance",
+    "spline_field",
     "to_triangles",
 ]
 
@@ -179,7 +180,7 @@ def _compare(sharp: Grids, smooth: Grids, point: wp.array(dtype=vec3), error_out
     i = wp.tid()
     far = wp.abs(grid_value(sharp, 0, point[i]))
     if far <= NEAR_SURFACE * sharp.spacing[0]:
-        spline = to_triangles(smooth, 0, point[i], far)[3]
+        spline = spline_field(smooth, 0, point[i])[3]
         within = far + real(2.0) * sharp.spacing[0]
         error_out[i] = wp.abs(spline - to_triangles(sharp, 0, point[i], within)[3])
 
@@ -318,8 +319,8 @@ def _spline_centre(grids: Grids, k: int, p: vec3):
 
 
 @wp.func
-def _from_spline(grids: Grids, k: int, p: vec3):
-    """Gradient and value of the quadratic spline: both are continuous."""
+def spline_field(grids: Grids, k: int, p: vec3):
+    """Gradient and value of a smooth mesh's quadratic spline: both are continuous."""
     n = grids.shape[k]
     h = grids.spacing[k]
     i, t = _spline_centre(grids, k, p)
@@ -352,21 +353,22 @@ def mesh_distance(grids: Grids, k: int, p: vec3):
 
 
 @wp.func
-def spline_distance(grids: Grids, k: int, p: vec3):
-    """Distance of `mesh_distance` from a smooth mesh. On CUDA each thread that calls `to_triangles` copies
-    the struct of the grids, which takes much longer than the spline."""
+def smooth_distance(grids: Grids, k: int, p: vec3):
+    """`mesh_distance` from a smooth mesh, without the code for triangles, which takes registers on CUDA."""
     d = grid_value(grids, k, p)
     if d > TRILINEAR * grids.spacing[k]:
-        return d
-    return _from_spline(grids, k, p)[3]
+        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
+    return spline_field(grids, k, p)
 
 
 @wp.func
 def mesh_field(grids: Grids, k: int, p: vec3, d: real):
     """Normal and distance where the grid's value is d: from the nearest triangle close to the surface; of a
     smooth mesh from its spline, whose gradient may differ slightly from length 1."""
+    if grids.coefficient.shape[0] > 0:
+        return spline_field(grids, k, p)
     h = grids.spacing[k]
-    if wp.abs(d) <= h or grids.coefficient.shape[0] > 0:
+    if wp.abs(d) <= h:
         return to_triangles(grids, k, p, wp.abs(d) + h)
     n = vec3(
         grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
@@ -402,10 +404,7 @@ def _listed(grids: Grids, k: int, p: vec3):
 
 @wp.func(inline=False)  # long, with Warp's queries, and called from a dozen places of a kernel
 def to_triangles(grids: Grids, k: int, p: vec3, within: real):
-    """Normal and distance from the nearest triangle within `within` [m], or four cells if there is none; of a
-    smooth mesh from its spline."""
-    if grids.coefficient.shape[0] > 0:
-        return _from_spline(grids, k, p)
+    """Normal and distance from the nearest triangle within `within` [m], or four cells if there is none."""
     h = grids.spacing[k]
     q = real(1.0e3) * p
     face = _listed(grids, k, p)

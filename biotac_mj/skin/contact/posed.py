@@ -33,6 +33,7 @@ __all__ = [
     "convected_anchor",
     "least_to",
     "meet",
+    "meet_side",
     "place_on",
     "touch_bound",
 ]
@@ -188,6 +189,17 @@ class Meeting:
 
 
 @wp.func
+def meet_side(dn: wp.vec4d, b: vec3):
+    """Contact of a sample with barycentric coordinates b with a surface without edges; dn: its `distance`."""
+    met = Meeting()
+    met.normal = vec3(dn[0], dn[1], dn[2])
+    met.gap = dn[3]
+    met.at = b
+    met.weight = real(1.0)
+    return met
+
+
+@wp.func
 def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3, meshes: int):
     """Contact of a sample of a face with geom g.
 
@@ -201,11 +213,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
         the face from its first corner, in the BioTac frame. meshes: 0 if no geom is a mesh, which removes
         code.
     """
-    met = Meeting()
-    met.normal = vec3(dn[0], dn[1], dn[2])
-    met.gap = dn[3]
-    met.at = b
-    met.weight = real(1.0)
+    met = meet_side(dn, b)
     window = geoms.window[g]
     if window == real(0.0):
         return met

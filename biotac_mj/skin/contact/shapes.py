@@ -7,7 +7,7 @@ radius r, its faces stay."""
 import warp as wp
 
 from ..types import real, vec3
-from .meshes import NEAR_SURFACE, TRILINEAR, Grids, grid_value, mesh_distance, to_triangles
+from .meshes import NEAR_SURFACE, TRILINEAR, Grids, grid_value, mesh_distance, spline_field, to_triangles
 
 __all__ = [
     "GEOM_TYPES",
@@ -186,7 +186,7 @@ def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: in
         h = grids.spacing[grid]
         if grids.coefficient.shape[0] > 0:
             if bound < (NEAR_SURFACE - TRILINEAR) * h:
-                bound = wp.max(bound, to_triangles(grids, grid, p, h)[3] - real(2.0) * grids.error[grid])
+                bound = wp.max(bound, spline_field(grids, grid, p)[3] - real(2.0) * grids.error[grid])
         elif h > _COARSE and bound < _NEAR:
             # a large mesh has large cells: its grid alone would keep too many faces
             bound = wp.max(bound, to_triangles(grids, grid, p, real(4.0) * h)[3])

@@ -15,12 +15,24 @@ import warp as wp
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
-from .posed import Geoms, convected_anchor, distance_to, face_radius, least_to, meet, place_on, touch_bound
+from .meshes import smooth_distance
+from .posed import (
+    Geoms,
+    convected_anchor,
+    distance_to,
+    face_radius,
+    least_to,
+    meet,
+    meet_side,
+    place_on,
+    touch_bound,
+)
 from .shapes import distance, lower_bound, primitive_distance
 
 __all__ = [
     "BLOCK",
     "CONSISTENT",
+    "CORE",
     "LAGGED",
     "MESHES",
     "CURRENT",
@@ -35,11 +47,8 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-SOLIDS, MESHES, SKINS = (
-    "solids",
-    "meshes",
-    "skins",
-)  # kinds of geoms that kernels support, each with the ones before
+# kinds of geoms that kernels support: one smooth mesh; and three kinds, each with the ones before
+CORE, SOLIDS, MESHES, SKINS = "core", "solids", "meshes", "skins"
 BLOCK = 256  # threads of a block of `by_sample`, and the most samples of a face
 # Friction modes: the bound is mu times the current normal force, with a symmetric tangent (CURRENT) or with
 # the exact one (CONSISTENT); it is stored as well (RECORDED); it is the stored one of an earlier equilibrium
@@ -246,6 +255,10 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                 if wp.static(shapes == SKINS):
                     dn = distance_to(geoms, g, w, p)
                     clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3]), radius))
+                elif wp.static(shapes == CORE):
+                    dn = smooth_distance(geoms.grids, geoms.grid[g], y)
+                    least = lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3])
+                    clearance = wp.min(clearance, least)
                 elif wp.static(shapes == MESHES):
                     dn = distance(
                         geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y
@@ -255,7 +268,10 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                 else:
                     dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
                     clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3], radius))
-                met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0, wp.static(int(shapes != SOLIDS)))
+                if wp.static(shapes == CORE):
+                    met = meet_side(dn, b)
+                else:
+                    met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0, wp.static(int(shapes != SOLIDS)))
                 if met.gap < gap:
                     gap = met.gap
                     touched = g
@@ -358,7 +374,7 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
 
     Args:
       has_law: whether surfaces have a ContactLaw. smooth: whether Coulomb's law has smoothed kinks.
-      shapes: SOLIDS, MESHES or SKINS; fewer kinds take fewer registers.
+      shapes: CORE, SOLIDS, MESHES or SKINS; fewer kinds take fewer registers.
     """
     law = "lawful" if has_law else "smooth" if smooth else "coulomb"
     module = f"{__name__}.{law}_{shapes}"
