@@ -31,7 +31,6 @@ LEFT_OUT = {
     ("start.md", "pip install ."): "a network; `make test-wheel` installs the wheel",
     ("gradients.md", "biotac lab estimate"): "a recording with places; test_differentiable_estimate.py",
     ("train.md", "biotac data generate --count 2600"): "a GPU; test_data_generate.py",
-    ("train.md", "biotac_mj.attach(spec"): "three choices for one finger; test_attach.py",
     ("data_sets.md", "biotac data generate --count 2600"): "a GPU; test_data_generate.py",
     ("recordings.md", "biotac data resimulate"): "a log of the reader's; test_resimulation.py",
     ("rendering.md", "biotac view --hand"): "MuJoCo Menagerie; test_menagerie.py",
