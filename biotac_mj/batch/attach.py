@@ -20,9 +20,9 @@ from ..coupling.steppers.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..fields import as_whole
-from ..geometry import closest
+from ..geometry import closest, core_surface
 from ..geometry.skins import skin_of_design, skin_reference
-from ..sensor import acquisition_kernels, core_surface
+from ..sensor import acquisition_kernels
 from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.signals import read_signal
