@@ -163,7 +163,7 @@ def state_size(nmode: int, nbody: int) -> int:
 def _average(ka: real):
     """Average of a wave over a disc of radius a: a bound of 2 J1(ka) / ka without zeros, as contacts have no
     sharp edge."""
-    return real(1.0) / wp.sqrt(real(1.0) + real(math.pi / 8.0) * ka * ka * ka)
+    return real(1.0) / wp.sqrt(real(1.0) + real(math.pi) / real(8.0) * ka * ka * ka)
 
 
 @wp.kernel
@@ -187,7 +187,7 @@ def shake(
     modes, then the band-pass."""
     w = wp.tid()
     one = real(1.0)
-    turn = real(2.0 * math.pi)
+    turn = real(2.0) * real(math.pi)  # a product outside would be in single precision
     period = one / real(SLOT_RATE)
     nmode = static_pressure.shape[0]
     nbody = slip.shape[1]
@@ -207,7 +207,7 @@ def shake(
             wave = turn / t[0]
             phase = state[w, b] + wave * speed * period
             state[w, b] = phase - turn * wp.floor(phase / turn)
-            h = real(0.5) * t[1] * wp.sin(phase) * _average(wave * wp.sqrt(area[w, g] * real(1.0 / math.pi)))
+            h = real(0.5) * t[1] * wp.sin(phase) * _average(wave * wp.sqrt(area[w, g] / real(math.pi)))
             if t[2] > real(0.0) and speed > real(0.0):
                 keep = wp.exp(-speed * period / real(_WAVE))
                 fresh = wp.sqrt(one - keep * keep) * draw_normal(

@@ -45,14 +45,8 @@ class Vectors:
             self.viscous_work = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
             self.flags = wp.zeros(9, dtype=int)
-            self.no_vector = wp.zeros((0, w), dtype=vec3)
-            self.no_list = wp.zeros(0, dtype=int)
-            self.no_flag = wp.zeros((0, w), dtype=int)
-            self.no_face = wp.zeros(0, dtype=wp.vec3i)
-            self.no_block = wp.zeros((0, w), dtype=mat33)
             # bound of each sample's friction at the start of the load increment [N]
             self.bound = wp.zeros((len(model.outer.face) * len(model.sample), w), dtype=real)
-            self.no_bound = wp.zeros((0, w), dtype=real)
             self.corner_normal_force = wp.zeros((3 * len(model.outer.face) if has_law else 0, w), dtype=real)
             few = model.device.is_cuda and w <= FEW
             self.face_chunk = 1 if few else data.chunk if w < 256 else _FACES
@@ -100,7 +94,7 @@ class Forces:
         self.ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
         self._mark = next(_MARKS)
         self._surfaces = [self._surface(data.outer, geoms.count, data.laws.struct, vectors.bound)]
-        self._surfaces += [self._surface(data.core, 1, self._no_laws, vectors.no_bound)]
+        self._surfaces += [self._surface(data.core, 1, self._no_laws, None)]
 
     def _surface(self, state, ngeom, laws, bound):
         """`ClearanceCache` and `Contact` of a surface."""
@@ -122,14 +116,9 @@ class Forces:
         return self._surfaces[0][1]
 
     @property
-    def external(self) -> wp.array:
-        """External forces at the nodes [node, world] [N], of length zero if there are none."""
-        return self.k.no_vector if self.d.external is None else self.d.external
-
-    @property
-    def gradient(self) -> wp.array:
-        """Gradient of the liquid's volume [node, world] [m^2], of length zero without a liquid."""
-        return self.d.gradient if self.m.has_liquid else self.k.no_vector
+    def gradient(self) -> wp.array | None:
+        """Gradient of the liquid's volume [node, world] [m^2]; None without a liquid."""
+        return self.d.gradient if self.m.has_liquid else None
 
     def launch(
         self,
@@ -158,7 +147,7 @@ class Forces:
         )
         self.launch(
             program, nodes.assemble_force, self._summed,
-            [self._slots, k.elements.corner_force, self.external, st.pressure, on, *self.node_forces],
+            [self._slots, k.elements.corner_force, d.external, st.pressure, on, *self.node_forces],
             [d.force],
         )  # fmt: skip
         if self.implicit:
@@ -253,7 +242,7 @@ class Forces:
         m, d, k, st = self.m, self.d, self.k, self.st
         c = d.core
         law = [st.contact_stiffness, st.reference]
-        area, touched = m.inner.area, [k.no_flag, k.no_flag, k.no_vector]
+        area, touched = m.inner.area, [None, None, None]
         if c:
             area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
         self.launch(
@@ -280,9 +269,5 @@ class Forces:
                 m.wet_node,
                 d.gradient,
             )
-        else:
-            liquid.face, liquid.start, liquid.slot, liquid.node = k.no_face, k.no_list, k.no_list, k.no_list
-            liquid.wet, liquid.corner, liquid.gradient = k.no_vector, k.no_vector, k.no_vector
-        with wp.ScopedDevice(m.device):
-            core = d.core.forces if d.core else nodes.empty_surface(d.nworld)
+        core = d.core.forces if d.core else nodes.SurfaceForces()
         return d.outer.forces, core, liquid

@@ -26,7 +26,7 @@ import numpy as np
 import warp as wp
 
 from ..threads import single_thread
-from .bodies import make_bodies
+from .bodies import Bodies
 from .compliant_bodies import CompliantBodies
 from .contact import broadphase, faces, penetration
 from .contact.posed import LoadPath
@@ -197,7 +197,7 @@ class SkinStep:
         self.implicit, w = self._forces.implicit, data.nworld
         self._compliant = CompliantBodies(self._forces) if data.bodies else None
         with wp.ScopedDevice(model.device):
-            self._bodies = data.bodies or make_bodies(0, w)
+            self._bodies = data.bodies or Bodies()
             self._path = LoadPath()
             self._path.pos_start, self._path.pos_end = (
                 wp.zeros((geoms.count, w), dtype=vec3) for _ in range(2)
@@ -508,7 +508,7 @@ class SkinStep:
 
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
-        forces = [d.force, *self._forces.node_forces, self._forces.external]
+        forces = [d.force, *self._forces.node_forces, d.external]
         self._launch(
             self._nodes_kernels.residuals, (k.nchunk, d.nworld),
             [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st],

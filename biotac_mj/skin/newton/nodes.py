@@ -17,7 +17,6 @@ __all__ = [
     "NodeSlots",
     "SurfaceForces",
     "assemble_force",
-    "empty_surface",
     "begin_nodes",
     "end_core",
     "end_nodes",
@@ -42,7 +41,8 @@ class NodeSlots:
 
 @wp.struct
 class SurfaceForces:
-    """Contact of a surface, to be summed into nodes; without such a surface all arrays are empty."""
+    """Contact of a surface, to be summed into nodes; without such a surface no array is set, and kernels see
+    empty ones."""
 
     face: wp.array(dtype=wp.vec3i)
     start: wp.array(dtype=int)  # CSR lists of the corners at each node, by 3 face + corner
@@ -53,19 +53,9 @@ class SurfaceForces:
     node_force: wp.array2d(dtype=vec3)  # [node, world] [N]
 
 
-def empty_surface(nworld: int) -> SurfaceForces:
-    """No contact surface, on Warp's default device."""
-    out = SurfaceForces()
-    out.face = wp.zeros(0, dtype=wp.vec3i)
-    out.start, out.slot = (wp.zeros(0, dtype=int) for _ in range(2))
-    out.touching, out.block = wp.zeros((0, nworld), dtype=int), wp.zeros((0, nworld), dtype=mat33)
-    out.corner, out.node_force = (wp.zeros((0, nworld), dtype=vec3) for _ in range(2))
-    return out
-
-
 @wp.struct
 class LiquidForces:
-    """Gradient of the liquid's volume, to be summed into nodes; without a liquid all arrays are empty."""
+    """Gradient of the liquid's volume, to be summed into nodes; without a liquid no array is set."""
 
     face: wp.array(dtype=wp.vec3i)
     start: wp.array(dtype=int)  # CSR lists of the corners at each node, by 3 face + corner

@@ -22,12 +22,12 @@ class Residual(NamedTuple):
     Attributes:
       norms: (4, nchunk, nworld); the first is the square of r, the third that of the gradient.
       r: [nvert, nworld] residual, zero at fixed nodes.
-      gradient: of the liquid's volume [nvert, nworld], or of length zero.
+      gradient: of the liquid's volume [nvert, nworld]; None without a liquid.
     """
 
     norms: wp.array
     r: wp.array
-    gradient: wp.array
+    gradient: wp.array | None
 
 
 class Preconditioner(Protocol):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ..newton.nodes import empty_surface
+from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds
 from ..program import Fork, Launcher
 from ..types import SINGLE
@@ -93,8 +93,7 @@ class DensePreconditioner:
         self.needs_torch = self._inverse.needs_torch
         self._in_parallel = Fork(self.device, nworld <= FEW).run  # most sizes have no system
         self._outer, self._row_group = surfaces[0], None
-        with wp.ScopedDevice(self.device):
-            self._surfaces = [empty_surface(nworld) if s is None else s.forces for s in surfaces]
+        self._surfaces = [SurfaceForces() if s is None else s.forces for s in surfaces]
 
     def begin_step(self, program: Launcher, x: wp.array) -> None:
         """Takes x, for the deformed shape; the undeformed inverse is valid for every step."""

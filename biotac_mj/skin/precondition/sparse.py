@@ -192,7 +192,7 @@ class SparsePreconditioner:
         """See `precondition.Preconditioner`."""
         norms, r, gradient = residual
         on, square, r, z, partial = (a.numpy() for a in (st.active, norms, r, z_out, partial_out))
-        gradient = gradient.numpy() if len(gradient) else None
+        gradient = None if gradient is None else gradient.numpy()
         touched, touching = self.any_touch.numpy(), [s.touching.numpy() for s in self._surfaces]
 
         def update():
