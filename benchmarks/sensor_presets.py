@@ -23,11 +23,18 @@ import scipy.io
 from records import write_json
 from vibration import read_rows
 
-from biotac_mj.recordings.own import colour, noise, rest_of
+from biotac_mj.recordings.own import noise, rest_of
 from biotac_mj.sensor.channels import ELECTRODES
 
 _BEGIN = 5.0  # [s] of a log that nothing touches
 _FRAME = 100  # rows of a hold in a second
+
+
+def colour(pac: np.ndarray) -> tuple[float, float]:
+    """Lag-one correlation and white-noise RMS of samples (n, k) of PAC, blocks of k."""
+    pac = pac - pac.mean()
+    keep = float((pac[:, 1:] * pac[:, :-1]).mean() / (pac**2).mean())
+    return keep, float(pac.std() * np.sqrt(1 - keep**2))
 
 
 def of_text(path: pathlib.Path, force: pathlib.Path | None, rate: float) -> dict:

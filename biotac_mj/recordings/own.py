@@ -5,7 +5,7 @@ import numpy as np
 from ..sensor.channels import counts_from_log_impedance, log_impedance
 from ..sensor.presets import PER_DEGREE
 
-__all__ = ["colour", "noise", "rest_of"]
+__all__ = ["noise", "rest_of"]
 
 _TIMES = np.geomspace(0.1, 1.1, 60)  # candidate time constants of warm-up, over the recording's length
 _LIGHT = 0.08  # fraction of rows of a loaded sensor that are used: those with least force
@@ -17,13 +17,6 @@ def noise(counts: np.ndarray) -> np.ndarray:
     quiet = np.abs(second) <= 6 * np.maximum(np.median(np.abs(second), axis=0), 1)
     square = np.array([np.mean(d[q] ** 2) for d, q in zip(second.T, quiet.T, strict=True)]) / 6
     return np.sqrt(np.maximum(square - 1 / 12, 0))
-
-
-def colour(pac: np.ndarray) -> tuple[float, float]:
-    """Lag-one correlation and white-noise RMS of samples (n, k) of PAC, blocks of k."""
-    pac = pac - pac.mean()
-    keep = float((pac[:, 1:] * pac[:, :-1]).mean() / (pac**2).mean())
-    return keep, float(pac.std() * np.sqrt(1 - keep**2))
 
 
 def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:

@@ -11,7 +11,7 @@ from ..geometry.design import SINGLES
 from ..geometry.skin_geometry import SkinGeometry
 from ..matching.fit import SIGNS, Rows, Setup, fit_constants, fit_states, rows_of
 from ..matching.response import Response, log_changes
-from ..matching.states import PlateGrid, PlateStates, frame, plate_states
+from ..matching.states import PlateStates, frame, plate_states
 from ..recordings import Recording
 from ..sensor.channels import counts_from_log_impedance
 from ..sensor.film import FilmConduction
@@ -61,13 +61,12 @@ def fitted_touches(
     options: SkinOptions,
     rate: float,
     block: float,
-    grid: PlateGrid | None = None,
     progress: bool = True,
 ) -> tuple[list[Touch], Material, list[str]]:
     """Touches of `block` seconds [s] each, with fitted rest rows between them.
 
     Args:
-      rate: [Hz] of the used rows, at most. grid: of the table of states.
+      rate: [Hz] of the used rows, at most.
 
     Returns:
       touches, the material with the fitted Young's modulus, and notes.
@@ -81,7 +80,7 @@ def fitted_touches(
         bad = ~np.isfinite(recording.force).all(1)
         raise ValueError(f"{recording.name} has {bad.sum()} rows without force: cut it to those that have it")
     constant_rows = rows_of(electrodes, recording.force, _EVERY)
-    states = plate_states(geometry, material, options, grid, quiet=not progress)
+    states = plate_states(geometry, material, options, quiet=not progress)
     film = FilmConduction(geometry, sensor=None, electrode_radius=PRESETS["calibrated"].electrode_radius)
     response = Response(states, log_changes(states, film))
     const, _ = fit_constants(response, constant_rows, Setup())

@@ -159,7 +159,7 @@ def touches_of(
         if len(before) < 2 and rest is None:
             rest = _rest(recording, found)
         tare = found.counts[before].mean(0) if len(before) > 1 else rest
-        out.append(_touch(recording, found, name, taken[rows], pos[rows], mat[rows], tare))
+        out.append(_touch(recording, found, taken[rows], pos[rows], mat[rows], tare))
     notes += [f"{count} touches {why}: they were cut or left out" for why, count in rejected.items() if count]
     if not out:
         raise ValueError(
@@ -204,7 +204,7 @@ def _rest(recording, found):
     return rest
 
 
-def _touch(recording, found, name, rows, pos, mat, tare):
+def _touch(recording, found, rows, pos, mat, tare):
     counts = found.counts[rows].copy()
     counts[0] = tare
     wrench = np.full((len(rows), 6), np.nan, np.float32)

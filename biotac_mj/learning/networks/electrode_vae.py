@@ -29,46 +29,43 @@ class ElectrodeVAE(VAE):
     and log variance.
 
     Args:
-      channels: 19. hidden: widths of the encoder. latent: size of the code.
-      linear: for the variant: (latent, channels) orthonormal rows, principal components of the inputs. Code
+      hidden: widths of the encoder. latent: size of the code.
+      linear: for the variant: (latent, 19) orthonormal rows, principal components of the inputs. Code
         and decoder are then the components plus a correction by the network, so training starts near PCA's
         error. None: the paper's network.
     """
 
     def __init__(
         self,
-        channels: int = NELECTRODE,
         hidden: Sequence[int] = (256, 128, 64),
         latent: int = 8,
         linear: torch.Tensor | None = None,
     ):
         super().__init__()
         self.latent = latent
-        self.encoder = mlp([channels, *hidden, 2 * latent])
-        self.decoder = mlp([latent, *hidden[::-1], channels])
+        self.encoder = mlp([NELECTRODE, *hidden, 2 * latent])
+        self.decoder = mlp([latent, *hidden[::-1], NELECTRODE])
         self.skip_in = self.skip_out = None
         if linear is not None:
-            if tuple(linear.shape) != (latent, channels):
+            if tuple(linear.shape) != (latent, NELECTRODE):
                 raise ValueError(
                     f"linear has shape {tuple(linear.shape)}: "
-                    f"the code of {latent} from {channels} channels needs that shape"
+                    f"the code of {latent} from {NELECTRODE} channels needs that shape"
                 )
-            self.skip_in, self.skip_out = (
-                nn.Linear(channels, latent, bias=False),
-                nn.Linear(latent, channels, bias=False),
-            )
+            self.skip_in = nn.Linear(NELECTRODE, latent, bias=False)
+            self.skip_out = nn.Linear(latent, NELECTRODE, bias=False)
             with torch.no_grad():
                 self.skip_in.weight.copy_(linear), self.skip_out.weight.copy_(linear.T)
                 for last in (self.encoder[-1], self.decoder[-1]):
                     last.weight.mul_(0.1), last.bias.zero_()
 
     def encode(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and log variance of the code, (n, latent) each, of x (n, channels)."""
+        """Mean and log variance of the code, (n, latent) each, of x (n, 19)."""
         mean, log_variance = self.encoder(x).chunk(2, -1)
         if self.skip_in is not None:
             mean = mean + self.skip_in(x)
         return mean, log_variance.clamp(-14, 4)
 
     def decode(self, z: torch.Tensor) -> torch.Tensor:
-        """(n, channels) of codes z (n, latent)."""
+        """(n, 19) of codes z (n, latent)."""
         return self.decoder(z) if self.skip_out is None else self.decoder(z) + self.skip_out(z)

@@ -3,8 +3,6 @@
 The points' neighbours are constant (the skin bends by a few millimetres), so sampling and grouping are done
 once on the rest shape (Qi et al., 2017, repeat them for every cloud)."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -14,6 +12,8 @@ from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["PointNet", "farthest_points"]
+
+_POINTS, _NEIGHBOURS = (128, 32, 8), 16  # of the levels; in each group
 
 
 def farthest_points(point: np.ndarray, count: int) -> np.ndarray:
@@ -27,29 +27,21 @@ def farthest_points(point: np.ndarray, count: int) -> np.ndarray:
 
 
 class PointNet(nn.Module):
-    """Displacements of all nodes -> outputs, through set abstraction over 128, 32 and 8 points.
+    """Displacements of all nodes -> electrodes, through set abstraction over 128, 32 and 8 points.
 
     Args:
-      vert: (nvert, 3) rest positions [m]. free: nodes to sample from (those that can move).
-      outputs: 19. points: of the levels. neighbours: in each group. dropout: in the head.
+      vert: (nvert, 3) rest positions [m]. free: nodes to sample from (those that can move). dropout: in the
+        head.
     """
 
-    def __init__(
-        self,
-        vert: np.ndarray,
-        free: np.ndarray,
-        outputs: int = NELECTRODE,
-        points: Sequence[int] = (128, 32, 8),
-        neighbours: int = 16,
-        dropout: float = 0.3,
-    ):
+    def __init__(self, vert: np.ndarray, free: np.ndarray, dropout: float = 0.3):
         super().__init__()
         vert, free = np.asarray(vert, float), np.asarray(free)
-        if len(free) < points[0]:
+        if len(free) < _POINTS[0]:
             raise ValueError(
-                f"the skin has {len(free)} free nodes: {points[0]} points cannot be sampled from them"
+                f"the skin has {len(free)} free nodes: {_POINTS[0]} points cannot be sampled from them"
             )
-        sample = free[farthest_points(vert[free], points[0])]
+        sample = free[farthest_points(vert[free], _POINTS[0])]
         self.register_buffer("sample", torch.as_tensor(sample), persistent=False)
         place = vert[sample]
         size = np.abs(place - place.mean(0)).max()
@@ -58,9 +50,9 @@ class PointNet(nn.Module):
         )
         self.stages = nn.ModuleList()
         width = 3
-        for i, (count, out) in enumerate(zip(points[1:], (64, 128))):
+        for i, (count, out) in enumerate(zip(_POINTS[1:], (64, 128))):
             centre = farthest_points(place, count)
-            k = min(neighbours, len(place))
+            k = min(_NEIGHBOURS, len(place))
             group = cKDTree(place).query(place[centre], k)[1]
             relative = (place[group] - place[centre][:, None]) / size
             self.register_buffer(f"group{i}", torch.as_tensor(group), persistent=False)
@@ -73,10 +65,10 @@ class PointNet(nn.Module):
             "place", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False
         )
         self.whole = nn.Sequential(mlp([width + 3, 256, 256]), nn.ELU())
-        self.head = mlp([256, 256, 128, outputs], dropout)
+        self.head = mlp([256, 256, 128, NELECTRODE], dropout)
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
-        """(batch, outputs) of u (batch, nvert, 3), displacements divided by their scale."""
+        """(batch, 19) of u (batch, nvert, 3), displacements divided by their scale."""
         x = u[:, self.sample]
         for i, stage in enumerate(self.stages):
             x = x[:, getattr(self, f"group{i}")]

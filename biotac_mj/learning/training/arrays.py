@@ -15,7 +15,7 @@ if typing.TYPE_CHECKING:
     from ...data import TactileSet
     from ..networks.points import SkinPoints
 
-__all__ = ["Arrays", "check_columns", "join", "load_arrays"]
+__all__ = ["Arrays", "check_columns", "join", "load_arrays", "spread_rows"]
 
 
 @dataclasses.dataclass
@@ -114,6 +114,13 @@ def join(sets: list[Arrays]) -> Arrays:
     whole = {k: torch.cat([getattr(p, k) for p in shifted]) for k in tensors}
     whole |= {k: np.concatenate([getattr(p, k) for p in shifted]) for k in ("objects", "labelled")}
     return dataclasses.replace(shifted[0], **whole)
+
+
+def spread_rows(rows: torch.Tensor, count: int) -> torch.Tensor:
+    """At most `count` of rows (k,), evenly spaced."""
+    if len(rows) <= count:
+        return rows
+    return rows[torch.linspace(0, len(rows) - 1, count, device=rows.device).long()]
 
 
 def check_columns(data: "TactileSet") -> None:

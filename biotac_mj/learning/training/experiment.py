@@ -23,7 +23,7 @@ from ..instants.linear import ridges
 from ..predictor import PointsModel
 from ..protocol import interaction_errors, quartiles
 from ..weights import save_forward, save_inverse, save_points_model
-from .arrays import check_columns, load_arrays
+from .arrays import check_columns, load_arrays, spread_rows
 from .config import LearningConfig, without_obsolete
 from .features import Pod
 from .fitting import Checkpoints
@@ -321,7 +321,7 @@ def train_split(
         predictions["electrode_vae"] = network_change(through, arrays.tare[both], config)
         codes["mesh_vae"] = served["latent_projection"].through_code
         back["latent_inverse"] = lambda r: served["latent_projection"](network_target(arrays, r, config))
-        fit_patch = fit[torch.linspace(0, len(fit) - 1, min(2000, len(fit)), device=device).long()]
+        fit_patch = spread_rows(fit, 2000)
         patches["latent_inverse"] = patch_of_push(
             _in_batches(lambda r: back["latent_inverse"](r)[1], fit_patch).cpu().numpy(),
             arrays.force[fit_patch].float().cpu().numpy(),
@@ -348,7 +348,7 @@ def train_split(
         for name, one in served.items():
             path = out / f"{name}-{split}.safetensors"
             save_points_model(path, one.net, points, config, about | {"patch": patches["latent_inverse"]})
-    _write(out, f"{split}-{seed}", arrays, check, rows, both, truth, predictions, report)
+    _write(out, f"{split}-{seed}", arrays, check, both, truth, predictions, report)
 
 
 def division_of(path: pathlib.Path | str, split: str, seed: int, count: int) -> Split:
@@ -384,11 +384,9 @@ def _median(got, truth, owner):
 
 
 @torch.no_grad()
-def _mesh_errors(arrays, code, rows, most=3000):
+def _mesh_errors(arrays, code, rows):
     """Mean node error of the code on test rows by object [mm]."""
-    rows = rows[arrays.time[rows] > 0]
-    if len(rows) > most:
-        rows = rows[torch.linspace(0, len(rows) - 1, most, device=rows.device).long()]
+    rows = spread_rows(rows[arrays.time[rows] > 0], 3000)
     parts = [field_errors(code(arrays.field[r].float()), arrays.field[r].float()) for r in rows.split(256)]
     errors = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     owner = arrays.objects[arrays.owner[rows].cpu().numpy()]
@@ -411,7 +409,7 @@ def _inverse_summary(errors):
     return out
 
 
-def _write(out, name, arrays, check, rows, both, truth, predictions, report):
+def _write(out, name, arrays, check, both, truth, predictions, report):
     owner = arrays.owner[both].cpu().numpy()
     content = {
         "truth": truth,

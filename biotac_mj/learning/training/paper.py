@@ -12,6 +12,7 @@ from ..networks.heads import FromRest
 from ..networks.mesh_vae import MeshVAE
 from ..networks.pointnet import PointNet
 from . import fitting
+from .arrays import spread_rows
 from .fitting import Checkpoints, TrainingOptions, fast_products, root_mean_square
 from .local import counts_change
 
@@ -106,7 +107,7 @@ def train_latent_projection(
     model = LatentProjection(points, config).to(arrays.device)
     curves = {name: [] for name in ("mesh", "electrode", "to_electrode", "to_mesh")}
     unit = 1e-3 / config.mesh_scale
-    mesh_rows, mesh_check = arrays.rows(train), _spread(arrays.rows(validation), 512)
+    mesh_rows, mesh_check = arrays.rows(train), spread_rows(arrays.rows(validation), 512)
     vae, electrode = model.mesh, model.electrode
 
     def field(rows):
@@ -197,8 +198,3 @@ def train_pointnet(
                               seed=seed, graph=False)  # fmt: skip
     fitting.train(from_rest, loss, rows, options, validate, checkpoints)
     return net.eval()
-
-
-def _spread(rows, count):
-    """At most `count` rows, evenly spaced."""
-    return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows)), device=rows.device).long()]
