@@ -4,8 +4,8 @@
     observations, extras = env.reset()
     observations, reward, terminated, truncated, extras = env.step(actions)
 
-`task` has what all share, `touch` what a policy may feel, `libraries` what RSL-RL, skrl and Gymnasium ask of
-an environment."""
+`task` is their base class, `touch` the observations of touch, `libraries` has wrappers for RSL-RL, skrl and
+Gymnasium."""
 
 import inspect
 import typing
@@ -56,7 +56,7 @@ def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
 
 
 def _keywords(kind):
-    """Of a task's class, in the order in which they matter: its own, those of all tasks, those of BioTacs."""
+    """Keywords of a task's class: its own, those of all tasks, those of BioTacs, in this order."""
     own = [
         name
         for base in (kind, BatchTask)

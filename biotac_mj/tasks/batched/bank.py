@@ -1,5 +1,5 @@
-"""States of worlds that are kept, so that an episode begins where something is held already: closing fingers
-takes longer than the task."""
+"""Stored states of worlds, so that episodes start with the object in the grip: closing the fingers takes
+longer than the task."""
 
 from collections.abc import Sequence
 
@@ -12,18 +12,17 @@ from ...batch.rows import Rows
 
 __all__ = ["Bank"]
 
-# of mujoco_warp's Data: what the next step goes on from, and what was sensed in the last one
+# of mujoco_warp's Data: what a step depends on, and the last sensor data
 _FIELDS = ("time", "qpos", "qvel", "act", "ctrl", "qacc", "qacc_warmstart", "qfrc_applied", "xfrc_applied")
 _FIELDS += ("mocap_pos", "mocap_quat", "xpos", "xmat", "sensordata")
 
 
 class Bank:
-    """All that differs between worlds in what mujoco_warp's Data, skins and sensors carry from step to step:
-    kept once, and given to any world.
+    """States of all worlds: mujoco_warp's Data, skins and sensors; each can be copied to any world.
 
     Args:
       d: mujoco_warp's Data. batches: with a skin in each of its worlds.
-      others: (nworld, ...) torch tensors besides, written in place.
+      others: further (nworld, ...) torch tensors, written in place.
     """
 
     def __init__(self, d: mjw.Data, batches: Sequence[Batch], others: Sequence[torch.Tensor] = ()):
@@ -32,22 +31,22 @@ class Bank:
         words = wp.array(ptr=row.ptr, dtype=wp.int32, shape=row.shape, device=row.device, copy=False)
         fields = [getattr(d, name) for name in _FIELDS]
         self._parts = [wp.to_torch(a) for a in (words, *fields) if a.size] + list(others)
-        # friction is no state of a skin, but what is held is held with it
+        # friction is no state of a skin, but a grip depends on it
         self._parts += [wp.to_torch(b.skin.geoms.struct.friction).T for b in batches]
         self._kept = []
 
     @property
     def nbytes(self) -> int:
-        """What is kept [bytes]."""
+        """Size of the stored states [bytes]."""
         return sum(part.nbytes for part in self._parts)
 
     def keep(self) -> None:
-        """Keeps the present state of every world."""
+        """Stores the present state of every world."""
         self._rows.write()
         self._kept = [part.clone() for part in self._parts]
 
     def give(self, worlds: torch.Tensor, source: torch.Tensor) -> None:
-        """Worlds (k,) get the states that worlds `source` (k,) were in, numbers."""
+        """Copies the stored states of worlds `source` (k,) to worlds (k,)."""
         self._rows.write()
         for now, kept in zip(self._parts, self._kept, strict=True):
             now.index_copy_(0, worlds, kept.index_select(0, source))

@@ -1,4 +1,4 @@
-"""What holds a free body while fingers close on it: a spring that lets go."""
+"""A spring that holds a free body while fingers close on it, and then releases it."""
 
 import dataclasses
 import functools
@@ -13,7 +13,7 @@ __all__ = ["HeldSettings", "HeldTask"]
 
 @wp.struct
 class _Fixture:
-    """What holds the body in the beginning: stiffness [N/m], damping [N s/m, N m s], until when [s]."""
+    """The spring: stiffness [N/m], damping [N s/m], twist [N m s], times of its release [s]."""
 
     body: int
     qpos: int
@@ -54,10 +54,10 @@ class HeldSettings(TaskSettings):
 
     Attributes:
       mass: of the body, between these [kg].
-      close, hold, release: [s] fingers close until `close`; a soft fixture holds the body until `hold` and
-        lets it go until `release`.
-      stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
-      lost: how far the body may go from where it is held before it is lost [m].
+      close, hold, release: [s] fingers close until `close`; a spring holds the body until `hold` and is
+        released until `release`.
+      stiffness [N/m], damping [N s/m], twist [N m s]: of the spring.
+      lost: distance from its place in the grip at which the body counts as lost [m].
     """
 
     mass: tuple = (10e-3, 30e-3)

@@ -1,4 +1,4 @@
-"""A fingertip finds the rim of a plate blindly and follows it."""
+"""A fingertip finds the rim of a plate by touch and follows it."""
 
 import dataclasses
 
@@ -20,15 +20,15 @@ _PAD_DOWN = (0.5**0.5, 0.5**0.5, 0.0, 0.0)  # w x y z: tip along -x, pad along -
 
 @dataclasses.dataclass(frozen=True)
 class Settings(TaskSettings):
-    """The task's numbers; see `TaskSettings` too.
+    """Numbers of the task; see `TaskSettings` too.
 
     Attributes:
-      radius: of the plate [m]. gap: how far the pad begins above it [m]. inside: how far inside its rim [m].
-      turn: by how much the rim is turned against the finger there [rad].
-      rate, reach: how far a decision moves the goals of x, y, z [m] and yaw [rad], and in all.
-      on_rim: within which of the rim the pad is on it [m]; forces: between which it presses [N].
-      speed: along the rim that is paid in full [m/s]. way: along it that is a success [m].
-      lost: how far from the rim the pad may be [m].
+      radius: of the plate [m]. gap: initial height of the pad over it [m]. inside: initial distance inside
+        its rim [m]. turn: initial angle of the rim to the finger [rad].
+      rate, reach: change of the goals of x, y, z [m] and yaw [rad] by a decision, and in total.
+      on_rim: distance from the rim at which the pad is on it [m]. forces: range of the pressing force [N].
+      speed: along the rim for the full reward [m/s]. way: distance along it for a success [m].
+      lost: distance from the rim at which the episode is lost [m].
     """
 
     decisions: int = 60
@@ -48,17 +48,16 @@ class Settings(TaskSettings):
 
 
 class FollowEdge(BatchTask):
-    """A finger is above a round plate, some millimetres inside its rim: it goes down, finds the rim, which
-    lies to its right, and follows it tip first. Height, distance and direction of the rim differ between
-    worlds and are not told.
+    """A finger starts above a round plate, some millimetres inside its rim. It moves down, finds the rim on
+    its right, and follows it tip first. Height, distance and direction of the rim differ between worlds and
+    are not observed.
 
     Actions: along the finger (tip first), to its left, up, and its turn. Observations: "body" (num_envs, 13):
-    places of four joints from where they began [cm, rad], velocities, goals in shares of `reach`, the time;
+    changes of four joints [cm, rad], velocities, goals as fractions of `reach`, the time;
     "state" (num_envs, 4): distance outside the rim [mm], turn against it [rad], height of the pad over the
     plate [mm], force [N]. Reward of a decision, where the pad presses with a force between `forces`: 0.1, up
-    to 0.3 more the nearer it is to the rim, and on it up to 0.6 more for the speed along it. A success: `way`
-    along the rim, on it, by the end.
-    """
+    to 0.3 more near the rim, and on it up to 0.6 more for the speed along it. Success: `way` along the rim,
+    on it, by the end."""
 
     num_actions = 4
     camera = ((-0.02, 0.012, -0.01), 0.12, 125.0, -25.0)

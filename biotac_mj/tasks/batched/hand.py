@@ -26,7 +26,7 @@ _STARTS = 20
 
 @dataclasses.dataclass(frozen=True)
 class Rod:
-    """What is rolled: a capsule.
+    """The rod, a capsule.
 
     Attributes:
       radius, half_length [m]: of its cylinder; mass [kg].

@@ -24,16 +24,16 @@ _TIP_DOWN = {  # w x y z: tip along -z, pads that face each other
 
 @dataclasses.dataclass(frozen=True)
 class Settings(HeldSettings):
-    """The task's numbers; see `HeldSettings` too.
+    """Numbers of the task; see `HeldSettings` too.
 
     Attributes:
-      tilt: of the peg in the grip [rad], and shift: along the pads' breadth [m], either way. Where the hole
-        is: across by `off` [m] either way, its edge below the peg's tip by `gap` [m].
+      tilt: largest tilt of the peg in the grip [rad]. shift: largest shift along the pads' breadth [m]. off:
+        largest distance of the hole across [m]. gap: range of the height of the peg's tip over its edge [m].
       clearance: between peg and hole on each side [m].
-      depth: of the tip in the hole that is a success [m].
-      rate, reach: how far a decision moves the goals of x, z [m] and pitch [rad], and in all.
-      squeeze: how much farther than to the peg the fingers want to close [m].
-      near: how far across from the hole it still pays to be [m].
+      depth: of the tip in the hole for a success [m].
+      rate, reach: change of the goals of x, z [m] and pitch [rad] by a decision, and in total.
+      squeeze: distance of the fingers' goals inside the peg [m].
+      near: scale of the distance across from the hole in the reward [m].
     """
 
     decisions: int = 45
@@ -53,14 +53,14 @@ class Settings(HeldSettings):
 
 
 class InsertPeg(HeldTask):
-    """Two fingers hold a peg over a hole, tilted and off their middle by what is not told: they are to put it
-    upright and into the hole. Its mass, its friction, the place and the height of the hole differ too.
+    """Two fingers hold a peg over a hole, tilted and off their middle, put it upright and insert it. Tilt,
+    shift, mass and friction of the peg and the place of the hole differ between worlds and are not observed.
 
-    Actions: across, up, and pitch. Observations: "body" (num_envs, 10): places of these three joints from
-    where they began [cm, rad], velocities, goals in shares of `reach`, the time; "state" (num_envs, 6): tilt
+    Actions: across, up, and pitch. Observations: "body" (num_envs, 10): changes of these three joints [cm,
+    rad], velocities, goals as fractions of `reach`, the time; "state" (num_envs, 6): tilt
     [rad], tip across from the hole [mm], depth [mm], pitch of the grip against the peg [rad], forces [N].
-    Reward of a decision in which the peg is held: 0.1, up to 0.3 more the nearer the tip is to the hole's
-    axis, and up to 0.6 more the lower it is. A success: `depth` by the end.
+    Reward of a decision with the peg in the grip: 0.1, up to 0.3 more for a tip near the hole's axis, and up
+    to 0.6 more for its depth. Success: `depth` by the end.
     """
 
     num_actions, body = 3, "peg"

@@ -48,12 +48,12 @@ def rsl_rl_env(env: BatchTask) -> "rsl_rl.env.VecEnv":
 
 
 def _policy(observations):
-    """(num_envs, n) of what a policy sees."""
+    """Observations (num_envs, n) of a policy."""
     return torch.cat([observations["body"], observations["touch"]], dim=1)
 
 
 def _spaces(env):
-    """Of one world: what a policy sees, and what it does."""
+    """Spaces of observations and actions of one world."""
     import gymnasium
 
     shape = _policy(env.observe()).shape[1:]
@@ -62,7 +62,7 @@ def _spaces(env):
 
 
 def skrl_env(env: BatchTask) -> object:
-    """What `skrl.envs.wrappers.torch.wrap_env(..., wrapper="isaaclab")` takes: observations are
+    """Environment for `skrl.envs.wrappers.torch.wrap_env(..., wrapper="isaaclab")`: observations are
     {"policy": (num_envs, n)}, body and touch.
 
     Raises:

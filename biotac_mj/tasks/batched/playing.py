@@ -41,10 +41,10 @@ def find_policy(task: str, policy: pathlib.Path | str | None = None) -> pathlib.
 
 
 def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
-    """The worlds in which a policy learned.
+    """The environment in which a policy learned.
 
     Args:
-      card: of the policy; of a task alone {"task": name}. changes: of the keywords of `make`.
+      card: of the policy, or {"task": name}. changes: of the keywords of `make`.
     """
     full_card = {"biotac": {"sensor": "random"}} | card
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in full_card.get("settings", {}).items()}
@@ -55,10 +55,10 @@ def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
 
 
 def acting(task: str, policy: pathlib.Path | str | None, device: str) -> tuple[str, Callable, dict]:
-    """What a policy sees, a function (env) -> actions (num_envs, num_actions), and its card.
+    """Observation of a policy, a function (env) -> actions (num_envs, num_actions), and its card.
 
     Args:
-      policy: a file, None (`find_policy`), "script", which knows the truth, or "random".
+      policy: a file, None (`find_policy`), "script", which uses the true state, or "random".
     """
     if policy == "script":
         return "none", lambda env: env.script(), {"task": task}
@@ -78,7 +78,7 @@ def play(
     acts: Sequence[tuple[slice, Callable]],
     seed: int = HELD_OUT,
 ) -> list[dict]:
-    """An episode of each world, from beginnings that are drawn by `seed`, what is held is held anew.
+    """Plays an episode in each world, from random initial states and new grips, by `seed`.
 
     Args:
       acts: [(worlds, policy)]; a policy is a function of the environment to the actions of all or of these

@@ -19,7 +19,7 @@ _CLIP = 10.0  # deviations from the mean beyond which an observation is cut
 
 
 class Network(torch.nn.Module):
-    """A perceptron that knows mean and spread of what it sees.
+    """A perceptron that normalises its input by mean and variance.
 
     Args:
       nseen, nout: widths. hidden: units of the layers between.

@@ -1,6 +1,6 @@
-"""Proximal policy optimisation (Schulman et al. 2017) for worlds that step together, with a critic that sees
-what the policy does not; and before it imitation of a teacher that sees it too, where the policy itself has
-acted (Ross et al. 2011)."""
+"""Proximal policy optimisation (Schulman et al. 2017) in parallel worlds, with a critic of the true state;
+before it imitation of a teacher that uses the true state, in states that the policy visits (Ross et al.
+2011)."""
 
 import dataclasses
 
@@ -13,19 +13,19 @@ __all__ = ["Learner", "Lessons", "Numbers"]
 
 @dataclasses.dataclass(frozen=True)
 class Numbers:
-    """Of the method.
+    """Settings of both methods.
 
     Attributes:
       steps: decisions between updates. epochs, parts: of an update.
       gamma, lam: discount of a decision, and of generalised advantages. clip: of ratios of densities.
-      rate: of learning at first. It falls to `least` of it while the teacher counts; PPO adapts it so that an
-        update changes the policy by `divergence` [nat].
-      norm: of gradients at most.
-      taught: part of the time of learning in which policies imitate the teacher. PPO follows.
-      study: time of imitation between updates, as a part of that of acting; lessons: steps in it at most,
-        each from `several` states of the newest `remembered`.
-      renew: where episodes begin with states that were kept, these are kept anew after so many times the
-        decisions that this takes: a policy that meets the same few again learns these by heart.
+      rate: initial learning rate. During imitation it falls to the fraction `least`; PPO adapts it such that
+        an update changes the policy by `divergence` [nat].
+      norm: limit of gradients.
+      taught: fraction of the training time with imitation, before PPO.
+      study: time of imitation between updates over that of acting; lessons: limit of its steps, each from
+        `several` states of the newest `remembered`.
+      renew: stored initial states are replaced after so many times the decisions that this takes, because a
+        policy would memorise the same few states.
     """
 
     steps: int = 8
@@ -47,7 +47,7 @@ class Numbers:
 
 
 class Lessons:
-    """What was sensed in the newest `size` states, and what the teacher would have done there.
+    """Readings in the newest `size` states, and the teacher's actions there.
 
     Args:
       size: in states. seed: of draws. device: of torch.
@@ -67,7 +67,7 @@ class Lessons:
         self._count += len(taught)
 
     def draw(self, count: int) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """What was sensed {name: (count, ...)}, and what the teacher would have done (count, nout)."""
+        """Random readings {name: (count, ...)}, and the teacher's actions (count, nout)."""
         known = min(self._count, self._size)
         device = self._rows["taught"].device
         which = torch.randint(known, (count,), generator=self._draw, device=device)
@@ -79,7 +79,7 @@ class Learner:
     """A policy that learns.
 
     Args:
-      nseen, nknown, nout: widths of what the policy sees, the critic knows, and of actions.
+      nseen, nknown, nout: widths of observations, of the critic's input, and of actions.
       seed: of networks and exploration. device: of torch.
     """
 
@@ -112,7 +112,7 @@ class Learner:
         return actions
 
     def record(self, reward: torch.Tensor, done: torch.Tensor, over: torch.Tensor) -> None:
-        """What the last actions brought (n,): reward, whether the episode ended, whether by time alone."""
+        """Results of the last actions (n,): reward, whether the episode ended, whether by its time limit."""
         kept = self._kept[-1]
         # what would have come after an episode's time is worth what its last state was
         kept += [reward + self.numbers.gamma * kept[6] * over, done.float()]
@@ -184,12 +184,12 @@ class Learner:
                 group["lr"] = min(1e-2, group["lr"] * 1.5)
 
     def state(self) -> dict:
-        """All that goes on from here."""
+        """State of the training."""
         parts = {"policy": self.policy, "critic": self.critic, "optimiser": self._optimiser}
         return {name: part.state_dict() for name, part in parts.items()} | {"draw": self._draw.get_state()}
 
     def resume(self, state: dict) -> None:
-        """Goes on from a `state`."""
+        """Continues from a `state`."""
         self.policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
         self._optimiser.load_state_dict(state["optimiser"])

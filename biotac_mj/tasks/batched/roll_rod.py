@@ -20,22 +20,21 @@ _CHOICES = {"goal": ("angle", "place"), "actions": ("servos", "pads")}
 
 @dataclasses.dataclass(frozen=True)
 class Settings(HeldSettings):
-    """The task's numbers; see `HeldSettings` too. Where `prepare` is not 0 the fingers close in so many
-    decisions, and episodes begin with the rod held.
+    """Numbers of the task; see `HeldSettings` too. With `prepare` the fingers close in so many decisions, and
+    episodes start with the rod in the grip.
 
     Attributes:
-      target: the rod is to be rolled by an angle between these [rad]; fingers that only
-        close roll it by -0.25.
-      rate: how far a decision moves a servo's goal at most [rad]; reach: from where it began [rad].
-      offset: how far off the rod begins, across and along the pads [m].
-      tolerance: within which of its target the rod is where it should be [rad].
-      held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
-      goal: "angle", or "place": the rod is to lie a told distance along the fingers, toward their tips, from
-        the middle of their pads [m]; `target`, `tolerance` and `near` are then in metres.
-      actions: "servos", eleven that move; or "pads": six, of the pads of two fingers and the thumb across the
-        rod and towards it, `rate` and `reach` then in metres.
-      lead: how far the goals of the fingers' pads are moved one way, and the thumb's the other, while they
-        close [m]: soft servos give way along the pads, and a rod comes to lie 5 mm from their middle.
+      target: range of the target angle [rad]; fingers that only close roll the rod by -0.25.
+      rate: largest change of a servo's goal in a decision [rad]; reach: in total [rad].
+      offset: range of the rod's initial place, across and along the pads [m].
+      tolerance: error that counts as a success [rad].
+      held: reward of a decision with the rod in the grip; near: scale of the error in the reward [rad].
+      goal: "angle"; or "place": a distance along the fingers, towards their tips, from the middle of their
+        pads [m], with `target`, `tolerance` and `near` in metres.
+      actions: "servos", eleven joints; or "pads": six movements of the pads of two fingers and the thumb,
+        across the rod and towards it, with `rate` and `reach` in metres.
+      lead: shift of the goals of the fingers' pads, opposite to the thumb's, while they close [m]: soft
+        servos yield along the pads, and a rod comes to lie 5 mm from their middle.
     """
 
     target: tuple = (-0.5, 0.0)
@@ -56,8 +55,8 @@ class Settings(HeldSettings):
     lead: float = 0.0
 
 
-# The rod is to come to a told place on the pads. Exact angles of the joints, which differ by 1e-3 rad, tell
-# the place to 0.1 mm; no hand's encoders do.
+# The rod is rolled to a given place on the pads. Exact joint angles, which differ by 1e-3 rad, determine the
+# place to 0.1 mm; the encoders of a hand do not.
 PLACE = Settings(
     decisions=12,
     prepare=17,
@@ -77,7 +76,7 @@ PLACE = Settings(
 )
 
 
-_LATE = 2.0  # decisions by which a rod follows the goals of the pads
+_LATE = 2.0  # delay of a rod behind the goals of the pads [decisions]
 
 
 def rolled(begun: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
@@ -90,21 +89,21 @@ def rolled(begun: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
 
 
 class RollRod(HeldTask):
-    """A Shadow Hand holds a rod between its thumb and two fingers and rolls it by a told angle, or to a told
-    place on the pads (`PLACE`). Where the rod lies, what it weighs and how it rubs differ between worlds and
-    are not told.
+    """A Shadow Hand holds a rod between its thumb and two fingers and rolls it by a given angle, or to a
+    given place on the pads (`PLACE`). The rod's initial place, mass and friction differ between worlds and
+    are not observed.
 
-    Observations: "body" (num_envs, 39, or with pads' actions 34): angles of thirteen joints from where they
-    began, their velocities / 10 rad/s, goals of eleven servos from where they would be [rad] (of six pads'
-    movements, in shares of `reach`), what is told [rad or mm], the time; "touch": since the fingers were
-    open; "state" (num_envs, 6): angle [rad], place [mm], error / `near`, forces of the fingers [N]. Reward of
-    a decision: 0.2 while the rod is held, and exp(-(error / near)^2) when the fixture has let it go; where a
-    place is told (`Settings.goal`) 1 / (1 + (error / near)^2).
+    Observations: "body" (num_envs, 39, or with pads' actions 34): changes of thirteen joint angles,
+    their velocities / 10 rad/s, changes of the goals of eleven servos [rad] (of six movements of pads, as
+    fractions of `reach`), the target [rad or mm], the time; "touch": changes since the fingers were open;
+    "state" (num_envs, 6): angle [rad], place [mm], error / `near`, forces of the fingers [N]. Reward of a
+    decision: 0.2 with the rod in the grip, and after its release exp(-(error / near)^2), for a place
+    (`Settings.goal`) 1 / (1 + (error / near)^2).
 
     Args:
       hand: Menagerie's shadow_hand/right_hand.xml; None looks for it in the folder that the variable
         MENAGERIE_ROOT names.
-      rod: what is rolled. The others: see `BatchTask`.
+      rod: its shape and mass. The others: see `BatchTask`.
 
     Raises:
       FileNotFoundError: no such hand. ValueError: another hand, or a number that cannot be.
@@ -189,11 +188,11 @@ class RollRod(HeldTask):
         return ((self.angle if self.cfg.goal == "angle" else self.place) - self._target).abs()
 
     def script(self) -> torch.Tensor:
-        """Pads that go one way while the thumb goes the other take the rod along. It follows them by two
-        decisions late, and is met where it will be.
+        """Moves the fingers' pads against the thumb, by the rod's place that is predicted for two decisions
+        later, since it follows with this delay.
 
         Raises:
-          ValueError: the settings are not those of a told place.
+          ValueError: the settings are not those of a place.
         """
         if self.cfg.goal != "place" or self.cfg.actions != "pads":
             raise ValueError("a script rolls the rod to a place by its pads: take settings=PLACE")

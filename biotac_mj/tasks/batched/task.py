@@ -1,5 +1,5 @@
-"""What the tasks in batches share: worlds in mujoco_warp with PyTorch tensors, decisions, episodes, what is
-observed."""
+"""Base class of the tasks in batches: worlds in mujoco_warp with PyTorch tensors, decisions, episodes,
+observations."""
 
 import abc
 import dataclasses
@@ -23,20 +23,20 @@ _FELT = 0.02  # force of a finger that holds something, at least [N]
 
 @dataclasses.dataclass(frozen=True)
 class TaskSettings:
-    """A task's numbers.
+    """Numbers of a task.
 
     Attributes:
-      timestep: of the simulation [s]. substeps: of them in a decision. decisions: in an episode.
-      prepare: decisions by which the worlds are brought to where episodes begin: states that hold what they
-        should are kept once, and each episode begins with one of them that is drawn.
-      encoder: deviation of the joints' positions as observed [rad or m], anew in each decision; of their
-        velocities it is this by the time of a decision.
-      rate: by how much an action of 1 moves the goal of what it moves, reach: how far it goes in all; one, or
-        of each action [m or rad].
-      gentle: a finger that feels more loses the episode [N].
-      friction: of the skins, between these.
-      work: of one solve of a skin at most (`SkinOptions.max_work`); rounds: in which skins and bodies look
-        for their balance in a step. A step waits for the worst of its worlds. loss: of the rubber.
+      timestep: of the simulation [s]. substeps: time steps in a decision. decisions: in an episode.
+      prepare: decisions that close the fingers before an episode. States with the object in the grip are
+        stored once, and each episode starts from one of them at random.
+      encoder: standard deviation of observed joint positions [rad or m], new in each decision; that of
+        velocities is this divided by the time of a decision.
+      rate: change of an actuator's goal by an action of 1; reach: largest total change; one number, or one
+        for each action [m or rad].
+      gentle: largest force of a finger, beyond which the episode is lost [N].
+      friction: range of the skins' friction.
+      work: limit of one solve of a skin (`SkinOptions.max_work`). rounds: limit of rounds of skins and bodies
+        in a step. A step takes as long as its slowest world. loss: loss factor of the rubber.
     """
 
     timestep: float = 4e-3
@@ -56,28 +56,26 @@ class TaskSettings:
 class BatchTask(abc.ABC):
     """Many worlds with BioTacs in which a policy acts by touch.
 
-    Interface: Isaac Lab's (`reset`, `step` with torch tensors on one device, worlds that end begin anew by
-    themselves). Observations are a dict of groups: "body" (num_envs, n), what the machine knows of itself and
-    is told; "touch" (num_envs, m), see `Touch.observe`; "state" (num_envs, k), for a critic alone. Widths n
-    and m are those of one decision times `history`.
+    The interface is that of Isaac Lab: `reset` and `step` take and return torch tensors on one device, and
+    worlds whose episode ends are reset at once. Observations are a dict of groups: "body" (num_envs, n),
+    proprioception and goals; "touch" (num_envs, m), see `Touch.observe`; "state" (num_envs, k), the true
+    state, for a critic. n and m are widths of one decision times `history`.
 
     Args:
-      num_envs: worlds. device: of Warp and torch. seed: of what is drawn.
-      observe: what "touch" has, one of `touch.OBSERVE`; "learned" takes the electrodes of the shipped latent
-        projections in place of the film's.
-      history: decisions of which "body" and "touch" have what was sensed, the last one first; an episode that
-        is younger repeats its first.
-      model_error: deviations of the factors by which counts change more or less than the skins of this tier
-        say, drawn in each episode: of a finger's electrodes (one for all, one for each), of PDC, of PAC; or
-        one deviation.
-      settings: the task's numbers; None takes the class's own.
-      biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`. Skins are coarse and condensed where
-        nothing else is said.
+      num_envs: number of worlds. device: of Warp and torch. seed: of all random draws.
+      observe: content of "touch", one of `touch.OBSERVE`; "learned" takes the electrodes of the shipped
+        latent projections in place of the film's.
+      history: number of decisions in "body" and "touch", the last one first; a younger episode repeats its
+        first decision.
+      model_error: standard deviations of factors on changes of counts, drawn in each episode, for the error
+        of this tier: of a finger's electrodes (one factor for all, one for each), PDC and PAC; or one number.
+      settings: numbers of the task; None: the class's own.
+      biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`; by default coarse and condensed.
 
     Attributes:
       num_envs, num_actions, max_episode_length, device, observes, history, model_error, biotac.
       model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}. prefixes: {finger: of its names}.
-      good: (k,) worlds whose states were kept, where episodes begin with them.
+      good: (k,) worlds whose states were stored for the beginning of episodes.
       episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
 
     Raises:
@@ -86,7 +84,7 @@ class BatchTask(abc.ABC):
 
     num_actions: int
     settings = TaskSettings()  # of the class
-    gamma = 0.95  # by which a decision's reward counts less than that of the one before, in learning
+    gamma = 0.95  # discount of a decision in learning
     camera: tuple  # lookat (3,) [m], distance [m], azimuth, elevation [deg] of a picture
 
     def __init__(
@@ -192,36 +190,35 @@ class BatchTask(abc.ABC):
     def _draw_goals(self, which):  # noqa: B027 - most have no goal
         """Draws the goals of worlds (num_envs,) of bool."""
 
-    def _act(self):  # noqa: B027 - in most nothing else acts
-        """Before a substep; launches only."""
+    def _act(self):  # noqa: B027 - most tasks have none
+        """Further forces before a substep; launches only."""
 
     @abc.abstractmethod
     def _command(self):
-        """Writes the controls of `_moved`."""
+        """Writes the controls for the goals `_moved`."""
 
     @abc.abstractmethod
     def _sense_body(self, off, speed_off):
-        """[(num_envs, k)] of what the machine knows by encoders that are off by so much [rad or m, and that
-        per second]; linear in both."""
+        """[(num_envs, k)] of proprioception, with errors `off` of positions [rad or m] and `speed_off` of
+        velocities; linear in both."""
 
     @abc.abstractmethod
     def _state(self):
-        """[(num_envs, k)] of what a critic may know besides."""
+        """[(num_envs, k)] of the true state for a critic."""
 
     @abc.abstractmethod
     def _judge(self):
-        """After a decision: what it pays, whether the episode is still on, whether it is where it should be,
-        and how far it is off, (num_envs,) each."""
+        """After a decision: reward, whether the object is in the grip, success and error, (num_envs,)
+        each."""
 
     @property
     @abc.abstractmethod
     def held(self) -> torch.Tensor:
-        """(num_envs,) whether what is held is held."""
+        """(num_envs,) whether the object is still in the grip, or the finger near its target."""
 
     @abc.abstractmethod
     def script(self) -> torch.Tensor:
-        """(num_envs, num_actions) of a controller that knows what no policy does: by it the task can be
-        solved."""
+        """Actions (num_envs, num_actions) of a controller that uses the true state and solves the task."""
 
     # what they share
 
@@ -252,18 +249,18 @@ class BatchTask(abc.ABC):
 
     @property
     def force(self) -> torch.Tensor:
-        """(num_envs, nfinger) that each finger feels [N]; not observed."""
+        """(num_envs, nfinger) contact force of each finger [N]; not observed."""
         return self._sensed[:, self._forces].norm(dim=2)
 
     def _moves(self, actions):
-        """By how much actions (num_envs, num_actions) move what they move."""
+        """Changes of the goals by actions (num_envs, num_actions)."""
         return self._rate * actions
 
     def reset(self, seed: int | None = None) -> tuple[dict, dict]:
-        """All worlds begin anew: observations, extras.
+        """Resets all worlds; returns observations, extras.
 
         Args:
-          seed: of what is drawn from now on; None goes on.
+          seed: of the random draws from now on; None: continue.
         """
         if seed is not None:
             self._draw.manual_seed(as_whole("seed", seed, 0))
@@ -312,8 +309,7 @@ class BatchTask(abc.ABC):
         return self.observe(), reward, terminated, truncated, extras
 
     def stagger(self) -> None:
-        """Has worlds be anywhere in their episodes, as if they had begun one after the other: what a learner
-        gets at once is then not all of one age."""
+        """Sets random ages of the episodes, so that a learner's batches contain all ages."""
         self.episode_length_buf[:] = self._integers(self.cfg.decisions)
 
     def observe(self, choice: str | None = None) -> dict:
@@ -336,8 +332,8 @@ class BatchTask(abc.ABC):
     def sense_anew(
         self, choice: str, body: torch.Tensor, changes: torch.Tensor, world: torch.Tensor
     ) -> torch.Tensor:
-        """(n, m) of body and touch, by a choice of `touch.OBSERVE`, that a policy might have seen where this
-        was `sensed` in n worlds: with other errors of encoders and of the model."""
+        """Observations (n, m) of body and touch for what was `sensed` in n worlds, with new errors of
+        encoders and model; choice: of `touch.OBSERVE`."""
         gain = self._touch.draw_gains(len(body), self.model_error, self._draw)
         touch = self._touch.observe(choice, changes * gain[:, None], world)
         # an episode that is young repeats its first decision, with its noise
@@ -348,12 +344,11 @@ class BatchTask(abc.ABC):
         return torch.cat([(body + noise).flatten(1), touch.flatten(1)], dim=1)
 
     def prepare_held(self, seed: int | None = None) -> int:
-        """Has all worlds act as `settings.prepare` says, and keeps the states of those that hold what they
-        should: with them later episodes begin, with what the body there weighs and how it rubs. All worlds
-        begin anew.
+        """Closes the fingers of all worlds (`settings.prepare`), and stores the states of those with the
+        object in the grip, its mass and friction included. Later episodes start from them. Resets all worlds.
 
         Args:
-          seed: of what is drawn from now on; None goes on.
+          seed: of the random draws from now on; None: continue.
 
         Returns:
           how many worlds held theirs.
@@ -384,10 +379,10 @@ class BatchTask(abc.ABC):
         return len(self.good)
 
     def close(self) -> None:  # noqa: B027
-        """Nothing is left to close."""
+        """Does nothing; part of the interface."""
 
     def _advance(self, move):
-        """A decision: goals go by `move` (num_envs, num_actions), and time goes on."""
+        """A decision: changes the goals by `move` (num_envs, num_actions) and simulates."""
         waits, reach = (self._age == 0)[:, None, None], self._reach
         self._moved[:] = torch.minimum(torch.maximum(self._moved + move, -reach), reach)
         self._command()
@@ -399,8 +394,8 @@ class BatchTask(abc.ABC):
         self._touch.tare[:] = torch.where(waits, self._touch.channels, self._touch.tare)
 
     def _sense(self, begun):
-        """What is sensed after a decision goes before what was sensed earlier; in worlds (num_envs,) of bool
-        that begin there is nothing earlier."""
+        """Adds the latest readings to the history; worlds (num_envs,) of bool that were reset have no earlier
+        ones."""
         touched = (self._age > 0)[:, None, None]
         changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
         body = torch.cat(self._sense_body(0.0, 0.0), dim=1)
@@ -420,7 +415,7 @@ class BatchTask(abc.ABC):
             mjw.step(self._m, self._d)
 
     def _begin(self, which):
-        """Worlds (num_envs,) of bool begin anew."""
+        """Resets worlds (num_envs,) of bool."""
         import mujoco_warp as mjw
 
         if not which.any():
@@ -452,7 +447,7 @@ class BatchTask(abc.ABC):
         return torch.randint(high, (self.num_envs,), generator=self._draw, device=self.device)
 
     def _noise(self, body):
-        """By how much encoders are off in what a body knows (..., k)."""
+        """Random errors of encoders in proprioception (..., k)."""
         if self._blur is None:
             s = self.cfg
             off = self._sense_body(s.encoder, s.encoder / (s.substeps * s.timestep))

@@ -1,4 +1,4 @@
-"""What a policy feels: the choices of `observe`, from the sensors of all worlds."""
+"""Observations of touch, by the choices of `observe`, from the sensors of all worlds."""
 
 import functools
 import typing
@@ -20,7 +20,7 @@ __all__ = ["OBSERVE", "Touch", "as_deviations", "check_observe"]
 
 OBSERVE = ("none", "binary", "force", "electrodes", "electrodes+pac", "learned")
 _CHANNELS = ("electrodes", "pdc", "pac")
-_COUNTS = 100.0  # by which changes are divided
+_COUNTS = 100.0  # unit of changes
 _SIGMA = 50.0  # PDC beyond so many deviations of its noise is a touch, as drivers of real sensors have it
 
 
@@ -94,10 +94,10 @@ class Touch:
         """(nworld, h, n) of a choice of OBSERVE, from the `channels` as changes from those at rest, (nworld,
         h, nfinger, k) of h decisions, in these worlds.
 
-        Of each finger "none" has nothing; "binary" whether PDC is 50 deviations of its noise above its level
-        at rest; "force" the force [N] and the mean place of what presses [cm] by `WeightedElectrodes`,
-        without the way from electrodes to skin; "electrodes" and "learned" the changes of the electrodes and
-        of PDC, in hundreds of counts; "electrodes+pac" those of PAC's 22 samples of a frame too."""
+        For each finger: "none" nothing; "binary" whether PDC is 50 deviations of its noise above its
+        baseline; "force" the force [N] and the mean place of contact [cm] by `WeightedElectrodes`, on the
+        core; "electrodes" and "learned" the changes of electrodes and PDC, in hundreds of counts;
+        "electrodes+pac" also those of PAC's 22 samples of a frame."""
         electrodes, pdc, pac = changes.split(self._split, dim=3)
         if choice == "none":
             parts = [pdc[..., :0]]

@@ -1,14 +1,13 @@
-"""Policies that learn a task, one for each kind of touch and each seed, side by side in the worlds of one
+"""Trains policies of a task, one for each kind of touch and each seed, in parallel in the worlds of one
 batch.
 
     python -m biotac_mj.tasks.batched.training insert_peg --observe electrodes none --minutes 5 --out out/peg
 
-Each learns in its own share of the worlds. Every half minute the folder gets `TASK-OBSERVE-SEED.safetensors`,
-the policy with a card of what it saw and how it does, and a file beside it from which `--resume` goes on; so
-it may be stopped at any time. When the minutes are over each policy plays its worlds once more, from
-beginnings that none has seen, without exploration and without the error of the model that they learned with
-(`BatchTask.model_error`): that is the success on its card. Needs the extras
-`batch` and `learning`; on a GPU some minutes, on a CPU a day."""
+Each policy has its own fraction of the worlds. Every half minute it is written to
+`TASK-OBSERVE-SEED.safetensors` with a card (observations, scores), with a second file for `--resume`; so a
+training may be stopped at any time. At the end each policy plays an episode in each of its worlds, from
+unseen states, without exploration and without `BatchTask.model_error`: the success on its card. Needs the
+extras `batch` and `learning`; takes minutes on a GPU, a day on a CPU."""
 
 import argparse
 import dataclasses
@@ -30,20 +29,20 @@ from .task import BatchTask
 
 __all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
 
-# what sensors have in learning besides the spread of real ones (`sensor="random"`)
+# effects of the sensors in learning, in addition to the spread of real ones (`sensor="random"`)
 RANDOMISED = ("gain", "pdc_gain", "warmup", "drift")
 # of electrodes, PDC and PAC of coarse skins in the condensed tier, against the full one and the default skin
 _MODEL_ERROR = (0.07, 0.17, 0.1)  # (docs/lab/tasks.md)
 _KEEP = 30.0  # [s] between files
-_STRAY = 0.3  # deviation of actions from the teacher's while he acts: he shows the way back too
+_STRAY = 0.3  # deviation of the teacher's actions, so that it also shows how to recover
 _HISTORY = 12  # decisions that a policy sees: noise of the encoders is new in each
 
 
 class Run:
-    """One policy that learns in its share of the worlds.
+    """One policy that learns in its fraction of the worlds.
 
     Args:
-      env: the environment of all. worlds: slice of them. observe: of OBSERVE. seed: of networks.
+      env: the environment. worlds: slice of its worlds. observe: of OBSERVE. seed: of networks.
     """
 
     def __init__(self, env: BatchTask, worlds: slice, observe: str, seed: int, numbers: Numbers):
@@ -57,7 +56,7 @@ class Run:
         return seen_by(self.env, self.observe, self.worlds)
 
     def known(self, worlds: slice | None = None) -> torch.Tensor:
-        """What the critic knows: the truth, in these worlds, None: its own."""
+        """Input of the critic, the true state, in these worlds; None: its own."""
         found = self.env.observe("none")
         known = torch.cat([found["body"], found["state"]], dim=1)
         return known[self.worlds if worlds is None else worlds]
@@ -68,12 +67,12 @@ class Run:
 
     @torch.no_grad()
     def compare(self, right: torch.Tensor) -> None:
-        """Keeps how far it is from what the teacher would do in all worlds, RMS, over some ten decisions."""
+        """Updates the RMS difference to the teacher's actions, averaged over some ten decisions."""
         square = (self.act(self.env).clamp(-1, 1) - right[self.worlds]).square().mean()
         self.off = float((0.9 * self.off**2 + 0.1 * square) ** 0.5)
 
     def record(self, reward: torch.Tensor, done: torch.Tensor, extras: dict) -> None:
-        """What the decision of all worlds brought."""
+        """Records the result of a decision of all worlds."""
         w = self.worlds
         self.learner.record(reward[w], done[w], extras["time_outs"][w])
         self.decisions += w.stop - w.start
@@ -89,12 +88,12 @@ class Run:
             self._ended = [0, 0]
 
     def rate(self, last: int = 8) -> float:
-        """Of the last episodes in learning, those that succeeded."""
+        """Fraction of the last episodes in learning that succeeded."""
         rows = self.rows[-last:]
         return sum(r["success"] for r in rows) / max(1, sum(r["ended"] for r in rows))
 
     def files(self, folder: pathlib.Path, task: str) -> tuple[pathlib.Path, pathlib.Path]:
-        """Of the policy, and of what it goes on from."""
+        """Files of the policy, and of the state of its training."""
         name = f"{task}-{self.observe}-{self.seed}"
         return folder / f"{name}.safetensors", folder / f"{name}.resume"
 
@@ -111,7 +110,7 @@ class Run:
         return card
 
     def resume(self, folder: pathlib.Path, task: str) -> None:
-        """Goes on from the files.
+        """Continues from the files.
 
         Raises:
           FileNotFoundError: there is none.
@@ -134,14 +133,14 @@ def train(
     resume: bool = False,
     taught: float = Numbers.taught,
 ) -> list[dict]:
-    """Policies that learn side by side; returns their cards.
+    """Trains policies in parallel; returns their cards.
 
     Args:
-      env: their worlds, as many for each. task: its name. runs: [(observe, seed)].
-      minutes: of learning; in the end they play besides. out: folder of the files.
+      env: the worlds, divided evenly. task: its name. runs: [(observe, seed)].
+      minutes: of learning, without the episodes at the end. out: folder of the files.
       about: further entries of the cards.
-      resume: goes on from files of an earlier call, without the teacher.
-      taught: part of the minutes in which they imitate the teacher.
+      resume: continue from files of an earlier call, without the teacher.
+      taught: fraction of the minutes with imitation of the teacher.
 
     Raises:
       ValueError: minutes that are none, or a run that is given twice.
@@ -214,16 +213,16 @@ def train(
 
 
 def _now(env):
-    """[s], when the device has done what it was given."""
+    """[s], after all work of the device."""
     if env.device != "cpu":
         torch.cuda.synchronize(env.device)
     return time.perf_counter()
 
 
 def _study(learners, lessons, acted, progress):
-    """All learn from lessons for a part of the time (`Numbers.study`) in which they acted [s]; progress: part
-    of the teacher's time that is over. Errors of encoders and of the model are others in each lesson: states
-    are few, and would be known by them."""
+    """Imitation for a fraction (`Numbers.study`) of the time of acting [s]; progress: elapsed fraction of the
+    teacher's time. Each lesson draws new errors of encoders and model, because a policy would recognise the
+    few states by these errors."""
     numbers, begin = learners[0].learner.numbers, time.perf_counter()
     for _ in range(numbers.lessons):
         for run in learners:
@@ -281,7 +280,7 @@ def of_runs(
     device: str | None = None,
     hand: pathlib.Path | None = None,
 ) -> BatchTask:
-    """The worlds in which runs [(observe, seed)] learn, so many for each.
+    """An environment for runs [(observe, seed)], with so many worlds for each.
 
     Raises:
       ValueError: "learned" beside another choice: its sensors are others.
