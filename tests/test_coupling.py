@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 import biotac_mj
 from biotac_mj.coupling import attach
-from biotac_mj.coupling.implicit import coupled
+from biotac_mj.coupling.implicit import coupled, group
 from biotac_mj.coupling.implicit import world as coupled_world
 from biotac_mj.geometry.rigid import cross, displace, displacement, rotation
 
@@ -441,6 +441,55 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
     data.qvel[:] = np.tile([0.01, 0, 0, 0.5, 1.0, 2.0], 2) * np.repeat([1, -1], 6)
     mujoco.mj_step(model, data, 10)
     assert len(seen) >= 20 and min(seen) > 0.05
+
+
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_bodies_give_way_as_all_else_lets_them(jacobian, monkeypatch):
+    """A ball between two pads on joints with dry friction: the compliance is that of the inverse of inertia,
+    implicit damping and all rows that hold but the skin's own."""
+    seen, find = [], group.SkinGroup.find_compliance
+
+    def watch(self, skins, inertia):
+        find(self, skins, inertia)
+        H = np.zeros((model.nv, model.nv))
+        row, column = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
+        H[row, column] = H[column, row] = data.M if inertia is None else inertia
+        rows = np.zeros((data.nefc, model.nv))
+        if mujoco.mj_isSparse(model):
+            mujoco.mju_sparse2dense(rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+        else:
+            rows[:] = data.efc_J.reshape(rows.shape)
+        holds = data.efc_state == mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC
+        for skin in skins:
+            others = holds.copy()
+            others[skin.instance.metric.numbers] = False
+            J = skin.jacobian.reshape(-1, model.nv)
+            springs = rows[others].T @ (data.efc_D[others, None] * rows[others])
+            wanted = skin.square[0] * J @ np.linalg.solve(H + springs, J.T)
+            np.testing.assert_allclose(skin.compliance[0, 0], wanted, rtol=1e-9, atol=1e-15)
+            seen.append(np.abs(springs).max())
+
+    fingers = "".join(
+        f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5" '
+        f'frictionloss=".2"/><geom size=".003" mass=".03" {GHOST}/></body>'
+        for i, (z, s) in enumerate(((-0.0131, 1), (0.0131, -1)))
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="0.002" integrator="implicitfast" jacobian="{jacobian}"/>'
+        f'<worldbody>{fingers}<body name="box"><freejoint/><geom type="box" size=".004 .004 .005" '
+        'mass=".005"/></body></worldbody></mujoco>'
+    )
+    for i, quat in enumerate((PAD_UP, PAD_DOWN)):
+        attach(
+            spec, body=f"finger{i}", quat=quat, pos=[0.01, 0, 0], prefix=f"b{i}_",
+            skin=spring_skin.pad_geometry(), stepper="springs", readings="none", options={"stiffness": 1e3},
+        )  # fmt: skip
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    monkeypatch.setattr(group.SkinGroup, "find_compliance", watch)
+    data.qfrc_applied[:2] = 1.0
+    mujoco.mj_step(model, data, 30)
+    assert len(seen) > 40 and min(seen[-10:]) > 0.1  # against 0.03 kg
 
 
 @pytest.mark.parametrize("timestep", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])

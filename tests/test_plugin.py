@@ -402,9 +402,9 @@ def test_disabled_equalities_are_refused_two_way(model):
     biotac_mj.plugin.clear_errors()
 
 
-@pytest.mark.parametrize("coupling, limit", [("one-way", 150), ("two-way", 480)])
+@pytest.mark.parametrize("coupling, limit", [("one-way", 120), ("two-way", 320)])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
-    """Calls of Python functions in a step whose skin costs nothing, 127 and 430 (docs/lab/coupling.md), on
+    """Calls of Python functions in a step whose skin costs nothing, 105 and 287 (docs/lab/coupling.md), on
     whatever machine."""
     ball = (
         '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" '

@@ -169,11 +169,9 @@ class Instance:
         """The arrays of a coupled step that begins: the linear model in force is that of the last step."""
         arrays, (head, models, *_) = self._arrays, self.parts
         arrays.record(self.horizon, 0.5 * self.by_stages)
-        n = len(models)
-        parts = models[:, :6], models[:, 6:42].reshape(n, 6, 6), models[:, 42:45], models[:, 45:54]
-        for (last, now), part in zip(arrays.models, parts):
-            last[:] = now[:] = part.reshape(now.shape)
-        arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(n, 3, 3)
+        for (last, now), part in zip(arrays.models, self.last_model()):
+            last[:] = now[:] = part
+        arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)
         arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
         arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
         arrays.begin()

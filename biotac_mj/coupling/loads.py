@@ -97,7 +97,7 @@ class Loads:
         ctypes.memmove(force.ctypes.data, data.efc_force, data.nefc * 8)
         contact[data.ncon :] = self._touch
         for one in self.coupled:
-            force[one.metric.numbers()] = 0.0
+            force[one.metric.numbers] = 0.0
         pyramidal = self.model.opt.cone == _PYRAMIDAL
         for k, t in enumerate(touches):
             row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]

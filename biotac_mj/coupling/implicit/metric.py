@@ -37,7 +37,7 @@ class Metric:
     """The rows between the BioTac's body and the bodies that can touch it.
 
     Attributes:
-      first: number of the first row of each slot.
+      first: number of the first row of each slot; numbers: of all rows.
 
     Raises:
       ValueError: the model has fewer slots than bodies that can touch.
@@ -57,7 +57,7 @@ class Metric:
             )
         self.root = roots
         self._layout, self._filled, self._held = None, False, None
-        self.first, self._numbers = [], np.zeros(0, int)
+        self.first, self.numbers = [], np.zeros(0, int)
         self.slot = dict(zip(needed, slots))
         for root, slot in self.slot.items():
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
@@ -125,7 +125,7 @@ class Metric:
         if data.nisland:
             self._weights.append((rows.iefc_D, rows.iefc_R, rows.map_efc2iefc[self._all]))
         if self.model.is_sparse:
-            mine, column = self._numbers, rows.efc_J_colind
+            mine, column = self.numbers, rows.efc_J_colind
             count, start = rows.efc_J_rownnz[mine], rows.efc_J_rowadr[mine]
             at = np.arange(count.sum()) + np.repeat(start - np.cumsum(count) + count, count)
             self._entries = rows.efc_J, at, (np.repeat(np.arange(len(mine)), count), column[at])
@@ -150,14 +150,10 @@ class Metric:
                     "constraint changed?"
                 )
             self.first.append(int(index[0]))
-        self._numbers = rows = (np.array(self.first)[:, None] + np.arange(6)).ravel()
+        self.numbers = rows = (np.array(self.first)[:, None] + np.arange(6)).ravel()
         # neighbours as a rule; a slice is written faster than numbered rows
         near = (np.diff(rows) == 1).all()
         self._all = slice(int(rows[0]), int(rows[-1]) + 1) if near else rows
-
-    def numbers(self) -> np.ndarray:
-        """Numbers of its rows."""
-        return self._numbers
 
     def release(self) -> None:
         """Leaves the rows without any stiffness."""
