@@ -13,7 +13,8 @@ from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
-from .lanes import block_sum, sync
+from .broadphase import ROOT3
+from .lanes import block_max, block_rank, block_sum, sync
 from .states import BALANCED, EVALUATE, NEWTON, Linear, Newton
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system
@@ -99,6 +100,8 @@ def evaluation(shapes: str) -> wp.Function:
         nin: int,
         at: int,
         coupled: int,
+        anew: int,
+        travel: real,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
         touch: Contact,
@@ -106,15 +109,30 @@ def evaluation(shapes: str) -> wp.Function:
         s: Scratch,
     ):
         """Forces vector[G] of the contact law at displacements vector[at] of the candidates, and flags of
-        those that touch."""
+        those that touch; returns `Newton.travel`. Unless all are to be evaluated `anew`, since geoms have
+        moved, faces are left out that nothing can have reached."""
         sync()
+        most = real(0.0)
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
             u = vec3(s.vector[w, at, 3 * k], s.vector[w, at, 3 * k + 1], s.vector[w, at, 3 * k + 2])
+            most = wp.max(most, wp.length_sq(c.rest[i, 0] + u - x[i, w]))
             x[i, w] = c.rest[i, 0] + u
+        travel = wp.where(anew == 1, real(0.0), travel + ROOT3 * wp.sqrt(block_max(most)))
+        count = int(0)
+        for begin in range(0, nface, threads):
+            f = int(0)
+            left = int(0)
+            if begin + t < nface:
+                f = s.face[w, begin + t]
+                left = wp.where(anew == 1 or s.free[w, f] <= travel, 1, 0)
+            rank = block_rank(left)
+            if left == 1:
+                s.look[w, count + rank[0]] = f
+            count += rank[1]
         sync()
         several = s.bodies.compliance.shape[0] > 1
-        touch_faces(w, t, threads, nface, s.face, s.close_to, geoms, x, touch, coupled)
+        touch_faces(w, t, threads, count, s.look, s.close_to, geoms, x, touch, coupled, travel, s.free)
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
@@ -162,6 +180,7 @@ def evaluation(shapes: str) -> wp.Function:
             s.stiff[w, k] = stiff
             s.on[w, nnode + k] = wp.where(stiff > real(0.0), 1, 0)
         sync()
+        return travel
 
     @wp.func
     def evaluate_contact(
@@ -179,15 +198,17 @@ def evaluation(shapes: str) -> wp.Function:
         they are held."""
         d = s.solve.newton[w]
         o = s.solve.increment[w]
-        if d.fresh >= 0:
+        anew = wp.where(d.fresh >= 0, 1, 0)
+        if anew == 1:
             skin = d.linear
             if d.foretold == 1:
                 skin = d.before
             multiply(w, t, threads, o.nnode, 3 * o.nnode + o.nin, F, d.fresh, 1, skin, c, s)
         if d.foretold == 1:
             _swap_poses(w, t, threads, geoms, s)
-        evaluate(
-            w, t, threads, o.nface, o.ncore, o.nnode, o.nin, d.at, 1 - d.ends, geoms, x, touch, c, s
+        d.travel = evaluate(
+            w, t, threads, o.nface, o.ncore, o.nnode, o.nin, d.at, 1 - d.ends, anew, d.travel, geoms, x,
+            touch, c, s,
         )  # fmt: skip
         if d.foretold == 1:
             _swap_poses(w, t, threads, geoms, s)

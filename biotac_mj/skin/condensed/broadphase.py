@@ -11,6 +11,7 @@ from ..contact.broadphase import (
     motion_bound,
     sample_within,
 )
+from ..contact.faces import Contact
 from ..contact.meshes import TRILINEAR, smooth_distance
 from ..contact.penetration import core_clearance
 from ..contact.posed import SKIN, Geoms, face_radius
@@ -20,12 +21,15 @@ from .lanes import block_max, block_rank, keep_rows, sync
 from .structs import BACK, Constants, Remembered, Scratch
 
 __all__ = [
+    "ROOT3",
     "choose_view",
     "find_faces",
+    "find_inner_faces",
     "find_nodes",
     "forget_faces",
     "is_deep",
     "largest_displacement",
+    "may_be_reached",
     "measure_core",
 ]
 
@@ -36,7 +40,7 @@ _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at
 _STILL = wp.constant(real(2e-4))  # so far, where the core's may be nearer than these tell [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
 _NEARLY = wp.constant(real(3e-5))  # more than the core's spline is off the distance [m]
-_ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
+ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
 
 
 @wp.func
@@ -213,19 +217,17 @@ def find_faces(
     view: int,
     travel: real,
     moved: real,
-    fraction: real,
     near: wp.int64,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
-    """Adds the faces within reach of a geom [m] and those geoms, and the inner faces that are nearer to the
-    core than a fraction of their displacement; how many there are of each, and how many are new, with the
-    faces that have a new geom. Beyond capacity none is listed. view, travel, near: those of `choose_view`.
-    moved: how far the skin has at most [m]."""
-    free = reach + _ROOT3 * travel
-    most = free + _ROOT3 * moved
+    """Adds the faces within reach of a geom [m] and those geoms; how many there are, and how many are new,
+    with those that have a new geom. Beyond capacity none is listed. view, travel, near: those of
+    `choose_view`. moved: how far the skin has at most [m]."""
+    free = reach + ROOT3 * travel
+    most = free + ROOT3 * moved
     if most > _AWAY:  # so far nobody has looked
         most = real(wp.inf)
         free = most
@@ -239,7 +241,7 @@ def find_faces(
             if s.near[w, f] == 0 and s.far[w, view, f] < most:
                 room = s.far[w, view, f] - free  # by which it has to move
                 left = 1
-                if room > real(0.0) and room * room > _ROOT3 * _ROOT3 * _moved(f, w, c.face, x, c):
+                if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, x, c):
                     left = 0
         rank = block_rank(left)
         if left == 1:
@@ -279,6 +281,61 @@ def find_faces(
     for k in range(t, close, threads):
         new += s.near[w, s.look[w, k]]
     sync()
+    nface = _list_marked(w, t, threads, 0, s.near, s.face)
+    for k in range(t, wp.min(nface, s.face.shape[1]), threads):
+        f = s.face[w, k]
+        face = c.face[f]
+        center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+        _count, within = geoms_within(center, radius + wp.max(reach, real(0.0)), w, geoms, near)
+        if within & s.close_to[w, f] != within:
+            s.close_to[w, f] = within | s.close_to[w, f]
+            new += 1
+    return nface, block_rank(new)[1]
+
+
+@wp.func
+def may_be_reached(
+    w: int,
+    t: int,
+    threads: int,
+    reach: real,
+    near: wp.int64,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """Whether a face that was not within reach of a geom [m] when the increment began may have come to one
+    since, by how far nodes and near geoms have moved at most."""
+    nodes = real(0.0)
+    for k in range(t, c.node.shape[0], threads):
+        i = c.node[k]
+        nodes = wp.max(nodes, wp.length_sq(x[i, w] - touch.x_last[i, w]))
+    posed = real(0.0)
+    for g in range(geoms.count):
+        if has(near, g):
+            moved = motion_bound(
+                s.sought_pos[g, w], s.sought_mat[g, w], geoms.pos[g, w], geoms.mat[g, w], c.center, c.radius
+            )
+            posed = wp.max(posed, moved)
+    return ROOT3 * (wp.sqrt(block_max(nodes)) + posed) >= reach
+
+
+@wp.func
+def find_inner_faces(
+    w: int,
+    t: int,
+    threads: int,
+    fraction: real,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Adds the inner faces that are nearer to the core than a fraction of their displacement; how many there
+    are, and how many are new. Beyond capacity none is listed."""
+    nsample = c.sample.shape[0]
+    new = int(0)
     inside = int(0)
     for begin in range(0, c.inner_face.shape[0], threads):
         f = begin + t
@@ -299,17 +356,8 @@ def find_faces(
     for k in range(t, inside, threads):
         new += s.near_core[w, s.look[w, k]]
     sync()
-    nface = _list_marked(w, t, threads, 0, s.near, s.face)
     ncore = _list_marked(w, t, threads, 0, s.near_core, s.core_face)
-    for k in range(t, wp.min(nface, s.face.shape[1]), threads):
-        f = s.face[w, k]
-        face = c.face[f]
-        center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-        _count, within = geoms_within(center, radius + wp.max(reach, real(0.0)), w, geoms, near)
-        if within & s.close_to[w, f] != within:
-            s.close_to[w, f] = within | s.close_to[w, f]
-            new += 1
-    return nface, ncore, block_rank(new)[1]
+    return ncore, block_rank(new)[1]
 
 
 @wp.func

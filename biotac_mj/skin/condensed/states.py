@@ -72,7 +72,7 @@ class Increment:
     view: int  # of `broadphase.choose_view`
     travel: real
     near: wp.int64
-    reach: real  # faces closer than this are candidates [m]
+    reach: real  # faces closer than this are candidates when the increment begins [m]
     spent: real
     error: real
     pressure: real
@@ -102,6 +102,7 @@ class Newton:
     viscosity: real  # artificial
     slope: real
     work: real
+    travel: real  # how far nodes have come at most since all faces were evaluated, over all evaluations [m]
     alpha: real  # length of the step that is tried, and what is known of shorter and longer ones
     low: real
     high: real

@@ -202,6 +202,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
         ("touched", touched),
     ):
         setattr(s, name, wp.zeros((nworld, count), dtype=int))
+    s.free = wp.zeros((nworld, nface), dtype=real)
     s.close_to = wp.zeros((nworld, nface), dtype=wp.int64)
     s.force = wp.zeros((nworld, nouter), dtype=vec3)
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
@@ -225,8 +226,8 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.solve.phase = wp.zeros(nworld, dtype=int)
     for name, of in (("stepping", LoadStepping), ("increment", Increment), ("newton", Newton)):
         setattr(s.solve, name, wp.zeros(nworld, dtype=of))
-    s.pos, s.from_pos, s.held_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(3))
-    s.mat, s.from_mat, s.held_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(3))
+    s.pos, s.from_pos, s.held_pos, s.sought_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(4))
+    s.mat, s.from_mat, s.held_mat, s.sought_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(4))
     s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
     s.seen_mat = wp.zeros((room.views, ngeom, nworld), dtype=mat33)
     s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near

@@ -13,10 +13,12 @@ from .bodies import find_groups, pose_by_forces, pose_by_load
 from .broadphase import (
     choose_view,
     find_faces,
+    find_inner_faces,
     find_nodes,
     forget_faces,
     is_deep,
     largest_displacement,
+    may_be_reached,
     measure_core,
 )
 from .correction import is_measured
@@ -247,6 +249,9 @@ def search(
         o.bulge = r.bulge[w]
         if p.known == 1:
             moved = real(2.0) * _largest_motion(w, geoms)
+        for g in range(t, geoms.count, threads):
+            s.sought_pos[g, w] = geoms.pos[g, w]
+            s.sought_mat[g, w] = geoms.mat[g, w]
         view, travel, near = choose_view(w, t, threads, geoms, c, s)
         o.view = view
         o.travel = travel
@@ -263,9 +268,15 @@ def search(
         fraction = real(0.0)
         if first == 1 and p.holds == 0 and largest > real(0.0):
             fraction = wp.min(real(1.0), real(1.5) * moved / largest)
-        nface, ncore, new = find_faces(
-            w, t, threads, o.reach, o.view, o.travel, largest, fraction, o.near, geoms, x, c, s
-        )  # fmt: skip
+        nface = o.nface
+        new = int(0)
+        if first == 1 or may_be_reached(w, t, threads, o.reach, o.near, geoms, x, touch, c, s):
+            reach = wp.where(first == 1, o.reach, real(0.0))
+            nface, new = find_faces(
+                w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, x, c, s
+            )  # fmt: skip
+        ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
+        new += inner
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
         elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
@@ -301,7 +312,6 @@ def search(
             exact = wp.where(p.to < real(1.0), _PASSING, TOLERANCE)
             s.solve.newton[w] = newton_from(foretold, before, l, p.left - o.spent, exact)
     o.searches += 1
-    o.reach = real(0.0)
     o.passes = 0
     o.solving = looking
     if t == 0:

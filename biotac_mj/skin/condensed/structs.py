@@ -90,6 +90,7 @@ class Scratch:
 
     near: wp.array2d(dtype=int)  # which faces are candidates, by their place among them plus one; 0: none
     near_core: wp.array2d(dtype=int)  # which inner ones
+    free: wp.array2d(dtype=real)  # `Newton.travel` until which a candidate face touches nothing [m]
     look: wp.array2d(dtype=int)  # faces of which that is not known yet
     face: wp.array2d(dtype=int)  # their numbers
     core_face: wp.array2d(dtype=int)
@@ -130,6 +131,8 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
+    sought_pos: wp.array2d(dtype=vec3)  # where candidates were sought first
+    sought_mat: wp.array2d(dtype=mat33)
     held_pos: wp.array2d(dtype=vec3)  # where they were at the balance from which another is foretold
     held_mat: wp.array2d(dtype=mat33)
     # of `broadphase.choose_view` [view, geom, world]: where geoms were when it was taken; [world, view]: how

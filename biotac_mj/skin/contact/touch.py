@@ -411,10 +411,13 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         x: wp.array2d(dtype=vec3),
         c: Contact,
         friction_mode: int,
+        travel: real,
+        free: wp.array2d(dtype=real),
     ):
         """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block
         with one sample for each thread, or on the CPU by a single thread, which leaves out faces whose ball
-        touches nothing."""
+        touches nothing. free[w, face] becomes travel plus a lower bound of the face's clearance, less than
+        travel where it touches [m]."""
         if one_thread() == 1:
             for n in range(count):
                 f = listed[w, n]
@@ -423,7 +426,8 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
                 if clearance > contact_range(c.laws, w):
                     write_face(f, w, 0, FaceSum(), c)
                 else:
-                    _clearance = touch_face(f, w, geoms, x, c, friction_mode, near[w, f])
+                    clearance = touch_face(f, w, geoms, x, c, friction_mode, near[w, f])
+                free[w, f] = travel + clearance
             return
         nsample = c.sample.shape[0]
         parallel_faces = threads // nsample
@@ -431,18 +435,21 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         for first in range(0, count, parallel_faces):
             k = first + t // nsample
             mine = int(-1)
-            touching = int(0)
+            clearance = real(1.0)
             force = vec3()
             K = mat33()
             at = vec3()
             if k < count and t < parallel_faces * nsample:
                 mine = listed[w, k]
-                touching, _least, force, K, at, _total = touch_samples(
+                touching, clearance, force, K, at, _total = touch_samples(
                     mine, s, s + 1, w, geoms, x, c, friction_mode, near[w, mine]
                 )
-            clearance = add_samples(mine, w, real(-touching), force, K, at, nsample, c.corner, c.block)
+                if touching == 1:
+                    clearance = real(-1.0)
+            clearance = add_samples(mine, w, clearance, force, K, at, nsample, c.corner, c.block)
             if mine >= 0 and s == 0:
-                c.touching[mine, w] = int(-clearance)
+                c.touching[mine, w] = wp.where(clearance > real(-1.0), 0, 1)
+                free[w, mine] = travel + clearance
 
     @wp.kernel(module=module, enable_backward=False)
     def by_face(
