@@ -28,7 +28,6 @@ __all__ = [
     "FORMAT",
     "SHIPPED",
     "amend",
-    "checksum",
     "describe",
     "find_weights",
     "is_inverse",
@@ -41,6 +40,7 @@ __all__ = [
     "save_points_model",
     "shipped",
     "window_of",
+    "write_tensors",
 ]
 
 _DAMAGED = "it is damaged: train again, or copy it again"
@@ -152,18 +152,25 @@ def save_points_model(
 
 
 def _save(path, tensors, geometry, meta, graph=()):
-    from safetensors.torch import save
-
     big = lambda v: v.half() if v.is_floating_point() and v.numel() > 4096 else v  # noqa: E731
-    tensors = {k: big(v.detach()).cpu().contiguous() for k, v in tensors.items()} | dict(graph)
-    meta = meta | {"format": FORMAT, "channels": list(ELECTRODES), "checksum": checksum(tensors)}
+    tensors = {k: big(v.detach()).cpu() for k, v in tensors.items()} | dict(graph)
+    meta = meta | {"channels": list(ELECTRODES)}
     if geometry is not None:
         meta |= {"mesh": mesh_key(geometry), "skin": geometry.name}
+    write_tensors(path, tensors, meta)
+
+
+def write_tensors(path: pathlib.Path | str, tensors: dict[str, torch.Tensor], meta: dict) -> None:
+    """Writes a file for `read_tensors`; meta: its description, JSON types."""
+    from safetensors.torch import save
+
+    tensors = {name: value.contiguous() for name, value in tensors.items()}
+    meta = meta | {"format": FORMAT, "checksum": _checksum(tensors)}
     with replacing(path) as temporary:
         temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
 
 
-def checksum(tensors: dict[str, torch.Tensor]) -> str:
+def _checksum(tensors: dict[str, torch.Tensor]) -> str:
     """Of names, shapes, types and numbers: permuted or exchanged tensors may have the same shape."""
     found = hashlib.sha256()
     for name in sorted(tensors):
@@ -202,7 +209,7 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
         tensors = {k: file.get_tensor(k) for k in (file.keys() if names is None else names)}
     if not isinstance(meta, dict):
         raise ValueError(f"{path} is no file of weights (it describes itself by {meta!r:.50}): {remedy}")
-    if names is None and meta.get("checksum", "") not in ("", checksum(tensors)):
+    if names is None and meta.get("checksum", "") not in ("", _checksum(tensors)):
         raise ValueError(
             f"{path} holds other weights than were written (its checksum differs): train again, or copy it "
             "again"
@@ -265,12 +272,9 @@ def _refuse_other(meta, path, geometry, direction):
 
 def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) -> None:
     """Copies a file of weights with further entries in its description; more: JSON types."""
-    from safetensors.torch import load, save
+    from safetensors.torch import load
 
-    meta = describe(source) | more
-    with replacing(target) as temporary:
-        tensors = load(pathlib.Path(source).read_bytes())
-        temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
+    write_tensors(target, load(pathlib.Path(source).read_bytes()), describe(source) | more)
 
 
 def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel | PointsModel":

@@ -3,7 +3,6 @@ interval, and a novelty score against the training rows. Saved as one file."""
 
 import dataclasses
 import functools
-import json
 import pathlib
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from ...data.schema import SPLITS
 from ...data.splits import assign, least_count
 from ...fields import check_entries
-from ...files import replacing
 from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
 from ..protocol import conformal_width
 from .examples import Examples
@@ -150,15 +148,13 @@ class Reader:
     def save(self, path: pathlib.Path | str) -> None:
         """Writes a safetensors file."""
         import torch
-        from safetensors.numpy import save
 
-        from ..weights import FORMAT, checksum
+        from ..weights import write_tensors
 
-        meta = self.meta | {"format": FORMAT, "direction": "reader", "channels": list(self.electrodes)}
-        tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in self.tensors.items()}
-        meta["checksum"] = checksum({name: torch.from_numpy(value) for name, value in tensors.items()})
-        with replacing(path) as temporary:
-            temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
+        tensors = {
+            name: torch.tensor(np.asarray(value), dtype=torch.float32) for name, value in self.tensors.items()
+        }
+        write_tensors(path, tensors, self.meta | {"direction": "reader", "channels": list(self.electrodes)})
 
     @classmethod
     def load(cls, path: pathlib.Path | str) -> "Reader":
