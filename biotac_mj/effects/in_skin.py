@@ -20,33 +20,14 @@ __all__ = ["Inside", "friction_branch", "memory_of", "moduli", "stiffening"]
 # measured by benchmarks/discrepancy_in_skin_maps.py on presses of the coarse skin (docs/lab/memory.md):
 # apparent c2 of the force over the stiffening c2 / c1 of the rubber,
 _STIFFENING = (-120, -40, -12, -4, -1, 0, 1, 4, 12, 40, 120, 400, 1000)
-
-
 _C2 = (
-    -0.7168,
-    -0.3972,
-    -0.1518,
-    -0.0522,
-    -0.0131,
-    0.0,
-    0.0128,
-    0.0470,
-    0.1197,
-    0.2990,
-    0.6382,
-    1.3962,
-    2.4646,
+    *(-0.7168, -0.3972, -0.1518, -0.0522, -0.0131, 0.0),
+    *(0.0128, 0.0470, 0.1197, 0.2990, 0.6382, 1.3962, 2.4646),
 )
-
-
 # and, for widths of the hysteresis [m], the strain of slip of a friction branch and its modulus over the
 # fraction
 _WIDTH = (0.05e-3, 0.1e-3, 0.2e-3, 0.3e-3, 0.4e-3, 0.6e-3)
-
-
 _STRAIN = (0.00030, 0.00105, 0.00319, 0.00436, 0.00683, 0.01297)
-
-
 _BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
+from .beside import last_measured
 from .evidence import BLOCKS, evidence
 from .fault import Fault
 from .log import Log
@@ -209,8 +210,7 @@ def _without_rails(x):
     same = np.diff(x, axis=0) == 0
     ends = np.isin(x, (0, FULL_SCALE))
     ends &= np.pad(same, ((1, 0), (0, 0))) | np.pad(same, ((0, 1), (0, 0)))
-    last = np.maximum.accumulate(np.where(ends, 0, np.arange(len(x))[:, None]), axis=0)
-    return np.take_along_axis(x, last, axis=0)
+    return last_measured(x, ends)
 
 
 def _is_single_overflow(x, rows, band):

@@ -8,6 +8,7 @@ from scipy.ndimage import percentile_filter, uniform_filter1d
 from scipy.signal import find_peaks
 
 from ..sensor.channels import FULL_SCALE
+from .beside import last_measured, line_ends
 from .codes import mostly_coarse
 from .evidence import BLOCKS, NAN, evidence, runs
 from .fault import Fault
@@ -105,12 +106,11 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
     if not log.in_counts or len(rows) < _LEAST or not good.any() or mostly_coarse(log, faults):
         return []
     x, masked = log.counts[rows][:, good], log.masked[rows][:, good]
-    before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
-    x = np.take_along_axis(x, before, axis=0)  # masked samples take the last valid value
+    x = last_measured(x, masked)
     noise = noise_level(x)
     if np.median(noise) < 0.7:
         return []
-    before, after, spread = _ends(x)
+    before, after, spread = line_ends(x, _LINE)
     jump = (after - before) / noise / spread
     # a loss affects all channels: a fifth of the others must jump too
     others = np.sort(np.abs(jump), axis=1)[:, : max(_FEW, jump.shape[1] - log.some(_FEW))]
@@ -142,17 +142,6 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
         "score": float(np.log(score[chosen].max())),
     }
     return [_alternative(log, found, rows, chosen + _LINE, noise, x)]
-
-
-def _ends(x):
-    """Ends of least-squares lines on the left and right of every gap between rows of x (n, c), and the
-    standard deviation of their difference in noise units."""
-    h, n = _LINE, len(x)
-    line = np.vander(np.arange(h), 2)
-    end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(line)
-    before = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
-    after = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
-    return before[:-h], after[h:], np.sqrt(2 * (end**2).sum())
 
 
 def _isolated(score, around):

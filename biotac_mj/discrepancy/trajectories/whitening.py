@@ -121,16 +121,21 @@ class Comparison:
             out.append(self._stack(counts, pdc, scale * slope[:, :3]))
         return out
 
+    def _split(self, i, residual):
+        """Of the whitened residual (n, width) of trajectory i the part along what its pose does (3,), and the
+        rest (n width,)."""
+        r, u = (residual / self.sigmas[i]).ravel(), self._basis[i][0]
+        along = u.T @ r
+        return along, r - u @ along
+
     def unposed(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n, width) less what the most probable error of the trial's pose explains."""
-        r = (residual / self.sigmas[i]).ravel()
-        u, s, _ = self._basis[i]
-        return (r - u @ (s**2 / (1 + s**2) * (u.T @ r))).reshape(residual.shape) * self.sigmas[i]
+        (along, apart), (u, s, _) = self._split(i, residual), self._basis[i]
+        return (apart + u @ (along / (1 + s**2))).reshape(residual.shape) * self.sigmas[i]
 
     def astray(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(3,) errors of the trial's pose, of unit variance by noise and repeatability together."""
-        u, s, _ = self._basis[i]
-        return u.T @ (residual / self.sigmas[i]).ravel() / np.sqrt(1 + s**2)
+        return self._split(i, residual)[0] / np.sqrt(1 + self._basis[i][1] ** 2)
 
     def calibrated(self, nuisance: Nuisance) -> "Comparison":
         """The same about a base model whose modulus was fitted."""
@@ -145,8 +150,9 @@ class Comparison:
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""
         out = []
-        for (u, s, v), r in zip(self._basis, self._scaled(effects, nuisance)):
-            out.append(self.repeatability * v.T @ (s / (1 + s**2) * (u.T @ r.ravel())))
+        for i, r in enumerate(self.raw(effects, nuisance)):
+            _, s, v = self._basis[i]
+            out.append(self.repeatability * v.T @ (s / (1 + s**2) * self._split(i, r)[0]))
         return np.array(out)
 
     def predict(self, runs: list) -> list:
@@ -158,18 +164,13 @@ class Comparison:
     def vector(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n width + 3,) whose square is the trajectory's mean square: the whitened residual, rows together,
         and the pose's error in units of its repeatability."""
-        r = (residual / self.sigmas[i]).ravel()
-        u, s, _ = self._basis[i]
-        along = u.T @ r
-        apart = np.concatenate([(r - u @ along) / np.sqrt(self.width), along / np.sqrt(1 + s**2)])
-        return apart / np.sqrt(len(residual))
+        along, apart = self._split(i, residual)
+        along = along / np.sqrt(1 + self._basis[i][1] ** 2)
+        return np.concatenate([apart / np.sqrt(self.width), along]) / np.sqrt(len(residual))
 
-    def _scaled(self, effects, nuisance):
-        return [r / s for r, s in zip(self.raw(effects, nuisance), self.sigmas)]
-
-    def vectors(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
+    def vectors(self, effects: list, nuisance: Nuisance = KNOWN) -> list:
         """`vector` of every trajectory."""
-        return [self.vector(i, r) for i, r in enumerate(self.raw(effects, nuisance, exact))]
+        return [self.vector(i, r) for i, r in enumerate(self.raw(effects, nuisance))]
 
     def raw(
         self,

@@ -6,6 +6,7 @@ edge as well; when the load is as it was it is gone, and a jump is not."""
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from ....quality.beside import last_measured, line_ends
 from ....quality.noise import noise_level
 from ....recordings.recording import designed
 from ..candidates import Candidate, Detector
@@ -58,15 +59,11 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     masked = session.masked[rows]
     if len(rows) < 200:
         return {}
-    before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
-    x = np.take_along_axis(session.counts[rows], before, axis=0)  # a masked sample is the last one measured
-    n, h = len(x), _LINE
+    x, h = last_measured(session.counts[rows], masked), _LINE
     noise = np.maximum(noise_level(x), 0.7)
-    end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(np.vander(np.arange(h), 2))
-    left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))
-    right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
-    step = right[h:] - left[:-h]
-    size = np.abs(step) / noise / np.sqrt(2 * (end**2).sum())
+    left, right, spread = line_ends(x, h)
+    step = right - left
+    size = np.abs(step) / noise / spread
     peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
     times = np.zeros_like(size)  # elsewhere nobody asks
     times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
@@ -90,7 +87,7 @@ def edges(session: Session) -> dict[int, list[Edge]]:
         if not np.ptp(x[at - h : at, k]) or not np.ptp(x[at : at + h, k]):
             continue  # it stands still there: stuck
         row = np.diff(x[at - 3 : at + 3, k])
-        rough = 2 * noise[k] * np.sqrt(2 * (end**2).sum())
+        rough = 2 * noise[k] * spread
         least, most = _AT_ONCE
         if not least * abs(step[i, k]) - rough < np.abs(row).max() < most * abs(step[i, k]) + rough:
             continue
