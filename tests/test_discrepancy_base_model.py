@@ -387,12 +387,12 @@ def test_trembling_poses_are_still_and_clean_after_the_touch():
 
 
 def test_pose_scatter_that_an_offset_explains_is_not_added():
-    """An offset along headings that differ scatters the poses; at least what is stated is left."""
+    """An offset along headings that differ scatters the poses by as much; at least what is stated is left."""
     data, effect = measured([]), by_id("depth0")
     sim, chosen = Springs(), np.arange(len(data))
     turns = Rotation.from_rotvec(np.outer(np.linspace(-0.9, 0.9, len(data)), [1, 0, 0])).as_matrix()
     tilted = [dataclasses.replace(t, mat=np.tile(turn, (len(t.time), 1, 1))) for t, turn in zip(data, turns)]
-    hidden = (effect, {"dz": 2e-4})
+    hidden = (effect, {"dz": -2e-4})
     fields = sim.fields(tilted, progress=False)
     seen = [
         dataclasses.replace(t, electrodes=r.counts, pdc=r.pdc, force=r.force)
@@ -401,6 +401,8 @@ def test_pose_scatter_that_an_offset_explains_is_not_added():
     stated = Comparison(sim, seen, fields, measurement_noise(seen))
     wide = dataclasses.replace(stated, repeatability=3e-4)
     assert wide.scatter([], Nuisance(), chosen) > 8e-5
+    along = [pose @ t.heading for pose, t in zip(wide.poses([], Nuisance()), seen)]
+    np.testing.assert_allclose(along, -2e-4, atol=0.6e-4)
     assert wide.scatter([hidden], Nuisance(), chosen) == stated.repeatability
 
 

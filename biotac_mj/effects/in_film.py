@@ -1,13 +1,15 @@
 """Loss of liquid and rough walls as changes of the skin and the film: less liquid under the skin, a sunk
 skin, another law of the film's conductance."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..sensor.film import FilmConduction
 from ..skin import SkinData, SkinModel
 
-__all__ = ["RoughFilm", "SunkFilm", "drain", "remaining_liquid"]
+__all__ = ["RoughFilm", "SeveralFilms", "SunkFilm", "drain", "remaining_liquid"]
 
 _MOST = 0.8  # largest lost fraction of the liquid, as in `sensing.FluidLoss`
 _DRAINED_PER_STEP = 0.02  # fraction of the liquid lost in one step of the skin
@@ -48,6 +50,16 @@ class SunkFilm(FilmConduction):
         sunk = np.array(vert_xpos, float)
         sunk[..., self.node, :] += self._sunk
         return super().impedance(sunk)
+
+
+class SeveralFilms:
+    """Films under one skin: impedances (nfilm, ...) of each."""
+
+    def __init__(self, films: Sequence[FilmConduction]):
+        self._films = films
+
+    def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
+        return np.stack([one.impedance(vert_xpos) for one in self._films])
 
 
 def remaining_liquid(rate: float, clock: float, before: float = 0.0) -> float:

@@ -13,11 +13,12 @@ import tqdm
 from ....effects.contact import TACKY, Adhesion
 from ....effects.in_skin import memory_of, moduli
 from ....effects.rubber import Stiffening, modulus_of
+from ....geometry.rigid import across
 from ....geometry.skins import load_skin
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import OTHER_MESH
-from .fields import MAPS, Curve, Fields, stack
+from .fields import MAPS, Curve, Fields, stack, unstack
 
 if typing.TYPE_CHECKING:
     from ..trajectory import Trajectory
@@ -25,10 +26,11 @@ if typing.TYPE_CHECKING:
 __all__ = ["Solver", "filled", "inflated", "softer", "solved_fields", "spots", "sunk", "tacky"]
 
 _SHIFT = 40e-6  # [m] of the poses for differences
-_DEEPER = np.array([-0.12e-3, 0.0, _SHIFT, 0.12e-3])  # [m] along the press
+# [m] along the press: densest where errors of poses lie, since rows before the touch begin to touch there
+_DEEPER = 20e-6 * np.array([-6, -4, -2, -1, 0, 1, 2, 4, 6])
 _FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
 _RADIUS, _BUBBLE = 0.15, 8e-9
-_FILM = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])  # logarithms of its least thickness
+_FILM = np.linspace(-0.8, 0.8, 17)  # logarithms of its least thickness
 _SOFTER = -0.25  # of the logarithm of the modulus
 _UNEVEN = 0.2  # [1/cm] of the modulus
 _SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
@@ -58,13 +60,13 @@ class Solver(typing.Protocol):
 
 
 def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
-    """The skin along the trajectories and its differences: 18 solutions of the data set by the condensed
+    """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
     tier, beside one of the simulator's own; kept in `cache`."""
     spheres = any("sphere" in t.tool for t in trajectories)
     # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
     with tqdm.tqdm(
-        total=(18 + len(spots(trajectories)) + spheres + inflated(sim) + 4 * (quick is not sim))
+        total=(20 + len(spots(trajectories)) + spheres + inflated(sim) + 4 * (quick is not sim))
         * len(trajectories),
         desc="skin",
         disable=not progress or None,
@@ -89,16 +91,8 @@ def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool 
         slopes |= filled(quick, trajectories, here, tick)
         slopes |= sunk(quick, trajectories, here, tick)
         slopes |= softer(quick, trajectories, here, tick)
-        for axis in range(3):
-            unit = np.zeros(3)
-            unit[axis] = _SHIFT
-            moved = quick.solve(
-                trajectories,
-                offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories],
-                progress=tick,
-            )
-            slopes["xyz"[axis]] = _difference(moved, here, _SHIFT)
-        deeper = _deeper(quick, trajectories, here, slopes, tick)
+        deeper = _deeper(quick, trajectories, here, tick)
+        slopes |= _shifts(quick, trajectories, here, deeper, tick)
         if spheres:
             slopes["radius"] = _difference(
                 quick.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
@@ -113,40 +107,52 @@ def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool 
     return Fields(base, slopes, trajectories, here, deeper=deeper, film=film)
 
 
-def _deeper(sim, trajectories, base, slopes, tick):
+def _deeper(sim, trajectories, base, tick):
     """What shifts along the press change: load rises faster than depth, and begins where the object
-    touches. A short one is what those in x, y and z together say."""
-    less, more = (
-        sim.solve(
-            trajectories,
-            offset=[np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories],
-            progress=tick,
-        )
-        for by in (_DEEPER[0], _DEEPER[-1])
-    )
+    touches."""
     changes = []
-    for i, t in enumerate(trajectories):
-        straight = sum(h * stack(slopes[x][i]) for h, x in zip(t.heading, "xyz"))
-        none = np.zeros_like(straight)
-        changes.append(
-            np.array(
-                [stack(less[i]) - stack(base[i]), none, _SHIFT * straight, stack(more[i]) - stack(base[i])]
-            )
-        )
-    return Curve(_DEEPER, changes)
+    for by in _DEEPER:
+        offset = [np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories]
+        solved = sim.solve(trajectories, offset=offset, progress=tick) if by else base
+        changes.append([stack(one) - stack(here) for one, here in zip(solved, base)])
+    return Curve(_DEEPER, [np.array(of) for of in zip(*changes)])
+
+
+def _shifts(sim, trajectories, base, deeper, tick):
+    """Differences by shifts along the sensor's axes. Across the press they are solved; a shift with a part
+    along it would touch earlier or later, of which the curve knows."""
+    sides = [across(t.heading[None]) for t in trajectories]
+    solved = []
+    for k in range(2):
+        offset = [np.tile(_SHIFT * side[k], (len(t.time), 1)) for t, side in zip(trajectories, sides)]
+        solved.append(_difference(sim.solve(trajectories, offset=offset, progress=tick), base, _SHIFT))
+    out = {axis: [] for axis in "xyz"}
+    for i, (t, side) in enumerate(zip(trajectories, sides)):
+        straight = [deeper.slope(i, 0.0), *(stack(one[i]) for one in solved)]
+        for k, axis in enumerate("xyz"):
+            share = t.heading[k], side[0][0, k], side[1][0, k]
+            out[axis].append(unstack(sum(by * slope for by, slope in zip(share, straight))))
+    return out
 
 
 def _films(sim, trajectories, base, tick):
-    """What another least thickness of the film changes, about rest."""
+    """What another least thickness of the film changes, about rest: it does not act on the skin, which is
+    solved once for all of them."""
+    from ....effects.in_film import SeveralFilms
+
+    model, own = sim.skin_and_film(0.0, 0.0)
     given = read_dict(sim.options, "options").get("film") or {}
-    own = sim.skin_and_film(0.0, 0.0)[1].residual_film
+    thick = [float(by * own.residual_film) for by in np.exp(_FILM)]
+    settings = [sim.options | {"film": {**given, "residual_film": one}} for one in (*thick, thick)]
+    films = [sim.but({0.0: model}, options=one).skin_and_film(0.0, 0.0)[1] for one in settings[:-1]]
+    several = sim.but({0.0: model, "film": SeveralFilms(films)}, options=settings[-1])
     changes = []
-    for log in _FILM:
-        film = {**given, "residual_film": float(np.exp(log) * own)}
-        other = sim.but(options=sim.options | {"film": film})
-        solved = other.solve(trajectories, progress=tick) if log else base
-        changes.append([stack(one) for one in _about_rest(_difference(solved, base))])
-    return Curve(_FILM, [np.array(of) for of in zip(*changes)])
+    for solved, here in zip(several.solve(trajectories, progress=tick), base):
+        n, electrodes = here["log_z"].shape
+        log_z = solved["log_z"].reshape(n, -1, electrodes) - here["log_z"][:, None]
+        log_z = np.broadcast_to(log_z - log_z[0], (n, len(_FILM), electrodes))  # alike where there is no film
+        changes.append(np.pad(np.swapaxes(log_z, 0, 1), ((0, 0), (0, 0), (4, 0))))
+    return Curve(_FILM, changes)
 
 
 def _uneven(sim, trajectories, base, tick):

@@ -4,6 +4,7 @@ these differences make every effect affordable."""
 import dataclasses
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from ....effects.catalogue import CATALOGUE
 from ....effects.contact import TACKY
@@ -12,7 +13,7 @@ from ....sensor.channels import temperature_from_counts
 
 _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
 
-__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "square", "stack", "unlike"]
+__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "square", "stack", "unlike", "unstack"]
 
 MAPS = "along", "across"  # of a modulus that varies with place
 _ANSWERS = {name for effect in CATALOGUE for name in effect.answers}  # that effects after the skin use
@@ -119,35 +120,31 @@ class Curve:
     def __init__(self, at: np.ndarray, changes: list[np.ndarray]):
         """at: (m,) that were solved, rising, one of them 0. changes: per trajectory (m, n, 23)."""
         self.solved, self.changes = at, changes
-        self.tangents = [_tangents(at, one) for one in changes]
+        self._cubics = [CubicHermiteSpline(at, one, _tangents(at, one)) for one in changes]
 
     def part(self, which: np.ndarray) -> "Curve":
         return Curve(self.solved, [self.changes[i] for i in which])
 
     def at(self, i: int, value: np.ndarray | float) -> np.ndarray:
         """(n, 23) change of trajectory i by values (n,), or one of all rows."""
-        wide, share, low, high, left, right = self._interval(i, value)
-        inside = np.clip(share, 0, 1)
-        back = 1 - inside
-        change = (1 + 2 * inside) * back**2 * low + inside**2 * (3 - 2 * inside) * high
-        change += wide * inside * back * (back * left - inside * right)
-        return change + (share - inside) * wide * np.where(share < 0, left, right)
+        inside = np.clip(value, self.solved[0], self.solved[-1])
+        (a, b, c, d), x = self._cubic(i, inside)
+        change, beyond = ((a * x + b) * x + c) * x + d, np.subtract(value, inside)[..., None]
+        return change + beyond * self.slope(i, inside) if beyond.any() else change
 
     def slope(self, i: int, value: np.ndarray | float) -> np.ndarray:
         """(n, 23) of the change at values (n,), or one of all rows."""
-        wide, share, low, high, left, right = self._interval(i, value)
-        inside = np.clip(share, 0, 1)
-        by = 6 * inside * (1 - inside) * (high - low) / wide
-        return by + (1 - inside) * (1 - 3 * inside) * left - inside * (2 - 3 * inside) * right
+        (a, b, c, _), x = self._cubic(i, np.clip(value, self.solved[0], self.solved[-1]))
+        return (3 * a * x + 2 * b) * x + c
 
-    def _interval(self, i, value):
-        changes, tangents = self.changes[i], self.tangents[i]
-        row = np.arange(changes.shape[1])
+    def _cubic(self, i, value):
+        """Coefficients (4, n, 23) of each row's cubic at its own value, and how far that is from where the
+        cubic begins (n, 1)."""
+        cubics = self._cubics[i]
+        row = np.arange(cubics.c.shape[2])
         value = np.broadcast_to(value, row.shape)
-        k = np.clip(np.searchsorted(self.solved, value, "right") - 1, 0, len(self.solved) - 2)
-        wide = (self.solved[k + 1] - self.solved[k])[:, None]
-        share = (value - self.solved[k])[:, None] / wide
-        return wide, share, changes[k, row], changes[k + 1, row], tangents[k, row], tangents[k + 1, row]
+        k = np.clip(np.searchsorted(cubics.x, value, "right") - 1, 0, len(cubics.x) - 2)
+        return cubics.c[:, k, row], (value - cubics.x[k])[:, None]
 
 
 def _tangents(at, changes):
@@ -198,6 +195,11 @@ def nearest(solved: list, now: dict) -> tuple:
 def stack(one: dict) -> np.ndarray:
     """(n, 23) force, pressure and ln Z of a solution."""
     return np.column_stack([one["force"], one["pressure"], one["log_z"]])
+
+
+def unstack(values: np.ndarray) -> dict:
+    """A solution of (n, 23) force, pressure and ln Z."""
+    return {"force": values[:, :3], "pressure": values[:, 3], "log_z": values[:, 4:]}
 
 
 def _begin(order, t, base, slopes, first_tdc):

@@ -239,7 +239,7 @@ class Simulator:
         store = self.__dict__.setdefault("_models", {})
         if bubble not in store:
             geometry = load_skin(self.skin)
-            (rubber, options, modulus), film = self._read(liquid=True)
+            rubber, options, modulus = self._read(liquid=True)[0]
             if bubble:
                 volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
                 # liquid and air in series: V / K + V0 / p0
@@ -248,12 +248,13 @@ class Simulator:
                 )
             device = "cpu" if self.tier == "condensed" else self.device
             model = store[bubble] = SkinModel(geometry, rubber, options, device, modulus=modulus)
-            if "film" not in store:
-                filled = options.fill_volume or options.rest_pressure
-                solved = model.geometry  # with all nodes that are solved
-                rest = dataclasses.replace(solved, vert=model.rest.vert) if filled else solved
-                store["film"] = FilmConduction(rest, sensor=self._numbers() or self.sensor, **film)
         model = store[bubble]
+        if "film" not in store:
+            (_, options, _), film = self._read(liquid=True)
+            filled = options.fill_volume or options.rest_pressure
+            solved = model.geometry  # with all nodes that are solved
+            rest = dataclasses.replace(solved, vert=model.rest.vert) if filled else solved
+            store["film"] = FilmConduction(rest, sensor=self._numbers() or self.sensor, **film)
         if log_friction:
             model = copy.copy(model)
             model.material = dataclasses.replace(
@@ -262,7 +263,7 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
-        """The skin along the trajectories and its differences: 18 solutions of the data set by the condensed
+        """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
         tier, beside one of the simulator's own; kept in `cache`."""
         return solved_fields(self, trajectories, progress)
 
