@@ -7,9 +7,9 @@ import warp as wp
 
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.rubber.element_points import Kind, material_functions
-from biotac_mj.skin.rubber.law import barrier_energy, energy_density
+from biotac_mj.skin.rubber.law import COMPRESSED, barrier, energy_density
 from biotac_mj.skin.rubber.points import Mesh, Rubber, deformation_of
-from biotac_mj.skin.types import DOUBLE, real, vec3
+from biotac_mj.skin.types import DOUBLE, mat33, real, vec3
 
 __all__ = ["Elements", "begin", "commit", "energy_of", "gradients"]
 
@@ -72,6 +72,15 @@ class Elements:
         out = np.zeros((self.nvert, self.nworld, 3))
         np.add.at(out, np.repeat(np.arange(self.nvert), np.diff(start)), corner.numpy()[slot])
         return out
+
+
+@wp.func
+def barrier_energy(law: int, mu: real, F: mat33):
+    """Energy density of the barrier against total compression [J/m^3]."""
+    J = wp.determinant(F)
+    if law == 3 or J >= COMPRESSED:
+        return real(0.0)
+    return mu * COMPRESSED * barrier(J)[0]
 
 
 @functools.cache

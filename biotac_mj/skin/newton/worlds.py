@@ -121,7 +121,6 @@ class Worlds:
     start_rz: wp.array(dtype=real)  # `rz` at the start of the linear solve
     rz: wp.array(dtype=real)  # residual . preconditioned residual [J]
     body_residual: wp.array(dtype=real)  # twice the energy of the bodies' error of position [J]
-    norm: wp.array(dtype=real)  # of the residual [N]
     slope: wp.array(dtype=real)  # residual . direction at length 0 [J]
     low: wp.array(dtype=real)  # bracket of the step length
     high: wp.array(dtype=real)

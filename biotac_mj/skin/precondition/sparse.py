@@ -60,7 +60,6 @@ class SparseFactor:
         with single_thread():  # its fronts are small: more threads would wait for each other
             self._solver = SupernodalFactor(stiffness, self.elimination, free)
         self.size = stiffness.shape[0]
-        self._free = free
         self._index = np.full(len(vert), -1)
         self._index[free] = np.arange(len(free))
         self._cluster_nodes = self.elimination.clusters

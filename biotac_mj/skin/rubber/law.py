@@ -23,7 +23,9 @@ import warp as wp
 from ..types import double, mat33, narrow, real, single, vec3, widen
 
 __all__ = [
+    "COMPRESSED",
     "LAWS",
+    "barrier",
     "dilatation",
     "dilatation_gradient",
     "dilatation_hessian",
@@ -32,7 +34,6 @@ __all__ = [
     "polar_single",
     "polar_upright",
     "barrier_derivative",
-    "barrier_energy",
     "barrier_stress",
     "stress",
     "stress_derivative",
@@ -40,7 +41,7 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-_COMPRESSED = wp.constant(wp.float64(0.2))  # J0
+COMPRESSED = wp.constant(wp.float64(0.2))  # J0
 _FLAT = wp.constant(wp.float64(0.02))  # J below which the parabolas continue
 
 LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
@@ -308,7 +309,7 @@ def barrier(J: typing.Any):
     """f and its two derivatives with t at t = J / J0, in the precision of J."""
     one = type(J)(1.0)
     flat = type(J)(_FLAT)
-    limit = type(J)(_COMPRESSED)
+    limit = type(J)(COMPRESSED)
     t = wp.max(J, flat) / limit
     over = J / limit - t  # as in `isochoric`
     bend = (one + one) / (t * t * t) - (one + one)
@@ -318,19 +319,10 @@ def barrier(J: typing.Any):
 
 
 @wp.func
-def barrier_energy(law: int, mu: real, F: mat33):
-    """Energy density of the barrier against total compression [J/m^3]."""
-    J = wp.determinant(F)
-    if law == 3 or J >= _COMPRESSED:
-        return real(0.0)
-    return mu * _COMPRESSED * barrier(J)[0]
-
-
-@wp.func
 def barrier_stress(law: int, mu: real, F: mat33):
     """First Piola stress of the barrier [Pa]."""
     J = wp.determinant(F)
-    if law == 3 or J >= _COMPRESSED:
+    if law == 3 or J >= COMPRESSED:
         return mat33()
     return mu * barrier(J)[1] * cofactor(F)
 
@@ -339,8 +331,8 @@ def barrier_stress(law: int, mu: real, F: mat33):
 def barrier_derivative(law: int, mu: typing.Any, F: typing.Any, dF: typing.Any):
     """Directional derivative of the barrier's stress [Pa], in the precision of F."""
     J = wp.determinant(F)
-    if law == 3 or J >= type(J)(_COMPRESSED):
+    if law == 3 or J >= type(J)(COMPRESSED):
         return F - F
     f = barrier(J)
     G = cofactor(F)
-    return mu * (f[2] / type(J)(_COMPRESSED) * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
+    return mu * (f[2] / type(J)(COMPRESSED) * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
