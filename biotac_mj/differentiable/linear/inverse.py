@@ -60,7 +60,8 @@ class FaceBlocks:
 
 class FactorInverse:
     """(A - B + a b')^-1 of each world by the Woodbury identity, on the CPU; A is the stiffness of the factor
-    over `softness`.
+    over `softness`. All sums are in double precision: with the steps' preconditioner, whose sums over rows
+    are in single precision, GMRES takes as many products, but gradients are off by 1e-3.
 
     Args:
       factors: of the skin. softness: (nworld,), see `newton.worlds.Worlds`.
