@@ -75,7 +75,8 @@ class Preconditioner(Protocol):
         """Computes z for another r in the running worlds. partial: square of r by chunks."""
 
     def renew_if_due(self, program: Launcher, x: wp.array) -> None:
-        """After a linear solve at x [nvert, nworld]: takes the factor of this shape if solves were long."""
+        """After a linear solve at x [nvert, nworld]: takes the factor of this shape if solves were long; by
+        default never, as where a new inverse takes longer than the products that it saves."""
 
     def renew(self, program: Launcher, x: wp.array) -> None:
         """Takes the factor of the shape x, if the preconditioner supports it."""

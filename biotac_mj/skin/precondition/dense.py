@@ -16,7 +16,7 @@ from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds
 from ..program import Fork, Launcher
 from ..types import SINGLE
-from . import Residual, body_tangent, right_hand_sides, touching_nodes, woodbury
+from . import Preconditioner, Residual, body_tangent, right_hand_sides, touching_nodes, woodbury
 from .inverse import Inverse
 
 if typing.TYPE_CHECKING:
@@ -31,7 +31,7 @@ THREADS_FEW = 64  # block size with few worlds: small, so that more multiprocess
 LANES_FEW = 8  # threads that sum one node with few worlds: a single thread would wait for each read
 
 
-class DensePreconditioner:
+class DensePreconditioner(Preconditioner):
     """The dense preconditioner of all worlds of one SkinData, see `precondition.Preconditioner`.
 
     Attributes:
@@ -98,12 +98,6 @@ class DensePreconditioner:
     def begin_step(self, program: Launcher, x: wp.array) -> None:
         """Takes x, for the deformed shape; the undeformed inverse is valid for every step."""
         self._x = x
-
-    def renew_if_due(self, program: Launcher, x: wp.array) -> None:
-        """Does nothing: a new inverse would take longer than the products that it saves."""
-
-    def renew(self, program: Launcher, x: wp.array) -> None:
-        """Does nothing, see `renew_if_due`."""
 
     def update(
         self,
