@@ -209,102 +209,77 @@ def read_block(A: wp.array3d(dtype=float), w: int, row: int, column: int):
     )  # fmt: skip
 
 
-@wp.kernel
-def fill_system(
-    # In:
-    has_liquid: int,
-    size: wp.array(dtype=int),
-    link: wp.array3d(dtype=int),
-    spring: wp.array3d(dtype=wp.mat33),
-    W: wp.array3d(dtype=float),
-    on: wp.array(dtype=int),
-    threads: int,
-    # Out:
-    A_out: wp.array3d(dtype=float),
-):
-    """A = I + D W by blocks."""
-    w, t = wp.tid()
-    if on[w] == 0:
-        return
-    n = size[w]
-    if t == 0 and has_liquid == 1:
-        A_out[w, 0, 0] = 1.0 + STIFF * W[w, 0, 0]
-    for p in range(t, n * n, threads):
-        i = p // n
-        j = p % n
-        total = wp.mat33()
-        if i == j:
-            total = wp.identity(n=3, dtype=float)
-        for k in range(link.shape[2]):
-            l = link[w, i, k]
-            if l >= 0:
-                total += spring[w, i, k] * read_block(W, w, has_liquid + 3 * l, has_liquid + 3 * j)
-        row = has_liquid + 3 * i
-        column = has_liquid + 3 * j
-        for a in range(3):
-            for b in range(3):
-                A_out[w, row + a, column + b] = total[a, b]
-        if has_liquid == 1 and i == 0:
-            for b in range(3):
-                A_out[w, 0, column + b] = STIFF * W[w, 0, column + b]
-        if has_liquid == 1 and j == 0:
-            v = wp.vec3()
+def _spring_products(adjoint):
+    """Kernel that computes 1 + D X by blocks, or, with `adjoint`, the transpose of X D, so that threads which
+    sum one entry of a product with it each read neighbouring numbers. A spring is equal for both of its
+    nodes; it may be unsymmetric, as that of slip."""
+
+    @wp.func
+    def of_block(K: wp.mat33, X: wp.array3d(dtype=float), w: int, row: int, column: int):
+        if wp.static(adjoint):
+            return wp.transpose(read_block(X, w, column, row) * K)
+        return K * read_block(X, w, row, column)
+
+    @wp.func
+    def of_liquid(K: wp.mat33, X: wp.array3d(dtype=float), w: int, row: int):
+        if wp.static(adjoint):
+            return wp.transpose(K) * wp.vec3(X[w, 0, row], X[w, 0, row + 1], X[w, 0, row + 2])
+        return K * wp.vec3(X[w, row, 0], X[w, row + 1, 0], X[w, row + 2, 0])
+
+    @wp.kernel(module=f"{__name__}.{'adjoint' if adjoint else 'product'}", enable_backward=False)
+    def multiply(
+        # In:
+        has_liquid: int,
+        size: wp.array(dtype=int),
+        link: wp.array3d(dtype=int),
+        spring: wp.array3d(dtype=wp.mat33),
+        X: wp.array3d(dtype=float),
+        on: wp.array(dtype=int),
+        threads: int,
+        # Out:
+        out: wp.array3d(dtype=float),
+    ):
+        w, t = wp.tid()
+        if on[w] == 0:
+            return
+        n = size[w]
+        if t == 0 and has_liquid == 1:
+            out[w, 0, 0] = wp.static(0.0 if adjoint else 1.0) + STIFF * X[w, 0, 0]
+        for p in range(t, n * n, threads):
+            i = p // n
+            j = p % n
+            row = has_liquid + 3 * i
+            column = has_liquid + 3 * j
+            total = wp.mat33()
+            if wp.static(not adjoint):
+                if i == j:
+                    total = wp.identity(n=3, dtype=float)
             for k in range(link.shape[2]):
-                at = 1 + 3 * link[w, i, k]
-                if at > 0:
-                    v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
+                l = link[w, i, k]
+                if l >= 0:
+                    total += of_block(spring[w, i, k], X, w, has_liquid + 3 * l, column)
             for a in range(3):
-                A_out[w, row + a, 0] = v[a]
+                for b in range(3):
+                    out[w, row + a, column + b] = total[a, b]
+            if has_liquid == 1 and i == 0:
+                for b in range(3):
+                    if wp.static(adjoint):
+                        out[w, 0, column + b] = STIFF * X[w, column + b, 0]
+                    else:
+                        out[w, 0, column + b] = STIFF * X[w, 0, column + b]
+            if has_liquid == 1 and j == 0:
+                v = wp.vec3()
+                for k in range(link.shape[2]):
+                    l = link[w, i, k]
+                    if l >= 0:
+                        v += of_liquid(spring[w, i, k], X, w, 1 + 3 * l)
+                for a in range(3):
+                    out[w, row + a, 0] = v[a]
+
+    return multiply
 
 
-@wp.kernel
-def multiply_springs(
-    # In:
-    has_liquid: int,
-    size: wp.array(dtype=int),
-    link: wp.array3d(dtype=int),
-    spring: wp.array3d(dtype=wp.mat33),
-    B: wp.array3d(dtype=float),
-    on: wp.array(dtype=int),
-    threads: int,
-    # Out:
-    G_out: wp.array3d(dtype=float),
-):
-    """G = B D. It is stored transposed, so that threads which sum one entry each read neighbouring numbers. A
-    spring is equal for both of its nodes."""
-    w, t = wp.tid()
-    if on[w] == 0:
-        return
-    n = size[w]
-    if t == 0 and has_liquid == 1:
-        G_out[w, 0, 0] = STIFF * B[w, 0, 0]
-    for p in range(t, n * n, threads):
-        j = p // n
-        i = p % n
-        row = has_liquid + 3 * i
-        column = has_liquid + 3 * j
-        total = wp.mat33()
-        for k in range(link.shape[2]):
-            l = link[w, j, k]
-            if l >= 0:
-                total += read_block(B, w, row, has_liquid + 3 * l) * spring[w, j, k]
-        for a in range(3):
-            for b in range(3):
-                G_out[w, column + b, row + a] = total[a, b]
-        if has_liquid == 1 and j == 0:
-            for a in range(3):
-                G_out[w, 0, row + a] = STIFF * B[w, row + a, 0]
-        if has_liquid == 1 and i == 0:
-            v = wp.vec3()
-            for k in range(link.shape[2]):
-                at = 1 + 3 * link[w, j, k]
-                if at > 0:
-                    push = wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
-                    v += (
-                        wp.transpose(spring[w, j, k]) * push
-                    )  # from the left, since the tangent of slip may be unsymmetric
-            for b in range(3):
-                G_out[w, column + b, 0] = v[b]
+fill_system, multiply_springs = _spring_products(False), _spring_products(True)
 
 
 @wp.kernel
