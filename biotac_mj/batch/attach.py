@@ -11,7 +11,7 @@ import warp as wp
 
 from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_two_way
 from ..coupling.handle import SENSORS
-from ..coupling.implicit import energy, poses, rounds
+from ..coupling.implicit import energy, poses, rounds, rows
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.sensing.counts import film_of
 from ..coupling.settings import SensorSettings, SettingKeywords, Settings
@@ -57,7 +57,7 @@ __all__ = ["attach", "make"]
 
 # what takes long to compile, or is launched first: it begins before the skin is made
 _KERNELS = [rest_gap.module, meshes, closest, liquid, release, rest, rounds, film_kernels, core_surface]
-_KERNELS += [kernels, transfer, acquisition_kernels, poses, dynamics, energy, integrator, skin_kernels]
+_KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, dynamics, energy, integrator, skin_kernels]
 # keywords of `biotac_mj.attach` that a batch has no use for
 _NOT_OF_WORLDS = ("device", "stepper", "on_error")
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)

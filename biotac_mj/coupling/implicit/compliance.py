@@ -101,6 +101,12 @@ def factor(
         sync()
 
 
+# an overload that a launch makes would change the module after it was compiled
+for _real in (wp.float32, wp.float64):
+    _arrays = {"inertia": wp.array2d(dtype=_real), "J": wp.array3d(dtype=_real), "D": wp.array2d(dtype=_real)}
+    wp.overload(factor, _arrays)
+
+
 @wp.func
 def substitute(L: wp.array3d(dtype=real), w: int, c: int, x: wp.array3d(dtype=real)):
     """Solves L L' y = x[w, c] in place, by one thread."""

@@ -70,3 +70,9 @@ def write_rows(
         elif n < rownnz[w, r]:
             at = rowadr[w, r] + n
             J_out[w, 0, at] = type(J_out[w, 0, at])(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
+
+
+# an overload that a launch makes would change the module after it was compiled
+for _real in (wp.float32, wp.float64):
+    _arrays = {name: wp.array2d(dtype=_real) for name in ("D_out", "aref_out", "pos_out")}
+    wp.overload(write_rows, _arrays | {"J_out": wp.array3d(dtype=_real)})
