@@ -127,7 +127,7 @@ def assemble(
     size = np.ptp(mesh.vert, axis=0).max() * 1e3
     if not 5.0 <= size <= 100.0:
         raise ValueError(
-            f"the skin's largest dimension is {size:.4g} mm, not between 5 and 100 mm: is the file in metres?"
+            f"the skin's largest dimension is {size:.4g} mm, not between 5 and 100 mm: scale it to metres"
         )
     bodies = [(core, "core"), (nail, "nail plate"), (clamp, "clamp plate")]
     for (vert, face), label in bodies:

@@ -28,8 +28,7 @@ def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeomet
 
     Raises:
       FileNotFoundError: no such path, or no mesh in the folder.
-      ValueError: unreadable file, a mesh that `TetMesh.check` refuses, wrong units, missing rigid bodies; the
-        text says what to do.
+      ValueError: an unreadable file, missing rigid bodies, or a mesh that `assemble` refuses.
     """
     path = pathlib.Path(path)
     if path.is_dir():
@@ -42,13 +41,7 @@ def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeomet
                 "pass the path of one of them"
             )
         path = found[0]
-    mesh = read_tet_mesh(path).check()
-    size = np.ptp(mesh.vert, axis=0).max()
-    if not 0.005 <= size <= 0.1:
-        raise ValueError(
-            f"{path.name}: the largest dimension is {size:.4g} m, "
-            "not between 0.005 and 0.1 m (5 to 100 mm): scale the file to metres"
-        )
+    mesh = read_tet_mesh(path)
     core, nail, clamp = _rigid_bodies(path.parent)
     return assemble(name or path.parent.name, mesh, core, nail, clamp)
 
