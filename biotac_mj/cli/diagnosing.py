@@ -91,7 +91,7 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         "fraction of the data held out for the test (default: "
         "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     )
-    verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="SHARE", help=kept)
+    verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="FRACTION", help=kept)
     verb.add_argument(
         "--tier",
         default="full",
