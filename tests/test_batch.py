@@ -494,8 +494,8 @@ def test_a_step_without_a_balance_pulls_no_ball():
             mujoco.mj_step(model, data)
             push.append(biotac.read(data, "contact_force")[1])
             settled.append(biotac.read(data, "status")[0])
-        batch_push, batch_settled = [], []  # with the work that mj_step has
-        for _, mjm, d, _ in thrown([speed], 0.0, 0.1, 2e-3, 14, options={"skin": {"max_work": 145}}):  # noqa: B007
+        batch_push, batch_settled = [], []  # with even less work than mj_step has
+        for _, mjm, d, _ in thrown([speed], 0.0, 0.1, 2e-3, 14, options={"skin": {"max_work": 80}}):  # noqa: B007
             batch_push.append(read(mjm, d, "contact_force")[0, 1])
             batch_settled.append(read(mjm, d, "status")[0, 0])
         unsettled += np.sum(np.equal(settled, 0)), np.sum(np.equal(batch_settled[1:], 0))

@@ -431,43 +431,41 @@ def test_a_geom_deep_in_the_core_is_told_and_survived():
     assert handle.read(data, "contact_force")[1] > 0.1
 
 
-def test_an_unconverged_step_keeps_the_last_state_and_is_counted():
-    model, data, handle = pressing(
-        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}}, **COARSE
-    )
-    data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
-    mujoco.mj_step(model, data, 5)
-    failed = handle.read(data, "status")[1]
-    good, force = data.plugin_state.copy(), handle.read(data, "contact_force")
-    assert handle.read(data, "status")[0] == 1 and force[1] > 0
-    data.mocap_pos[0, 2] -= 2.2e-3  # on the core at once: three iterations cannot
-    mujoco.mj_step(model, data, 2)
+def test_an_unconverged_step_goes_on_from_its_iterate():
+    """What acts is the contact law there: 2.2 mm deeper than a touch it is nine times as large as the touch's
+    linear model."""
+    onto_the_core = []
+    for options in ({}, {"max_newton": 3}):
+        model, data, handle = pressing(
+            f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": options}, **COARSE
+        )
+        data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
+        mujoco.mj_step(model, data, 5)
+        failed, force = handle.read(data, "status")[1], handle.read(data, "contact_force")
+        assert handle.read(data, "status")[0] == 1 and force[1] > 0
+        data.mocap_pos[0, 2] -= 2.2e-3  # on the core at once: three iterations cannot
+        mujoco.mj_step(model, data, 2)
+        onto_the_core.append(handle.read(data, "contact_force"))
     status = handle.read(data, "status")
     assert status[0] == 0 and status[1] == failed + 2 and status[3] > 3e-4
-    # what acts is its linear model where the ball is now, deeper along +y of the BioTac
-    tangent = good[3 + 6 : 3 + 42].reshape(6, 6)
-    acting = force + tangent @ [0, 2.2e-3, 0, 0, 0, 0]
-    np.testing.assert_allclose(handle.read(data, "contact_force"), acting, rtol=1e-3, atol=1e-6)
-    assert np.array_equal(
-        data.plugin_state[3 + 68 :], good[3 + 68 :]
-    )  # all but the counters and the pose of the one touching body
-    data.mocap_pos[0, 2] += 2.2e-3
-    mujoco.mj_step(model, data, 3)
-    assert handle.read(data, "status")[:2].tolist() == [1, status[1]]
+    np.testing.assert_allclose(*onto_the_core[::-1], atol=0.02 * onto_the_core[0][1])
+    data.mocap_pos[0, 2] += 2.2e-3  # and back: the skin begins anew where that is in vain, too
+    mujoco.mj_step(model, data, 8)
+    assert handle.read(data, "status")[0] == 1
     np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.01, atol=1e-5)
 
 
 def test_a_press_that_asked_for_too_much_work_goes_on():
-    """Where a body is held, whatever the skin does, the next step may be dearer: it would be as hard, in vain
-    and for ever."""
+    """From its iterate, where a body is held whatever the skin does: it would be as hard, in vain and for
+    ever."""
     model, data, handle = pressing(
-        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_work": 20}}, **COARSE
+        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_work": 12}}, **COARSE
     )
     data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
     mujoco.mj_step(model, data, 5)
     data.mocap_pos[0, 2] -= 6e-4
     mujoco.mj_step(model, data)
-    assert handle.read(data, "status")[[0, 6]].tolist() == [0, 0]
+    assert handle.read(data, "status")[[0, 6]].tolist() == [0, 1]
     mujoco.mj_step(model, data)
     assert handle.read(data, "status")[[0, 6]].tolist() == [1, 1]
     assert handle.read(data, "contact_force")[1] > 0.3

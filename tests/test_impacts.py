@@ -651,3 +651,35 @@ def test_a_box_that_sank_beside_a_press_comes_up_with_it():
         withheld = max(withheld, handle.read(data, "status")[7])
     assert withheld == 0.0
     assert min(height) < height[0] - 1e-4 and height[-1] == pytest.approx(height[0], abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    "half, mass, timestep, pos, quat, velocity",
+    [
+        ((4e-3, 4.4e-3, 2.1e-3), 0.0042, 0.001, (-0.0098, 0.0001), (0.27, -0.03, 0.36, -0.89),
+         (0.08, -0.02, -1.12, -1.9, 2.32, 4.12)),
+        ((3.4e-3, 4.8e-3, 5.4e-3), 0.0514, 0.004, (-0.0075, -0.0026), (0.02, 0.35, 0.71, -0.61),
+         (0.03, 0.19, -0.7, -3.43, 3.43, -15.36)),
+    ],
+)  # fmt: skip
+def test_a_box_that_leaves_is_not_pulled(half, mass, timestep, pos, quat, velocity):
+    """In the full tier, where solves of steps on its edges and corners are cut off: what acts then is the
+    contact law at the best iterate, and the law pushes."""
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" gravity="0 0 0"/><worldbody>'
+        '<site name="mount" quat="1 -1 0 0"/>'
+        f'<body name="box" pos="{pos[0]} {pos[1]} .0235" quat="{" ".join(map(str, quat))}"><freejoint/>'
+        f'<geom type="box" size="{" ".join(map(str, half))}" mass="{mass}"/></body></worldbody></mujoco>'
+    )
+    handle = biotac_mj.attach(spec, site="mount", tier="full", skin="coarse", readings="none")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = velocity
+    push, settled = [], []
+    while len(push) < 60 and not (push and push[-1] == 0 and max(push) > 0):
+        mujoco.mj_step(model, data)
+        push.append(handle.read(data, "contact_force")[1])
+        settled.append(handle.read(data, "status")[0])
+    assert max(push) > 1 and data.qvel[2] > 0.1 * abs(velocity[2])
+    assert min(push) > -1e-3 * max(push)
+    assert not all(settled)

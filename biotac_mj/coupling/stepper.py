@@ -63,7 +63,8 @@ class SkinResult:
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
       load_factor: fraction of the touching bodies' motion in this step at which all this holds: 1 where it
-        converged; of their way into the skin, where they are deeper in the core than one fits.
+        converged, or was cut off at an iterate that goes all the way; of their way into the skin, where they
+        are deeper in the core than one fits.
       pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
       load: (k,) size of the force on each contact that the state holds [N], where somebody may want it.
       cost: of the solve, as a share of what a hard one may cost.

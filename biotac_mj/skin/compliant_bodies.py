@@ -25,7 +25,8 @@ class CompliantBodies:
             self._wrench = wp.zeros((n, w, 6), dtype=real)
             self._stiffness = wp.zeros((n, *self._faces), dtype=wp.spatial_matrixd)
             self._load = wp.zeros((2 * n, *self._faces), dtype=vec3)
-            self._none = wp.zeros(self._groups, dtype=wp.spatial_vectord)
+            self._none, self._least = (wp.zeros(self._groups, dtype=wp.spatial_vectord) for _ in range(2))
+            self._x_least = wp.zeros_like(self._data.x)
             self.needs_wrench = wp.zeros(w, dtype=int)
         # a view of `_wrench` with the type that the kernels here take
         self._data.body_contact.skin_wrench = wp.array(
@@ -73,6 +74,18 @@ class CompliantBodies:
     def restore(self, program: Launcher, on: wp.array) -> None:
         """Returns to the wrenches of the last accepted increment."""
         self._set(program, self._data.bodies.converged, on, self._data.bodies.posed)
+
+    def keep_iterate(self, program: Launcher) -> None:
+        """Keeps the iterate of the least error."""
+        d, on = self._data, self._data.worlds.improved
+        self._set(program, d.bodies.posed, on, self._least)
+        self._set(program, d.x, on, self._x_least)
+
+    def take_iterate(self, program: Launcher) -> None:
+        """Takes it in the worlds that are cut off."""
+        d, on = self._data, self._data.worlds.cut_off
+        self._set(program, self._least, on, d.bodies.posed)
+        self._set(program, self._x_least, on, d.x)
 
     def release(self, program: Launcher, on: wp.array) -> None:
         """Sets the wrenches to zero."""
@@ -143,7 +156,7 @@ class CompliantBodies:
         self._launch(program, self._kernels.add_body_forces, (self._k.nchunk, d.nworld), inputs, [r, square])
 
     def _set(self, program, value, on, out):
-        self._launch(program, nodes.set_where, self._groups, [value, on, out])
+        self._launch(program, nodes.set_where, out.shape, [value, on, out])
 
     def _launch(self, program, kernel, dim, inputs, outputs=()):
         self._forces.launch(program, kernel, dim, inputs, outputs)

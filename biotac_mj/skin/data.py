@@ -127,7 +127,7 @@ class SkinData:
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
       load_factor: (nworld,) fraction of the geoms' path in the last step at which positions, wrench, pressure
-        and tangent are valid: 1 if it converged.
+        and tangent are valid: 1 if it converged, or ended with its best iterate (`load_path.end_path`).
       nonconverged: (nworld,) number of steps since the reset that did not converge.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.

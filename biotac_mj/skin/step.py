@@ -58,6 +58,7 @@ _FREE = (
 make_second_solve = None
 
 _LEAST_INCREMENT = 1 / 32  # of the load factor
+_PASSING = 1e-2  # tolerance of increments that a step goes through, where bodies give way
 
 
 def step(
@@ -346,7 +347,7 @@ class SkinStep:
         if self._compliant:
             self._compliant.begin(program, touched_by)
         self.M.begin_step(program, d.x)
-        bounds = [m.options.max_newton, m.options.max_work]
+        bounds = [m.options.max_newton, m.options.max_work, int(self._compliant is not None)]
         given = [m.law, m.material.youngs_modulus, *bounds, g.struct, motion, st]
         self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._path, k.flags])
         if self._compliant:
@@ -361,7 +362,7 @@ class SkinStep:
             program.branch(self._any_pending, self._find_pending)
         self._try()
         program.loop(self._any_open, self._try_next)
-        self._launch(load_path.end_path, w, [st], [self._any_short])
+        self._launch(load_path.end_path, w, [bounds[2], st], [self._any_short])
         program.branch(self._any_short, self._stay)
         self._finish(motion, touched_by, wrench)
 
@@ -474,6 +475,9 @@ class SkinStep:
     def _stay(self):
         """Sets nodes and geoms to the end of the load path, and evaluates forces and tangents there."""
         self._place(self.st.load_factor, self.st.moving)
+        if self._compliant:
+            self._compliant.take_iterate(self._launcher)
+            self._pose(self.st.load_factor, self.st.cut_off)
         self._forces.evaluate(self._launcher, self.st.moving)
         self._precondition()
 
@@ -500,8 +504,11 @@ class SkinStep:
         """Updates residual, preconditioner and the first direction, and tests for convergence."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
-        bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid), self.d.rest_pressure]
+        passing = max(m.options.tolerance, _PASSING) if self._compliant else m.options.tolerance
+        bounds = [m.options.tolerance, passing, m.options.max_work, int(m.has_liquid), self.d.rest_pressure]
         self._decide(convergence.check_convergence, [*bounds, k.partial, k.norms, st], [self._newton_on])
+        if self._compliant:
+            self._compliant.keep_iterate(self._launcher)
         if m.has_liquid:
             given = [m.free_mask, self.d.gradient, st]
             self._launch(nodes.correct_pressure, self.d.x.shape, given, [self.d.x, self.d.force])

@@ -36,6 +36,7 @@ def _finishes(error: real, last: real, tolerance: real, left: int):
 def check_convergence(
     # In:
     tolerance: real,
+    passing: real,
     max_work: int,
     has_liquid: int,
     rest_pressure: wp.array(dtype=real),
@@ -50,11 +51,14 @@ def check_convergence(
 
     If only the pressure is above its tolerance, by at most a factor of `_CORRECTED`, the world converges with
     the pressure that z predicts. In a stiff liquid the nodes move by picometres for it, see
-    `nodes.correct_pressure`."""
+    `nodes.correct_pressure`.
+
+    passing: tolerance of load increments within the path."""
     w, t = wp.tid()
     if st.active[w] == 0:
         if t == 0:
             st.pressure_correction[w] = real(0.0)
+            st.improved[w] = 0
         return
     # read before the sums, so that both take place at the same time: a read after a write waits for it
     viscosity = st.viscosity[w]
@@ -91,6 +95,7 @@ def check_convergence(
     gz = total[4]
     gg = total[5]
     st.pressure_correction[w] = real(0.0)
+    st.improved[w] = 0
     if not wp.isfinite(rr + rz):
         st.active[w] = 0
         st.failed[w] = 1
@@ -109,11 +114,16 @@ def check_convergence(
     st.last_error[w] = error
     st.error[w] = wp.sqrt(far / work)
     enough = tolerance
+    if st.trial_factor[w] < real(1.0):
+        enough = passing
+    elif st.error[w] < st.least_error[w] and st.inverted[w] < 2:
+        st.least_error[w] = st.error[w]
+        st.improved[w] = 1
     needs_pressure = has_liquid
     if iterations == start_iterations:
         st.start_error[w] = wp.sqrt(far / work)
     elif friction_mode == LAGGED:  # the friction bounds are not known more accurately
-        enough = wp.max(tolerance, _LAGGED_TOLERANCE * start_error)
+        enough = wp.max(enough, _LAGGED_TOLERANCE * start_error)
         needs_pressure = 0
     if far < real(0.25) * best:
         st.best_square[w] = far

@@ -253,11 +253,22 @@ def place_geoms(
 
 
 @wp.kernel
-def end_path(st: Worlds, any_short: wp.array(dtype=int)):
+def end_path(keeps_iterate: int, st: Worlds, any_short: wp.array(dtype=int)):
     """Ends the load path of world w. Worlds that did not reach its end are moving; they have failed if no
-    increment converged."""
+    increment converged.
+
+    keeps_iterate: 1 where bodies give way: there a step ends with the iterate at the end of its path whose
+    error was least, if that is less than the share of the path that the increments did not go. Its forces are
+    those of the contact law where the bodies go, and so push."""
     w = wp.tid()
     f = st.load_factor[w]
+    st.cut_off[w] = 0
+    if keeps_iterate == 1 and st.wanted[w] == 1 and st.reason[w] != NOT_FINITE:
+        if st.least_error[w] < real(1.0) - f:
+            st.cut_off[w] = 1
+            st.load_factor[w] = real(1.0)
+            st.error[w] = st.least_error[w]
+            f = real(1.0)
     st.moving[w] = 0
     st.failed[w] = 1 - st.wanted[w]
     if st.wanted[w] == 0:

@@ -110,6 +110,9 @@ class Worlds:
     rounds: wp.array(dtype=int)  # equilibria with lagged friction bounds in this increment
     start_error: wp.array(dtype=real)  # `error` at the start of the try
     reference_try: wp.array(dtype=int)  # whether a try from the reference configuration was made
+    least_error: wp.array(dtype=real)  # of an iterate at the end of the path; bodies give way
+    improved: wp.array(dtype=int)  # `least_error` is that of the present iterate
+    cut_off: wp.array(dtype=int)  # the step ends with the iterate of the least error
     guessed: wp.array(dtype=int)  # the step repeats the last increment, and is not cut back
     repeat: wp.array(dtype=real)  # factor on the last increment in the initial guess
     # linear solve and line search
@@ -191,6 +194,7 @@ def begin_worlds(
     youngs_modulus: real,
     limit: int,
     max_work: int,
+    keeps_iterate: int,
     geoms: Geoms,
     motion: wp.array2d(dtype=vec3),
     st: Worlds,
@@ -201,7 +205,10 @@ def begin_worlds(
     flags: wp.array(dtype=int),
 ):
     """Starts the step of world w: checks its input, sets the load path, and finds the factor on the last
-    increment for the initial guess from how closely the touching geoms repeat their last motion."""
+    increment for the initial guess from how closely the touching geoms repeat their last motion.
+
+    keeps_iterate: see `load_path.end_path`: what the first try comes to is not lost, so that it may take all
+    work but what increments need at least."""
     w = wp.tid()
     if w == 0:
         for k in range(flags.shape[0]):
@@ -257,10 +264,13 @@ def begin_worlds(
     st.active[w] = finite
     st.failed[w] = 0
     st.deep[w] = 0
+    st.least_error[w] = real(1.0e300)
     st.iterations[w] = 0
     st.work[w] = st.spent[w]
     st.friction_mode[w] = CURRENT
     begin_try(st, w, limit, max_work)
+    if keeps_iterate == 1:
+        st.work_limit[w] = st.work[w] + 9 * (max_work - st.work[w]) / 10
     if st.guessed[w] == 1:  # no increment follows
         st.work_limit[w] = max_work
     st.load_factor[w] = real(0.0)
