@@ -1,6 +1,7 @@
 """The proof: what is written as a sensor file is what is judged, group by group, on data kept aside."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from test_discrepancy_workflow import Springs, measured
 from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
-from biotac_mj.discrepancy.trajectories.proof import proved
+from biotac_mj.discrepancy.trajectories.proof import _closed, _Off, proved
 from biotac_mj.discrepancy.trajectories.workflow import about_rests
 from biotac_mj.effects.catalogue import by_id
 
@@ -75,3 +76,10 @@ def test_errors_of_poses_are_taken_out_of_residuals(late):
         along = u.T @ (written[i] / comparison.sigmas[i]).ravel()
         left = u.T @ (residual / comparison.sigmas[i]).ravel()
         np.testing.assert_allclose(left, along / (1 + s**2), atol=1e-9)
+
+
+def test_what_is_left_beyond_resolution_is_not_of_the_base():
+    comparison = types.SimpleNamespace(noises=np.ones(2), sigmas=[np.full(2, 2.0)])
+    residuals = np.full((5, 2), 10.0), np.full((5, 2), 6.0)
+    sides = [(None, [r], _Off(float(((r**2).mean(1) - 1).sum()), 0.0)) for r in residuals]
+    assert _closed(comparison, *sides, 0.05, [0]) == pytest.approx(1 - np.sqrt((35 - 3) / (99 - 3)))

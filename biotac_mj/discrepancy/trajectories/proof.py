@@ -130,13 +130,13 @@ def _closed(comparison, before, after, law, aside):
     change by which their laws may be off.
 
     What they leave beyond noise is what their laws lack and what the base model is off by, each as much as is
-    expected of it: that share, and the model's resolution."""
+    expected of it: that share, and the model's resolution, which the base is off by at most."""
     (_, first, begun), (_, last, left) = before, after
     change = sum((((a - b) / comparison.noises) ** 2).mean(1).sum() for a, b in zip(first, last))
     base = sum(
         len(r) * ((comparison.sigmas[i] / comparison.noises) ** 2 - 1).mean() for i, r in zip(aside, last)
     )
     remains = max(left.channels, 0.0)
-    lacking = remains * law**2 * change / max(law**2 * change + base, 1e-12)
-    hidden = begun.channels - remains + lacking
+    of_base = min(base, remains * base / max(law**2 * change + base, 1e-12))
+    lacking, hidden = remains - of_base, begun.channels - of_base
     return float(1 - np.sqrt(lacking / hidden)) if hidden > lacking else 0.0
