@@ -36,16 +36,6 @@ class Memory(SavedState):
         """Forces (k,) on these coordinates [N]."""
         return self.forces[:, 1]
 
-    @property
-    def softening(self) -> float:
-        """Softening at which the forces were computed."""
-        return float(self.solved[0])
-
-    @property
-    def swelling(self) -> float:
-        """Swelling at which the forces were computed."""
-        return float(self.solved[1])
-
     def key(self) -> tuple:
         """All variables on which the nodes depend."""
         return self.forces.tobytes(), self.pressure, self.solved.tobytes()
