@@ -145,6 +145,8 @@ class FemStepper:
     def put(
         self, state: np.ndarray, placed: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
     ) -> np.ndarray:
+        if self.inertial and not self._part(state, "started")[0]:
+            return state  # the skin begins with the core's motion, geoms where they go
         saved, (pos, mat) = self._layout.read(state), (a.copy() for a in self.came_to(state))
         if not self._model.device.is_cuda and self._overlaps(geom_pos, geom_mat):
             geom_pos = self._proximity.outside(geom_pos, geom_mat, self._reach)

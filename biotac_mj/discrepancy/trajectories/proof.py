@@ -109,20 +109,28 @@ def _by_chance(comparison, aside):
     return np.sqrt(2 * sum(len(comparison.trajectories[i].time) for i in aside) / comparison.width)
 
 
+def _independent(comparison, i):
+    """As how many independent rows of a trajectory each channel counts (width,): what the model misses is the
+    same in all rows, noise is another in each."""
+    rows = len(comparison.trajectories[i].time)
+    alike = 1 - (comparison.noises / comparison.sigmas[i]) ** 2
+    return rows / (1 + (rows - 1) * alike**2)
+
+
 def _worse(comparison, before, after, aside) -> bool:
     """Whether trajectories are further off than before, all channels together or a group of them, by what
     counts as evidence."""
     rows = np.mean([len(comparison.trajectories[i].time) for i in aside])
-    loss = [excess(after[0]["mean_square"]) - excess(before[0]["mean_square"])]
+    loss = [rows * (excess(after[0]["mean_square"]) - excess(before[0]["mean_square"]))]
+    independent = np.array([_independent(comparison, i) for i in aside])
     squares = [
         np.array([((r / comparison.sigmas[i]) ** 2).mean(0) for i, r in zip(aside, residuals)])
         for _, residuals, _ in (before, after)
     ]
-    loss += [
-        excess(squares[1][:, part].mean(1)) - excess(squares[0][:, part].mean(1))
-        for part in comparison.groups.values()
-    ]
-    return bool(0.5 * rows * max(loss) > _NATS)
+    for part in comparison.groups.values():
+        first, last = (np.log(np.maximum(square[:, part].mean(1), 1.0)) for square in squares)
+        loss.append(np.mean(independent[:, part].mean(1) * (last - first)))
+    return bool(0.5 * max(loss) > _NATS)
 
 
 def _closed(comparison, before, after, law, aside):
