@@ -20,6 +20,7 @@ from biotac_mj.files import replacing
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import quaternion_from_y
 from biotac_mj.geometry.solid import bounds_solid
+from biotac_mj.geometry.tet_mesh import enclosed_volume
 from biotac_mj.press import PressOptions, approach, build_scene, plan_path, press, render, report
 from biotac_mj.press.indenter import make_indenter
 from biotac_mj.press.record import write_readings, write_skin
@@ -250,6 +251,22 @@ def test_indenter_meshes_are_checked(tmp_path):
     trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], process=False).export(tmp_path / "inside_out.obj")
     shape = make_indenter(f"mesh:{tmp_path / 'inside_out.obj'}")
     assert bounds_solid(shape.vert, shape.face)
+    inside_out, larger = (trimesh.Trimesh(s * ball.vertices, ball.faces[:, ::-1]) for s in (1, 2))
+    cavity, beside = inside_out.copy(), inside_out.copy().apply_translation([9e-3, 0, 0])
+    upright = trimesh.Trimesh(2 * ball.vertices, ball.faces)
+    for shells, volume in (
+        ([ball, beside], 2),  # of equal size
+        ([upright, beside], 9),
+        ([larger, beside], 9),
+        ([upright, cavity], 7),
+        ([larger, ball, beside], 8),
+    ):
+        trimesh.util.concatenate(shells).export(tmp_path / "shells.stl")
+        shape = make_indenter(f"mesh:{tmp_path / 'shells.stl'}")
+        assert enclosed_volume(shape.vert, shape.face) == pytest.approx(volume * ball.volume, rel=1e-4)
+        assert bounds_solid(shape.vert, shape.face)
+    pair = trimesh.util.concatenate([upright, beside])
+    assert not bounds_solid(pair.vertices, pair.faces)
     trimesh.creation.icosphere(radius=3.0).export(tmp_path / "big.obj")
     with pytest.raises(ValueError, match="must be in metres"):
         make_indenter(f"mesh:{tmp_path / 'big.obj'}")

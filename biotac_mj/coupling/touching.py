@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from ..geometry.rigid import matrix
-from ..geometry.solid import bounds_solid, close_rim, convex_hull, ground
+from ..geometry.solid import bounds_solid, close_rim, convex_hull, face_outwards, ground
 from .config import OWN, Config
 from .stepper import Geom
 from .structs import ModelView
@@ -379,7 +379,7 @@ def _hull_points(model, mesh):
 def _solid(vert, face, hull):
     """Mesh ((n, 3), (m, 3)) that stands for one given as bytes, or None, and whether it is that one."""
     vert = np.frombuffer(vert, np.float32).reshape(-1, 3).astype(np.float64)
-    face = np.frombuffer(face, np.int32).reshape(-1, 3)
+    face = face_outwards(vert, np.frombuffer(face, np.int32).reshape(-1, 3))
     if bounds_solid(vert, face):
         return (vert, face), True
     number = np.frombuffer(hull, np.int32)

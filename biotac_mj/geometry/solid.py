@@ -1,14 +1,25 @@
 """Triangle meshes as solids: tests whether a mesh bounds a solid, convex hulls, solids of height fields."""
 
 import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["bounds_solid", "close_rim", "convex_hull", "fills_hull", "ground", "no_solid", "spread_points"]
+__all__ = [
+    "bounds_solid",
+    "close_rim",
+    "convex_hull",
+    "face_outwards",
+    "fills_hull",
+    "ground",
+    "no_solid",
+    "spread_points",
+]
 
 
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
     """Whether a mesh (n, 3) [m], (m, 3) bounds a solid: every edge is traversed equally often in both
-    directions, and faces are oriented outwards. Vertices within 1 nm are merged."""
+    directions, and the outermost shells face outwards. Vertices within 1 nm are merged."""
     return no_solid(vert, face) is None
 
 
@@ -16,12 +27,8 @@ def no_solid(vert: np.ndarray, face: np.ndarray) -> str | None:
     """Why a mesh does not bound a solid, see `bounds_solid`, and the remedy; None if it does."""
     if not len(face):
         return "has no faces: give a triangle mesh"
-    _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
-    welded = merged.reshape(-1)[face]
-    edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    there, back = (np.sort(edges @ [len(vert), 1][::step]) for step in (1, -1))
-    if not np.array_equal(there, back):
+    edges, _, (there, back) = _half_edges(vert, face)
+    if not np.array_equal(np.sort(there), np.sort(back)):
         _, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
         odd = int((count % 2).sum())
         if odd:
@@ -30,7 +37,58 @@ def no_solid(vert: np.ndarray, face: np.ndarray) -> str | None:
     volume = np.linalg.det(vert[face] - vert.mean(axis=0))
     if abs(volume.sum()) <= 1e-6 * np.abs(volume).sum():
         return "encloses no volume: give a solid"
-    return None if volume.sum() > 0 else "is inside out: flip its faces, so that all normals point outwards"
+    if volume.sum() > 0 and np.array_equal(face_outwards(vert, face), face):
+        return None
+    return "is inside out: flip its faces, so that all normals point outwards"
+
+
+def _half_edges(vert, face):
+    """Half edges (k, 2) of a mesh with vertices within 1 nm merged, the face of each (k,), and numbers (k,)
+    of each and of its opposite."""
+    _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
+    welded = merged.reshape(-1)[face]
+    edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
+    long = edges[:, 0] != edges[:, 1]
+    edges, owner = edges[long], np.tile(np.arange(len(face)), 3)[long]
+    return edges, owner, [edges @ [len(vert), 1][::step] for step in (1, -1)]
+
+
+def face_outwards(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Faces (m, 3) of a closed mesh (n, 3) [m], each shell that is inside no other one turned outwards, and
+    with it what is inside it, so that a cavity stays one. An open mesh stays as it is."""
+    _, owner, edges = _half_edges(vert, face)
+    there, back = (np.lexsort((owner, number)) for number in edges)
+    if not np.array_equal(edges[0][there], edges[1][back]):
+        return face
+    joined = sparse.coo_array((np.ones(len(owner)), (owner[there], owner[back])), shape=[len(face)] * 2)
+    _, part = connected_components(joined, directed=False)
+    volume = np.bincount(part, np.linalg.det(vert[face] - vert.mean(axis=0)))
+    # degenerate faces are shells of no volume
+    inwards = np.flatnonzero(volume < -1e-9 * np.abs(volume).sum())
+    others = np.flatnonzero(np.abs(volume) > 1e-9 * np.abs(volume).sum())
+    shell = {k: face[part == k] for k in others.tolist()} if len(inwards) else {}
+    turned = []
+    for k in inwards.tolist():
+        if not any(_inside(vert, shell[k], other) for other in shell.values()):
+            turned += [k, *(j for j, other in shell.items() if _inside(vert, other, shell[k]))]
+    return np.where(np.isin(part, turned)[:, None], face[:, ::-1], face)
+
+
+def _inside(vert, inner, outer):
+    """Whether a shell (k, 3) is inside another one (m, 3)."""
+    point, corner = vert[inner].reshape(-1, 3), vert[outer].reshape(-1, 3)
+    if (point.min(axis=0) <= corner.min(axis=0)).any() or (point.max(axis=0) >= corner.max(axis=0)).any():
+        return False
+    return all(abs(_winding(at, vert[outer])) > 0.5 for at in point[:: len(point) // 32 + 1])
+
+
+def _winding(point, corner):
+    """How often closed triangles (m, 3, 3) surround a point: solid angles, van Oosterom and Strackee 1983."""
+    a, b, c = np.moveaxis(corner - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))
+    across = np.linalg.det(np.stack([a, b, c], axis=1))
+    return np.arctan2(across, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi)
 
 
 def close_rim(face: np.ndarray) -> np.ndarray:

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..geometry.indenters import INDENTERS, indenter
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
-from ..geometry.solid import no_solid
-from ..geometry.tet_mesh import enclosed_volume
+from ..geometry.solid import face_outwards, no_solid
 from ..reading import reading
 from ..triangles import trimesh
 from ..units import read_quantity
@@ -113,9 +112,8 @@ def _from_file(path):
             "scale it from millimetres"
         )
     mesh.update_faces(mesh.unique_faces())
-    vert, face = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    if enclosed_volume(vert, face) < 0:  # which side is the inside of a closed surface is no question
-        face = face[:, ::-1]
+    vert = np.asarray(mesh.vertices)
+    face = face_outwards(vert, np.asarray(mesh.faces))  # the inside of a closed surface is no question
     wrong = no_solid(vert, face)
     if wrong is not None:
         raise ValueError(f"the indenter mesh {path} {wrong}")
