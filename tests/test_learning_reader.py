@@ -13,13 +13,15 @@ from recorded import synthetic  # noqa: E402
 from safetensors import safe_open  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
+from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.geometry.design import read_design  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
 from biotac_mj.learning.instants.force import causal_average  # noqa: E402
 from biotac_mj.learning.instants.novelty import NoveltyDetector, StuckDetector  # noqa: E402
 from biotac_mj.learning.instants.reader import Reader, fit_reader, judge  # noqa: E402
 from biotac_mj.learning.instants.terms import Terms  # noqa: E402
-from biotac_mj.learning.weights import shipped  # noqa: E402
+from biotac_mj.learning.protocol import is_better  # noqa: E402
+from biotac_mj.learning.weights import load_forward, shipped  # noqa: E402
 from biotac_mj.recordings import write  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance  # noqa: E402
 
@@ -186,6 +188,8 @@ def test_a_model_comes_back_from_its_file(reader, tmp_path):
         back.predict(data.counts)
     with pytest.raises(ValueError, match="holds no model that reads electrodes"):
         Reader.load(shipped("forward"))
+    with pytest.raises(ValueError, match="m.safetensors reads force from electrodes, and a signal needs"):
+        load_forward(tmp_path / "m.safetensors", load_skin("coarse"))
     tensors = dict(reader.tensors)
     del tensors["rows.apart"]
     dataclasses.replace(reader, tensors=tensors).save(tmp_path / "less.safetensors")
@@ -238,6 +242,32 @@ def test_terms_without_the_common_mode_do_not_see_it():
     terms = Terms.fit(x, products=3, common=True, length=1.0)
     np.testing.assert_allclose(terms(x + 0.3), terms(x), atol=1e-9)
     assert np.abs(Terms.fit(x, products=3, length=1.0)(x + 0.3) - terms(x)).max() > 0.1
+
+
+def test_a_force_of_noise_is_not_offered_for_use(tmp_path, capsys):
+    """The ridges of noise gain what chance gives them."""
+    one, out = synthetic(n=1200), str(tmp_path / "m.safetensors")
+    train = ["learn", "train", str(tmp_path / "rec.h5"), "--out", out]
+    write(tmp_path / "rec.h5", [dataclasses.replace(one, object_pos=None, object_quat=None)])
+    assert cli.main(train) == 0
+    said = capsys.readouterr().out
+    assert "use it with `biotac learn predict" in said and "no better" not in said
+    noise = np.random.default_rng(0).normal(size=one.force.shape)
+    write(tmp_path / "rec.h5", [dataclasses.replace(one, force=noise, object_pos=None, object_quat=None)])
+    assert cli.main(train) == 0
+    said = capsys.readouterr().out
+    assert "note: force: no better than the mean" in said and "use it with" not in said
+    write(tmp_path / "rec.h5", [dataclasses.replace(one, force=np.ones_like(noise))])
+    assert cli.main(train) == 2
+    assert "synthetic: the force never changes, so that it cannot be learned" in capsys.readouterr().err
+
+
+def test_better_is_what_trajectories_tell():
+    owner, other = np.repeat(np.arange(10), 20), np.ones((200, 2))
+    part = np.repeat(np.random.default_rng(1).normal(size=10), 20)[:, None]
+    assert is_better(0.9 * other, other, owner) and not is_better(other, other, owner)
+    assert not is_better((0.99 + 0.1 * part) * other, other, owner)  # one or the other, by trajectory
+    assert not is_better(0.5 * other, other, 0 * owner)
 
 
 def test_commands_keep_a_model_and_use_it(tmp_path, capsys):

@@ -377,11 +377,12 @@ def add_design(verbs: argparse._SubParsersAction) -> None:
         verb.add_argument(f"--{name}", type=length, nargs=3, metavar=axes, help=text)
     verb.add_argument("--mesh", metavar="FILE", help=".msh, .tet or .vtu [m], its rim or back on y = 0")
     verb.add_argument("--core-mesh", metavar="FILE.obj", help="of the core [m]")
-    verb.add_argument("--thickness", type=length, default=1.5e-3, help="of a dome's shell")
-    verb.add_argument("--edge", type=length, default=1.2e-3, help="of the tetrahedra")
-    for name in ("electrodes", "excitation"):
-        text = "columns x y z [mm]: x to the fingertip, z out of the nail; none: no electrodes"
-        verb.add_argument(f"--{name}", metavar="FILE", help=text)
+    verb.add_argument("--thickness", type=length, default="1.5mm", help="of a dome's shell")
+    verb.add_argument("--edge", type=length, default="1.2mm", help="of the tetrahedra")
+    text = "columns x y z [mm]: x to the fingertip, z out of the nail (default: no electrodes)"
+    verb.add_argument("--electrodes", metavar="FILE", help=text)
+    text = "columns x y z [mm] of the excitation electrodes, which --electrodes needs"
+    verb.add_argument("--excitation", metavar="FILE", help=text)
     verb = add_verb(verbs, "show", _show_design, "Describe a fingertip.")
     verb.add_argument("design", metavar="DESIGN", help="biotac, biotac_sp, or a folder made by `new`")
 

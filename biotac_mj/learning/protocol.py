@@ -3,11 +3,19 @@ paper's is counts / 2048."""
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import wilcoxon
+from scipy.stats import t, wilcoxon
 
 from ..sensor.channels import NELECTRODE
 
-__all__ = ["conformal_width", "coverage_curve", "interaction_errors", "paired_test", "quartiles"]
+__all__ = [
+    "check_changes",
+    "conformal_width",
+    "coverage_curve",
+    "interaction_errors",
+    "is_better",
+    "paired_test",
+    "quartiles",
+]
 
 
 def interaction_errors(
@@ -79,6 +87,31 @@ def paired_test(a: ArrayLike, b: ArrayLike) -> dict:
         "better": float((difference < 0).mean()),
         "p": p,
     }
+
+
+def is_better(error: np.ndarray, other: np.ndarray, owner: ArrayLike) -> bool:
+    """Whether the RMS errors of trajectories are smaller than others by more than chance: a paired one-sided
+    test at 5 % (Student's t) of their differences.
+
+    Args:
+      error, other: (n, k) of the same rows. owner: (n,) trajectory of each row; of one alone nothing is
+        known.
+    """
+    _, index = np.unique(owner, return_inverse=True)
+    mine, theirs = (np.bincount(index, (e**2).mean(axis=1)) / np.bincount(index) for e in (error, other))
+    gain = np.sqrt(theirs) - np.sqrt(mine)
+    n = len(gain)
+    return n > 1 and bool(gain.mean() > t.ppf(0.95, n - 1) * gain.std(ddof=1) / np.sqrt(n))
+
+
+def check_changes(source: str, force: np.ndarray) -> None:
+    """Raises a ValueError where a force (n, 3) [N] is the same in all rows that have one."""
+    known = force[np.isfinite(force).all(axis=1)]
+    if len(known) and not np.ptp(known, axis=0).any():
+        raise ValueError(
+            f"{source}: the force never changes, so that it cannot be learned: leave it out, or record again "
+            "with the force sensor on"
+        )
 
 
 def conformal_width(error: np.ndarray, owner: ArrayLike, alpha: float = 0.1) -> np.ndarray:

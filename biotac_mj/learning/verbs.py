@@ -307,11 +307,13 @@ def _save_reader(args, reader, scores):
         error = ""
         if row["rmse"] is not None:
             error = f"RMSE {row['rmse']:.4g} {row['unit']} (the mean {row['rmse_of_mean']:.4g}), "
-            useless += [name] * (row["rmse"] >= row["rmse_of_mean"])
+            useless += [name] * (not row["better"])
         print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
+    use = f"; use it with `biotac learn predict {args.out} RECORDING`"
     if useless:
+        use = ""
         print(f"  note: {', '.join(useless)}: no better than the mean: do not use it, record more touches")
-    print(f"written: {args.out}; use it with `biotac learn predict {args.out} RECORDING`")
+    print(f"written: {args.out}{use}")
 
 
 def _add_predict(verbs, verb):

@@ -241,6 +241,11 @@ def _directions(meta):
 
 def _refuse_other(meta, path, geometry, direction):
     stated = meta.get("direction")
+    if stated == "reader" and direction == "forward":
+        raise ValueError(
+            f"{path} reads force from electrodes, and a signal needs a model that predicts electrodes: train "
+            "one with `biotac learn train FOLDER`"
+        )
     if meta.get("format") != FORMAT or direction not in _directions(meta):
         raise ValueError(
             f"{path} holds no {direction} model of {FORMAT}: it says {meta.get('format')}, {stated}, "

@@ -9,7 +9,7 @@ from ...geometry.design import SINGLES
 from ...recordings import Recording
 from ...sensor.channels import log_impedance
 
-__all__ = ["Examples", "from_recording", "from_set"]
+__all__ = ["Examples", "blocks", "from_recording", "from_set"]
 
 _BLOCKS = 56  # trajectories of a recording: its rows are correlated in time (docs/lab/learning.md)
 
@@ -40,6 +40,11 @@ class Examples:
         return log_impedance(self.counts) - (log_impedance(self.tare) if self.tared else 0.0)
 
 
+def blocks(n: int) -> np.ndarray:
+    """(n,) block of each row of a recording, which stands for a trajectory."""
+    return np.arange(n) * _BLOCKS // n
+
+
 def from_recording(recording: Recording) -> Examples:
     """A recording as 56 blocks in order of time, with force and contact position if it has them.
 
@@ -54,8 +59,7 @@ def from_recording(recording: Recording) -> Examples:
             f"{recording.name} has neither force nor contact place, so that no model can be kept: "
             "give --force"
         )
-    owner = np.arange(len(counts)) * _BLOCKS // len(counts)
-    return Examples(counts, counts, owner, targets, False, recording.name, False)
+    return Examples(counts, counts, blocks(len(counts)), targets, False, recording.name, False)
 
 
 def from_set(path: pathlib.Path | str) -> Examples:

@@ -11,7 +11,7 @@ from ...data.schema import SPLITS
 from ...data.splits import assign, least_count
 from ...fields import check_entries
 from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
-from ..protocol import conformal_width
+from ..protocol import check_changes, conformal_width, is_better
 from .examples import Examples
 from .linear import best_ridge, principal_components
 from .novelty import NoveltyDetector, StuckDetector, compressed
@@ -218,7 +218,7 @@ def fit_reader(
       level: of the intervals. seed: of the random features and the subsample of rows.
 
     Raises:
-      ValueError: too few trajectories.
+      ValueError: too few trajectories, or a force that never changes.
     """
     least = _least_aside(level)
     if len(kept) < least or len(train) < _FOLDS:
@@ -227,6 +227,8 @@ def fit_reader(
             f"{100 * level:.0f} % need {least} aside and at least {_FOLDS} to train; record more touches"
         )
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
+    if "force" in data.targets:
+        check_changes(data.source, data.targets["force"][fit])
     x = data.log_change
     mean, axes, _ = principal_components(x[fit])
     tensors = {"mean": mean, "axes": axes}
@@ -313,7 +315,8 @@ def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple
 
 
 def _scores(reader, data, test, train):
-    """Errors on the trajectories `test`, and those of the mean of `train`."""
+    """Errors on the trajectories `test`, those of the mean of `train`, and whether the trajectories tell that
+    they are smaller."""
     known = np.isin(data.owner, train)
     rows = np.isin(data.owner, test)
     found = reader.predict(data.counts[rows], data.tare[rows], None if data.pdc is None else data.pdc[rows])
@@ -327,6 +330,7 @@ def _scores(reader, data, test, train):
             "unit": UNITS[name],
             "half": float(reader.tensors[f"{name}.half"].mean()),
             "rmse": float(np.sqrt((error[there] ** 2).mean())) if there.any() else None,
+            "better": is_better(error[there], mean[there], data.owner[rows][there]),
             "rmse_of_mean": float(np.sqrt((mean[there] ** 2).mean())) if there.any() else None,
             "covered": float((error <= found.half[name])[there].mean()) if there.any() else None,
         }

@@ -9,7 +9,8 @@ import numpy as np
 from ...files import save_figure, write_json
 from ...recordings.recording import Recording
 from ...sensor.channels import FULL_SCALE, log_impedance
-from ..protocol import quartiles
+from ..protocol import check_changes, is_better, quartiles
+from .examples import blocks
 from .force import TRIALS, fit_force
 from .linear import principal_components, ridge
 from .transfer import TOUCHES, label, touches_of_force, transfer_force
@@ -95,7 +96,7 @@ def evaluate_recording(
             result["force_regression"]["models"]["transferred"] = errors
             result["notes"] += notes
         result["notes"] += _unjudged(result["force_regression"]["models"], recording.force, ntrain)
-        result["notes"] += _useless(result["force_regression"]["models"])
+        result["notes"] += _useless(predicted, recording.force, ntrain)
     else:
         result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
@@ -126,11 +127,8 @@ def _usable(recording):
             f"{recording.name}: no electrode changes: this is no recording of a touch; check the sensor and "
             "record again"
         )
-    if recording.force is not None and not np.ptp(recording.force, axis=0).any():
-        raise ValueError(
-            f"{recording.name}: the force never changes, so that it cannot be learned: leave it out, or "
-            "record again with the force sensor on"
-        )
+    if recording.force is not None:
+        check_changes(recording.name, recording.force)
     return recording, counts, notes + assumed
 
 
@@ -267,10 +265,12 @@ def _unjudged(models, force, ntrain):
     return notes
 
 
-def _useless(models):
-    """A note if the model is no better than the mean."""
-    own, mean = models["drift_aware"]["rmse"], models["predict_mean"]["rmse"]
-    axes = [f"F{axis}" for axis, a, b in zip("xyz", own, mean) if a is not None and a >= b]
+def _useless(predicted, force, ntrain):
+    """A note if the blocks of unseen rows do not tell that the model is better than the mean."""
+    error, mean = (y[ntrain:] - force[ntrain:] for y in (predicted, force[:ntrain].mean(axis=0) + 0 * force))
+    block = blocks(len(force))[ntrain:]
+    better = [is_better(error[:, k : k + 1], mean[:, k : k + 1], block) for k in range(3)]
+    axes = [f"F{axis}" for k, axis in enumerate("xyz") if np.ptp(force[:, k]) and not better[k]]
     if not axes:
         return []
     return [f"{', '.join(axes)}: drift_aware is no better than the mean here: record more touches like these"]
