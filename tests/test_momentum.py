@@ -90,6 +90,56 @@ def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier, speed)
     assert_told(rows)
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_stiffness_that_rows_cannot_hold_does_not_act(integrator):
+    """A cylinder whose tangent has a negative direction at a rim: of all that the model has rows hold what is
+    positive."""
+    model, data, handle = scene(
+        'type="cylinder" size=".00463 .00576" mass=".010567" friction=".1 .005 .0001"',
+        0.0,
+        5e-4,
+        integrator,
+        **CONDENSED,
+    )
+    data.qpos[:] = [0.0002, 0, 0.01623, 0.84862, -0.352314, -0.060457, 0.389955]
+    data.qvel[:] = [-0.114068, 0.066106, -1.098932, -9.632, 7.32374, 53.934426]
+    rows = list(steps(model, data, handle, 14))
+    assert_told(rows)
+    assert max(told[2] for _, told, _ in rows) > 1 and all(status[0] == 1 for *_, status in rows)
+
+
+def test_a_finger_with_an_equality_constraint_moves_on():
+    """Its dampers are stiff for its inertia, and the tangent of its touch has a negative direction."""
+    spec = mujoco.MjSpec.from_string("""
+    <mujoco><option timestep="0.002" integrator="implicitfast" jacobian="dense"/><worldbody>
+      <site name="tip" quat="1 -1 0 0"/>
+      <body pos="-.05 0 .016">
+        <joint name="j1" axis="0 1 0" damping=".002" stiffness=".01" armature="1e-6"/>
+        <geom type="capsule" fromto="0 0 0 .02 0 0" size=".003" mass=".01" contype="0" conaffinity="0"/>
+        <body pos=".02 0 0">
+          <joint name="j2" axis="0 1 0" damping=".002"/>
+          <geom type="capsule" fromto="0 0 0 .02 0 0" size=".003" mass=".008" contype="0" conaffinity="0"/>
+          <body name="thrown" pos=".02 0 0">
+            <joint axis="0 1 0" damping=".002" range="-40 40" limited="true"/>
+            <geom type="cylinder" size=".004 .003" mass=".005"/>
+          </body>
+        </body>
+      </body></worldbody>
+      <tendon><fixed name="both"><joint joint="j1" coef="1"/><joint joint="j2" coef="-1"/></fixed></tendon>
+      <equality><tendon tendon1="both" polycoef="0 0 0 0 0"/></equality>
+    </mujoco>""")
+    handle = biotac_mj.attach(spec, site="tip", readings="none", **CONDENSED)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = [0.534047, 7.858955, -3.384874]
+    pushed = 0.0
+    for _ in range(30):
+        mujoco.mj_step(model, data)
+        assert handle.read(data, "status")[0] == 1
+        pushed = max(pushed, handle.read(data, "contact_force")[1])
+    assert pushed > 0.02
+
+
 def test_skin_and_core_are_reported_together():
     """5 kg go down to the core, which MuJoCo's own contacts hold; force and torque are the body's."""
     model, data, handle = scene(

@@ -427,9 +427,10 @@ def test_a_gripper_whose_pads_are_bodies_of_their_own():
 
 
 def test_a_link_that_is_drawn_by_the_mesh_of_its_tip():
-    """Of a hand like LEAP the picture of the link goes with its tip, and the link's own boxes are shown."""
+    """Of a hand like LEAP the picture of the link goes with its tip, and the link's own boxes are shown. No
+    finger begins in the palm, which would push it to one side or the other."""
     links = "".join(
-        f'<body name="{f}_ds" pos="{0.05 * i} 0 0"><joint axis="0 0 1" stiffness="1" damping=".01"/>'
+        f'<body name="{f}_ds" pos="{0.05 * (i + 1)} 0 0"><joint axis="0 0 1" stiffness="1" damping=".01"/>'
         + f'<geom name="{f}_ds_visual" type="mesh" mesh="whole" {GHOST} group="1" mass="0"/>'
         + "".join(
             f'<geom name="{f}_ds_collision_{k}" type="box" size=".005 .005 .005" group="3"/>'

@@ -7,6 +7,7 @@ unless something else is said."""
 import warp as wp
 
 from ..coupling.implicit.rounds import Model
+from ..coupling.implicit.rows import hold_by_rows
 from ..coupling.implicit.rules import share_that_pushes
 from ..geometry.rigid_warp import LEVER, motion
 from ..sensor.acquisition_kernels import Place
@@ -130,7 +131,7 @@ def accept_models(
             p = turn * (p - geoms.pos[k, w]) + geoms.pos_last[k, w]
             R = turn * R
         model.wrench0[g, w] = wrench[g, w]
-        model.tangent0[g, w] = tangent[g, w]
+        model.tangent0[g, w] = hold_by_rows(tangent[g, w])
     model.pos0[g, w] = p
     model.mat0[g, w] = R
     if reason[w] != CONVERGED:

@@ -7,13 +7,46 @@ import warp as wp
 
 from ...skin.types import mat66, real, vec6
 
-__all__ = ["write_rows"]
+__all__ = ["hold_by_rows", "keep_held", "write_rows"]
 
 wp.set_module_options({"enable_backward": False})
 
 
 _NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
 _PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
+
+
+@wp.func
+def _pivot(S: mat66, whole: vec6, k: int):
+    """Pivot k of what is left of a matrix with diagonal `whole`, 0 where it is none, and its column of L."""
+    column = vec6()
+    if S[k, k] <= _PIVOT * wp.abs(whole[k]):
+        return wp.float64(0.0), column
+    for i in range(k, 6):
+        column[i] = S[i, k] / S[k, k]
+    return S[k, k], column
+
+
+@wp.func
+def hold_by_rows(S: mat66):
+    """What rows hold of a stiffness: L D L' without the pivots that are not positive. A model has that alone,
+    so that what it says acts is what the rows do."""
+    whole = wp.get_diag(S)
+    left = S
+    held = mat66()
+    for k in range(6):
+        pivot, column = _pivot(left, whole, k)
+        one = pivot * wp.outer(column, column)
+        left -= one
+        held += one
+    return held
+
+
+@wp.kernel
+def keep_held(tangent: wp.array2d(dtype=mat66)):
+    """`hold_by_rows` of each body's, in place."""
+    g, w = wp.tid()
+    tangent[g, w] = hold_by_rows(tangent[g, w])
 
 
 @wp.kernel
@@ -51,13 +84,8 @@ def write_rows(
             group = g
     whole = wp.get_diag(S)
     for k in range(6):
-        pivot = wp.float64(0.0)
-        column = vec6()
-        if S[k, k] > _PIVOT * wp.abs(whole[k]):
-            pivot = S[k, k]
-            for i in range(k, 6):
-                column[i] = S[i, k] / pivot
-            S -= pivot * wp.outer(column, column)
+        pivot, column = _pivot(S, whole, k)
+        S -= pivot * wp.outer(column, column)
         r = first + k
         if n == 0:
             D_out[w, r] = type(D_out[w, r])(wp.max(pivot, _NEGLIGIBLE))

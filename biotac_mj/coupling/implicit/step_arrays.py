@@ -15,6 +15,7 @@ from .compliance import Response, add_stiffness
 from .kinematics import Kinematics, row
 from .marks import Marks
 from .rounds import Model, Rounds, Solid
+from .rows import keep_held
 from .rules import LOSS_FREQUENCY
 from .springs import Springs
 
@@ -50,7 +51,7 @@ class StepArrays:
     Attributes:
       qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
-      stiffness: of the rows, see `Metric.record`.
+      keep_held: launches `rows.keep_held` on the model. stiffness: of the rows, see `Metric.record`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
       models: views of wrench0, tangent0, pos0 and mat0, in the last step and in this one.
     """
@@ -86,6 +87,7 @@ class StepArrays:
     def _respond(self, springs):
         """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
         one, jacobian, r, L = self._one, self._kinematics.jacobian, self._rounds, springs.L
+        self.keep_held = row((keep_held, self._model.tangent0.shape, [self._model.tangent0]))
         self.stiffness, response = (r.square, jacobian, self._model.tangent0), Response(jacobian, self._model)
         self.find_compliance = row(*response.compliance(one, L, r.square, self._compliance))
         dim, stiffness = (1, jacobian.shape[2]), springs.stiffness
