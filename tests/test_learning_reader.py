@@ -252,7 +252,7 @@ def test_a_force_of_noise_is_not_offered_for_use(tmp_path, capsys):
     assert cli.main(train) == 0
     said = capsys.readouterr().out
     assert "use it with `biotac learn predict" in said and "no better" not in said
-    noise = np.random.default_rng(0).normal(size=one.force.shape)
+    noise = np.random.default_rng(5).normal(size=one.force.shape)  # RMSE 2e-4 N below the mean's
     write(tmp_path / "rec.h5", [dataclasses.replace(one, force=noise, object_pos=None, object_quat=None)])
     assert cli.main(train) == 0
     said = capsys.readouterr().out
@@ -264,7 +264,7 @@ def test_a_force_of_noise_is_not_offered_for_use(tmp_path, capsys):
 
 def test_better_is_what_trajectories_tell():
     owner, other = np.repeat(np.arange(10), 20), np.ones((200, 2))
-    part = np.repeat(np.random.default_rng(1).normal(size=10), 20)[:, None]
+    part = np.repeat(np.linspace(-1, 1, 10), 20)[:, None]
     assert is_better(0.9 * other, other, owner) and not is_better(other, other, owner)
     assert not is_better((0.99 + 0.1 * part) * other, other, owner)  # one or the other, by trajectory
     assert not is_better(0.5 * other, other, 0 * owner)
