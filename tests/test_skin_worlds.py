@@ -485,7 +485,7 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     wp.launch_tiled(
         check_convergence,
         dim=[1],
-        inputs=[1e-4, 750, 0, data.rest_pressure, *arrays, st],
+        inputs=[1e-4, 1e-4, 750, 0, data.rest_pressure, *arrays, st],
         outputs=[any_active],
         block_dim=1,
         device="cpu",
@@ -516,7 +516,8 @@ def test_viscous_skin_is_in_balance_within_an_increment(viscosity, increment, rz
     part, norms = (np.zeros((k, 1, 1)) for k in (2, 4))
     part[0], norms[0], norms[1] = rz * tolerance**2, 1e-4, 1.0
     arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, norms)]
-    given = [tolerance, 750, 0, data.rest_pressure, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
+    bounds = [tolerance, tolerance, 750, 0, data.rest_pressure]
+    given = [*bounds, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
     wp.launch_tiled(check_convergence, dim=[1], inputs=given, block_dim=1, device="cpu")
     assert bool(st.active.numpy()[0]) is not balanced
 
