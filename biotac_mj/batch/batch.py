@@ -187,7 +187,7 @@ class Batch(Skins):
         self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, self._of_step))
 
     def _put_bodies(self, m):
-        """Tells the skins which bodies were put somewhere; finds whether these were put into the skin."""
+        """Lets bodies that were placed begin without contact; finds which were placed in the skin."""
         r, skin, clearance = self._of_step, self.skin, self._clearance
         laws, geoms = skin.data.laws.struct, skin.geoms.struct
         self.place_geoms(r.here_pos, r.here_mat, m.geom_pos, m.geom_quat)

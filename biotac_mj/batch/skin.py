@@ -113,7 +113,7 @@ class BatchSkin:
             self.fraction, self._path = (
                 wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)
             )
-            self._led = wp.array(touching.led, dtype=bool)
+            self._by_mocap = wp.array(touching.by_mocap, dtype=bool)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
         self.release = Release(model, self.data, self.geoms)
@@ -165,15 +165,15 @@ class BatchSkin:
             launch_step(m, d, self.geoms)
 
     def put_bodies(self, placed: wp.array, began: wp.array, where: wp.array) -> None:
-        """Makes bodies that were put somewhere begin where the geoms are now, without contact: as
-        `SkinStepper.put` for one world. Launches only.
+        """Lets bodies that were placed begin where the geoms are now, without contact, as `SkinStepper.put`
+        does for one world. Launches only.
 
         Args:
           placed: (ngroup, nworld) int, which bodies. began: (nworld,) int, whether a step was made.
           where: (nworld,) int, in which worlds there are any.
         """
         outer, geoms, nsample = self.data.outer, self.geoms.struct, len(self.model.sample)
-        self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self._led], [geoms])
+        self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self._by_mocap], [geoms])
         faces = len(self.model.outer.face), self.nworld
         self._launch(kernels.forget_contacts, faces, [where, nsample, geoms], [outer.anchor_geom])
         self._come_from_outside(where)

@@ -95,21 +95,21 @@ def forget_poses(
     # In:
     placed: wp.array2d(dtype=int),
     began: wp.array(dtype=int),
-    led: wp.array(dtype=bool),
+    by_mocap: wp.array(dtype=bool),
     # In and out:
     geoms: Geoms,
 ):
-    """Of geoms on bodies [group, world] that were put where they are nothing is known. What a mocap body
-    leads went that way, after the first step."""
+    """Forgets the last poses of geoms on bodies that were placed [group, world]. After the first step the
+    poses of a body that a mocap body moves are its motion."""
     g, w = wp.tid()
     h = geoms.group[g]
-    if placed[h, w] == 1 and not (led[h] and began[w] == 1):
+    if placed[h, w] == 1 and not (by_mocap[h] and began[w] == 1):
         geoms.pos_last[g, w] = vec3(real(wp.nan), real(wp.nan), real(wp.nan))
 
 
 @wp.kernel
 def forget_contacts(on: wp.array(dtype=int), nsample: int, geoms: Geoms, anchor_geom: wp.array2d(dtype=int)):
-    """Geoms of which nothing is known had no contact with the samples of face f."""
+    """Clears the contact of the samples of face f with geoms whose last poses are not known."""
     f, w = wp.tid()
     if on[w] == 0:
         return

@@ -58,7 +58,7 @@ class Instance:
       kinematics: `Kinematics` of the touching bodies.
       sensed: whether the readings of this step are written.
       number: among the two-way instances; springs: `Springs` of the mjData.
-      put: the skin's state after bodies were put somewhere before this step; None: none was.
+      put: the skin's state after bodies were placed before this step; None: none was.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
 
@@ -176,7 +176,7 @@ class Instance:
         arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
         arrays.begin()
         self.touching.check(arrays.start_pos, arrays.start_mat)
-        placed = (arrays.placed > 0) & ~(self.touching.led & (head[STARTED] != 0.0))
+        placed = (arrays.placed > 0) & ~(self.touching.by_mocap & (head[STARTED] != 0.0))
         if placed.any() and hasattr(self.setup.skin.stepper, "put"):
             here = self.touching.geom_pose(arrays.here_pos, arrays.here_mat)
             with self.setup.skin.lock:
@@ -185,7 +185,7 @@ class Instance:
 
     @property
     def _skin(self):
-        """The skin's state when the step begins, after who put bodies elsewhere."""
+        """The skin's state when the step begins, after bodies were placed."""
         return self.parts[2] if self.put is None else self.put
 
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:

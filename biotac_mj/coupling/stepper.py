@@ -120,15 +120,15 @@ class SkinStepper(Protocol):
         """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds; needed of a stepper whose
         results may be short of the poses asked for."""
 
-    # A stepper may have the methods below. With the first, bodies that were put somewhere did not slide
-    # there, with the others a skin that rests costs next to nothing.
+    # A stepper may have the methods below. With the first, bodies that were placed have not slid there; with
+    # the others a skin that rests costs next to nothing.
 
     def put(
         self, state: np.ndarray, placed: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
     ) -> np.ndarray:
-        """Copy of a state in which some geoms, (ngeom,) of bool, were put to poses (ngeom, 3), (ngeom, 3, 3)
-        by hand: they had no contact, and their way begins there, or where they have just left the skin at
-        rest if that is inside it."""
+        """The state after the user placed some geoms, (ngeom,) of bool, at poses (ngeom, 3), (ngeom, 3, 3):
+        they have no contact, and their path begins there, or where they just leave the skin at rest if they
+        are inside it."""
 
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""

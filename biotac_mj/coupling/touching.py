@@ -44,8 +44,8 @@ class Touching:
         where another one's skin is pushed as well and answers for the other half.
       path: (ngroup,) of a body's way that what the skin meets goes along: half, where that is another skin.
       skins: numbers of the touching bodies that are BioTacs with a skin.
-      led: (ngroup,) bool, whether a mocap body leads it or the BioTac: how it goes is known from its poses
-        alone, since a mocap body has no velocity.
+      by_mocap: (ngroup,) bool, whether a mocap body moves it or the BioTac: its motion is known from its
+        poses alone, since a mocap body has no velocity.
       parted: whether nothing touches, wherever bodies are: the skin sees its geoms far away.
       notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
 
@@ -89,8 +89,8 @@ class Touching:
         # one that is only read answers for nothing, and where others do not meet this one it answers for all
         if self.skins and not compiling and config.coupling == "two-way" and _is_met(model, core):
             self.fraction[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
-        led = model.body_mocapid[model.body_rootid] >= 0
-        self.led = led[self.body] | led[core]
+        moved = model.body_mocapid[model.body_rootid] >= 0
+        self.by_mocap = moved[self.body] | moved[core]
         self._geom_pos, self._geom_mat = model.geom_pos[ids][:, :, None], matrix(model.geom_quat[ids])
 
     def warn(self, model: ModelView | None = None) -> None:

@@ -245,7 +245,7 @@ def use_euler(step: real, ahead: real, greedy: wp.array(dtype=int), r: Rounds):
 
 @wp.kernel
 def look_inside(laws: Laws, clearance: wp.array(dtype=wp.vec2d), r: Rounds):
-    """Which of the bodies that were put somewhere were put into the skin, by their clearance from it."""
+    """Finds which of the bodies that were placed are in the skin, by their clearance from it."""
     w = wp.tid()
     if not clearance[w][0] < contact_range(laws, w):
         r.inside[w] = 0
