@@ -263,6 +263,8 @@ class Instance:
             result.pose = (pos, mat) if bodies is None else self._came_to(result.state)
             result.wrench = fraction[:, None] * result.wrench
             result.tangent = (fraction * path)[:, None, None] * result.tangent
+            if self.two_way:
+                result.tangent = self._arrays.held(result.tangent)
             if not result.converged:
                 result = self._as_far_as_known(result, before)
             if len(self._solved) > 8:

@@ -122,12 +122,10 @@ class Coupled:
         if asked is None:
             return
         arrays, self.asked, self.result = self.arrays, asked, result
+        self.instance.keep(result)
         arrays.asked_pos[:], arrays.asked_mat[:] = asked
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
         arrays.pos0[:], arrays.mat0[:] = result.pose
-        arrays.keep_held()
-        result.tangent = arrays.tangent0.copy()
-        self.instance.keep(result)
         if not result.converged:
             pose, bodies = self._solved_for
             let_go = pose if bodies is None else bodies.without(np.arange(len(pose[0])), *pose)

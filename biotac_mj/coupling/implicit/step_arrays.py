@@ -8,7 +8,7 @@ import warp as wp
 
 from ...geometry.rigid_warp import motion, size_of
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
-from ...skin.types import real, vec6
+from ...skin.types import mat66, real, vec6
 from ..setup import Setup
 from . import energy, rounds
 from .compliance import Response, add_stiffness
@@ -51,7 +51,7 @@ class StepArrays:
     Attributes:
       qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
-      keep_held: launches `rows.keep_held` on the model. stiffness: of the rows, see `Metric.record`.
+      stiffness: of the rows, see `Metric.record`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
       models: views of wrench0, tangent0, pos0 and mat0, in the last step and in this one.
     """
@@ -63,6 +63,7 @@ class StepArrays:
         self._solid = solid
         with wp.ScopedDevice("cpu"):
             self._rounds = rounds.make_rounds(*shape)
+            tangent = wp.zeros(shape, dtype=mat66)
             self._model, self._last = (rounds.make_model(*shape) for _ in range(2))
             self._rounds.surface = wp.array([setup.surface_energy], dtype=real)
             self._wrench, self._qacc = wp.zeros(shape, dtype=vec6), wp.zeros_like(kinematics.d.qvel)
@@ -71,6 +72,7 @@ class StepArrays:
             self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
             self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
         self._one.fill_(1)
+        self._tangent, self._keep_held = _seen(tangent), row((keep_held, shape, [tangent]))
         self.wrench, self.left_out = _seen(self._wrench), _seen(self._left_out)
         self.qacc, self.compliance = self._qacc.numpy()[0], self._compliance.numpy()[:, :, 0]
         self.off, self._is_marked, self._found = (
@@ -84,10 +86,15 @@ class StepArrays:
                     setattr(self, name, _seen(array))
         self.models = [(_seen(getattr(self._last, name)), getattr(self, name)) for name in Model.vars]
 
+    def held(self, tangent: np.ndarray) -> np.ndarray:
+        """What rows hold of tangents (ngroup, 6, 6), see `rows.hold_by_rows`."""
+        self._tangent[:] = tangent
+        self._keep_held()
+        return self._tangent.copy()
+
     def _respond(self, springs):
         """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
         one, jacobian, r, L = self._one, self._kinematics.jacobian, self._rounds, springs.L
-        self.keep_held = row((keep_held, self._model.tangent0.shape, [self._model.tangent0]))
         self.stiffness, response = (r.square, jacobian, self._model.tangent0), Response(jacobian, self._model)
         self.find_compliance = row(*response.compliance(one, L, r.square, self._compliance))
         dim, stiffness = (1, jacobian.shape[2]), springs.stiffness
