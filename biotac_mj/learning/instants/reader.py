@@ -227,7 +227,7 @@ def fit_reader(
             f"{100 * level:.0f} % need {least} aside and at least {_FOLDS} to train; record more touches"
         )
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
-    if "force" in data.targets:
+    if list(data.targets) == ["force"]:  # where the place is known, that is learned
         check_changes(data.source, data.targets["force"][fit])
     x = data.log_change
     mean, axes, _ = principal_components(x[fit])
