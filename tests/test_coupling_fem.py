@@ -431,8 +431,10 @@ def test_a_geom_deep_in_the_core_is_told_and_survived():
     assert handle.read(data, "contact_force")[1] > 0.1
 
 
-def test_an_unconverged_step_goes_on_from_its_iterate():
-    """What acts is the contact law there: 2.2 mm deeper than a touch it is nine times as large as the touch's
+@pytest.mark.parametrize("back", [8, pytest.param(3, marks=pytest.mark.xfail(strict=True))])
+def test_an_unconverged_step_goes_on_from_its_iterate(back):
+    """back: steps after which the skin is as before; 3 where an unconverged step kept the last state.
+    What acts is the contact law there: 2.2 mm deeper than a touch it is nine times as large as the touch's
     linear model."""
     onto_the_core = []
     for options in ({}, {"max_newton": 3}):
@@ -450,7 +452,7 @@ def test_an_unconverged_step_goes_on_from_its_iterate():
     assert status[0] == 0 and status[1] == failed + 2 and status[3] > 3e-4
     np.testing.assert_allclose(*onto_the_core[::-1], atol=0.02 * onto_the_core[0][1])
     data.mocap_pos[0, 2] += 2.2e-3  # and back: the skin begins anew where that is in vain, too
-    mujoco.mj_step(model, data, 8)
+    mujoco.mj_step(model, data, back)
     assert handle.read(data, "status")[0] == 1
     np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.01, atol=1e-5)
 
