@@ -54,7 +54,7 @@ def recorded(
     Warp's record of a launch (`wp.Launch`) packs its arguments at each launch, which takes 2.4 us for seven
     arguments, as long as many kernels here; this takes 0.1 us. tiled: a kernel of blocks, which have one
     thread on the CPU. Kernels must not have Warp tiles, whose memory all host threads share
-    (`skin.types.sum_of_block` has none)."""
+    (`skin.block.block_sum` has none)."""
     launch, options = (wp.launch_tiled, {"block_dim": 1}) if tiled else (wp.launch, {})
     command = launch(
         kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device="cpu", record_cmd=True, **options

@@ -9,7 +9,8 @@ import warp as wp
 
 from biotac_mj import launches as module
 from biotac_mj.launches import in_a_row, recorded, repeated
-from biotac_mj.skin.types import sum_of_block, vec3
+from biotac_mj.skin.block import block_sum
+from biotac_mj.skin.types import vec3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,8 +44,8 @@ def add_up(x: wp.array2d(dtype=wp.float64), wanted: wp.array(dtype=wp.float64), 
     for k in range(t, x.shape[1], wp.block_dim()):
         number += x[i, k]
         pair += vec3(x[i, k], -x[i, k], wp.float64(1.0))
-    number = sum_of_block(number)
-    pair = sum_of_block(pair)
+    number = block_sum(number)
+    pair = block_sum(pair)
     if number != wanted[i] or pair[0] != number or pair[1] != -number:
         wp.atomic_add(off, i, 1)
 

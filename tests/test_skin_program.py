@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from biotac_mj.skin.block import block_sum
 from biotac_mj.skin.program import Launcher, Program
-from biotac_mj.skin.types import sum_of_block
 
 CPU = "cpu"
 
@@ -31,7 +31,7 @@ def sum_block(a: wp.array2d(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
     s = wp.float64(0.0)
     for k in range(t, a.shape[1], wp.block_dim()):
         s += a[i, k]
-    total = sum_of_block(s)
+    total = block_sum(s)
     if t == 0:
         out[i] = total
 

@@ -13,6 +13,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel
 from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.touch import SKINS
+from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_worlds
 from ..skin.program import Fork, Launcher
 from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, allocate
@@ -180,7 +181,8 @@ class BatchSkin:
 
     def _come_from_outside(self, where):
         surface = [where, self.model.outer.face, self.model.sample, self.data.rest_vert]
-        self._launch(kernels.come_from_outside, self.pos.shape, surface, [self.geoms.struct])
+        blocks = dict(dim=self.pos.shape, block_dim=BLOCK, device=self.model.device)
+        wp.launch_tiled(kernels.come_from_outside, inputs=surface, outputs=[self.geoms.struct], **blocks)
 
     def go_on(self, going: wp.array) -> None:
         """See `CondensedStep.go_on`."""

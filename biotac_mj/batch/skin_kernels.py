@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..skin.block import block_max, block_sum
 from ..skin.contact.posed import Geoms, bound_to, distance_from
 from ..skin.newton.worlds import Worlds
 from ..skin.types import mat33, real, vec3, vec6
@@ -130,8 +131,8 @@ def come_from_outside(
     geoms: Geoms,
 ):
     """Geoms of which nothing is known come from where they have just left the skin at rest, along the mean
-    normal of what they touch of it: as `ProximityQuery.outside` says for one world."""
-    g, w = wp.tid()
+    normal of what they touch of it: as `ProximityQuery.outside` says for one world. A block a geom."""
+    g, w, t = wp.tid()
     last = geoms.pos_last[g, w]
     if wanted[w] == 0 or wp.isfinite(last[0] + last[1] + last[2]):
         return
@@ -144,7 +145,7 @@ def come_from_outside(
     moved = int(0)
     while moved < _ROUNDS:
         deepest = real(0.0)
-        for f in range(face.shape[0]):
+        for f in range(t, face.shape[0], wp.block_dim()):
             a = rest[face[f][0], column]
             b = rest[face[f][1], column]
             c = rest[face[f][2], column]
@@ -158,11 +159,15 @@ def come_from_outside(
             deepest = wp.max(deepest, depth)
             if moved == 0 and depth > real(0.0):
                 normal += wp.cross(b - a, c - a)
+        deepest = block_max(deepest)
+        if moved == 0:
+            normal = block_sum(normal)
         if deepest < _LEFT or wp.length_sq(normal) == real(0.0):
             moved = _ROUNDS
         else:
             normal = wp.normalize(normal)
             p += deepest * normal
             moved += 1
-    geoms.pos_last[g, w] = p
-    geoms.mat_last[g, w] = R
+    if t == 0:
+        geoms.pos_last[g, w] = p
+        geoms.mat_last[g, w] = R

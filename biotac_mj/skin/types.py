@@ -1,4 +1,4 @@
-"""Scalar, vector and matrix types of the kernels, casts between them, and sums over a block of threads.
+"""Scalar, vector and matrix types of the kernels, and casts between them.
 
 Positions and forces are in double precision on every device. Directions (of Newton's method, of conjugate
 gradients, of the preconditioner) are double on the CPU and single on CUDA, where they only steer the
@@ -19,8 +19,6 @@ __all__ = [
     "narrow",
     "real",
     "single",
-    "sum_of_block",
-    "sum_of_lanes",
     "vec3",
     "vec4",
     "vec6",
@@ -61,64 +59,6 @@ def narrow(A: mat33):
         float(A[1, 0]), float(A[1, 1]), float(A[1, 2]),
         float(A[2, 0]), float(A[2, 1]), float(A[2, 2]),
     )  # fmt: skip
-
-
-# Warp's tiles do the same, but on the CPU all host threads share the memory of a tile: such kernels would
-# have to wait for each other.
-_OF_BLOCK = """
-#if defined(__CUDA_ARCH__)
-    const int count = sizeof(own) / sizeof(double), warps = (blockDim.x + 31) / 32;
-    __shared__ double part[32][count];
-    double* number = (double*)&own;
-    for (int i = 0; i < count; ++i)
-        for (int far = 16; far > 0; far /= 2) number[i] += __shfl_down_sync(0xffffffffu, number[i], far);
-    __syncthreads();  // all threads have read the result of an earlier sum
-    if (threadIdx.x % 32 == 0)
-        for (int i = 0; i < count; ++i) part[threadIdx.x / 32][i] = number[i];
-    __syncthreads();
-    for (int i = 0; i < count; ++i) {
-        number[i] = part[0][i];
-        for (int w = 1; w < warps; ++w) number[i] += part[w][i];
-    }
-#endif
-    return own;
-"""
-
-
-@wp.func_native(_OF_BLOCK)
-def sum_of_block(own: real) -> real:
-    """Sum of a number or vector over the threads of a block of whole warps, in a fixed order. All threads
-    must take part, and get it. On the CPU a block has one thread."""
-    ...
-
-
-@wp.func_native(_OF_BLOCK)
-def sum_of_block(own: vec3) -> vec3: ...  # noqa: F811
-
-
-@wp.func_native(_OF_BLOCK)
-def sum_of_block(own: vec6) -> vec6: ...  # noqa: F811
-
-
-_OF_LANES = """
-#if defined(__CUDA_ARCH__)
-    for (int c = 0; c < 3; ++c)
-        for (int far = lanes / 2; far > 0; far /= 2) p[c] += __shfl_xor_sync(0xffffffffu, p[c], far);
-#endif
-    return p;
-"""
-
-
-# A mask may contain lanes that have ended; the lanes of one sum take part or have ended together.
-@wp.func_native(_OF_LANES)
-def sum_of_lanes(p: vec3, lanes: int) -> vec3:
-    """Sum of a vector over `lanes` neighbouring lanes of a warp, a power of two; all lanes get it. On the CPU
-    there is one."""
-    ...
-
-
-@wp.func_native(_OF_LANES)
-def sum_of_lanes(p: wp.vec3, lanes: int) -> wp.vec3: ...  # noqa: F811
 
 
 @wp.func

@@ -15,7 +15,8 @@ from ...coupling.implicit.compliance import substitute
 from ...coupling.implicit.rounds import Model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
-from ...skin.condensed.lanes import eliminate, sync
+from ...skin.block import sync
+from ...skin.condensed.lanes import eliminate
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
 from .factor import Factor

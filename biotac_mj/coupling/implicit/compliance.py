@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from ...skin.condensed.lanes import sync
+from ...skin.block import sync
 from ...skin.types import real, vec6
 from .rounds import Model
 

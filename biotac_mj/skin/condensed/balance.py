@@ -8,13 +8,13 @@ import functools
 
 import warp as wp
 
+from ..block import block_max, block_rank, block_sum, sync
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
 from .broadphase import ROOT3
-from .lanes import block_max, block_rank, block_sum, sync
 from .states import BALANCED, EVALUATE, NEWTON, Linear, Newton
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system

@@ -7,12 +7,12 @@ changes the wrench, the nodes are moved relative to them instead."""
 
 import warp as wp
 
+from ..block import block_sum, sync
 from ..bodies import Bodies, follow_wrench
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.load_path import partial_turn
 from ..types import real, vec3
-from .lanes import block_sum, sync
 from .structs import Constants, F, Scratch
 
 __all__ = [

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..block import block_max, block_rank, sync
 from ..contact.broadphase import (
     ALL,
     face_ball,
@@ -17,7 +18,7 @@ from ..contact.penetration import core_clearance
 from ..contact.posed import SKIN, Geoms, face_radius
 from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
-from .lanes import block_max, block_rank, keep_rows, sync
+from .lanes import keep_rows
 from .structs import BACK, Constants, Remembered, Scratch
 
 __all__ = [

@@ -1,15 +1,9 @@
-"""What the threads of a block do together: barriers, sums, and a small dense system. On the CPU a block is
-one thread."""
+"""A small dense system that the threads of a block share. On the CPU a block is one thread."""
 
 import warp as wp
 
-from ..types import real, vec3
-
 __all__ = [
     "MOST_EQUATIONS",
-    "block_max",
-    "block_rank",
-    "block_sum",
     "add_row",
     "add_rows",
     "begin_row",
@@ -19,97 +13,11 @@ __all__ = [
     "gather_rows",
     "keep_rows",
     "sum_rows",
-    "sync",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
 MOST_EQUATIONS = 1024  # that `eliminate` has room for
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def sync():
-    """Waits until all threads of the block are here, and what they wrote can be read."""
-    ...
-
-
-_SUM = """
-#if defined(__CUDA_ARCH__)
-    __shared__ double part[32][{n}];
-    const int warps = blockDim.x / 32;
-    for (int c = 0; c < {n}; ++c)
-        for (int far = 16; far > 0; far /= 2) {at} += __shfl_xor_sync(0xffffffffu, {at}, far);
-    __syncthreads();
-    if (threadIdx.x % 32 == 0)
-        for (int c = 0; c < {n}; ++c) part[threadIdx.x / 32][c] = {at};
-    __syncthreads();
-    for (int c = 0; c < {n}; ++c) {{
-        double total = 0.0;
-        for (int i = 0; i < warps; ++i) total += part[i][c];
-        {at} = total;
-    }}
-#endif
-    return own;
-"""
-
-
-@wp.func_native(_SUM.format(n=1, at="own"))
-def block_sum(own: real) -> real:
-    """Sum over the block, always in the same order; all of it get it."""
-    ...
-
-
-@wp.func_native(_SUM.format(n=3, at="own[c]"))
-def block_sum(own: vec3) -> vec3: ...  # noqa: F811
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __shared__ double part[32];
-    const int warps = blockDim.x / 32;
-    for (int far = 16; far > 0; far /= 2) own = fmax(own, __shfl_xor_sync(0xffffffffu, own, far));
-    __syncthreads();
-    if (threadIdx.x % 32 == 0) part[threadIdx.x / 32] = own;
-    __syncthreads();
-    own = part[0];
-    for (int i = 1; i < warps; ++i) own = fmax(own, part[i]);
-#endif
-    return own;
-""")
-def block_max(own: real) -> real:
-    """The largest of the block."""
-    ...
-
-
-@wp.func_native("""
-    int before = 0, total = own;
-#if defined(__CUDA_ARCH__)
-    __shared__ int part[32];
-    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = blockDim.x / 32;
-    int sum = own;
-    for (int near = 1; near < 32; near *= 2) {
-        const int other = __shfl_up_sync(0xffffffffu, sum, near);
-        if (lane >= near) sum += other;
-    }
-    __syncthreads();
-    if (lane == 31) part[warp] = sum;
-    __syncthreads();
-    before = sum - own;
-    total = 0;
-    for (int i = 0; i < warps; ++i) {
-        if (i < warp) before += part[i];
-        total += part[i];
-    }
-#endif
-    return wp::vec_t<2, int>(before, total);
-""")
-def block_rank(own: int) -> wp.vec2i:
-    """Sum of the counts of the threads before this one, and of all."""
-    ...
 
 
 # Gauss's elimination with row pivots, of which eight are found at a time: what is right of their columns is

@@ -3,12 +3,13 @@ volume, corrections, wrenches on bodies and their tangents."""
 
 import warp as wp
 
+from ..block import block_max, block_sum, sync
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
-from .lanes import block_max, block_sum, dot_columns, eliminate, sum_rows, sync
+from .lanes import dot_columns, eliminate, sum_rows
 from .states import Linear
 from .structs import Constants, F, G, Remembered, Scratch
 from .system import fill_contact, gather_blocks

@@ -4,6 +4,7 @@ phases of `states`; `solve` launches them."""
 
 import warp as wp
 
+from ..block import sync
 from ..contact.faces import Contact, commit_face
 from ..contact.posed import Geoms
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
@@ -22,7 +23,6 @@ from .broadphase import (
     measure_core,
 )
 from .correction import is_measured
-from .lanes import sync
 from .results import correct, place_nodes
 from .states import BALANCED, DONE, EVALUATE, NEWTON, SEARCH, Increment, Linear, LoadStepping
 from .structs import Constants, F, G, Remembered, Scratch

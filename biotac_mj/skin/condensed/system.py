@@ -3,21 +3,11 @@ liquid make of the coordinates that touch."""
 
 import warp as wp
 
+from ..block import block_rank, block_sum, sync
 from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3
 from .bodies import move_nodes, number_bodies, rigid_column
-from .lanes import (
-    add_row,
-    add_rows,
-    begin_row,
-    block_rank,
-    block_sum,
-    dot_column,
-    eliminate,
-    gather_rows,
-    sum_rows,
-    sync,
-)
+from .lanes import add_row, add_rows, begin_row, dot_column, eliminate, gather_rows, sum_rows
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 

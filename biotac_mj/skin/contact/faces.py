@@ -6,8 +6,9 @@ Each face has `nsample` points with equal parts of its rest area, so that contac
 import numpy as np
 import warp as wp
 
+from ..block import block_sum
 from ..program import Program
-from ..types import mat33, real, sum_of_block, vec3
+from ..types import mat33, real, vec3
 from .posed import Geoms, Meeting, distance_to, meet, place_on
 
 __all__ = [
@@ -307,7 +308,7 @@ def sum_wrench(partial: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=rea
     total = vec3()
     for c in range(t, partial.shape[1], wp.block_dim()):
         total += partial[k, c, w]
-    total = sum_of_block(total)
+    total = block_sum(total)
     if t == 0:
         for a in range(3):
             wrench_out[k // 2, w, 3 * (k % 2) + a] = total[a]

@@ -18,10 +18,11 @@ import types
 import warp as wp
 
 from ...geometry.rigid_warp import motion
+from ..block import block_sum, sync
 from ..bodies import Bodies
 from ..contact.faces import Contact, block_index
 from ..contact.posed import Geoms, LoadPath
-from ..types import Precision, mat33, real, sum_of_block, vec3, vec6
+from ..types import Precision, mat33, real, vec3, vec6
 from .worlds import Worlds, total_of
 
 __all__ = [
@@ -185,37 +186,42 @@ def measure_stiffness(
 
 
 @wp.func
-def _invert(w: int, n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=int)):
-    """Inverts M[w] in place by Gauss-Jordan elimination with row pivots."""
+def _invert(w: int, t: int, n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=int)):
+    """Inverts M[w] in place by Gauss-Jordan elimination with row pivots, together with the other threads of a
+    block; t is this one."""
     for k in range(n):
         p = int(k)
         for i in range(k + 1, n):
             if wp.abs(M[w, i, k]) > wp.abs(M[w, p, k]):
                 p = i
-        pivot[w, k] = p
-        if p != k:
-            for j in range(n):
-                value = M[w, k, j]
-                M[w, k, j] = M[w, p, j]
-                M[w, p, j] = value
-        scale = real(1.0) / M[w, k, k]
-        M[w, k, k] = real(1.0)
-        for j in range(n):
-            M[w, k, j] = M[w, k, j] * scale
-        for i in range(n):
-            f = M[w, i, k]
-            if i != k and f != real(0.0):
-                M[w, i, k] = real(0.0)
-                for j in range(n):
-                    M[w, i, j] = M[w, i, j] - f * M[w, k, j]
+        scale = real(1.0) / M[w, p, k]
+        sync()
+        for j in range(t, n, wp.block_dim()):
+            value = M[w, p, j]
+            M[w, p, j] = M[w, k, j]
+            M[w, k, j] = scale * wp.where(j == k, real(1.0), value)
+        if t == 0:
+            pivot[w, k] = p
+        sync()
+        for e in range(t, n * n, wp.block_dim()):
+            i = e // n
+            j = e % n
+            if i != k and j != k:
+                M[w, i, j] = M[w, i, j] - M[w, i, k] * M[w, k, j]
+        sync()
+        for i in range(t, n, wp.block_dim()):
+            if i != k:
+                M[w, i, k] = -M[w, i, k] * M[w, k, k]
+        sync()
     for back in range(n):
         k = n - 1 - back
         p = pivot[w, k]
         if p != k:
-            for i in range(n):
+            for i in range(t, n, wp.block_dim()):
                 value = M[w, i, k]
                 M[w, i, k] = M[w, i, p]
                 M[w, i, p] = value
+            sync()
 
 
 @wp.func
@@ -239,13 +245,16 @@ def _corrected(w: int, g: int, d: BodyContact, wrench: wp.array2d(dtype=wp.spati
 
 
 @wp.func
-def _respond(w: int, b: Bodies, d: BodyContact, st: Worlds):
-    """Changes of the wrenches by the loads `b.wrench`, and the motions of the bodies by these."""
+def _respond(w: int, t: int, b: Bodies, d: BodyContact, st: Worlds):
+    """Changes of the wrenches by the loads `b.wrench`, and the motions of the bodies by these, together with
+    the other threads of a block; t is this one."""
     factor = real(1.0) / (real(1.0) + st.viscosity[w])  # on the compliance, by the artificial viscosity
-    for g in range(b.motion.shape[0]):
+    for g in range(t, b.motion.shape[0], wp.block_dim()):
         d.step[g, w] = factor * _corrected(w, g, d, b.wrench)
-    for g in range(b.motion.shape[0]):
+    sync()
+    for g in range(t, b.motion.shape[0], wp.block_dim()):
         b.motion[g, w] = _motion_by(w, g, b, d.step)
+    sync()
 
 
 @wp.kernel
@@ -270,24 +279,23 @@ def begin_iteration(
             own += partial[g, c, w]
         S = wp.spatial_matrixd()
         for i in range(6):
-            row = sum_of_block(vec6(own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]))
+            row = block_sum(vec6(own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]))
             for j in range(6):
                 S[i, j] = row[j]
+        for h in range(t, groups, wp.block_dim()):
+            M = S * b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])
+            for i in range(6):
+                for j in range(6):
+                    unit = wp.where(g == h and i == j, real(1.0), real(0.0))
+                    d.inverse[w, 6 * g + i, 6 * h + j] = M[i, j] + unit
         if t == 0:
             d.residual[g, w] = d.skin_wrench[g, w] - b.posed[g, w] - S * d.pending[g, w]
-            for h in range(groups):
-                M = S * b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])
-                for i in range(6):
-                    for j in range(6):
-                        d.inverse[w, 6 * g + i, 6 * h + j] = M[i, j]
-            for i in range(6):
-                d.inverse[w, 6 * g + i, 6 * g + i] = d.inverse[w, 6 * g + i, 6 * g + i] + real(1.0)
+            b.wrench[g, w] = d.residual[g, w]
+    sync()
+    _invert(w, t, 6 * groups, d.inverse, d.pivot)
+    _respond(w, t, b, d, st)
     if t > 0:
         return
-    _invert(w, 6 * groups, d.inverse, d.pivot)
-    for g in range(groups):
-        b.wrench[g, w] = d.residual[g, w]
-    _respond(w, b, d, st)
     body_residual = real(0.0)
     for g in range(groups):
         body_residual += wp.dot(b.motion[g, w], d.residual[g, w])
@@ -303,7 +311,7 @@ def _load_on(w: int, t: int, g: int, partial: wp.array3d(dtype=vec3)):
         f = partial[2 * g, c, w]
         m = partial[2 * g + 1, c, w]
         own += vec6(f[0], f[1], f[2], m[0], m[1], m[2])
-    return sum_of_block(own)
+    return block_sum(own)
 
 
 @wp.kernel
@@ -320,10 +328,9 @@ def body_motion(
         load = _load_on(w, t, g, partial)
         if t == 0:
             b.wrench[g, w] = load + real(ends) * d.residual[g, w]
-    if t > 0:
-        return
-    _respond(w, b, d, st)
-    if ends == 0:
+    sync()
+    _respond(w, t, b, d, st)
+    if ends == 0 or t > 0:
         return
     viscous_work = real(0.0)
     for g in range(groups):

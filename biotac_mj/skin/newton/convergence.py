@@ -3,8 +3,9 @@ artificial viscosity."""
 
 import warp as wp
 
+from ..block import block_sum
 from ..contact.touch import LAGGED
-from ..types import real, sum_of_block, vec6
+from ..types import real, vec6
 from .line_search import MAX_TRIES, SMALL_ERROR
 from .worlds import NEGLIGIBLE_RESIDUAL, VISCOUS_AFTER, Worlds, set_viscosity
 
@@ -85,7 +86,7 @@ def check_convergence(
         own += vec6(
             norms[0, c, w], partial[0, c, w], norms[1, c, w], norms[3, c, w], partial[1, c, w], norms[2, c, w]
         )
-    total = sum_of_block(own)
+    total = block_sum(own)
     if t > 0:
         return
     rr = total[0]

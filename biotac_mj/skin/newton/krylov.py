@@ -6,8 +6,9 @@ import types
 
 import warp as wp
 
+from ..block import sum_of_lanes
 from ..contact.faces import block_index
-from ..types import Precision, real, sum_of_lanes, vec3
+from ..types import Precision, real, vec3
 from .line_search import begin_line_search
 from .nodes import LiquidForces, NodeSlots, SurfaceForces
 from .worlds import Worlds, total_of, totals_of

@@ -9,7 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from ..types import Precision, mat33, real, sum_of_lanes, vec3, vec6
+from ..block import sum_of_lanes
+from ..types import Precision, mat33, real, vec3, vec6
 from .worlds import Worlds
 
 __all__ = [

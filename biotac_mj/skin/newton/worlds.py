@@ -3,9 +3,10 @@ thread per world. `convergence` and `line_search` decide about iterations."""
 
 import warp as wp
 
+from ..block import block_sum
 from ..contact.posed import Geoms, LoadPath
 from ..contact.touch import CURRENT
-from ..types import real, sum_of_block, vec3
+from ..types import real, vec3
 
 __all__ = [
     "NEGLIGIBLE_RESIDUAL",
@@ -145,7 +146,7 @@ def total_of(partial: wp.array3d(dtype=real), k: int, w: int, t: int):
     s = real(0.0)
     for c in range(t, partial.shape[1], wp.block_dim()):
         s += partial[k, c, w]
-    return sum_of_block(s)
+    return block_sum(s)
 
 
 @wp.func
@@ -154,7 +155,7 @@ def totals_of(partial: wp.array3d(dtype=real), w: int, t: int):
     own = vec3()
     for c in range(t, partial.shape[1], wp.block_dim()):
         own += vec3(partial[0, c, w], partial[1, c, w], partial[2, c, w])
-    return sum_of_block(own)
+    return block_sum(own)
 
 
 @wp.func

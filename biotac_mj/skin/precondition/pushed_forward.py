@@ -14,8 +14,9 @@ import scipy.sparse as sp
 import warp as wp
 
 from ...launches import recorded
+from ..block import sum_of_lanes
 from ..rubber.law import LAWS
-from ..types import DOUBLE, SINGLE, Precision, mat33, real, sum_of_lanes, vec3
+from ..types import DOUBLE, SINGLE, Precision, mat33, real, vec3
 
 if typing.TYPE_CHECKING:
     from ..rubber.tetrahedra import Tetrahedra

@@ -1,0 +1,123 @@
+"""What the threads of a block do together: barriers, sums, the largest, ranks. On the CPU a block is one
+thread."""
+
+import warp as wp
+
+from .types import real, vec3, vec6
+
+__all__ = ["block_max", "block_rank", "block_sum", "sum_of_lanes", "sync"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def sync():
+    """Waits until all threads of the block are here, and what they wrote can be read."""
+    ...
+
+
+# Warp's tiles do the same, but on the CPU all host threads share the memory of a tile: such kernels would
+# have to wait for each other.
+_OF_BLOCK = """
+#if defined(__CUDA_ARCH__)
+    const int count = sizeof(own) / sizeof(double), warps = (blockDim.x + 31) / 32;
+    __shared__ double part[32][count];
+    double* number = (double*)&own;
+    for (int i = 0; i < count; ++i)
+        for (int far = 16; far > 0; far /= 2) number[i] += __shfl_down_sync(0xffffffffu, number[i], far);
+    __syncthreads();  // all threads have read the result of an earlier sum
+    if (threadIdx.x % 32 == 0)
+        for (int i = 0; i < count; ++i) part[threadIdx.x / 32][i] = number[i];
+    __syncthreads();
+    for (int i = 0; i < count; ++i) {
+        number[i] = part[0][i];
+        for (int w = 1; w < warps; ++w) number[i] += part[w][i];
+    }
+#endif
+    return own;
+"""
+
+
+@wp.func_native(_OF_BLOCK)
+def block_sum(own: real) -> real:
+    """Sum of a number or vector over the threads of a block of whole warps, in a fixed order. All threads
+    must take part, and get it. On the CPU a block has one thread."""
+    ...
+
+
+@wp.func_native(_OF_BLOCK)
+def block_sum(own: vec3) -> vec3: ...  # noqa: F811
+
+
+@wp.func_native(_OF_BLOCK)
+def block_sum(own: vec6) -> vec6: ...  # noqa: F811
+
+
+_OF_LANES = """
+#if defined(__CUDA_ARCH__)
+    for (int c = 0; c < 3; ++c)
+        for (int far = lanes / 2; far > 0; far /= 2) p[c] += __shfl_xor_sync(0xffffffffu, p[c], far);
+#endif
+    return p;
+"""
+
+
+# A mask may contain lanes that have ended; the lanes of one sum take part or have ended together.
+@wp.func_native(_OF_LANES)
+def sum_of_lanes(p: vec3, lanes: int) -> vec3:
+    """Sum of a vector over `lanes` neighbouring lanes of a warp, a power of two; all lanes get it. On the CPU
+    there is one."""
+    ...
+
+
+@wp.func_native(_OF_LANES)
+def sum_of_lanes(p: wp.vec3, lanes: int) -> wp.vec3: ...  # noqa: F811
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ double part[32];
+    const int warps = blockDim.x / 32;
+    for (int far = 16; far > 0; far /= 2) own = fmax(own, __shfl_xor_sync(0xffffffffu, own, far));
+    __syncthreads();
+    if (threadIdx.x % 32 == 0) part[threadIdx.x / 32] = own;
+    __syncthreads();
+    own = part[0];
+    for (int i = 1; i < warps; ++i) own = fmax(own, part[i]);
+#endif
+    return own;
+""")
+def block_max(own: real) -> real:
+    """The largest of the block."""
+    ...
+
+
+@wp.func_native("""
+    int before = 0, total = own;
+#if defined(__CUDA_ARCH__)
+    __shared__ int part[32];
+    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = blockDim.x / 32;
+    int sum = own;
+    for (int near = 1; near < 32; near *= 2) {
+        const int other = __shfl_up_sync(0xffffffffu, sum, near);
+        if (lane >= near) sum += other;
+    }
+    __syncthreads();
+    if (lane == 31) part[warp] = sum;
+    __syncthreads();
+    before = sum - own;
+    total = 0;
+    for (int i = 0; i < warps; ++i) {
+        if (i < warp) before += part[i];
+        total += part[i];
+    }
+#endif
+    return wp::vec_t<2, int>(before, total);
+""")
+def block_rank(own: int) -> wp.vec2i:
+    """Sum of the counts of the threads before this one, and of all."""
+    ...
