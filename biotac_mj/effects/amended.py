@@ -10,6 +10,7 @@ import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import design_of, skin_reference
+from ..geometry.tet_mesh import enclosed_volume
 from ..sensor.presets import Sensor, read_sensor
 from ..short_repr import short_repr
 from ..skin.model import SkinOptions
@@ -147,12 +148,9 @@ def _with_liquid(options, whole, geometry):
 
 def _liquid(geometry):
     """Volume between skin and core [m^3]."""
-
-    def volume(vert, face):
-        a, b, c = (vert[face[:, i]] for i in range(3))
-        return abs((np.cross(a, b) * c).sum()) / 6
-
-    return volume(geometry.vert, geometry.inner_face) - volume(geometry.core_vert, geometry.core_face)
+    solids = (geometry.vert, geometry.inner_face), (geometry.core_vert, geometry.core_face)
+    cavity, core = (abs(enclosed_volume(*solid)) for solid in solids)
+    return cavity - core
 
 
 def _plain_sensor(sensor: Sensor) -> dict:

@@ -8,7 +8,7 @@ from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.surface import face_areas
-from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_faces, enclosed_volume
+from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_cells, enclosed_volume
 
 __all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
 
@@ -63,7 +63,7 @@ def _open_surfaces(mesh, face, fixed, core_vert):
             "the skin's boundary has 1 closed part and no face of it is held: mesh the skin as one shell "
             "around one cavity, or let the rim of a dome or the back of a block lie on the backing"
         )
-    surfaces = connected_faces(free)
+    surfaces = connected_cells(free)
     if len(surfaces) > 2:
         raise ValueError(
             f"held faces cut the skin's surface into {len(surfaces)} parts: a solid pad has one, a dome "

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from biotac_mj.geometry.closest import ray_hits
+from biotac_mj.geometry.closest import ray_distances
 from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
@@ -26,7 +26,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         enclosed_volume(skin.core_vert * 1e3, skin.core_face),
     )
     rays = zip(skin.electrode_pos * 1e3, skin.electrode_normal)
-    met = [ray_hits(vert[skin.inner_face], *ray) for ray in rays]
+    gaps = np.array([ray_distances(vert[skin.inner_face], *ray).min() for ray in rays])
     lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
     return {
         "nodes": skin.nvert,
@@ -47,7 +47,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "thickness minimum": thickness.min(),
         "thickness maximum": thickness.max(),
         "box": [vert.min(axis=0), vert.max(axis=0)],
-        "gaps": np.array([hits.min() if len(hits) else np.nan for hits in met]),
+        "gaps": np.where(np.isfinite(gaps), gaps, np.nan),
     }
 
 

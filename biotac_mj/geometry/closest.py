@@ -29,7 +29,7 @@ __all__ = [
     "nearest_listed",
     "pack_lists",
     "pseudonormals",
-    "ray_hits",
+    "ray_distances",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -40,7 +40,6 @@ FACE = wp.constant(
 )  # where a closest point is: a corner (0 to 2), the edge opposite to one (3 to 5), or this
 SLACK = 1e-4  # [mm] above the rounding of single precision
 _SLACK = wp.constant(real(SLACK))
-_ON_EDGE = 1e-9  # barycentric coordinate within which a ray meets a triangle's edge
 _FARTHEST = 1.0e5  # [mm] from the mesh at which a triangle is still found
 
 
@@ -268,15 +267,28 @@ def pseudonormals(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
     return np.concatenate([around[corner], along[edge]], 1)
 
 
-def ray_hits(corner: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Distances (k,) along a ray, in lengths of its direction (3,), from its start (3,) to the triangles that
-    it meets, of corners (n, 3, 3) (Moeller and Trumbore)."""
+def ray_distances(
+    corner: np.ndarray,
+    start: np.ndarray,
+    direction: np.ndarray,
+    least: float = 0.0,
+    margin: float = 1e-9,
+) -> np.ndarray:
+    """Distances (n,) along rays to triangles of corners (n, 3, 3), inf where a ray misses its triangle
+    (Moeller and Trumbore 1997).
+
+    Args:
+      start, direction: (3,) of one ray, or (n, 3) of a ray for each triangle; distances are in lengths of the
+        direction.
+      least: smallest distance that counts, negative for hits behind the start.
+      margin: barycentric coordinate by which triangles are wider, so that no ray passes between two.
+    """
     first, along, across = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    normal = np.cross(direction, across)
+    normal, offset = np.cross(direction, across), start - first
+    side, direction = np.cross(offset, along), np.broadcast_to(direction, first.shape)
+    pairs = (along, normal), (offset, normal), (side, direction), (across, side)
+    over, u, v, t = (np.einsum("ij,ij->i", *pair) for pair in pairs)
     with np.errstate(divide="ignore", invalid="ignore"):
-        over = 1 / (along * normal).sum(1)
-        u = ((start - first) * normal).sum(1) * over
-        side = np.cross(start - first, along)
-        v, t = (side @ direction) * over, (side * across).sum(1) * over
-        inside = (u > -_ON_EDGE) & (v > -_ON_EDGE) & (u + v < 1 + _ON_EDGE)
-    return t[inside & (t > 0) & np.isfinite(t)]
+        u, v, t = u / over, v / over, t / over
+        met = (u >= -margin) & (v >= -margin) & (u + v <= 1 + margin) & (t >= least)
+    return np.where(met, t, np.inf)

@@ -10,7 +10,7 @@ import numpy as np
 
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
-from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
+from biotac_mj.geometry.tet_mesh import TetMesh, connected_cells, enclosed_volume
 from biotac_mj.reading import read_text, reading
 
 __all__ = ["import_mesh", "read_obj", "read_tet_mesh"]
@@ -126,8 +126,6 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
     Raises:
       ValueError: it cannot be read.
     """
-    import scipy.sparse as sparse
-
     vert, face = [], []
     for number, line in enumerate(_lines(path), 1):
         word = line.split()
@@ -151,16 +149,8 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
             "export the rigid bodies again as .obj"
         )
     vert, index = np.unique(np.array(vert), axis=0, return_inverse=True)
-    face = index.reshape(-1)[np.array(face)]
-    graph = sparse.coo_matrix(
-        (np.ones(2 * len(face)), (face[:, :2].T.ravel(), face[:, 1:].T.ravel())), shape=(len(vert),) * 2
-    )
-    _, label = sparse.csgraph.connected_components(graph, directed=False)
-    bodies = []
-    for component in np.unique(label[face[:, 0]]):
-        used, local = np.unique(face[label[face[:, 0]] == component], return_inverse=True)
-        bodies.append((vert[used], local.reshape(-1, 3).astype(np.int32)))
-    return bodies
+    parts = [np.unique(part, return_inverse=True) for part in connected_cells(index.reshape(-1)[face])]
+    return [(vert[used], local.reshape(-1, 3).astype(np.int32)) for used, local in parts]
 
 
 def _rigid_bodies(folder):

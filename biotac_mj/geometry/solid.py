@@ -14,6 +14,7 @@ __all__ = [
     "ground",
     "no_solid",
     "spread_points",
+    "winding",
 ]
 
 
@@ -79,11 +80,11 @@ def _inside(vert, inner, outer):
     point, corner = vert[inner].reshape(-1, 3), vert[outer].reshape(-1, 3)
     if (point.min(axis=0) <= corner.min(axis=0)).any() or (point.max(axis=0) >= corner.max(axis=0)).any():
         return False
-    return all(abs(_winding(at, vert[outer])) > 0.5 for at in point[:: len(point) // 32 + 1])
+    return all(abs(winding(at, vert[outer])) > 0.5 for at in point[:: len(point) // 32 + 1])
 
 
-def _winding(point, corner):
-    """How often closed triangles (m, 3, 3) surround a point: solid angles, van Oosterom and Strackee 1983."""
+def winding(point: np.ndarray, corner: np.ndarray) -> float:
+    """How often closed triangles (m, 3, 3) surround a point: solid angle (van Oosterom, Strackee 1983)."""
     a, b, c = np.moveaxis(corner - point, 1, 0)
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))

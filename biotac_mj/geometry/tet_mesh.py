@@ -90,7 +90,7 @@ class TetMesh:
 
         A component with positive `enclosed_volume` is an outer surface, one with negative volume a cavity.
         """
-        surfaces = connected_faces(self.boundary)
+        surfaces = connected_cells(self.boundary)
         return sorted(surfaces, key=lambda face: -abs(enclosed_volume(self.vert, face)))
 
     def check(self) -> "TetMesh":
@@ -146,16 +146,16 @@ class TetMesh:
         return self
 
 
-def connected_faces(face: np.ndarray) -> list[np.ndarray]:
-    """Connected components (n_i, 3) of faces (n, 3); connected faces share a node."""
+def connected_cells(cell: np.ndarray) -> list[np.ndarray]:
+    """Connected components (n_i, k) of faces or tetrahedra (n, k); connected ones share a node."""
     import scipy.sparse as sparse
 
-    edge = np.concatenate([face[:, :2], face[:, 1:]])
-    size = int(face.max(initial=-1)) + 1
-    graph = sparse.coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(size, size))
+    edge = np.concatenate([cell[:, :-1].T.ravel()[None], cell[:, 1:].T.ravel()[None]])
+    size = int(cell.max(initial=-1)) + 1
+    graph = sparse.coo_matrix((np.ones(edge.shape[1]), edge), shape=(size, size))
     _, label = sparse.csgraph.connected_components(graph, directed=False)
-    label = label[face[:, 0]]
-    return [face[label == i] for i in np.unique(label)]
+    label = label[cell[:, 0]]
+    return [cell[label == i] for i in np.unique(label)]
 
 
 def check_closed(face: np.ndarray, name: str = "surface") -> None:

@@ -4,56 +4,25 @@ to first contact by ray casting."""
 import mujoco
 import numpy as np
 
+from ..geometry.closest import ray_distances
+from ..geometry.core_surface import CoreSurface
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.solid import winding
+from ..geometry.surface import face_areas
 
-__all__ = ["first_touch", "is_inside", "nearest_point", "room", "surface_point"]
+__all__ = ["first_touch", "is_inside", "nearest_point", "normal_at", "room", "surface_point"]
 
 # radius over which a normal is averaged [m]: about two edges of the default skin
 _PATCH = 1.5e-3
 _TOUCHING = 1e-5  # [m] largest depth of bonded skin in a solid
 
 
-def _hits(tri, origin, direction):
-    """Distances (m,) along a ray to the triangles tri (m, 3, 3), inf if it misses (Moeller and Trumbore,
-    1997)."""
-    a, ab, ac = tri[:, 0], tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]
-    p = np.cross(direction, ac)
-    det = np.einsum("ij,ij->i", ab, p)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = origin - a
-        u = np.einsum("ij,ij->i", s, p) / det
-        q = np.cross(s, ab)
-        v = q @ direction / det
-        t = np.einsum("ij,ij->i", ac, q) / det
-        # slightly wider than the triangle, so that no ray passes between two
-        return np.where((u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t >= 0), t, np.inf)
-
-
-def _closest(tri, point):
-    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: its projection on the plane if that is
-    inside, else the closest point of the three edges."""
-    a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
-    normal = np.cross(b - a, c - a)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    foot = point - np.einsum("ij,ij->i", point - a, normal)[:, None] * normal
-    inside = np.ones(len(tri), bool)
-    best, best_distance = foot.copy(), np.full(len(tri), np.inf)
-    for p, q in ((a, b), (b, c), (c, a)):
-        inside &= np.einsum("ij,ij->i", np.cross(q - p, foot - p), normal) >= 0
-        t = np.clip(np.einsum("ij,ij->i", point - p, q - p) / np.einsum("ij,ij->i", q - p, q - p), 0, 1)
-        on_edge = p + t[:, None] * (q - p)
-        distance = np.linalg.norm(on_edge - point, axis=1)
-        best = np.where((distance < best_distance)[:, None], on_edge, best)
-        best_distance = np.minimum(best_distance, distance)
-    return np.where(inside[:, None], foot, best)
-
-
-def _normal_at(tri, point):
-    """Unit outward normal of the surface around a point, averaged by area over a small patch."""
-    area_normal = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
-    distance = np.linalg.norm(tri.mean(1) - point, axis=1)
+def normal_at(geometry: SkinGeometry, point: np.ndarray) -> np.ndarray:
+    """Unit outward normal (3,) of the outer surface around a point (3,) [m], averaged by area over a small
+    patch."""
+    distance = np.linalg.norm(geometry.vert[geometry.outer_face].mean(1) - point, axis=1)
     weight = np.clip(1 - distance / max(_PATCH, 1.01 * distance.min()), 0, None)
-    normal = weight @ area_normal
+    normal = weight @ face_areas(geometry.vert, geometry.outer_face)
     return normal / np.linalg.norm(normal)
 
 
@@ -74,34 +43,26 @@ def surface_point(geometry: SkinGeometry, x: float, angle: float) -> tuple[np.nd
     tri = geometry.vert[geometry.outer_face]
     outward = np.array([0.0, -np.cos(angle), np.sin(angle)])
     reach = 2 * np.abs(geometry.vert).max()
-    distance = _hits(tri, np.array([x, 0.0, 0.0]) + reach * outward, -outward).min()
+    distance = ray_distances(tri, np.array([x, 0.0, 0.0]) + reach * outward, -outward).min()
     if distance >= reach:
         low, high = 1e3 * tri[..., 0].min(), 1e3 * tri[..., 0].max()
         raise ValueError(
             f"no skin at x = {1e3 * x:g} mm: it reaches from {low:.1f} to {high:.1f} mm; choose x inside"
         )
     point = np.array([x, 0.0, 0.0]) + (reach - distance) * outward
-    return point, _normal_at(tri, point)
+    return point, normal_at(geometry, point)
 
 
 def nearest_point(geometry: SkinGeometry, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The point of the outer surface nearest to position (3,) [m], and its unit outward normal (3,)."""
-    tri = geometry.vert[geometry.outer_face]
-    candidates = _closest(tri, np.asarray(position, float))
-    point = candidates[np.linalg.norm(candidates - position, axis=1).argmin()]
-    return point, _normal_at(tri, point)
+    surface = CoreSurface(geometry.vert, geometry.outer_face)
+    point = surface.closest(np.asarray(position, float)[None])[1][0]
+    return point, normal_at(geometry, point)
 
 
 def is_inside(vert: np.ndarray, face: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a point (3,) is inside a closed mesh (n, 3) [m], (m, 3), by the solid angle (van Oosterom and
-    Strackee, 1983)."""
-    a, b, c = np.moveaxis(vert[face] - np.asarray(point, float), 1, 0)
-    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    denominator = la * lb * lc + sum(
-        np.einsum("ij,ij->i", p, q) * length for p, q, length in ((a, b, lc), (b, c, la), (c, a, lb))
-    )
-    return bool(abs(np.arctan2(volume, denominator).sum()) > np.pi)
+    """Whether a point (3,) is inside a closed mesh (n, 3) [m], (m, 3)."""
+    return bool(abs(winding(np.asarray(point, float), vert[face])) > 0.5)
 
 
 def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> float:
@@ -112,9 +73,9 @@ def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> fl
         (geometry.nail_vert, geometry.nail_face),
         (geometry.clamp_vert, geometry.clamp_face),
     )
-    unit = np.asarray(direction, float) / np.linalg.norm(direction)
-    start = np.asarray(point, float) - _TOUCHING * unit
-    distances = [_hits(vert[face], start, unit).min(initial=np.inf) for vert, face in solids]
+    along = np.asarray(direction, float) / np.linalg.norm(direction)
+    start = np.asarray(point, float) - _TOUCHING * along
+    distances = [ray_distances(vert[face], start, along).min(initial=np.inf) for vert, face in solids]
     return max(float(min(distances)) - _TOUCHING, 0.0)
 
 

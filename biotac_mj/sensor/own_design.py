@@ -6,8 +6,6 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
 from ..files import write_json
@@ -18,7 +16,7 @@ from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.importing import read_obj, read_tet_mesh
 from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.tet_mesh import TetMesh, enclosed_volume
+from ..geometry.tet_mesh import TetMesh, connected_cells, enclosed_volume
 from .channels import counts_from_impedance
 from .film import FilmConduction
 from .film.conduction import ELECTRODE_RADIUS
@@ -175,11 +173,7 @@ def new_design(
 
 def _check_mesh(mesh):
     """Raises a ValueError where a mesh [mm] is none of one pad on the plane y = 0."""
-    n = len(mesh.vert)
-    joined = sparse.coo_array(
-        (np.ones(mesh.elem.size), (np.repeat(mesh.elem[:, 0], 4), mesh.elem.ravel())), (n, n)
-    )
-    parts = len(np.unique(connected_components(joined, directed=False)[1][mesh.elem]))
+    parts = len(connected_cells(mesh.elem))
     if parts > 1:
         raise ValueError(f"the mesh has {parts} separate parts: give the mesh of one pad")
     top = mesh.vert[mesh.elem, 1].max()

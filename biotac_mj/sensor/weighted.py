@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry.closest import ray_hits
+from ..geometry.closest import ray_distances
 from ..geometry.design import BIOTAC
 from ..geometry.skin_geometry import SkinGeometry
 
@@ -94,5 +94,6 @@ class WeightedElectrodes:
 
     def _on_skin(self, start, out):
         """Exit point of a ray from inside through the skin at rest."""
-        hits = ray_hits(self.geometry.vert[self.geometry.outer_face], start, out)
-        return start + hits.max() * out if len(hits) else np.full(3, np.nan)
+        away = ray_distances(self.geometry.vert[self.geometry.outer_face], start, out)
+        away = away[np.isfinite(away)]
+        return start + away.max() * out if len(away) else np.full(3, np.nan)

@@ -13,11 +13,13 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ...geometry.closest import ray_distances
 from ...geometry.core_surface import CoreSurface
 from ...geometry.pads import column_tetrahedra
 from ...geometry.rigid import across
 from ...geometry.skin_geometry import SkinGeometry
-from ...geometry.surface import node_normals
+from ...geometry.surface import face_areas, node_normals
+from ...geometry.tet_mesh import connected_cells
 from ...sensor.film import excitation_places
 
 __all__ = ["LiquidConduction"]
@@ -140,18 +142,9 @@ class LiquidConduction:
         above it has its nearest node's height, or nan at `rest`."""
         column, face = self._pair
         corner = np.asarray(vert_xpos, float)[self.geometry.inner_face]
-        a, ab, ac = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        d, s = self.normal[column], self.core_point[column] - a[face]
-        p = np.cross(d, ac[face])
-        det = np.einsum("ij,ij->i", ab[face], p)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.einsum("ij,ij->i", s, p) / det
-            q = np.cross(s, ab[face])
-            v = np.einsum("ij,ij->i", d, q) / det
-            t = np.einsum("ij,ij->i", ac[face], q) / det
-        hit = (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1 + 1e-6) & (t > -1e-3)
+        away = ray_distances(corner[face], self.core_point[column], self.normal[column], -1e-3, 1e-6)
         gap = np.full(len(self.core_point), np.inf)
-        np.minimum.at(gap, column[hit], t[hit])
+        np.minimum.at(gap, column, away)
         lost = ~np.isfinite(gap)
         if rest:
             gap[lost] = np.nan
@@ -221,11 +214,10 @@ def _triangulate(point, core):
     middle = (point.max(0) + point.min(0)) / 2
     flat = (point - middle) * [0.5, 1, 1]  # about as long as it is wide
     triangle = ConvexHull(flat / np.linalg.norm(flat, axis=1, keepdims=True)).simplices
-    a, b, c = np.moveaxis(point[triangle], 1, 0)
-    normal = np.cross(b - a, c - a)
-    inwards = np.einsum("ij,ij->i", normal, core.normal[core.closest((a + b + c) / 3)[2]]) < 0
+    area, outwards = face_areas(point, triangle), core.normal[core.closest(point[triangle].mean(1))[2]]
+    inwards = np.einsum("ij,ij->i", area, outwards) < 0
     triangle[inwards] = triangle[inwards][:, ::-1]
-    return triangle[np.linalg.norm(normal, axis=1) > 1e-12]
+    return triangle[np.linalg.norm(area, axis=1) > 5e-13]
 
 
 def _smooth_normals(point, triangle):
@@ -238,12 +230,7 @@ def _smooth_normals(point, triangle):
 
 def _wet_component(triangle, wet, disc):
     """The connected wet triangles under the first electrode (m, 3) and their nodes (k,)."""
-    from scipy.sparse.csgraph import connected_components
-
-    triangle = triangle[wet[triangle].all(1)]
-    edge = np.concatenate([triangle[:, :2], triangle[:, 1:]])
-    label = connected_components(
-        coo_matrix((np.ones(len(edge)), edge.T), shape=(len(wet),) * 2), directed=False
-    )[1]
-    triangle = triangle[label[triangle[:, 0]] == label[np.flatnonzero(disc == 0)[0]]]
+    first = np.flatnonzero(disc == 0)[0]
+    parts = connected_cells(triangle[wet[triangle].all(1)])
+    triangle = next((part for part in parts if first in part), np.zeros((0, 3), int))
     return triangle, np.unique(triangle)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from ...geometry.core_surface import CoreSurface
 from ...geometry.rigid import matrix, quaternion_from_y, rotation
 from ...geometry.skin_geometry import SkinGeometry
-from ...press.approach import nearest_point
+from ...press.approach import normal_at
 from ..objects import OBJECTS, make_object
 from .clearance import Placed, first_touch, surface_samples
 
@@ -148,10 +148,10 @@ class _Planner:
         return out
 
     def _draw(self, rng):
-
         kind = str(rng.choice(self.kinds, p=self.probability))
         corner = self.geometry.vert[self.faces[rng.choice(len(self.faces), p=self.area)]]
-        point, normal = nearest_point(self.geometry, rng.dirichlet(np.ones(3)) @ corner)
+        point = rng.dirichlet(np.ones(3)) @ corner
+        normal = normal_at(self.geometry, point)
         first, second = _across(normal)
         # uniform over the cap of directions around the inward normal
         tilt, round_ = np.arccos(rng.uniform(np.cos(_TILT), 1)), rng.uniform(0, 2 * np.pi)

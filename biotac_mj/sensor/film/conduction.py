@@ -26,7 +26,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from scipy.special import j1
@@ -37,6 +37,7 @@ from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.geometry.tet_mesh import connected_cells
 from biotac_mj.launches import recorded
 from biotac_mj.sensor.channels import impedance_from_counts
 from biotac_mj.sensor.film import kernels
@@ -244,12 +245,9 @@ class FilmConduction:
                 f"the skin '{self.geometry.name}' has no free inner face: no liquid film; check inner_face "
                 "and fixed"
             )
-        graph = _face_graph(face, self.geometry.nvert)
-        label = connected_components(graph, directed=False)[1]
-        largest = np.argmax(np.bincount(label[face[:, 0]]))
-        face = face[label[face[:, 0]] == largest]
-        node = np.unique(face)
-        order = reverse_cuthill_mckee(graph[node][:, node].tocsr(), symmetric_mode=True)
+        face = max(connected_cells(face), key=len)
+        node, own = np.unique(face, return_inverse=True)
+        order = reverse_cuthill_mckee(_face_graph(own.reshape(-1, 3), len(node)), symmetric_mode=True)
         self.node = node[order]
         index = np.full(self.geometry.nvert, -1)
         index[self.node] = np.arange(len(node))
