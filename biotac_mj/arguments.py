@@ -3,13 +3,14 @@
 import argparse
 import difflib
 import math
+import os
 import pathlib
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from .files import check_output, check_output_file, refuse_inputs
-from .units import SI, UNITS, question, read_quantity
+from .units import SI, UNITS, number_of, question, read_quantity
 
 __all__ = [
     "SEED",
@@ -126,9 +127,10 @@ def quantity(
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
         if not least <= value <= most:
+            asked = question(number_of(text), most, kind, least)
             limits = f"{least / factor:.4g} to {most / factor:.4g} {usual}"
             raise argparse.ArgumentTypeError(
-                f"{text!r} is {value:g} {SI[kind]}: {question(value, most, kind)}{limits} can be given"
+                f"{text!r} is {value:g} {SI[kind]}: {asked}{limits} can be given"
             )
         if abs(value) > plain and not text.strip()[-1].isalpha():
             raise argparse.ArgumentTypeError(
@@ -223,11 +225,19 @@ def output_folder(*names: str) -> Callable[[str], str]:
     return _output(check)
 
 
-def output_file(*more: str) -> Callable[[str], str]:
-    """Type of a file that can be written, with others in its folder; no other argument may name it."""
+def output_file(suffix: str = "", new: bool = False) -> Callable[[str], str]:
+    """Type of a file that can be written; no other argument may name it.
+
+    Args:
+      suffix: of its name; "" for any. new: whether it must not exist, as what it holds cannot be made again.
+    """
 
     def check(text):
-        check_output_file(text, *more)
+        if new and os.path.lexists(text):
+            raise ValueError(f"{text} is there already: give a new name")
+        check_output_file(text)
+        if not text.endswith(suffix):
+            raise ValueError(f"{text} does not end in {suffix}: give a name that does")
         return (pathlib.Path(text),)
 
     return _output(check)

@@ -5,7 +5,7 @@ import re
 
 from .short_repr import short_repr
 
-__all__ = ["SI", "UNITS", "question", "read_quantity"]
+__all__ = ["SI", "UNITS", "number_of", "question", "read_quantity"]
 
 # units of each kind in SI; the SI unit first, the usual unit second
 UNITS = {
@@ -40,8 +40,15 @@ def read_quantity(name: str, value: object, kind: str) -> object:
     return float(found[1]) * units.get(found[2], 1.0)
 
 
-def question(value: float, most: float, kind: str) -> str:
-    """Question for messages whether a plain number above `most` was meant in the usual unit; "" if that is
-    too large, too."""
-    usual, factor = list(UNITS[kind].items())[1]
-    return f"did you mean {value:g}{usual}? " if abs(value) * factor <= most else ""
+def number_of(text: str) -> float:
+    """The number of a quantity that `read_quantity` takes, without its unit."""
+    return float(_TEXT.fullmatch(text)[1])
+
+
+def question(number: float, most: float, kind: str, least: float = -math.inf) -> str:
+    """Question for messages whether a number outside least..most was meant in the usual unit or in that of
+    SI; "" if neither is inside."""
+    si, usual = list(UNITS[kind])[:2]
+    meant = (unit for unit in (usual, si) if max(least, -most) <= number * UNITS[kind][unit] <= most)
+    unit = next(meant, None)
+    return f"did you mean {number:g}{unit}? " if unit else ""

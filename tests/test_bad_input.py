@@ -841,7 +841,7 @@ def numbers():
     ):
         yield Row(f"press --skin coarse {words}", asked)
     for verb in (
-        "recording import --out out",
+        "recording import --out out.h5",
         "recording show --out out",
         "learn judge",
         "data resimulate --out out",
@@ -929,7 +929,6 @@ OVER_FILES = {
     "lab mesh skin.npz --out": "skin.npz",
     "hand mount force.txt --body a --out": "force.txt",
     "recording show electrodes.txt --out": "electrodes.txt",
-    "recording export electrodes.txt --ros1": "electrodes.txt",
     "view --material material.json --render": "material.json",
     "lab estimate electrodes.txt --known force.txt --out": "force.txt",
 }
@@ -978,9 +977,14 @@ def outputs():
     ):
         yield Row(words, f"no value in {words.split()[-1]}: give one, or leave the option out")
     yield Row(
-        "recording import electrodes.txt --out electrodes.txt",
-        "--out electrodes.txt is one of the files that are",
+        "recording import shard.h5 --out shard.h5",
+        "--out shard.h5 is one of the files that are",
     )
+    yield Row("recording import electrodes.txt --out a.csv", "a.csv does not end in .h5: give a name that")
+    yield Row("recording export electrodes.txt --ros1 a.csv", "a.csv does not end in .bag: give a name that")
+    yield Row("recording export electrodes.txt --ros1 force.txt", "force.txt is there already: give a new")
+    yield Row("recording export electrodes.txt --ros2 mesh", "mesh is there already: give a new")
+    yield Row("recording record --topic /a --out shard.h5", "shard.h5 is there already: give a new")
     for words, file in OVER_FOLDERS.items():
         made = lambda path: (path.parent.mkdir(), path.write_text("{}"))  # noqa: E731
         said = f"--out there: there/{file} is one of the files that are read: choose another folder"

@@ -113,9 +113,12 @@ def test_units_mean_the_same_on_the_command_line_and_in_python():
         ("view --seconds 500ms", 0.5, None),
         ("view --seconds 300", None, "'300' is 300 s: did you mean 300ms? 0 to 6e+04 ms can be given"),
         ("data import log.txt --out set --block 10s", 10.0, None),
+        ("design new pad --block 0.02mm 9mm 9mm", None, "'0.02mm' is 2e-05 m: did you mean 0.02m? 0.1 to"),
+        ("design new pad --block 20 9mm 9mm", None, "'20' is 20 m: did you mean 20mm? 0.1 to 100 mm can"),
+        ("design new pad --block 200mm 9mm 9mm", None, "'200mm' is 0.2 m: 0.1 to 100 mm can be given"),
     ],
 )
-def test_a_plain_time_that_is_too_long_is_asked_about(words, value, said, capsys):
+def test_a_quantity_out_of_range_is_asked_about(words, value, said, capsys):
     try:
         args = cli.parser().parse_args(words.split())
     except SystemExit:

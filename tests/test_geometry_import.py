@@ -127,12 +127,19 @@ def test_bad_tetrahedra(folder, coarse):
         import_mesh(folder)
 
 
-@pytest.mark.parametrize(("factor", "size"), [(1e3, r"2.79\d?e\+04"), (1e-3, "0.0279")])
-def test_wrong_units(folder, coarse, factor, size):
+@pytest.mark.parametrize(
+    ("factor", "size", "remedy"),
+    [
+        (1e3, r"2.79\d?e\+04", r"is it in millimetres\? multiply it by 0.001"),
+        (1e-3, "0.0279", r"was it scaled twice\? multiply it by 1000"),
+        (1e-6, "2.79", "scale it to metres"),
+    ],
+)
+def test_wrong_units(folder, coarse, factor, size, remedy):
     write_tet(folder / "skin.tet", coarse.vert * factor, coarse.elem)
     with pytest.raises(
         ValueError,
-        match=rf"largest dimension is {size}.* mm, not between 5 and 100 mm: scale it to metres",
+        match=rf"largest dimension is {size}.* mm, not between 5 and 100 mm: {remedy}",
     ):
         import_mesh(folder)
 

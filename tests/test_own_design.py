@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from meshing import write_obj
 from readers_files import GROUND, SIX
 
 import biotac_mj
@@ -99,6 +100,19 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
     inside = PadShape(mesh=written(tmp_path / "shell.tet", shell.vert, shell.elem), core=(8.4, 8.4, 8.4))
     with pytest.raises(ValueError, match="the core reaches .* mm into the skin: no liquid fits"):
         new_design(tmp_path / "pad", inside, SIX, GROUND)
+    core = tmp_path / "core.obj"
+    write_obj(core, np.array([[0, -6, 0], [6, 0, 0], [-6, 0, 0], [0, 0, 6]]), np.array([[0, 1, 2], [0, 3, 1]]))
+    with pytest.raises(ValueError, match="the core's largest dimension is 1.2e.04 mm, .* is it in millimetres"):
+        new_design(tmp_path / "pad", PadShape(mesh=tmp_path / "shell.tet", core=core), SIX, GROUND)
+
+
+def test_a_design_is_not_overwritten(tmp_path):
+    flat = PadShape(block=(20.0, 20.0, 6.0), edge=6.0)
+    new_design(tmp_path / "flat", flat)
+    with pytest.raises(ValueError, match="flat' holds a design already: give another folder"):
+        new_design(tmp_path / "flat", flat)
+    with pytest.raises(ValueError, match="biotac_sp' names no design of your own"):
+        new_design(tmp_path / "biotac_sp", flat)
 
 
 @pytest.mark.parametrize(
@@ -111,8 +125,13 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
         ({"block": (20.0, 20.0, 6.0)}, (SIX, GROUND), "electrodes feel the liquid .*, and this pad is solid"),
         (DOMED, (SIX, ()), "6 electrodes and 0 of excitation"),
         (DOMED, ([*SIX[:5], [40, 0, -5]], GROUND), "E6 is 34.3 mm off the core, and a disc is 1 mm wide"),
+        (DOMED, (1e-3 * np.array(SIX), GROUND), "off the core, .*: are they in metres. give places .* in mm"),
+        (DOMED, (SIX, 1e3 * np.array(GROUND)), "off the core, .*: are they in micrometres. give places"),
+        (DOMED, ([*SIX[:5], [1, 0, 0]], GROUND), "E6 is 5 mm off the core"),  # on the backing is no liquid
         (DOMED, ([*SIX, [0, 0.6, -6]], GROUND), "E1 and E7 are 0.6 mm apart, and a disc is 1 mm wide"),
         ({"block": (2.0, 2.0, 2.0)}, (), "is 2 mm, not between 5 and 100 mm"),
+        ({"block": (0.02, 0.02, 0.006)}, (), "is 0.02 mm, .*: was it scaled twice. multiply it by 1000"),
+        ({"dome": (9e3,) * 3, "core": (6e3,) * 3}, (), "is 1.8e.04 mm, .*: is it in millimetres"),
     ],
 )
 def test_pads_that_cannot_be_are_refused(tmp_path, shape, places, said):

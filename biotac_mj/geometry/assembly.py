@@ -10,7 +10,7 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.surface import face_areas
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_cells, enclosed_volume
 
-__all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
+__all__ = ["assemble", "check_size", "fixed_nodes", "electrodes_on", "split_surfaces"]
 
 EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # an absent rigid body
 FIXED_WITHIN = 1e-5  # nodes within this distance of a rigid body are fixed [m] (Narang et al., ICRA 2021)
@@ -108,6 +108,20 @@ def electrodes_on(
     return position, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+def check_size(size: float, what: str = "skin", least: float = 5e-3) -> None:
+    """Raises ValueError unless the largest dimension [m] of a body is that of a part of a fingertip: from
+    `least` to 0.1."""
+    if least <= size <= 0.1:
+        return
+    meant = {1e-3: "is it in millimetres? ", 1e-6: "is it in micrometres? ", 1e3: "was it scaled twice? "}
+    factor = next((factor for factor in meant if least <= factor * size <= 0.1), None)
+    remedy = f"{meant[factor]}multiply it by {factor:g}" if factor else "scale it to metres"
+    raise ValueError(
+        f"the {what}'s largest dimension is {1e3 * size:.4g} mm, not between {1e3 * least:g} and 100 mm: "
+        f"{remedy}"
+    )
+
+
 def assemble(
     name: str,
     mesh: TetMesh,
@@ -124,11 +138,7 @@ def assemble(
       ValueError: see `TetMesh.check` and `split_surfaces`; an open rigid body; no fixed node; wrong units.
     """
     mesh.check()
-    size = np.ptp(mesh.vert, axis=0).max() * 1e3
-    if not 5.0 <= size <= 100.0:
-        raise ValueError(
-            f"the skin's largest dimension is {size:.4g} mm, not between 5 and 100 mm: scale it to metres"
-        )
+    check_size(np.ptp(mesh.vert, axis=0).max())
     bodies = [(core, "core"), (nail, "nail plate"), (clamp, "clamp plate")]
     for (vert, face), label in bodies:
         if not len(face):

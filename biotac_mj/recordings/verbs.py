@@ -11,12 +11,6 @@ _FORMS = ("biotac_sensors", "tactile_msgs")
 __all__ = ["add_load_arguments", "add_which", "add_verbs", "load_given"]
 
 
-def _new_folder(text):
-    if os.path.exists(text):
-        raise argparse.ArgumentTypeError(f"{text} is there already: give the name of a new folder")
-    return output_file()(text)
-
-
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
     """Adds them to argparse's subparsers; verb(verbs, name, run, text) makes one."""
     v = verb(
@@ -28,7 +22,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     )
     v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of its forces and poses")
     add_load_arguments(v)
-    v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
+    v.add_argument("--out", type=output_file(".h5"), required=True, metavar="FILE.h5", help="the recording")
     v = verb(
         verbs,
         "export",
@@ -41,8 +35,8 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     add_which(v)
     add_load_arguments(v)
     bag = v.add_mutually_exclusive_group(required=True)
-    bag.add_argument("--ros1", type=output_file(), metavar="OUT.bag", help="a bag of ROS 1")
-    bag.add_argument("--ros2", type=_new_folder, metavar="OUT", help="a bag of ROS 2: a folder to make")
+    bag.add_argument("--ros1", type=output_file(".bag", new=True), metavar="OUT.bag", help="a bag of ROS 1")
+    bag.add_argument("--ros2", type=output_file(new=True), metavar="OUT", help="a bag of ROS 2: a folder to make")
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
     v.add_argument("files", nargs="+", metavar="FILE", help="output or input of `biotac recording import`")
@@ -72,13 +66,14 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     )
     v.add_argument(
         "--protocol",
-        type=output_file(),
+        type=output_file(".yaml"),
         metavar="FILE.yaml",
         help="announce the steps of a checkup, from this file if it exists (`biotac checkup`), and "
         "write their times into it",
     )
     v.add_argument("--object", metavar="NAME", help="what touches")
-    v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
+    measured = output_file(".h5", new=True)
+    v.add_argument("--out", type=measured, required=True, metavar="FILE.h5", help="the recording")
 
 
 def add_which(verb: argparse.ArgumentParser) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.distance import pdist, squareform
 
 from ..files import write_json
-from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
+from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, check_size, fixed_nodes
 from ..geometry.core_surface import CoreSurface
-from ..geometry.design import Design
+from ..geometry.design import DESIGNS, Design
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.importing import read_obj, read_tet_mesh
 from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
@@ -64,6 +64,8 @@ class PadShape:
             )
         if self.block and self.core is not None:
             raise ValueError("a block is solid and has no core: leave --core out, or give --dome")
+        if self.mesh is None:  # before it is meshed
+            check_size(1e-3 * max(np.multiply(self.dome, (2, 2, 1)) if self.dome else self.block))
         if self.dome and isinstance(self.core, tuple):
             clearance = np.subtract(self.dome, self.core).min() - self.thickness
             if clearance <= 0:
@@ -103,6 +105,7 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
         core = dome_core((np.array(_xyz(shape.core)), 0.0), 30)
     elif shape.core is not None:
         vert, face = max(read_obj(shape.core), key=lambda body: abs(enclosed_volume(*body)))
+        check_size(np.ptp(vert, axis=0).max(), "core", 1e-3)
         core = 1e3 * vert, face if enclosed_volume(vert, face) > 0 else face[:, ::-1]
     bodies = [(1e-3 * vert, face) for vert, face in ((core, backing) if len(core[1]) else (backing, EMPTY))]
     skin = assemble(design.name, TetMesh(1e-3 * mesh.vert, mesh.elem), *bodies, design=design)
@@ -145,9 +148,13 @@ def new_design(
       title: its name in messages.
 
     Raises:
-      FileNotFoundError, ValueError: an invalid shape, or one that cannot be simulated.
+      FileNotFoundError, ValueError: an invalid shape, or one that cannot be simulated; a folder that holds a
+        design already, or has the name of one that is shipped.
     """
     folder = pathlib.Path(folder)
+    if folder.name in ("", "..", *DESIGNS) or (folder / "design.json").exists():
+        why = "holds a design already" if (folder / "design.json").exists() else "names no design of your own"
+        raise ValueError(f"{str(folder)!r} {why}: give another folder")
     n = len(electrodes_mm)
     if n and not shape.liquid:
         raise ValueError(
@@ -188,12 +195,15 @@ def _check_places(skin):
     """Raises a ValueError where an electrode is not on the core, or two of them would touch."""
     design, disc = skin.design, 2e3 * ELECTRODE_RADIUS  # [mm]
     place = design.in_biotac_frame(np.array([*design.electrodes_mm, *design.excitation]))
-    off = 1e3 * np.abs(CoreSurface(skin.core_vert, skin.core_face).closest(1e-3 * place)[0])
+    off = _off_core(skin, place)
     worst = int(off.argmax())
     if off[worst] > disc:
+        units = {1e3: "are they in metres? ", 1e-3: "are they in micrometres? "}
+        far = place[off > disc]
+        meant = (asked for factor, asked in units.items() if (_off_core(skin, factor * far) <= disc).all())
         raise ValueError(
             f"{design.discs[worst]} is {off[worst]:.3g} mm off the core, and a disc is {disc:.3g} mm wide: "
-            "give places on the core in mm, x to the fingertip, z out of the nail"
+            f"{next(meant, '')}give places on the core in mm, x to the fingertip, z out of the nail"
         )
     pair = squareform(pdist(place)) + np.diag(np.full(len(place), np.inf))
     i, k = np.unravel_index(pair.argmin(), pair.shape)
@@ -202,6 +212,13 @@ def _check_places(skin):
             f"{design.discs[i]} and {design.discs[k]} are {pair[i, k]:.3g} mm apart, and a disc is "
             f"{disc:.3g} mm wide: move them apart, or leave one out"
         )
+
+
+def _off_core(skin, place):
+    """Distance (n,) [mm] of places (n, 3) [mm] from the core's surface under the liquid."""
+    backed = (skin.core_vert[skin.core_face, 1] > -FIXED_WITHIN).all(axis=1)  # faces that lie on the backing
+    liquid = CoreSurface(skin.core_vert, skin.core_face[~backed])
+    return 1e3 * np.abs(liquid.closest(1e-3 * place)[0])
 
 
 def _xyz(lengths):

@@ -328,7 +328,7 @@ def _remedy(cell, row=None):
         return f"is this a time? What is read is {_CLOCKS}, in a column that the header calls time"
     if row == 0 and re.search("[a-z]", cell, re.I) and cell.lower() not in ("nan", "inf", "-nan", "-inf"):
         return "is this line a row of units, or of the header? Remove it"
-    return "a gap cannot be guessed; cut the recording there or log it again"
+    return "a gap cannot be guessed; write the number, or cut the file there"
 
 
 def _date(text):
