@@ -101,8 +101,12 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
     with pytest.raises(ValueError, match="the core reaches .* mm into the skin: no liquid fits"):
         new_design(tmp_path / "pad", inside, SIX, GROUND)
     core = tmp_path / "core.obj"
-    write_obj(core, np.array([[0, -6, 0], [6, 0, 0], [-6, 0, 0], [0, 0, 6]]), np.array([[0, 1, 2], [0, 3, 1]]))
-    with pytest.raises(ValueError, match="the core's largest dimension is 1.2e.04 mm, .* is it in millimetres"):
+    write_obj(
+        core, np.array([[0, -6, 0], [6, 0, 0], [-6, 0, 0], [0, 0, 6]]), np.array([[0, 1, 2], [0, 3, 1]])
+    )
+    with pytest.raises(
+        ValueError, match="the core's largest dimension is 1.2e.04 mm, .* is it in millimetres"
+    ):
         new_design(tmp_path / "pad", PadShape(mesh=tmp_path / "shell.tet", core=core), SIX, GROUND)
 
 

@@ -36,7 +36,9 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     add_load_arguments(v)
     bag = v.add_mutually_exclusive_group(required=True)
     bag.add_argument("--ros1", type=output_file(".bag", new=True), metavar="OUT.bag", help="a bag of ROS 1")
-    bag.add_argument("--ros2", type=output_file(new=True), metavar="OUT", help="a bag of ROS 2: a folder to make")
+    bag.add_argument(
+        "--ros2", type=output_file(new=True), metavar="OUT", help="a bag of ROS 2: a folder to make"
+    )
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
     v.add_argument("files", nargs="+", metavar="FILE", help="output or input of `biotac recording import`")
