@@ -94,7 +94,7 @@ def members(objects, sensor, splits, measured=None):
 
 def prepare(arrays, sensor, splits, config, folder):
     """Writes all that networks read; arrays: of all sets in one; sensor: (k,) numbers of theirs."""
-    features = Features(arrays, dataclasses.replace(config, window=(), mirror=False))
+    features = Features(arrays, config)
     geometry = arrays.geometry
     free = np.setdiff1d(np.arange(geometry.nvert), geometry.fixed)
     sample = free[farthest_points(geometry.vert[free], 128)]

@@ -39,9 +39,10 @@ def record(hand: pathlib.Path, decisions: int, seed: int) -> tuple[dict, tuple]:
     on it (n, 3) [N] and the friction; and the rod's radius and half length [m]."""
     import torch
 
-    from biotac_mj.tasks.batched import RollRod
+    from biotac_mj.tasks.batched.roll_rod import RollRod, Settings
 
-    env = RollRod(hand, num_envs=1, device="cpu")
+    open_fingers = Settings(prepare=0, decisions=50, gentle=np.inf)
+    env = RollRod(hand, num_envs=1, device="cpu", settings=open_fingers)
     env.reset(seed=seed)
     draw = torch.Generator().manual_seed(seed)
     seen = {name: ([], [], []) for name in env.batches}

@@ -51,8 +51,7 @@ def main(argv=None):
         model = load_forward(find_weights(name), geometry).to(args.device)
         for n in args.batches if args.device == "cuda" else [1]:
             u = 0.05 * torch.randn(n, geometry.nvert, 3, device=args.device)
-            average = torch.zeros(n, *model.memory, device=args.device) if model.window else None
-            work = functools.partial(model.log_change, u, average, 0.01)
+            work = functools.partial(model.log_change, u)
             wall, cpu = measure(work, args.device, 50 if n == 1 else 20)
             rows.append(
                 {

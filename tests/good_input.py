@@ -110,7 +110,7 @@ def _trained(folder, rng):
         "labelled": 20,
         "device": "cpu",
         "mesh": {"pod": {"all": {"mean": 0.1, "moved": 0.2}, "objects": {}}},
-        "inverse": {"pod_inverse": {"mean": 0.1, "moved": 0.2}},
+        "inverse": {"pod_inverse_taught": {"mean": 0.1, "moved": 0.2}},
         "seconds": {"pod_mlp": 1.0},
     }
     (folder / "trajectory-0.json").write_text(json.dumps(report))

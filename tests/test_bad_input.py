@@ -349,7 +349,6 @@ def files_of_sets():
         "data export set --quiet --out out", "unfinished (4 of 9 interactions)", "set/shard-00000.h5", half
     )
     yield Row("learn train nowhere --quiet", "no shards (shard-*.h5) at nowhere")
-    yield Row("learn train shard.h5 --quiet --only jelly", "the list of models has 'jelly'")
     yield Row("learn train shard.h5 --quiet --splits jelly", "no object 'jelly'")
     yield Row("diagnose nowhere.h5 --quiet", "no measured data at nowhere.h5")
 
@@ -693,9 +692,7 @@ def trained_models():
     yield Row("learn judge", "give one of a folder that")
     yield Row("learn judge trained --new-sensor shard.h5", "give one of a folder that")
     yield Row("learn judge trained --force force.txt", "--force goes with a recording")
-    yield Row("learn judge electrodes.txt --ship out", "--ship copies")
     yield Row("learn judge electrodes.txt --touches 9", "--touches goes with --known")
-    yield Row("learn judge trained --ship out", "no trained/forward-trajectory.safetensors: train seed 0 of")
     for words in (
         "electrodes.txt --json electrodes.txt",
         "electrodes.txt --force force.txt --json force.txt",
@@ -907,7 +904,6 @@ OUT = {
     "learn train shard.h5": ("--out", None),
     "data resimulate electrodes.txt": ("--out", "resimulate.json"),
     "learn predict inverse electrodes.txt": ("--out", "contact.png"),
-    "learn judge trained --ship": ("", None),
 }
 OUT_FILES = {
     "learn judge trained": "--json",

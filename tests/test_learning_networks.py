@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix  # noqa: E402
 from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE  # noqa: E402
 from biotac_mj.learning.networks.graph import ChebConv, SparseMatrix  # noqa: E402
-from biotac_mj.learning.networks.heads import LocalHead, PodHead, averages, next_average  # noqa: E402
+from biotac_mj.learning.networks.heads import LocalHead  # noqa: E402
 from biotac_mj.learning.networks.hierarchy import build_hierarchy  # noqa: E402
 from biotac_mj.learning.networks.mesh_vae import MeshVAE  # noqa: E402
 from biotac_mj.learning.networks.pointnet import PointNet  # noqa: E402
@@ -182,19 +182,11 @@ def test_mirrored_touch_is_seen_by_the_mirrored_electrodes(skin):
     )  # the mesh itself is symmetric to a few hundredths of a millimetre only
 
 
-def test_heads_are_zero_at_rest_and_averages_are_causal():
+def test_a_head_is_zero_at_rest():
     torch.manual_seed(0)
-    for head in (PodHead(6).eval(), LocalHead(5, 6).eval()):
-        assert head(torch.zeros(2, 19, 5), torch.zeros(2, 6)).abs().max() < 1e-6
-        assert head(torch.randn(2, 19, 5), torch.randn(2, 6)).abs().max() > 1e-3
-    value, time, first = torch.randn(5, 3), torch.arange(5) * 0.1, torch.zeros(5, dtype=torch.long)
-    got = averages(value, first, time, (0.2,))
-    mean = torch.zeros(1, 3)
-    for k in range(1, 5):
-        mean = next_average(mean, value[k], 0.1, (0.2,))
-        np.testing.assert_allclose(got[k], value[k] - mean[0], atol=1e-6)
-    value[4] += 1
-    np.testing.assert_array_equal(averages(value, first, time, (0.2,))[:4], got[:4])
+    head = LocalHead(5, 6).eval()
+    assert head(torch.zeros(2, 19, 5), torch.zeros(2, 6)).abs().max() < 1e-6
+    assert head(torch.randn(2, 19, 5), torch.randn(2, 6)).abs().max() > 1e-3
 
 
 def test_pointnet_reads_only_its_nodes(skin):

@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from learning_set import dent, log_change, make_set  # noqa: E402
+from ship_weights import ship  # noqa: E402
 
 import biotac_mj  # noqa: E402
 from biotac_mj import cli  # noqa: E402
@@ -22,20 +23,16 @@ from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.patch import contact_patch  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkFilm  # noqa: E402
-from biotac_mj.learning.shipping import ship  # noqa: E402
-from biotac_mj.learning.training import experiment, fitting  # noqa: E402
+from biotac_mj.learning.training import fitting  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
-from biotac_mj.learning.training.experiment import FORWARD, train_all  # noqa: E402
-from biotac_mj.learning.training.features import Pod  # noqa: E402
+from biotac_mj.learning.training.experiment import train_all  # noqa: E402
 from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains, fit_mixing  # noqa: E402
 from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
-from biotac_mj.learning.training.local import Features, train_head  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
-from biotac_mj.sensor.readings import PhysicsReadings  # noqa: E402
 
 SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
 
@@ -47,7 +44,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(folder, tmp_path_factory):
-    """One training of three models on both kinds of split."""
+    """One training of our models on both kinds of split."""
     out = tmp_path_factory.mktemp("trained")
     torch.set_num_threads(1)
     train_all(
@@ -57,7 +54,6 @@ def trained(folder, tmp_path_factory):
         ("trajectory", "ring_7mm"),
         SMALL,
         paper=False,
-        only=("local_taught", "local_window"),
         progress=False,
     )
     return out
@@ -91,25 +87,6 @@ def test_local_head_recovers_the_rule_on_an_unseen_object(trained, evaluated):
         assert not set(file["owner"][~file["test"]]) & set(ring)
 
 
-@pytest.mark.slow  # quick: gains of few touches, and the rule on an unseen object
-def test_no_sensor_is_taken_for_a_symmetric_one(tmp_path):
-    """Gains that scatter as those of two real sensors do: mirrored readings are another sensor's."""
-    config = LearningConfig(steps=250, batch=64, width=16, members=1, pod=32)
-    gain = np.exp(np.random.default_rng(3).normal(0, 0.27, 19))
-    a = load_arrays(make_set(tmp_path, count=100, labelled=80, gain=gain))
-    features = Features(a, config)
-    train, validation, test = np.r_[0:60, 80:100], np.arange(60, 66), np.arange(66, 80)
-    basis = Pod.fit(a.field, a.rows(train), config.pod)
-    pod = basis, features.components(basis), features.components(basis, True)
-    rows = a.rows(test, labelled=True)
-    error = {}
-    for mirror in (False, True):
-        kind = FORWARD["local_taught"] | ({"mirror": True} if mirror else {})
-        change = train_head(features, train, validation, config, pod=pod, **kind)(rows)
-        error[mirror] = float((change - a.change(rows)).square().mean(1).sqrt().median())
-    assert error[False] < 0.75 * error[True], error
-
-
 def test_weights_are_shipped_with_a_card(trained, evaluated, tmp_path):
     written = ship(trained, evaluated, tmp_path / "weights")
     assert sorted(p.name for p in written) == [
@@ -125,15 +102,15 @@ def test_weights_are_shipped_with_a_card(trained, evaluated, tmp_path):
         == load_skin("coarse").nvert
     )
     with pytest.raises(FileNotFoundError, match="seed 0"):
-        ship(tmp_path, {}, tmp_path / "other")
+        ship(tmp_path, {"data": "synthetic"}, tmp_path / "other")
 
 
 def test_training_goes_on_where_it_was_interrupted(trained, folder):
     stamp = (trained / "trajectory-0.json").stat().st_mtime_ns
-    same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
+    same = dict(paper=False, progress=False)
     train_all(folder, trained, (0,), ("trajectory",), SMALL, **same)
     assert (trained / "trajectory-0.json").stat().st_mtime_ns == stamp
-    for name, changes in (("models", same | {"only": None}), ("limit", same | {"limit": 9})):
+    for name, changes in (("paper", same | {"paper": True}), ("limit", same | {"limit": 9})):
         with pytest.raises(ValueError, match=rf"json is of other settings \({name}\): choose another --out"):
             train_all(folder, trained, (0,), ("trajectory",), SMALL, **changes)
 
@@ -145,34 +122,33 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
     def counted(self, n, seconds=0.0):
         count(self, n, seconds)
         steps.append(n)
-        if len(steps) == 400:  # within the second network, between two of its states that are kept
+        if len(steps) == 400:  # within the inverse, between two of its states that are kept
             raise KeyboardInterrupt
 
-    same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
-    monkeypatch.setattr(experiment, "_step_time", lambda *_: 0.0)  # its steps are not these
+    same = dict(paper=False, progress=False)
     monkeypatch.setattr(Checkpoints, "count", counted)
     monkeypatch.setattr(fitting, "_BETWEEN", 0.0)
     with pytest.raises(KeyboardInterrupt):
         train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
     (kept,) = tmp_path.glob("unfinished-*")
-    assert len(list(kept.iterdir())) == 4
+    assert len(list(kept.iterdir())) == 3
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
     done = steps[400:]
-    # three whole trainings, and the fourth up to a state that was kept
-    assert max(done) == 120 and done[:3] == [120, 120, 120] and 0 < done[3] < 120
+    # two whole trainings, and the third up to a state that was kept
+    assert done[:2] == [120, 120] and 0 < done[2] < 240
     for name in ("trajectory-0.npz", "forward-trajectory.safetensors", "inverse-trajectory.safetensors"):
         assert (tmp_path / name).read_bytes() == (trained / name).read_bytes()
     assert not kept.exists()
 
 
 @pytest.mark.slow
-def test_the_bar_reaches_its_end_and_the_time_is_said_before(folder, tmp_path, capsys, monkeypatch):
+def test_the_bar_reaches_its_end(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # elsewhere no bar is drawn
-    train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False, only=("pod_log",))
+    train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False)
     said, bar = capsys.readouterr()
-    assert "80 interactions" in said and "minutes on one core" in said
-    total = 120 * (1 + 1 + 2 + 1)  # the head, both inverses
-    assert f"0/{total}" in bar and (tmp_path / "trajectory-0.json").is_file()
+    total = 120 * (2 + 3)  # the head, the inverse
+    assert "80 interactions" in said and f"{total}/{total}" in bar
+    assert (tmp_path / "trajectory-0.json").is_file()
 
 
 @pytest.mark.slow
@@ -189,10 +165,9 @@ def test_the_papers_networks_train_too(folder, tmp_path):
         members=1,
         paper_steps=60,
     )
-    train_all(folder, tmp_path, (0,), ("trajectory",), config, only=("pod_log",), progress=False)
+    train_all(folder, tmp_path, (0,), ("trajectory",), config, progress=False)
     report = json.loads((tmp_path / "trajectory-0.json").read_text())
     assert {"pod", "mesh_vae"} == set(report["mesh"]) and {
-        "pod_inverse",
         "pod_inverse_taught",
         "latent_inverse",
     } == set(report["inverse"])
@@ -201,12 +176,10 @@ def test_the_papers_networks_train_too(folder, tmp_path):
     )
     skin = load_skin("coarse")
     u = torch.tensor(1e3 * dent(skin, [-9e-3, -7e-3, 0], 0.6e-3, 2e-3, 0)[None], dtype=torch.float32)
-    for name in ("forward", "pod_log", "latent_projection", "pointnet"):  # every network is kept and reads
+    for name in ("forward", "latent_projection", "pointnet"):  # every network is kept and reads
         model = load_forward(tmp_path / f"{name}-trajectory.safetensors", skin)
-        assert (
-            torch.isfinite(model.log_change(u)[0]).all() and not model.log_change(0 * u)[0].abs().max() > 1e-5
-        )
-    for name in ("inverse", "pod_inverse", "pod_inverse_taught", "latent_projection"):
+        assert torch.isfinite(model.log_change(u)).all() and not model.log_change(0 * u).abs().max() > 1e-5
+    for name in ("inverse", "latent_projection"):
         field, _ = load_inverse(tmp_path / f"{name}-trajectory.safetensors", skin)(torch.zeros(1, 19))
         assert field.shape == (1, skin.nvert, 3) and field.abs().max() < 1e-4  # [mm]
 
@@ -215,7 +188,7 @@ def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
     skin = load_skin("coarse")
     model = load_forward(weights, skin)
     u = dent(skin, [-9e-3, -7e-3, 1e-3], 0.8e-3, 2e-3, 0)
-    d = model.log_change(torch.tensor(1e3 * u[None], dtype=torch.float32))[0][0].numpy()
+    d = model.log_change(torch.tensor(1e3 * u[None], dtype=torch.float32))[0].numpy()
     wanted = log_change(skin, u)
     assert np.abs(d - wanted).max() < 0.15 * np.abs(wanted).max()
     with pytest.raises(ValueError, match=r"trained on skin 'coarse' with .* cannot read skin 'default'"):
@@ -323,38 +296,6 @@ def test_a_batch_takes_the_file_of_a_model(weights):
             batch.make(model, 2, "cpu", skin="coarse", **given)
 
 
-def test_a_window_remembers_in_the_state_and_settles(tmp_path):
-    from types import SimpleNamespace
-
-    from biotac_mj.learning.networks.heads import LocalHead
-    from biotac_mj.learning.training.features import FilmFeatures, Pod
-    from biotac_mj.learning.weights import save_forward
-    from biotac_mj.sensor.acquisition import Acquisition
-
-    skin = load_skin("coarse")
-    torch.manual_seed(0)
-    member = SimpleNamespace(head=LocalHead(3 * FilmFeatures.count, 4, 16))
-    config = LearningConfig(window=(0.05, 0.4), width=16)
-    about = {"nvert": skin.nvert, "model": "random"}
-    file = tmp_path / "w.safetensors"
-    save_forward(file, [member], Pod(skin.nvert, 4), config, {"kind": "local", "window": True}, skin, about)
-    readings = PhysicsReadings(skin, film=NetworkFilm(skin, file), noise=False, sensor="2")
-    assert readings.nstate == Acquisition().nstate + 1 + 2 * 19 * FilmFeatures.count
-    state = np.zeros(readings.nstate)
-    readings.reset(state)
-    moved = skin.vert + dent(skin, [-9e-3, -7e-3, 0], 0.3e-3, 2e-3, 0)
-    u = torch.tensor(1e3 * (moved - skin.vert)[None], dtype=torch.float32)
-    steady = readings.film.model.counts(u, REST_COUNTS["2"])[0].numpy()
-    trace = []
-    for k in range(400):
-        readings.advance(state, 0.01 * k, 0.01, moved, 0.0)
-        trace.append(readings.readings(state)["electrodes"])
-    assert np.abs(trace[2] - steady).max() > 2 > 1.01 >= np.abs(trace[-1] - steady).max()
-    copy = state.copy()  # the state is all there is: a replay is equal
-    readings.advance(state, 4.0, 0.01, skin.vert, 0.0), readings.advance(copy, 4.0, 0.01, skin.vert, 0.0)
-    np.testing.assert_array_equal(state, copy)
-
-
 def test_a_batch_gives_what_single_sensors_give(weights):
     import warp as wp
 
@@ -366,10 +307,7 @@ def test_a_batch_gives_what_single_sensors_give(weights):
     one = NetworkFilm(skin, weights)
     got = film.impedance.numpy()
     np.testing.assert_allclose(got[1], film.rest)
-    average = torch.zeros(3, *one.model.memory) if one.model.window else None
-    change = (
-        one.model.log_change(torch.tensor(1e3 * u, dtype=torch.float32), average, 0.01)[0].double().numpy()
-    )
+    change = one.model.log_change(torch.tensor(1e3 * u, dtype=torch.float32)).double().numpy()
     np.testing.assert_allclose(got[[0, 2]], (film.rest * np.exp(change))[[0, 2]], rtol=1e-5)
 
 

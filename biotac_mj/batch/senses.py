@@ -165,7 +165,7 @@ class Senses:
         self.heat = self.vibration = self._touched = None
         with wp.ScopedDevice(device):
             self._known, self._changed = (wp.zeros(nworld, dtype=int) for _ in range(2))
-            self._any, self._always = wp.zeros(1, dtype=int), wp.ones(nworld, dtype=int)
+            self._any = wp.zeros(1, dtype=int)
         self._rests, begins = [], None
         if warm:
             self.heat = Heat(rows[0].bodies, nworld=nworld, device=device)
@@ -217,7 +217,7 @@ class Senses:
     def lasting(self) -> list[wp.array]:
         """The arrays (nworld, ...) that outlive a step."""
         a = self.acquisition
-        own = [a.seed, a.drawn, a.row, a.time, a.state, self._known, *self.film.lasting]
+        own = [a.seed, a.drawn, a.row, a.time, a.state, self._known, self.film.impedance, self.film.valid]
         if not self.heat:  # else they are part of its state
             own += [a.temperature, a.liquid]
         return own + [state for _, state in self._rests]
@@ -256,7 +256,7 @@ class Senses:
             self.heat.advance(self._dt)
         due = self.acquisition.find_due(self._dt)
         self._any.zero_()
-        inputs = [due, self._always if self.film.remembers else awake]
+        inputs = [due, awake]
         outputs = [self._known, self._changed, self._any]
         wp.launch(find_changed, self._skin.nworld, inputs, outputs, device=due.device)
 

@@ -7,9 +7,8 @@ import torch
 from torch import nn
 
 from ..geometry.surface import node_normals
-from ..sensor.channels import NELECTRODE
 from .networks.graph import SparseMatrix
-from .networks.heads import FromRest, LocalHead, PodHead, next_average
+from .networks.heads import FromRest, LocalHead
 from .training.features import FilmFeatures, Pod
 from .training.local import counts_change
 from .training.paper import network_change
@@ -44,7 +43,7 @@ class _Served(nn.Module):
         """(n, 19) fractional counts for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
         (n, 19)."""
         tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
-        return counts_change(self.log_change(displacement)[0], tare) + tare
+        return counts_change(self.log_change(displacement), tare) + tare
 
 
 class PointsModel(_Served):
@@ -53,12 +52,7 @@ class PointsModel(_Served):
     Args:
       net: LatentProjection, or PointNet. points: SkinPoints. geometry: the skin that it reads.
       config: of the training. meta: description in the weights' file.
-
-    Attributes:
-      window: (), without memory.
     """
-
-    window: tuple[float, ...] = ()
 
     def __init__(
         self,
@@ -85,20 +79,15 @@ class PointsModel(_Served):
             self.register_buffer("inward", inward, persistent=False)
 
     @torch.no_grad()
-    def log_change(
-        self,
-        displacement: torch.Tensor,
-        average: torch.Tensor | None = None,
-        dt: float | torch.Tensor = 0.0,
-    ) -> tuple[torch.Tensor, None]:
-        """d ln Z (n, 19) relative to rest, for displacements (n, nvert, 3) [mm]; average and dt: unused, for
-        compatibility with `ForwardModel`."""
+    def log_change(self, displacement: torch.Tensor) -> torch.Tensor:
+        """d ln Z (n, 19) relative to rest, for displacements (n, nvert, 3) [mm]; raises like
+        `ForwardModel.log_change`."""
         self._check(displacement)
-        return self.electrodes(self.unit * self.to_points.fields(displacement)), None
+        return self.electrodes(self.unit * self.to_points.fields(displacement))
 
     def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
         """(k, 19) predicted change of counts in rows of a set."""
-        output = self.log_change(arrays.field[rows].float())[0]
+        output = self.log_change(arrays.field[rows].float())
         return network_change(output, arrays.tare[rows], self.config)
 
     @torch.no_grad()
@@ -120,59 +109,25 @@ class ForwardModel(_Served):
 
     Args:
       geometry: SkinGeometry of the training. meta: description in the weights' file. modes: components.
-
-    Attributes:
-      window: time constants [s] of the causal averages; () for a model without memory.
     """
 
     def __init__(self, geometry: "SkinGeometry", meta: dict, modes: int):
         super().__init__()
-        self.meta, self.window = meta, tuple(meta["window"])
-        self.nvert = geometry.nvert
-        self.local = meta["kind"]["kind"] == "local"
-        self.pod = Pod(geometry.nvert, modes)
-        self.film = FilmFeatures(geometry) if self.local else None
-        width = FilmFeatures.count * (1 + len(self.window))
-        make = (
-            (lambda: LocalHead(width, modes, meta["width"]))
-            if self.local
-            else (lambda: PodHead(modes, meta["width"]))
-        )
-        self.members = nn.ModuleList(make() for _ in range(meta["members"]))
-
-    @property
-    def memory(self) -> tuple[int, int, int]:
-        """Shape of a window's state for one sensor: (len(window), 19, features)."""
-        return (len(self.window), NELECTRODE, FilmFeatures.count)
+        self.meta, self.nvert = meta, geometry.nvert
+        self.pod, self.film = Pod(geometry.nvert, modes), FilmFeatures(geometry)
+        heads = (LocalHead(FilmFeatures.count, modes, meta["width"]) for _ in range(meta["members"]))
+        self.members = nn.ModuleList(heads)
 
     @torch.no_grad()
-    def log_change(
-        self, displacement: torch.Tensor, average: torch.Tensor | None = None, dt: float | torch.Tensor = 0.0
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """d ln Z relative to rest.
+    def log_change(self, displacement: torch.Tensor) -> torch.Tensor:
+        """d ln Z (n, 19) relative to rest.
 
         Args:
           displacement: (n, nvert, 3) tensor [mm].
-          average: (n, *memory) causal averages before this step; None: a skin that has been constant for
-            long.
-          dt: since the last call [s].
-
-        Returns:
-          (n, 19) and the averages after the step.
 
         Raises:
           ValueError: wrong number of nodes, or displacements that are not finite.
         """
         self._check(displacement)
-        pod, local = self.pod(displacement), None
-        if self.local:
-            now = self.film(displacement)
-            features = [now]
-            if self.window:
-                if average is None:
-                    average = now[:, None].expand(-1, len(self.window), -1, -1)
-                else:
-                    average = next_average(average.transpose(0, 1), now, dt, self.window).transpose(0, 1)
-                features += [now - average[:, k] for k in range(len(self.window))]
-            local = torch.cat(features, -1)
-        return torch.stack([m(local, pod) for m in self.members]).mean(0), average
+        features = self.film(displacement), self.pod(displacement)
+        return torch.stack([member(*features) for member in self.members]).mean(0)

@@ -19,8 +19,8 @@ PAPER = {
     "object": {"latent_projection": 0.015, "pointnet": 0.016},
 }
 UNIT = 2048.0
-# rows to compare with, nothing that is served; a window cannot be: see experiment.train_split
-_REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae", "local_window")
+# rows to compare with, nothing that is served
+_REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae")
 _LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 
@@ -246,7 +246,6 @@ def _split(folder, split, reports):
         "noise_floor": float(np.median(np.concatenate(noise))),
         "mesh_mm": _average([r["mesh"] for r in reports]),
         "inverse_mm": _average([r["inverse"] for r in reports]),
-        "ensemble_of": [r.get("ensemble_of") for r in reports],
         "train_seconds": {k: float(np.mean(v)) for k, v in seconds.items()},
         "device": reports[0]["device"],
     }

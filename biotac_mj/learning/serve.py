@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..sensor.presets import Sensor, read_sensor
-from .weights import find_weights, load_forward, window_of
+from .weights import check_forward, find_weights, load_forward
 
 if typing.TYPE_CHECKING:
     import warp as wp
@@ -28,15 +28,11 @@ class NetworkFilm:
 
     Attributes:
       geometry: the skin. rest: (n,) impedance at rest [ohm].
-      nstate: length of the state of a network with a window: the time of its last step, and its averages; 0
-        without.
     """
 
     def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
         self._weights, self.geometry = find_weights(weights), geometry
-        self._memory = window_of(self._weights, geometry)
-        size = int(np.prod(self._memory))
-        self.nstate = 1 + size if size else 0
+        check_forward(self._weights, geometry)
         self.rest = read_sensor(None, design=geometry.design).impedance
 
     @functools.cached_property
@@ -44,24 +40,14 @@ class NetworkFilm:
         return load_forward(self._weights, self.geometry)
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
-        """(n,) [ohm] for nodes (nvert, 3) [m]; of a network with a window, of a skin that stays there."""
-        return self.rest * np.exp(self.model.log_change(self._change(vert_xpos))[0][0].double().numpy())
-
-    def follow(self, state: np.ndarray, time: float, vert_xpos: np.ndarray) -> np.ndarray:
-        """Likewise at `time` [s] of a motion, for a network with a window; updates its state (nstate,), which
-        is (time, 0, ...) for a skin that was at rest."""
-        before = torch.as_tensor(state[1:].reshape(1, *self._memory), dtype=torch.float32)
-        change, after = self.model.log_change(self._change(vert_xpos), before, time - state[0])
-        state[0], state[1:] = time, after.numpy().ravel()
-        return self.rest * np.exp(change[0].double().numpy())
-
-    def _change(self, vert_xpos):
+        """(n,) [ohm] for nodes (nvert, 3) [m]."""
         vert_xpos = np.asarray(vert_xpos, float)
         if vert_xpos.shape != self.geometry.vert.shape:
             raise ValueError(
                 f"vert_xpos has shape {vert_xpos.shape}: this network reads {self.geometry.vert.shape}"
             )
-        return torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)[None]
+        u = torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)
+        return self.rest * np.exp(self.model.log_change(u[None])[0].double().numpy())
 
 
 class LearnedBatchFilm:
@@ -72,11 +58,11 @@ class LearnedBatchFilm:
 
     Args:
       geometry, weights: as for `NetworkFilm`. sensor: whose rest it reads. nworld: worlds. device: Warp
-        device. dt: time between two solves, for the window [s].
+        device.
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
-        design. lasting: the arrays that persist between steps. remembers: whether the network has a window.
+        design.
     """
 
     def __init__(
@@ -86,11 +72,10 @@ class LearnedBatchFilm:
         device: str = "cpu",
         weights: pathlib.Path | str | None = None,
         sensor: str | Sensor | None = None,
-        dt: float = 0.01,
     ):
         import warp as wp
 
-        self.device, self._dt = wp.get_device(device), dt
+        self.device = wp.get_device(device)
         torch_device = wp.device_to_torch(self.device)
         self.model = load_forward(find_weights(weights), geometry).to(torch_device)
         self.design = geometry.design
@@ -100,14 +85,7 @@ class LearnedBatchFilm:
             self.valid = wp.ones(nworld, dtype=int)
         self._rest = torch.as_tensor(self.rest, device=torch_device)
         self._vert = torch.as_tensor(geometry.vert, device=torch_device)
-        self._average = (
-            torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
-        )
-        self.remembers = bool(self.model.window)
-        self.lasting = [self.impedance, self.valid]
-        if self._average is not None:
-            self.lasting.append(wp.from_torch(self._average))
-        self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
+        self.nbytes = self.impedance.capacity
         self._pool = torch.cuda.MemPool() if self.device.is_cuda else None
         if self.device.is_cuda:  # torch's libraries take their memory before a capture begins
             x = self._vert[:, None].expand(-1, nworld, -1).contiguous()
@@ -137,11 +115,7 @@ class LearnedBatchFilm:
     def _solve(self, x, wanted, impedance, valid):
         u = (1e3 * (x.transpose(0, 1) - self._vert)).float()
         finite = torch.isfinite(u).all(dim=2).all(dim=1)
-        change, average = self.model.log_change(
-            torch.where(finite[:, None, None], u, 0), self._average, self._dt
-        )
-        now = wanted & finite
-        if self._average is not None:
-            self._average.copy_(torch.where(now[:, None, None, None], average, self._average))
-        impedance.copy_(torch.where(now[:, None], self._rest * change.double().exp(), impedance))
+        change = self.model.log_change(torch.where(finite[:, None, None], u, 0))
+        now = (wanted & finite)[:, None]
+        impedance.copy_(torch.where(now, self._rest * change.double().exp(), impedance))
         valid.copy_(torch.where(wanted, finite.int(), valid))

@@ -64,12 +64,6 @@ def _add_train(verbs, verb):
         "with + (default: trajectory ring_7mm, on a CPU trajectory)",
     )
     v.add_argument(
-        "--only",
-        nargs="+",
-        metavar="NAME",
-        help="of our models (default: all, on a CPU pod_taught local_taught)",
-    )
-    v.add_argument(
         "--paper",
         action=argparse.BooleanOptionalAction,
         help="latent projection and PointNet++, hours without a GPU (default: on a GPU)",
@@ -84,9 +78,8 @@ def _add_train(verbs, verb):
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
-# default on a CPU, minutes of training: the best head, and one without film features
-_ON_CPU = {"seeds": [0], "splits": ["trajectory"], "only": ["pod_taught", "local_taught"], "paper": False}
-_ON_GPU = {"seeds": [0, 1, 2, 3, 4], "splits": ["trajectory", "ring_7mm"], "only": None, "paper": True}
+_ON_CPU = {"seeds": [0], "splits": ["trajectory"], "paper": False}  # minutes of training
+_ON_GPU = {"seeds": [0, 1, 2, 3, 4], "splits": ["trajectory", "ring_7mm"], "paper": True}
 
 
 def _table_or_folder(text):
@@ -161,7 +154,6 @@ def _train_all(args):
         LearningConfig(**settings),
         args.device,
         args.paper,
-        args.only,
         args.limit,
         progress=not args.quiet,
         ray=args.ray,
@@ -221,12 +213,6 @@ def _add_judge(verbs, verb):
         help="of --new-sensor: writes the adapted sensor, for attach(effects=FILE)",
     )
     v.add_argument(
-        "--ship",
-        type=output_folder(),
-        metavar="FOLDER",
-        help="copy the trained weights there, each with a card",
-    )
-    v.add_argument(
         "--fraction", type=real(), default=0.7, help="fraction of the recording, in time, for training"
     )
     v.add_argument("--seed", type=SEED, default=0, help="of the recording's networks")
@@ -255,8 +241,6 @@ def _judge(args):
     for name in ("weights", "sensor"):
         if getattr(args, name) and not args.new_sensor:
             raise ValueError(f"--{name} goes with --new-sensor: give both, or neither")
-    if args.ship and (recorded or args.new_sensor):
-        raise ValueError("--ship copies what `biotac learn train` wrote: give its folder, or leave it out")
     if args.json is None:
         name = "recording" if recorded else "new_sensor"
         folder = args.source and not recorded
@@ -288,14 +272,8 @@ def _judge_new_sensor(args):
 
 def _judge_networks(args):
     from .report import evaluate_models, table
-    from .shipping import check_shippable, ship
 
-    if args.ship:
-        check_shippable(args.source)
-    result = evaluate_models(args.source, args.json)
-    print(table(result))
-    if args.ship:
-        print("written: " + ", ".join(map(str, ship(args.source, result, args.ship))))
+    print(table(evaluate_models(args.source, args.json)))
 
 
 def _save_reader(args, reader, scores):

@@ -28,6 +28,7 @@ __all__ = [
     "FORMAT",
     "SHIPPED",
     "amend",
+    "check_forward",
     "describe",
     "find_weights",
     "is_inverse",
@@ -39,7 +40,6 @@ __all__ = [
     "save_inverse",
     "save_points_model",
     "shipped",
-    "window_of",
     "write_tensors",
 ]
 
@@ -55,7 +55,6 @@ _DESCRIPTION_OF = {
         "nvert": int,
         "kind": dict,
         "members": int,
-        "window": list[float],
         "width": int,
         "scale": float,
     },
@@ -101,22 +100,20 @@ def save_forward(
     members: Sequence[Callable],
     pod: "Pod",
     config: "LearningConfig",
-    kind: dict,
     geometry: "SkinGeometry",
     about: dict,
 ) -> None:
     """Writes an ensemble of results of `local.train_head` (half precision, without buffers that follow from
     the mesh)."""
-    tensors = {"pod.basis": pod.basis, "pod.scale": pod.scale}
+    from .training.local import MODES
+
+    tensors = {"pod.basis": pod.basis[:, :MODES], "pod.scale": pod.scale[:MODES]}
     for k, member in enumerate(members):
         tensors |= {f"member{k}.{name}": value for name, value in member.head.state_dict().items()}
-    if kind["kind"] == "local":  # the residual uses the first components only
-        tensors["pod.basis"], tensors["pod.scale"] = pod.basis[:, :32], pod.scale[:32]
     meta = about | {
         "direction": "forward",
-        "kind": kind,
+        "kind": {"kind": "local"},
         "members": len(members),
-        "window": config.window if kind["window"] else (),
         "width": config.width,
         "scale": config.scale,
     }
@@ -252,6 +249,8 @@ def _refuse_other(meta, path, geometry, direction):
             f"{_kind(meta)}"
         )
     check_entries(f"the description of {path}", meta, _DESCRIPTION | _DESCRIPTION_OF[stated])
+    if stated == "forward" and (meta.get("window") or _kind(meta) != "local"):
+        raise ValueError(f"{path} is of a model that earlier versions had, {_kind(meta)}: train again")
     if meta["channels"] != list(ELECTRODES):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
@@ -304,14 +303,9 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
     return model.eval()
 
 
-def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
-    """Shape of a forward model's window state, from the file's header: (0,) without a window. Raises like
-    `load_forward` if it does not fit this skin."""
-    from .training.features import FilmFeatures
-
-    meta = describe(path)
-    _refuse_other(meta, path, geometry, "forward")
-    return (len(meta["window"]), NELECTRODE, FilmFeatures.count) if meta.get("window") else (0,)
+def check_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> None:
+    """Raises like `load_forward` if the header of a file says that it does not fit this skin."""
+    _refuse_other(describe(path), path, geometry, "forward")
 
 
 def _points_model(path, meta, tensors, geometry):

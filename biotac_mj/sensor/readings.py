@@ -94,7 +94,7 @@ class PhysicsReadings:
             self._warm = slice(self._warm.start, self._warm.start + self._heat.nstate)
         self._vibration, self._bodies, self._textures = vibration, bodies, textures or []
         self._shaken = slice(self._warm.stop, self._warm.stop + (vibration.nstate if vibration else 0))
-        self.nstate = self._shaken.stop + self.film.nstate
+        self.nstate = self._shaken.stop
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
     def reset(
@@ -122,8 +122,6 @@ class PhysicsReadings:
             temperature, liquid = begin[THERMISTOR], begin[ABOVE]
         if self._vibration is not None:
             state[self._shaken] = self._vibration.rest(textures or self._textures)
-        if self.film.nstate:
-            state[self._shaken.stop], state[self._shaken.stop + 1 :] = time, 0.0
         acquisition.reset(self._counts(state), impedance, pressure, temperature, time, liquid)
 
     def _counts(self, state):
@@ -156,7 +154,6 @@ class PhysicsReadings:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
         """
         counts, temperature, liquid = self._counts(state), None, 0.0
-        memory = state[self._shaken.stop :].copy()
         heat = self._advance_heat(state, dt, area, force)
         if heat is not None:
             temperature, liquid = heat[THERMISTOR], heat[ABOVE]
@@ -164,18 +161,15 @@ class PhysicsReadings:
             with contextlib.suppress(
                 NoFilmError
             ):  # the film of a skin after a hard hit: electrodes hold, as in batches
-                if self.film.nstate:
-                    impedance = self.film.follow(memory, time + dt, vert_xpos)
-                else:  # without contact the film need not be solved again
-                    still = np.array_equal(vert_xpos, self._rest_vert)
-                    impedance = self._rest if still else self.film.impedance(vert_xpos)
+                # without contact the film need not be solved again
+                still = np.array_equal(vert_xpos, self._rest_vert)
+                impedance = self._rest if still else self.film.impedance(vert_xpos)
         moved, shaken = self._vibrate(state, time, dt, shaking)
         self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken, liquid)
         if heat is not None:
             state[self._warm] = heat
         if moved is not None:
             state[self._shaken] = moved
-        state[self._shaken.stop :] = memory
 
     def _advance_heat(self, state, dt, area, force):
         """The heat's state after the step, None without heat."""

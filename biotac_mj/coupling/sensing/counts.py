@@ -132,7 +132,6 @@ class LearnedReadings(SensorReadings):
             raise ValueError("a network replaces the film: leave options['film'] out")
         super().__init__(config, geometry)
         self._network = NetworkFilm(geometry, self._options.get("weights"))
-        self.nstate += self._network.nstate
 
     @property
     def film(self) -> "NetworkFilm":

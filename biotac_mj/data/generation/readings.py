@@ -215,9 +215,7 @@ def prepare_worker(
     else:
         from ...learning.serve import NetworkFilm
 
-        film = _here["film"] = NetworkFilm(rest, weights)
-        if film.nstate:
-            raise ValueError(f"{signal} has a window, which remembers: stored motions need a network without")
+        _here["film"] = NetworkFilm(rest, weights)
 
 
 def read_in_worker(

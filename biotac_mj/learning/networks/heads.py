@@ -7,7 +7,7 @@ from torch import nn
 from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
-__all__ = ["FromRest", "LocalHead", "PodHead", "averages", "next_average", "steady"]
+__all__ = ["FromRest", "LocalHead", "steady"]
 
 
 class FromRest(nn.Module):
@@ -36,26 +36,6 @@ class FromRest(nn.Module):
         return work(x) - self._rest
 
 
-class PodHead(nn.Module):
-    """Components of the mesh -> (n, 19).
-
-    Args:
-      modes: components. width: of the two hidden layers. dropout: behind each.
-
-    Attributes:
-      damp: (modes,) factors on the components: at unit variance, the last ones would be mostly noise.
-    """
-
-    def __init__(self, modes: int, width: int = 128, dropout: float = 0.1):
-        super().__init__()
-        self.register_buffer("damp", torch.ones(modes))
-        self.net = mlp([modes, 2 * width, width, NELECTRODE], dropout)
-
-    def forward(self, local: torch.Tensor | None, pod: torch.Tensor) -> torch.Tensor:
-        """local is not used; pod (n, modes)."""
-        return self.net(pod * self.damp) - steady(self.net, torch.zeros_like(pod[:1]))
-
-
 class LocalHead(nn.Module):
     """One head for all electrodes on the features over each, a linear layer for each electrode, and a small
     residual on the whole mesh.
@@ -64,6 +44,9 @@ class LocalHead(nn.Module):
 
     Args:
       features: per electrode. modes: components of the mesh for the residual. width: of its layers.
+
+    Attributes:
+      damp: (modes,) factors on the components: at unit variance, the last ones would be mostly noise.
     """
 
     def __init__(self, features: int, modes: int, width: int = 128, dropout: float = 0.1):
@@ -101,37 +84,3 @@ def steady(net: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
     for layer in net:
         x = x if isinstance(layer, nn.Dropout) else layer(x)
     return x
-
-
-def next_average(
-    average: torch.Tensor, value: torch.Tensor, dt: float | torch.Tensor, tau: tuple[float, ...]
-) -> torch.Tensor:
-    """Causal exponential average after one more step of dt [s]; time constants tau, a tuple [s].
-
-    Args:
-      average: (len(tau), ...) before; value: (...) now. dt: float, or a tensor that broadcasts with value.
-    """
-    return torch.stack(
-        [
-            a + (1 - torch.exp(torch.as_tensor(-dt / t, dtype=value.dtype))) * (value - a)
-            for a, t in zip(average, tau)
-        ]
-    )
-
-
-def averages(
-    value: torch.Tensor, first: torch.Tensor, time: torch.Tensor, tau: tuple[float, ...]
-) -> torch.Tensor:
-    """(n, ..., len(tau) * k) of values (n, ..., k) at rows of many interactions: value minus its causal
-    averages, which start at zero.
-
-    Args:
-      first: (n,) first row of each row's interaction. time: (n,) [s] within it. tau: time constants [s].
-    """
-    position = torch.arange(len(value), device=value.device) - first
-    average = torch.zeros(len(tau), *value.shape, dtype=value.dtype, device=value.device)
-    for k in range(1, int(position.max()) + 1):
-        row = (position == k).nonzero()[:, 0]
-        dt = (time[row] - time[row - 1]).view(-1, *[1] * (value.ndim - 1))
-        average[:, row] = next_average(average[:, row - 1], value[row], dt, tau)
-    return torch.cat(list(value - average), -1)

@@ -9,7 +9,7 @@ from ...fields import check_types
 __all__ = ["LearningConfig", "without_obsolete"]
 
 # fields in files of earlier versions that had a single value
-_OBSOLETE = {"hierarchy": "geodesic", "tare": "row 0"}
+_OBSOLETE = {"hierarchy": "geodesic", "tare": "row 0", "mirror": True, "window": [0.5, 4.0]}
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
@@ -43,11 +43,8 @@ class LearningConfig:
         state on the validation interactions is kept.
       scale: unit of counts, 2048 for the paper's, after subtraction of row 0 of each interaction, before
         touch.
-      pod: number of principal components of the mesh. width: of our networks. mirror: training on the
-        simulation also uses every touch mirrored in z; training on a sensor does not, since none is that
-        symmetric (except `local_mirror`).
-      window: time constants [s] of the causal averages of features.
-      members: networks that are averaged in the best model.
+      pod: number of principal components of the mesh. width: of our networks.
+      members: networks that are averaged in our model.
       graphs: on a GPU, replay training steps as CUDA graphs.
     """
 
@@ -81,8 +78,6 @@ class LearningConfig:
     scale: float = 2048.0
     pod: int = 128
     width: int = 128
-    mirror: bool = True
-    window: tuple[float, ...] = (0.5, 4.0)
     members: int = 3
     graphs: bool = True
 

@@ -14,14 +14,13 @@ import numpy as np
 import torch
 
 from ...data import Split, TactileSet, split_by_interaction, split_by_object
-from ...fields import refuse_unknown
 from ...files import write_json, write_npz
 from ...reading import read_json
 from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
 from ..instants.linear import ridges
 from ..predictor import PointsModel
-from ..protocol import interaction_errors, quartiles
+from ..protocol import quartiles
 from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays, spread_rows
 from .config import LearningConfig, without_obsolete
@@ -31,19 +30,9 @@ from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_i
 from .local import Features, film_with_gains, train_head
 from .paper import network_change, network_target, train_latent_projection, train_pointnet
 
-__all__ = ["FORWARD", "division_of", "train_all", "train_split"]
+__all__ = ["division_of", "train_all", "train_split"]
 
-# name -> arguments of `local.train_head`, an ablation: each line adds one thing; local_mirror adds mirrored
-# touches to local_taught
-FORWARD = {
-    "pod_mlp": dict(kind="pod", log=False, teach=False, mirror=False, window=False),
-    "pod_log": dict(kind="pod", log=True, teach=False, mirror=False, window=False),
-    "pod_taught": dict(kind="pod", log=True, teach=True, mirror=False, window=False),
-    "local": dict(kind="local", log=True, teach=False, mirror=False, window=False),
-    "local_mirror": dict(kind="local", log=True, teach=False, mirror=True, window=False),
-    "local_taught": dict(kind="local", log=True, teach=True, mirror=False, window=False),
-    "local_window": dict(kind="local", log=True, teach=True, mirror=False, window=True),
-}
+_HEAD, _INVERSE = "local_taught", "pod_inverse_taught"  # names of our models in reports
 
 
 def train_all(
@@ -54,7 +43,6 @@ def train_all(
     config: LearningConfig | None = None,
     device: torch.device | str = "cpu",
     paper: bool = True,
-    only: Iterable[str] | None = None,
     limit: int | None = None,
     progress: bool = True,
     ray: str | None = None,
@@ -70,23 +58,20 @@ def train_all(
         object (or objects, with +) that is held out for the test.
       config: LearningConfig. device: of torch. paper: False skips what is slow without a GPU: latent
         projection and PointNet++.
-      only: names of our models to train; None: all of FORWARD. limit: number of interactions to read.
+      limit: number of interactions to read.
       progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for each split and
         seed, with one core, and one GPU if the device is one. All nodes read the set at its path.
     """
     config = config or LearningConfig()
     out = pathlib.Path(out)
-    names = list(FORWARD) if only is None else list(only)
-    refuse_unknown(names, FORWARD, "the list of models")
     settings = {
         "set": str(pathlib.Path(path).resolve()),
         "config": dataclasses.asdict(config),
-        "models": names,
         "paper": paper,
         "limit": limit,
     }
     _refuse_others(out, json.loads(json.dumps(settings)))
-    size = _steps_of(config, names, paper)
+    size = _steps_of(config, paper)
     tasks = [
         Task((split, seed), size, f"{split}-{seed}.json")
         for split in splits
@@ -100,38 +85,29 @@ def train_all(
         count = min(len(data), limit or len(data))
     for split in splits:
         division_of(path, split, 0, count)  # raises if it cannot be split
-    # time the steps for the estimate
-    timed_steps = size * len(tasks) if progress and ray is None and str(device) == "cpu" else 0
-    work = _Train(settings, str(device), size, timed_steps)
+    work = _Train(settings, str(device))
     for _ in run_tasks(
         work, tasks, out, "train", "step", ray, gpus=int(str(device) != "cpu"), progress=progress
     ):
         pass
 
 
-def _steps_of(config, names, paper):
-    """Most steps of all networks of a split and seed."""
-    head = {
-        name: config.steps * (2 if kind["teach"] and kind["log"] else 1) for name, kind in FORWARD.items()
-    }
-    ours = [head[name] for name in names]
-    again = (config.members - 1) * max(ours, default=0)
+def _steps_of(config, paper):
+    """Steps of all networks of a split and seed: heads, the inverse, the paper's."""
     papers = config.mesh_steps + 4 * config.paper_steps
-    return sum(ours) + again + (1 + 3) * config.steps + (papers if paper else 0)
+    return (2 * config.members + 3) * config.steps + (papers if paper else 0)
 
 
 @dataclasses.dataclass
 class _Train:
-    """Work of `shards.run_tasks`: all models of a split and seed; size: their steps.
+    """Work of `shards.run_tasks`: all models of a split and seed.
 
     Attributes:
-      settings: of the whole training. device: of torch. timed_steps: steps to time for an estimate, 0: none.
+      settings: of the whole training. device: of torch.
     """
 
     settings: dict
     device: str
-    size: int
-    timed_steps: int
 
     def __call__(self, values, folder, say):
         with _one_thread():
@@ -142,7 +118,6 @@ class _Train:
                 name = hashlib.sha256(json.dumps([given, self.device, split, seed]).encode()).hexdigest()[:16]
                 checkpoints = Checkpoints(folder / f"unfinished-{name}", say)
                 train_split(self._features, split, seed, folder, given, checkpoints)
-                say(self.size - checkpoints.steps)  # if a network with fewer steps was the best
                 shutil.rmtree(checkpoints.folder, ignore_errors=True)
                 yield split, seed
 
@@ -154,36 +129,7 @@ class _Train:
         features = Features(arrays, config)
         text = f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps"
         say(f"{text} read in {time.time() - begun:.0f} s")
-        if self.timed_steps:
-            minutes = self.timed_steps * _step_time(features, given["models"], given["paper"]) / 60
-            say(f"about {max(1, round(minutes))} minutes on one core; stopped, it goes on where it was")
         return features
-
-
-def _step_time(features, names, paper, steps=4):
-    """[s] per step, mean over all networks, from a short training. Components are zero, since their values do
-    not affect the time."""
-    arrays, config = features.arrays, features.config
-    labelled = np.flatnonzero(arrays.labelled)
-    rows = arrays.rows(labelled)
-    basis = Pod.fit(arrays.field, rows[: 4 * config.pod], min(config.pod, len(rows)))
-    flat = torch.zeros(len(arrays.owner), len(basis.scale))
-    pod = (basis, flat, flat if config.mirror else None)
-    papers = {
-        name: max(1, getattr(config, name) * steps // config.steps) for name in ("paper_steps", "mesh_steps")
-    }
-    short = dataclasses.replace(config, steps=steps, **papers)
-    parts = labelled, labelled[:8], short
-    for checkpoints in (Checkpoints(), Checkpoints()):  # the first calls are slow
-        for name in names:
-            train_head(features, *parts, pod=pod, checkpoints=checkpoints, **FORWARD[name])
-        for teach in (False, True):
-            train_inverse(arrays, *parts, pod, 0, teach, checkpoints)
-    if paper:
-        points, there = features.at_points
-        train_latent_projection(there, points, *parts, checkpoints=checkpoints)
-        train_pointnet(there, points, *parts, checkpoints=checkpoints)
-    return checkpoints.seconds / checkpoints.steps
 
 
 @contextlib.contextmanager
@@ -226,7 +172,7 @@ def train_split(
     """Trains one split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of
     seed 0, and last SPLIT-SEED.json with the settings of the whole training. checkpoints: of all networks."""
     arrays, config = features.arrays, features.config
-    path, names, checkpoints = settings["set"], settings["models"], checkpoints or Checkpoints()
+    path, checkpoints = settings["set"], checkpoints or Checkpoints()
     division = division_of(path, split, seed, len(arrays.objects))
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
@@ -245,46 +191,26 @@ def train_split(
 
     basis = timed("pod", lambda: Pod.fit(arrays.field, arrays.rows(train), config.pod, seed=seed))
     now = features.components(basis)
-    pod = (basis, now, features.components(basis, True) if config.mirror else None)
+    pod = (basis, now, features.components(basis, mirrored=True))
     predictions["tare"] = torch.zeros_like(truth)
     predictions["linear"] = timed("linear", lambda: _linear(arrays, now, fit, check, both))
     physics = arrays.simulated[both] - arrays.simulated[arrays.first[both]]
     predictions["physics"] = physics
     predictions["physics_gain"] = film_with_gains(arrays, fit, both)
 
-    def head(label, name, seed):
-        work = lambda: train_head(  # noqa: E731
-            features, train, validation, config, seed=seed, pod=pod, checkpoints=checkpoints, **FORWARD[name]
-        )
-        return timed(label, work)
-
-    models = {}
-    for name in names:
-        models[name] = head(name, name, seed)
-        predictions[name] = models[name](both)
-    if names:
-        # ensemble of the best model on validation. Windows are excluded: interactions of a second do not
-        # represent long holds, which occur in simulations
-        steady = [name for name in names if not FORWARD[name]["window"]] or names
-        errors = {
-            name: _median(predictions[name][: len(check)], truth[: len(check)], arrays.owner[check])
-            for name in steady
-        }
-        best = min(errors, key=errors.get)
-        more = [head(f"{best} again {k}", best, 1000 * (k + 1) + seed) for k in range(config.members - 1)]
-        members = [models[best], *more]
-        predictions["ensemble"] = torch.stack([m(both) for m in members]).mean(0)
-
-    inverses = {
-        name: timed(
+    more = config.members - 1
+    members = [
+        timed(
             name,
-            lambda teach=teach: train_inverse(
-                arrays, train, validation, config, pod, seed, teach, checkpoints
-            ),
+            lambda seed=k: train_head(features, train, validation, config, seed, pod, checkpoints),
         )
-        for name, teach in (("pod_inverse", False), ("pod_inverse_taught", True))
-    }
-    best_inverse = min(inverses, key=lambda name: inverses[name].validation)
+        for name, k in [(_HEAD, seed), *((f"{_HEAD} again {k}", 1000 * (k + 1) + seed) for k in range(more))]
+    ]
+    each = torch.stack([member(both) for member in members])
+    predictions[_HEAD], predictions["ensemble"] = each[0], each.mean(0)
+    inverse = timed(
+        _INVERSE, lambda: train_inverse(arrays, train, validation, config, pod, seed, checkpoints)
+    )
     report = {
         "split": split,
         "seed": seed,
@@ -299,7 +225,7 @@ def train_split(
     }
     every = arrays.rows(test)
     codes = {"pod": lambda u: basis.decode(basis(u))}
-    back = {name: lambda r, head=head: head(arrays.log_change(r)) for name, head in inverses.items()}
+    back = {_INVERSE: lambda r: inverse(arrays.log_change(r))}
     patches, served = dict.fromkeys(back, PATCH), {}
     if settings["paper"]:
         points, there = features.at_points
@@ -332,19 +258,12 @@ def train_split(
         for name, model in back.items()
     }
     report["seconds"] = seconds
-    if names:
-        report["ensemble_of"] = best
     if seed == 0:
         about = {"split": split, "seed": seed, "set": arrays.sensor, "nvert": arrays.geometry.nvert}
-        forward = {name: ([model], name) for name, model in models.items()}
-        if names:
-            forward["forward"] = members, best
-        for file, (ones, name) in forward.items():
-            path = out / f"{file}-{split}.safetensors"
-            save_forward(path, ones, basis, config, FORWARD[name], arrays.geometry, about | {"model": name})
-        for file, name in [*((name, name) for name in inverses), ("inverse", best_inverse)]:
-            path = out / f"{file}-{split}.safetensors"
-            save_inverse(path, inverses[name], arrays.geometry, about | {"model": name})
+        weights = out / f"forward-{split}.safetensors"
+        save_forward(weights, members, basis, config, arrays.geometry, about | {"model": _HEAD})
+        weights = out / f"inverse-{split}.safetensors"
+        save_inverse(weights, inverse, arrays.geometry, about | {"model": _INVERSE})
         for name, one in served.items():
             path = out / f"{name}-{split}.safetensors"
             save_points_model(path, one.net, points, config, about | {"patch": patches["latent_inverse"]})
@@ -376,11 +295,6 @@ def _linear(arrays, now, fit, check, both):
 @torch.no_grad()
 def _in_batches(work, rows):
     return torch.cat([work(r) for r in rows.split(512)])
-
-
-def _median(got, truth, owner):
-    got, truth, owner = (x.cpu().numpy() for x in (got, truth, owner))
-    return float(np.median(interaction_errors(got, truth, owner)[1]))
 
 
 @torch.no_grad()

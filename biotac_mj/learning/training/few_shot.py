@@ -9,7 +9,7 @@ import torch
 
 from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...files import write_json
-from ...sensor.channels import FULL_SCALE, NELECTRODE
+from ...sensor.channels import FULL_SCALE
 from ..protocol import interaction_errors
 from ..weights import load_forward
 from .arrays import load_arrays
@@ -115,8 +115,8 @@ def evaluate_new_sensor(
         arrays.change(rows).cpu().numpy(),
         arrays.owner[rows].cpu().numpy(),
     )
-    changes = arrays.film_change(), _log_changes(model, arrays)
-    film, network = (counts_change(z[rows], tare).cpu().numpy() for z in changes)
+    by_network = torch.cat([model.log_change(arrays.field[r].float()) for r in rows.split(512)])
+    film, network = (counts_change(z, tare).cpu().numpy() for z in (arrays.film_change()[rows], by_network))
     inputs = {"film": film, "weights": network, "film and weights": np.concatenate([film, network], 1)}
 
     def rms(predicted, keep):
@@ -155,21 +155,3 @@ def evaluate_new_sensor(
         own = {"rest": rest, "mixing": fit_mixing(film, truth, owner).tolist()}
         write_sensor_file(sensor, SensorFile({"sensor": own}, [], {}))
     return result
-
-
-def _log_changes(model, arrays):
-    """(n, 19) d ln Z of all rows; a window starts at rest with each interaction."""
-    position = torch.arange(len(arrays.owner), device=arrays.device) - arrays.first
-    out = torch.zeros(len(position), NELECTRODE, device=arrays.device)
-    average = torch.zeros(len(arrays.objects), *model.memory, device=arrays.device) if model.window else None
-    for k in range(int(position.max()) + 1):
-        row = (position == k).nonzero()[:, 0]
-        who = arrays.owner[row]
-        for chunk, mine in zip(row.split(512), who.split(512)):
-            u = arrays.field[chunk].float()
-            if average is None:
-                out[chunk] = model.log_change(u)[0]
-            else:
-                dt = (arrays.time[chunk] - arrays.time[chunk - 1 if k else chunk]).view(-1, 1, 1)
-                out[chunk], average[mine] = model.log_change(u, average[mine], dt)
-    return out

@@ -74,17 +74,12 @@ def train_inverse(
     config: "LearningConfig",
     pod: tuple,
     seed: int = 0,
-    teach: bool = False,
     checkpoints: Checkpoints | None = None,
 ) -> InverseHead:
-    """Trains on labelled interactions. pod: (Pod, components of all rows, those of the mirrored touches or
-    None).
+    """Trains on the simulation's own film of all training interactions, labelled or not, and of their mirror
+    images, then on labelled ones. pod: (Pod, components of all rows, those of the mirrored touches).
 
-    The loss weighs components by their size, so it is the error of the fields. teach: first learn from the
-    simulation's own film on all training interactions, labelled or not, and on their mirror images.
-
-    Returns:
-      the head; its attribute `validation` is its validation error [unit of the loss].
+    The loss weighs components by their size, so it is the error of the fields.
     """
     torch.manual_seed(seed)
     basis, now, then = pod
@@ -98,7 +93,7 @@ def train_inverse(
     both = torch.cat([rows, check])
     log_change[both] = arrays.log_change(both)
     head.scale.copy_(log_change[rows].square().mean(0).sqrt() + 1e-3)
-    every = arrays.rows(train) if teach else rows
+    every, film = arrays.rows(train), arrays.film_change()
     forces = torch.zeros(len(log_change), modes, device=arrays.device)
     for chunk in torch.cat([every, check]).split(4096):
         forces[chunk] = arrays.force[chunk].float() @ head.force_basis / head.force_scale[0]
@@ -111,21 +106,15 @@ def train_inverse(
         value = root_mean_square(u - (then if flip else now)[r] * size)
         return value if flip else value + 0.3 * root_mean_square(f - forces[r])
 
-    if teach:
-        film = arrays.film_change()
+    def symmetric(r):
+        return error(r, source=film) + 0.5 * error(r, True, film)
 
-        def symmetric(r):
-            return error(r, source=film) + (0.5 * error(r, True, film) if then is not None else 0)
-
-        options = TrainingOptions(
-            2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed, graph=config.graphs
-        )
-        fitting.train(head, symmetric, every, options, checkpoints=checkpoints)
-    rate = config.learning_rate * (0.5 if teach else 1)
-    options = TrainingOptions(
-        config.batch, config.steps, rate, weight_decay=0.01, seed=seed, graph=config.graphs
-    )
-    head.validation = fitting.train(head, error, rows, options, lambda: error(check), checkpoints)
+    more = dict(seed=seed, graph=config.graphs)
+    options = TrainingOptions(2 * config.batch, 2 * config.steps, 2 * config.learning_rate, **more)
+    fitting.train(head, symmetric, every, options, checkpoints=checkpoints)
+    rate = 0.5 * config.learning_rate
+    options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, **more)
+    fitting.train(head, error, rows, options, lambda: error(check), checkpoints)
     return head
 
 

@@ -1,5 +1,4 @@
-"""Our models: principal components or local film features, target d ln Z, with the simulation's film as a
-teacher."""
+"""Our model: film features over each electrode, target d ln Z, with the simulation's film as a teacher."""
 
 import functools
 import typing
@@ -10,7 +9,7 @@ import torch
 
 from ...sensor.channels import FULL_SCALE
 from ..networks.graph import SparseMatrix
-from ..networks.heads import LocalHead, PodHead, averages
+from ..networks.heads import LocalHead
 from . import fitting
 from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
 from .fitting import Checkpoints, TrainingOptions, root_mean_square
@@ -21,7 +20,9 @@ if typing.TYPE_CHECKING:
     from .config import LearningConfig
     from .features import Pod
 
-__all__ = ["Features", "counts_change", "film_with_gains", "train_head"]
+__all__ = ["MODES", "Features", "counts_change", "film_with_gains", "train_head"]
+
+MODES = 32  # components of the mesh that a head reads
 
 
 def film_with_gains(arrays: "Arrays", fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
@@ -45,32 +46,29 @@ class Features:
       arrays: Arrays. config: LearningConfig.
 
     Attributes:
-      film: FilmFeatures. local: (n, 19, k) current features, then these minus their causal averages.
-        mirrored: the same for the mirrored touches, or None.
+      film: FilmFeatures. local: (n, 19, k) of all rows. mirrored: the same for the mirrored touches.
     """
 
     def __init__(self, arrays: "Arrays", config: "LearningConfig"):
         self.arrays, self.config = arrays, config
         self.film = FilmFeatures(arrays.geometry).to(arrays.device)
         self.local = self._local(lambda u: u)
-        self.mirrored = self.matrix = None
-        if config.mirror:
-            self.matrix = SparseMatrix(mirror_matrix(arrays.geometry)).to(arrays.device)
-            self.mirrored = self._local(self.mirror)
+
+    @functools.cached_property
+    def mirrored(self) -> torch.Tensor:
+        return self._local(self.mirror)
+
+    @functools.cached_property
+    def _matrix(self):
+        return SparseMatrix(mirror_matrix(self.arrays.geometry)).to(self.arrays.device)
 
     def mirror(self, u: torch.Tensor) -> torch.Tensor:
         """Fields (n, nvert, 3) of the touches mirrored in the plane z = 0."""
-        return self.matrix.fields(u) * torch.tensor([1.0, 1.0, -1.0], device=u.device)
+        return self._matrix.fields(u) * torch.tensor([1.0, 1.0, -1.0], device=u.device)
 
     @torch.no_grad()
     def _local(self, change):
-        a = self.arrays
-        value = torch.cat([self.film(change(u)) for u in a.field.split(256)])
-        return (
-            torch.cat([value, averages(value, a.first, a.time, self.config.window)], -1)
-            if self.config.window
-            else value
-        )
+        return torch.cat([self.film(change(u)) for u in self.arrays.field.split(256)])
 
     @torch.no_grad()
     def components(self, pod: "Pod", mirrored: bool = False) -> torch.Tensor:
@@ -92,24 +90,16 @@ def train_head(
     train: np.ndarray,
     validation: np.ndarray,
     config: "LearningConfig",
-    kind: str = "local",
-    window: bool = True,
-    teach: bool = True,
-    mirror: bool = False,
-    log: bool = True,
-    seed: int = 0,
-    pod: tuple | None = None,
+    seed: int,
+    pod: tuple,
     checkpoints: Checkpoints | None = None,
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Trains one head.
+    """Trains one head: first on d ln Z of the simulation's own film in all training interactions, labelled or
+    not, and in their mirror images, since the simulation is symmetric; then on the sensor.
 
     Args:
       features: Features. train, validation: numbers of interactions.
-      kind: "pod" or "local". window: with causal averages. teach: first learn d ln Z of the simulation's own
-        film on all training interactions, labelled or not, and on their mirror images, since the simulation
-        is symmetric. mirror: also use mirrored measured touches, though no sensor is symmetric. log: target d
-        ln Z relative to a known tare; False: tared counts.
-      pod: (Pod, components, mirrored components or None), fitted on the training interactions.
+      pod: (Pod, components, mirrored components), fitted on the training interactions.
 
     Returns:
       function (rows) -> (k, 19) predicted change of counts; the head is its attribute `head`.
@@ -117,56 +107,34 @@ def train_head(
     a = features.arrays
     torch.manual_seed(seed)
     pod, now, then = pod
-    base = features.film.count
-    width = features.local.shape[2] if window else base
-    mirror = mirror and features.mirrored is not None
     order = torch.as_tensor(ELECTRODE_MIRROR, device=a.device)
-    if kind == "pod":
-        head = PodHead(now.shape[1], config.width).to(a.device)
-    else:
-        head = LocalHead(width, min(32, now.shape[1]), config.width).to(a.device)
-        rows = a.rows(train)
-        head.scale.copy_(features.local[rows][..., :width].square().mean((0, 1)).sqrt() + 1e-6)
-
+    head = LocalHead(features.film.count, min(MODES, now.shape[1]), config.width).to(a.device)
+    head.scale.copy_(features.local[a.rows(train)].square().mean((0, 1)).sqrt() + 1e-6)
     head.damp.copy_((pod.scale / pod.scale[0]).sqrt()[: len(head.damp)])
 
     def output(rows, flip=False):
         local = features.mirrored if flip else features.local
         pods = then if flip else now
-        return head(local[rows][..., :width], pods[rows][:, : 32 if kind == "local" else None])
+        return head(local[rows], pods[rows][:, :MODES])
 
-    def predict(rows, flip=False):
-        d = output(rows, flip)
-        tare = a.tare[rows]
-        return counts_change(d, tare[:, order] if flip else tare) if log else d * config.scale
+    def predict(rows):
+        return counts_change(output(rows), a.tare[rows])
 
     def loss(rows):
-        truth = a.change(rows)
-        value = root_mean_square(predict(rows) - truth)
-        if mirror:
-            value = value + 0.5 * root_mean_square(predict(rows, True) - truth[:, order])
-        return value / config.scale
+        return root_mean_square(predict(rows) - a.change(rows)) / config.scale
 
     labelled, check = a.rows(train, labelled=True), a.rows(validation, labelled=True)
-    if teach and log:
-        target = a.film_change()
+    target = a.film_change()
 
-        def teacher_loss(rows):
-            value = root_mean_square(output(rows) - target[rows])
-            return (
-                value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
-                if features.mirrored is not None
-                else value
-            )
+    def teacher_loss(rows):
+        value = root_mean_square(output(rows) - target[rows])
+        return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
 
-        options = TrainingOptions(
-            2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed, graph=config.graphs
-        )
-        fitting.train(head, teacher_loss, a.rows(train), options, checkpoints=checkpoints)
-    rate = config.learning_rate * (0.5 if teach else 1)
-    options = TrainingOptions(
-        config.batch, config.steps, rate, weight_decay=0.01, seed=seed, graph=config.graphs
-    )
+    more = dict(seed=seed, graph=config.graphs)
+    options = TrainingOptions(2 * config.batch, config.steps, 2 * config.learning_rate, **more)
+    fitting.train(head, teacher_loss, a.rows(train), options, checkpoints=checkpoints)
+    rate = 0.5 * config.learning_rate
+    options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, **more)
     error = lambda: root_mean_square(predict(check) - a.change(check))  # noqa: E731
     fitting.train(head, loss, labelled, options, error, checkpoints)
 
@@ -174,5 +142,5 @@ def train_head(
     def evaluate(rows):
         return torch.cat([predict(r) for r in rows.split(2048)])
 
-    evaluate.head, evaluate.pod, evaluate.width = head, pod, width
+    evaluate.head = head
     return evaluate

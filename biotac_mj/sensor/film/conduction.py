@@ -102,7 +102,6 @@ class FilmConduction:
       ValueError: a parameter out of range, or an electrode that the film does not cover.
     """
 
-    nstate = 0  # conduction has no memory
     _power = 1.0  # exponent of the conductance over thickness
 
     def __init__(
@@ -360,14 +359,11 @@ class BatchFilm:
       impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
       valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
         position that is not finite.
-      lasting: the arrays that persist between steps: these two.
-      rest: (n,) impedance at rest [ohm]. design: of the skin. remembers: False, without a memory of frames.
+      rest: (n,) impedance at rest [ohm]. design: of the skin.
       middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
         world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
       nbytes: device memory of all worlds.
     """
-
-    remembers = False
 
     def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
@@ -427,7 +423,6 @@ class BatchFilm:
             device=self.device,
             copy=False,
         )
-        self.lasting = [self.impedance, self.valid]
         per_world = [self.middle, self.thickness, self.local, self._edge, self._quads, self._resistance]
         self.nbytes = sum(array.capacity for array in per_world)
 

@@ -16,7 +16,7 @@ from ...short_repr import short_repr
 from .follow_edge import FollowEdge
 from .insert_peg import InsertPeg
 from .libraries import gymnasium_env, rsl_rl_env, skrl_env
-from .roll_rod import PLACE, RollRod
+from .roll_rod import RollRod
 from .task import BatchTask, TaskSettings
 from .touch import OBSERVE
 
@@ -39,7 +39,7 @@ TASKS = {"roll_rod": RollRod, "insert_peg": InsertPeg, "follow_edge": FollowEdge
 
 def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
     """A task of TASKS; keywords as its class has them, or as `biotac_mj.batch.attach` has them for the
-    BioTacs. The rod is rolled to a place.
+    BioTacs.
 
     Raises:
       ValueError: there is no such task. TypeError: there is no such keyword.
@@ -50,8 +50,6 @@ def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
         refuse_unknown(keywords, _keywords(TASKS[task]), f"a call of make({task!r})")
     except ValueError as error:
         raise TypeError(str(error)) from None
-    if task == "roll_rod":
-        keywords = {"settings": PLACE} | keywords
     return TASKS[task](num_envs=num_envs, **keywords)
 
 

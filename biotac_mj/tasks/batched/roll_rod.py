@@ -13,92 +13,55 @@ import warp as wp
 from .fixture import HeldSettings, HeldTask
 from .hand import _PAD, Rod, build, find_pinch
 
-__all__ = ["PLACE", "RollRod", "Settings", "rolled"]
-
-_CHOICES = {"goal": ("angle", "place"), "actions": ("servos", "pads")}
+__all__ = ["RollRod", "Settings"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings(HeldSettings):
-    """Numbers of the task; see `HeldSettings` too. With `prepare` the fingers close in so many decisions, and
-    episodes start with the rod in the grip.
+    """Numbers of the task; see `HeldSettings` too. The encoders' error matters: exact joint angles, which
+    differ by 1e-3 rad, determine the rod's place to 0.1 mm, and those of a hand do not.
 
     Attributes:
-      target: range of the target angle [rad]; fingers that only close roll the rod by -0.25.
-      rate: largest change of a servo's goal in a decision [rad]; reach: in total [rad].
+      target: range of the target place, a distance along the fingers, towards their tips, from the middle of
+        their pads [m].
+      rate, reach: largest change of a pad's goal in a decision, and in total [m].
       offset: range of the rod's initial place, across and along the pads [m].
-      tolerance: error that counts as a success [rad].
-      held: reward of a decision with the rod in the grip; near: scale of the error in the reward [rad].
-      goal: "angle"; or "place": a distance along the fingers, towards their tips, from the middle of their
-        pads [m], with `target`, `tolerance` and `near` in metres.
-      actions: "servos", eleven joints; or "pads": six movements of the pads of two fingers and the thumb,
-        across the rod and towards it, with `rate` and `reach` in metres.
+      tolerance: error that counts as a success [m].
+      held: reward of a decision with the rod in the grip; near: scale of the error in the reward [m].
       lead: shift of the goals of the fingers' pads, opposite to the thumb's, while they close [m]: soft
         servos yield along the pads, and a rod comes to lie 5 mm from their middle.
     """
 
-    target: tuple = (-0.5, 0.0)
-    rate: float = 0.015
-    reach: float = 0.3
+    decisions: int = 12
+    prepare: int = 17
+    encoder: float = 5e-3
+    gentle: float = 4.0
+    target: tuple = (-1e-3, 3e-3)
+    rate: float = 0.8e-3
+    reach: float = 8e-3
     close: float = 0.4
-    hold: float = 0.5
-    release: float = 0.7
-    offset: tuple = (2e-3, 3e-3)
+    offset: tuple = (4e-3, 3e-3)
     mass: tuple = (8e-3, 30e-3)
-    tolerance: float = 0.06
+    tolerance: float = 0.4e-3
     held: float = 0.2
-    near: float = 0.1
+    near: float = 0.7e-3
     twist: float = 1e-4
     lost: float = 20e-3
-    goal: str = "angle"
-    actions: str = "servos"
-    lead: float = 0.0
-
-
-# The rod is rolled to a given place on the pads. Exact joint angles, which differ by 1e-3 rad, determine the
-# place to 0.1 mm; the encoders of a hand do not.
-PLACE = Settings(
-    decisions=12,
-    prepare=17,
-    hold=0.4,
-    release=0.55,
-    goal="place",
-    target=(-1e-3, 3e-3),
-    tolerance=0.4e-3,
-    near=0.7e-3,
-    offset=(4e-3, 3e-3),
-    lead=4e-3,
-    encoder=5e-3,
-    actions="pads",
-    rate=0.8e-3,
-    reach=8e-3,
-    gentle=4.0,
-)
+    lead: float = 4e-3
 
 
 _LATE = 2.0  # delay of a rod behind the goals of the pads [decisions]
 
 
-def rolled(begun: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
-    """Angles (n,) [rad], -pi to pi, by which attitudes `now` (n, 4), w x y z, are turned against `begun` (4,)
-    about their own third axis: the twist of conj(begun) now."""
-    w, x, y, z = begun
-    along = w * now[:, 3] - z * now[:, 0] - x * now[:, 2] + y * now[:, 1]
-    turned = 2 * torch.atan2(along, now @ begun)
-    return torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
-
-
 class RollRod(HeldTask):
-    """A Shadow Hand holds a rod between its thumb and two fingers and rolls it by a given angle, or to a
-    given place on the pads (`PLACE`). The rod's initial place, mass and friction differ between worlds and
-    are not observed.
+    """A Shadow Hand holds a rod between its thumb and two fingers and rolls it to a given place on the pads.
+    The rod's initial place, mass and friction differ between worlds and are not observed.
 
-    Observations: "body" (num_envs, 39, or with pads' actions 34): changes of thirteen joint angles,
-    their velocities / 10 rad/s, changes of the goals of eleven servos [rad] (of six movements of pads, as
-    fractions of `reach`), the target [rad or mm], the time; "touch": changes since the fingers were open;
-    "state" (num_envs, 6): angle [rad], place [mm], error / `near`, forces of the fingers [N]. Reward of a
-    decision: 0.2 with the rod in the grip, and after its release exp(-(error / near)^2), for a place
-    (`Settings.goal`) 1 / (1 + (error / near)^2).
+    Actions: movements of the pads of two fingers and the thumb, across the rod and towards it. Observations:
+    "body" (num_envs, 34): changes of thirteen joint angles, their velocities / 10 rad/s, changes of the goals
+    of six movements of pads, as fractions of `reach`, the target [mm], the time; "touch": changes since the
+    fingers were open; "state" (num_envs, 5): place [mm], error / `near`, forces of the fingers [N]. Reward of
+    a decision: 0.2 with the rod in the grip, and after its release 1 / (1 + (error / near)^2).
 
     Args:
       hand: Menagerie's shadow_hand/right_hand.xml; None looks for it in the folder that the variable
@@ -110,6 +73,7 @@ class RollRod(HeldTask):
     """
 
     body = "rod"
+    num_actions = 6
     gamma = 0.9  # a decision is paid at once; with 0.97 noise hides what it gave
     settings = Settings()
 
@@ -118,19 +82,13 @@ class RollRod(HeldTask):
         hand: pathlib.Path | str | None = None,
         num_envs: int = 256,
         *args: object,
-        settings: Settings | None = None,
         rod: Rod = Rod(),  # noqa: B008 - frozen
         **keywords: object,
     ):
-        s = self.settings if settings is None else settings
-        for name, choice in _CHOICES.items():
-            if getattr(s, name) not in choice:
-                raise ValueError(f"{name}={getattr(s, name)!r}: choose one of {', '.join(choice)}")
-        self.num_actions = 11 if s.actions == "servos" else 6
         menagerie = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
         self._hand = hand or menagerie / "shadow_hand" / "right_hand.xml"
         self._rod_made = rod
-        super().__init__(num_envs, *args, settings=s, **keywords)
+        super().__init__(num_envs, *args, **keywords)
 
     def _scene(self, skin):
         return *build(self._hand, self._rod_made, self.cfg.timestep, True, skin=skin), {}
@@ -154,20 +112,15 @@ class RollRod(HeldTask):
         self._axes = [tensor(x, dtype=torch.float32) for x in (np.cross(p.normal, p.axis), p.axis, p.centre)]
         self._cores = tensor(np.array([mjm.body(f"{q}core").id for q in prefixes.values()]))
         self._xpos, self._xmat = wp.to_torch(d.xpos), wp.to_torch(d.xmat)
-        self._pads = tensor(p.pads.T, dtype=torch.float32) if self.num_actions == 6 else None
+        self._pads = tensor(p.pads.T, dtype=torch.float32)
         self._target = torch.zeros(self.num_envs, device=self.device)
         # at the last decision of a script; none in an episode that begins
         self._place_before = torch.full((self.num_envs,), torch.nan, device=self.device)
 
     @property
     def target(self) -> torch.Tensor:
-        """(num_envs,) target angles [rad], or positions [m]."""
+        """(num_envs,) target places [m]."""
         return self._target
-
-    @property
-    def angle(self) -> torch.Tensor:
-        """(num_envs,) by which the rod is rolled about its axis [rad]."""
-        return rolled(self._start[self._at + 3 : self._at + 7], self.quat)
 
     @property
     def held(self) -> torch.Tensor:
@@ -184,18 +137,12 @@ class RollRod(HeldTask):
 
     @property
     def error(self) -> torch.Tensor:
-        """(num_envs,) how far the rod is from its target [rad or m]."""
-        return ((self.angle if self.cfg.goal == "angle" else self.place) - self._target).abs()
+        """(num_envs,) how far the rod is from its target [m]."""
+        return (self.place - self._target).abs()
 
     def script(self) -> torch.Tensor:
         """Moves the fingers' pads against the thumb, by the rod's place that is predicted for two decisions
-        later, since it follows with this delay.
-
-        Raises:
-          ValueError: the settings are not those of a place.
-        """
-        if self.cfg.goal != "place" or self.cfg.actions != "pads":
-            raise ValueError("a script rolls the rod to a place by its pads: take settings=PLACE")
+        later, since it follows with this delay."""
         place = self.place
         coming = place + _LATE * torch.nan_to_num(place - self._place_before)
         self._place_before[:] = place
@@ -205,13 +152,11 @@ class RollRod(HeldTask):
     def _judge(self):
         s, error = self.cfg, self.error
         free = (self._age * s.substeps * s.timestep > s.release).float()
-        off = (error / s.near) ** 2
-        paid = off.neg().exp() if s.goal == "angle" else 1 / (1 + off)
+        paid = 1 / (1 + (error / s.near) ** 2)
         return s.held + free * paid, self.held, error < s.tolerance, error
 
     def _command(self):
-        moved = self._moved if self._pads is None else self._moved @ self._pads
-        goal = self._opened + self._closing() * (self._closed - self._opened) + moved
+        goal = self._opened + self._closing() * (self._closed - self._opened) + self._moved @ self._pads
         self._ctrl[:, self._actuators] = goal.clamp(self._limits[0], self._limits[1])
 
     def _sense_body(self, off, speed_off):
@@ -219,13 +164,11 @@ class RollRod(HeldTask):
         angles = self._qpos[:, self._joints] - self._start[self._joints] + off
         velocities = self._qvel[:, self._dofs] + speed_off
         time = self.episode_length_buf[:, None] / s.decisions
-        moved = self._moved / s.reach if self._pads is not None else self._moved
-        goal = self._target if s.goal == "angle" else 1e3 * self._target
-        return [angles, velocities / 10.0, moved, goal[:, None], time]
+        return [angles, velocities / 10.0, self._moved / s.reach, 1e3 * self._target[:, None], time]
 
     def _state(self):
         error = self.error[:, None] / self.cfg.near
-        return [self.angle[:, None], 1e3 * self.place[:, None], error, self.force]
+        return [1e3 * self.place[:, None], error, self.force]
 
     def _draw_goals(self, which):
         self._target = self._target.where(~which, self._uniform(*self.cfg.target, self.num_envs))

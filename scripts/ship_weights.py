@@ -1,14 +1,18 @@
-"""Weights with a model card: `biotac learn judge DIR --ship FOLDER`."""
+"""The weights that ship, with a model card each: those of the trajectory split (all objects seen) in a folder
+of `biotac learn train` on a synthetic sensor.
 
+    python scripts/ship_weights.py out/train [--out biotac_mj/assets/weights]"""
+
+import argparse
 import json
 import pathlib
 import shutil
 
-from ..files import replacing
-from .report import UNIT
-from .weights import describe
+from biotac_mj.files import replacing
+from biotac_mj.learning.report import UNIT, evaluate_models
+from biotac_mj.learning.weights import describe
 
-__all__ = ["check_shippable", "ship"]
+__all__ = ["ship"]
 
 _MOST = 16 * 2**20  # bytes, all weights together
 _DIRECTION = {
@@ -17,37 +21,23 @@ _DIRECTION = {
 }
 
 
-def check_shippable(folder: pathlib.Path | str) -> dict[str, pathlib.Path]:
-    """Direction -> weights of the trajectory split in a folder of `biotac learn train`.
+def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -> list[pathlib.Path]:
+    """Copies the weights and writes a card for each.
+
+    Args:
+      folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder.
 
     Raises:
-      FileNotFoundError: seed 0 of that split was not trained, or only without our models (`--only`).
+      FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: a real sensor, or more
+        than 16 MB.
     """
-    folder = pathlib.Path(folder)
+    folder, target = pathlib.Path(folder), pathlib.Path(target)
+    if result["data"] != "synthetic":
+        raise ValueError(f"{folder} saw a {result['data']} sensor: cards say that weights saw synthetic ones")
     sources = {name: folder / f"{name}-trajectory.safetensors" for name in ("forward", "inverse")}
     for path in sources.values():
         if not path.is_file():
             raise FileNotFoundError(f"no {path}: train seed 0 of the split trajectory")
-    return sources
-
-
-def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -> list[pathlib.Path]:
-    """Copies the weights of the trajectory split (all objects seen) and writes a card for each.
-
-    Args:
-      folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder, such as
-        biotac_mj/assets/weights.
-
-    Raises:
-      FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: more than 16 MB.
-    """
-    folder, target = pathlib.Path(folder), pathlib.Path(target)
-    if result.get("data", "synthetic") != "synthetic":
-        raise ValueError(
-            "--ship is for models of synthetic data, as its cards say: keep this with `biotac learn train "
-            "DIR --out FILE.safetensors`"
-        )
-    sources = check_shippable(folder)
     size = sum(path.stat().st_size for path in sources.values())
     if size > _MOST:
         raise ValueError(
@@ -103,7 +93,7 @@ def _card(name, meta, size, result):
                 f"noise {found['noise_floor']:.1f}"
             )
         else:
-            row = found["inverse_mm"][meta.get("model", "pod_inverse")]
+            row = found["inverse_mm"][meta["model"]]
             centre = (
                 f", patch centre {row['centre_median']:.2f} mm (median)" if "centre_median" in row else ""
             )
@@ -112,3 +102,12 @@ def _card(name, meta, size, result):
                 f"where the skin moves {row['moved']:.4f} mm{centre}"
             )
     return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("folder", help="that `biotac learn train` wrote")
+    parser.add_argument("--out", default="biotac_mj/assets/weights", help="folder of weights and cards")
+    options = parser.parse_args()
+    written = ship(options.folder, evaluate_models(options.folder), options.out)
+    print(f"written: {', '.join(map(str, written))}")
