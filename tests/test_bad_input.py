@@ -740,7 +740,7 @@ def trained_models():
         ("", "give --object, one of"),
     ):
         yield Row(f"data resimulate electrodes.txt --quiet --skin coarse --out out {words}", said)
-    yield Row("learn train shard.h5 --quiet --out trained", "is of other settings (set, config, models")
+    yield Row("learn train shard.h5 --quiet --out trained", "is of other settings (set, config")
 
 
 def meshes():
