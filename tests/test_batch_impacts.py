@@ -244,6 +244,20 @@ def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     assert sum(a.lost for a, _ in both) <= 1.5 * sum(b.lost for _, b in both) + 3
 
 
+def test_a_thrown_box_has_the_force_of_the_plugin():
+    """To single precision, also where the candidates of a long step find no room at first."""
+    box = '<body><freejoint/><geom type="box" size=".004 .004 .004" mass="0.0486"/></body>'
+    quat = np.array([-2.828, 1.021, -0.960, -1.669])
+    qpos = np.concatenate([[-0.009, 0.001, 0.0155], quat / np.linalg.norm(quat)])
+    qvel = np.array([0.07, -0.044, -0.314, 0.131, -0.264, 7.03])
+    xml = scene(box, 0.002, 'integrator="implicit"')
+    where = {"site": "tip"}
+    single = in_plugin(xml, qpos, qvel, 12, where, skin="coarse", tier="condensed")
+    batch = in_batch(xml, qpos[None], qvel[None], 12, where, skin="coarse", tier="condensed")[0][0]
+    assert single.touched > 8 and batch.lost + single.lost == 0
+    np.testing.assert_allclose(batch.force, single.force, atol=1e-5 * single.size.max())
+
+
 @pytest.mark.slow
 def test_a_ball_that_hits_and_leaves_settles_in_every_step():
     """Friction begins where the ball meets the skin in every round, not in the first alone; and one that

@@ -225,8 +225,8 @@ def find_faces(
     s: Scratch,
 ):
     """Adds the faces within reach of a geom [m] and those geoms; how many there are, and how many are new,
-    with those that have a new geom. Beyond capacity none is listed. view, travel, near: those of
-    `choose_view`. moved: how far the skin has at most [m]."""
+    with those that have a new geom. view, travel, near: those of `choose_view`. moved: how far the skin has
+    at most [m]."""
     free = reach + ROOT3 * travel
     most = free + ROOT3 * moved
     if most > _AWAY:  # so far nobody has looked
@@ -283,7 +283,7 @@ def find_faces(
         new += s.near[w, s.look[w, k]]
     sync()
     nface = _list_marked(w, t, threads, 0, s.near, s.face)
-    for k in range(t, wp.min(nface, s.face.shape[1]), threads):
+    for k in range(t, nface, threads):
         f = s.face[w, k]
         face = c.face[f]
         center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
@@ -385,7 +385,7 @@ def find_nodes(
             i = c.number[face[a]]
             if i >= 0:
                 s.place[w, i] = 0
-    for k in range(t, ncore, threads):
+    for k in range(t, wp.min(ncore, s.core_face.shape[1]), threads):
         face = c.inner_face[s.core_face[w, k]]
         for a in range(3):
             i = c.inner_number[face[a]]
@@ -394,7 +394,7 @@ def find_nodes(
     sync()
     nnode = _list_marked(w, t, threads, -1, s.place, s.node)
     nin = _list_marked(w, t, threads, -1, s.core_place, s.core_node)
-    if nnode <= s.node.shape[1] and nin <= s.core_node.shape[1]:
+    if 3 * nnode + nin <= s.coordinate.shape[1]:
         for k in range(t, nnode, threads):
             for a in range(3):
                 s.coordinate[w, 3 * k + a] = 3 * s.node[w, k] + a

@@ -36,21 +36,19 @@ def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, in
 @dataclasses.dataclass(frozen=True)
 class Room:
     """For contact: nodes that touch, whose dense system takes most of the memory, 2.1 MB a world where they
-    are 240; samples that touch; candidates, faces and nodes of both surfaces; and views, see
-    `broadphase.choose_view`."""
+    are 240; samples that touch; coordinates of candidate nodes of both surfaces, and candidate faces of the
+    inner one; and views, see `broadphase.choose_view`."""
 
     touched: int
     contacts: int = 1_000_000
-    faces: int = 100_000
-    nodes: int = 100_000
+    coordinates: int = 1_000_000
     core_faces: int = 100_000
-    core_nodes: int = 100_000
     views: int = 1
 
     @classmethod
     def of_worlds(cls, nworld: int) -> "Room":
         """Capacity that fits the memory for `nworld` worlds."""
-        return cls(240 if nworld <= 1024 else 144, faces=768, nodes=448, core_faces=384, core_nodes=240)
+        return cls(240 if nworld <= 1024 else 144, coordinates=1584, core_faces=1024)
 
 
 class CondensedStep:
@@ -181,24 +179,23 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s = Scratch()
     nface, nouter, ninner = len(model.outer.face_np), len(linear.node), len(linear.inner)
     ncore = len(model.core_surface.face_np) if model.has_core else 0
-    faces, nodes = min(room.faces, nface), min(room.nodes, nouter)
-    touched = min(room.touched, nouter + ninner)
-    core_faces, core_nodes = min(room.core_faces, ncore), min(room.core_nodes, ninner)
-    n = 3 * nodes + core_nodes
+    touched, core_faces = min(room.touched, nouter + ninner), min(room.core_faces, ncore)
+    n = min(room.coordinates, 3 * nouter + ninner)
+    nodes = min(n // 3, nouter)
     for name, count in (
         ("near", nface),
         ("near_core", ncore),
         ("look", max(nface, ncore)),
-        ("face", faces),
+        ("face", nface),
         ("core_face", core_faces),
         ("place", nouter),
         ("core_place", ninner),
-        ("node", nodes),
-        ("core_node", core_nodes),
+        ("node", nouter),
+        ("core_node", ninner),
         ("coordinate", n),
         ("loaded", n),
         ("loaded_place", n),
-        ("on", nodes + core_nodes),
+        ("on", min(n, nouter + ninner)),
         ("touched", touched),
     ):
         setattr(s, name, wp.zeros((nworld, count), dtype=int))
@@ -214,7 +211,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.columns = wp.empty((nworld, alone * min(alone, 3 * touched)), dtype=float)
     s.known, s.last = wp.zeros((nworld, alone), dtype=int), wp.zeros((nworld, alone + 1), dtype=int)
     s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
-    s.stiff = wp.zeros((nworld, core_nodes), dtype=real)
+    s.stiff = wp.zeros((nworld, ninner), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))
     ring = model.ring.shape[1]
     s.block = wp.zeros((nworld, touched, ring), dtype=wp.mat33)

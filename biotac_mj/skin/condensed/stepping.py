@@ -231,7 +231,8 @@ def search(
     st: Worlds,
 ):
     """The phase SEARCH: finds the candidates, first at the start of an increment, then at its displacements,
-    until there are no new ones."""
+    until there are no new ones. Where those of a long motion find no room it begins anew with nearer ones:
+    the searches that follow find which of the others are touched."""
     p = s.solve.stepping[w]
     o = s.solve.increment[w]
     sync()
@@ -249,6 +250,7 @@ def search(
         o.bulge = r.bulge[w]
         if p.known == 1:
             moved = real(2.0) * _largest_motion(w, geoms)
+        moved *= wp.pow(real(0.5), real(o.halved))
         for g in range(t, geoms.count, threads):
             s.sought_pos[g, w] = geoms.pos[g, w]
             s.sought_mat[g, w] = geoms.mat[g, w]
@@ -279,16 +281,18 @@ def search(
         new += inner
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
-        elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
-            looking = 0
-            o.ok = 0
         else:
             o.nface = nface
             o.ncore = ncore
             nnode, nin = find_nodes(w, t, threads, nface, ncore, x, c, s)
             o.nnode = nnode
             o.nin = nin
-            if o.nnode > s.node.shape[1] or o.nin > s.core_node.shape[1]:
+            if ncore > s.core_face.shape[1] or 3 * nnode + nin > s.coordinate.shape[1]:
+                if first == 1 and moved > _REACH:
+                    o.halved += 1
+                    if t == 0:
+                        s.solve.increment[w] = o
+                    return
                 looking = 0
                 o.ok = 0
     if looking == 1:
