@@ -613,23 +613,24 @@ def test_the_skin_is_solved_until_a_fit_has_found_its_end(gain, more, times, mon
     assert solved == ([True] + [False] * times)[:times]  # with its parameters changed first
 
 
-@pytest.mark.parametrize("alone, first", [(90.0, "relax"), (30.0, "latency")])
-def test_an_effect_that_alone_explains_more_leads(alone, first):
-    """One that was tried late, beside another, and is likelier than all that was found."""
-    from biotac_mj.discrepancy.trajectories.search import Candidate, Search, _in_place_of
+@pytest.mark.parametrize(
+    "late, gain, alone, left",
+    [("gain", 39.0, 0.0, True), ("gain", 41.0, 0.0, False)]
+    + [("creep", 150.0, alone, alone > 150) for alone in (140.0, 390.0)],
+)
+def test_what_the_laws_of_others_lack_is_no_effect(monkeypatch, late, gain, alone, left):
+    """A tenth of what relaxation explains; and more than another law of relaxation explains by itself."""
+    from biotac_mj.discrepancy.trajectories import search
 
-    late, early = by_id("relax"), by_id("latency")
-    fits = {
-        frozenset(ids): types.SimpleNamespace(
-            score=score, effects=[(by_id(i), by_id(i).default()) for i in ids]
-        )
-        for ids, score in (((), 0.0), (("latency",), 40.0), (("relax",), alone))
-    }
-    found = [Candidate(early, fits[frozenset({"latency"})], 40.0, 0.0, [])]
-    search = Search(found[0].fit, found, [], fits)
-    assert _in_place_of(Candidate(late, None, 5.0, 0.0, []), search) == (first == "relax")
-    assert [one.effect.id for one in search.found] == [first]
-    assert search.fit is fits[frozenset({first})]
+    def fit(score, *ids):
+        effects = [(by_id(i), by_id(i).default()) for i in ids]
+        return types.SimpleNamespace(score=score, effects=effects)
+
+    monkeypatch.setattr(search, "fit_effects", lambda *args: fit(alone))
+    null, first = fit(0.0), search.Candidate(by_id("relax"), fit(400.0, "relax"), 400.0, 0.0, [])
+    tried = search.Search(first.fit, [first], [], {frozenset(): null})
+    one = search.Candidate(by_id(late), fit(400.0 + gain, "relax", late), gain, 0.0, [])
+    assert search._left_by_laws(None, one, tried, None) is left
 
 
 def test_signed_roots_have_the_rate_of_chance():

@@ -1,8 +1,8 @@
-"""How much is left above noise, trajectory by trajectory."""
+"""Which trajectories are off."""
 
 import numpy as np
 
-__all__ = ["astray", "excess", "few_off"]
+__all__ = ["astray", "few_off"]
 
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 # Mean square of one alone beyond what another balance at an edge makes of it: at most 5.2 in 41 contacts of
@@ -24,8 +24,3 @@ def astray(fitted: np.ndarray, aside: np.ndarray) -> np.ndarray:
 def few_off(square: np.ndarray) -> bool:
     """Whether no more than half of the trajectories with these mean squares are off."""
     return bool(np.mean(square > _OFF) <= 0.5)
-
-
-def excess(square: np.ndarray) -> float:
-    """Mean log of mean squares (trajectories,) above that of noise."""
-    return float(np.mean(np.log(np.maximum(square, 1.0))))
