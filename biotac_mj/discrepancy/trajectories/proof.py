@@ -124,15 +124,25 @@ def _compared(comparison, fit, rows):
 def _worse(comparison, before, after, aside) -> bool:
     """Whether a group of channels is further off than before, by more than chance makes of what the
     comparison resolves."""
-    rows = sum(len(comparison.trajectories[i].time) for i in aside)
+    rows = [len(comparison.trajectories[i].time) for i in aside]
+    independent = [_independent(comparison, i) for i in aside]
     for part in comparison.groups.values():
         first, last = (
             sum(((r / comparison.sigmas[i])[:, part] ** 2).mean(1).sum() for i, r in zip(aside, residuals))
             for _, residuals, _ in (before, after)
         )
-        if last - first > np.sqrt(2 * rows / (part.stop - part.start)):
+        chance = np.sqrt(sum(2 * n**2 / values[part].sum() for n, values in zip(rows, independent)))
+        if last - first > chance:
             return True
     return False
+
+
+def _independent(comparison, i):
+    """As how many independent rows of a trajectory each channel counts (width,): what the model misses is the
+    same in all rows, noise is another in each."""
+    rows = len(comparison.trajectories[i].time)
+    alike = 1 - (comparison.noises / comparison.sigmas[i]) ** 2
+    return rows / (1 + (rows - 1) * alike**2)
 
 
 def _closed(comparison, before, after, law, aside):
