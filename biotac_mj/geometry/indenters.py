@@ -13,6 +13,7 @@ __all__ = ["INDENTERS", "Indenter", "indenter"]
 _EDGE = 0.001  # rounding of cylinders, cube and ring [m]; the meshes have it within their tessellation
 _RING = (0.0035, 0.007)  # inner and outer radius [m]
 _RING_HEIGHT = 0.007  # [m], down to where the paper's ring joins its mount
+_SECTIONS = 96  # of a turned mesh
 _ALONG_X = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # turns a geom's z axis to the indenter's x axis
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -49,19 +50,16 @@ class Indenter:
         if self.geom_type == "sphere":
             radius = self.size[0]
             angle = np.linspace(0.0, np.pi, 49)
-            vert, face = _revolve(
-                np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1), closed=False
-            )
+            vert, face = _revolve(np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1))
         elif self.geom_type == "cylinder":
             radius, half = self.size
-            vert, face = _revolve(_rounded_rectangle(0.0, radius, -half, half, self.rounding), closed=False)
+            vert, face = _revolve(_rounded_rectangle(0.0, radius, -half, half, self.rounding))
             vert = vert[:, [1, 2, 0]]  # axis y to axis x (a rotation)
         elif self.geom_type == "box":
             vert, face = _rounded_box(np.array(self.size), self.rounding)
         else:
-            vert, face = _revolve(
-                _rounded_rectangle(*_RING, -_RING_HEIGHT / 2, _RING_HEIGHT / 2, self.rounding), closed=True
-            )
+            ring = _rounded_rectangle(*_RING, -_RING_HEIGHT / 2, _RING_HEIGHT / 2, self.rounding)
+            vert, face = _revolve(np.concatenate([ring, ring[:1]]))
         return vert + np.array(self.pos), face
 
 
@@ -113,40 +111,14 @@ def _rounded_rectangle(inner, outer, low, high, edge, arc=9):
     return np.concatenate(corners)[::-1]
 
 
-def _revolve(profile, closed, count=96):
-    """Closed mesh by turning a clockwise profile (n, 2) of (radius, height) about y; an open profile starts
-    and ends on the axis."""
-    angle = np.arange(count) * 2 * np.pi / count
-    if not closed:
-        top, bottom, profile = profile[0], profile[-1], profile[1:-1]
-    n = len(profile)
-    vert = np.stack(
-        [
-            np.outer(np.cos(angle), profile[:, 0]),
-            np.tile(profile[:, 1], (count, 1)),
-            np.outer(np.sin(angle), profile[:, 0]),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(count), np.arange(n if closed else n - 1), indexing="ij")
-    a, b = i * n + j, i * n + (j + 1) % n
-    c, d = (a + n) % (count * n), ((i + 1) % count) * n + (j + 1) % n
-    face = np.concatenate(
-        [np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([b, c, d], axis=-1).reshape(-1, 3)]
-    )
-    if not closed:
-        ring = np.arange(count) * n
-        following = np.roll(ring, -1)
-        poles = np.full(count, len(vert))
-        face = np.concatenate(
-            [
-                face,
-                np.stack([poles, following, ring], -1),
-                np.stack([poles + 1, ring + n - 1, following + n - 1], -1),
-            ]
-        )
-        vert = np.concatenate([vert, [[0.0, top[1], 0.0], [0.0, bottom[1], 0.0]]])
-    return vert, face.astype(np.int32)
+def _revolve(profile):
+    """Closed mesh by turning a clockwise profile (n, 2) of (radius, height) about y; the profile is closed or
+    starts and ends on the axis."""
+    from ..triangles import trimesh
+
+    # in millimetres, since trimesh drops triangles of less than 1e-8
+    turned = trimesh.creation.revolve(1e3 * profile[::-1], sections=_SECTIONS)
+    return 1e-3 * turned.vertices[:, [1, 2, 0]], turned.faces.astype(np.int32)  # axis z to y (a rotation)
 
 
 def _rounded_box(half, edge, arc=9):
