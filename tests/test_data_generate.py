@@ -294,22 +294,6 @@ def test_processes_of_several_devices_make_the_same_set(small, tmp_path, monkeyp
 
 
 @pytest.mark.slow
-def test_recordings_keep_readings_only(tmp_path):
-    options = dataclasses.replace(SMALL, count=1, labelled=0, recordings=1, kinds=("tap",))
-    report = generate(tmp_path, options, workers=0, progress=False)
-    assert report.interactions == 1 and report.recordings == 1 and report.made == 2
-    with TactileSet(tmp_path) as data, TactileSet(tmp_path / "recordings") as recorded:
-        assert len(data) == 1 and "measured_counts" not in data.columns
-        assert (
-            recorded.object.tolist() == ["table_edge"]
-            and recorded.geometry is None
-            and "displacement" not in recorded.columns
-        )
-        counts = recorded["measured_counts"][:]
-        assert np.isfinite(counts).all() and np.abs(counts[:, :19] - counts[0, :19]).max() > 20
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 def test_same_seed_same_file_on_cuda(tmp_path):
     devices = [device.alias for device in wp.get_cuda_devices()]
@@ -358,25 +342,21 @@ def test_condensed_tier(tmp_path):
 
 
 def test_all_objects_take_turns():
-    parts = batches(GenerateOptions(count=100, labelled=20, recordings=30, batch=3, measured_batch=10))
-    assert sorted(i for part in parts for i in part.members) == list(range(130))
-    role = {name: [p for p in parts if (p.simulated, p.measured) == flags] for name, flags in
-            dict(labelled=(True, True), plain=(True, False), recorded=(False, True)).items()}  # fmt: skip
-    assert {i for part in role["labelled"] for i in part.members} == set(range(20))
-    assert {name for part in role["labelled"] for name in part.names} == set(INDENTERS)
-    assert {name for part in role["plain"] for name in part.names} == set(OBJECTS)
-    assert {name for part in role["recorded"] for name in part.names} == set(OBJECTS) - set(INDENTERS)
-    assert all(len(set(part.names)) == 1 for part in role["plain"])  # whatever is measured mixes its objects
-    assert [len(part.members) for part in role["labelled"]] == [10, 10] and len(role["recorded"]) == 3
-    assert max(len(part.members) for part in role["plain"]) <= 3 and len(
-        {part.path for part in parts}
-    ) == len(parts)
+    parts = batches(GenerateOptions(count=100, labelled=20, batch=3, measured_batch=10))
+    assert sorted(i for part in parts for i in part.members) == list(range(100))
+    labelled, plain = ([p for p in parts if p.measured is measured] for measured in (True, False))
+    assert {i for part in labelled for i in part.members} == set(range(20))
+    assert {name for part in labelled for name in part.names} == set(INDENTERS)
+    assert {name for part in plain for name in part.names} == set(OBJECTS)
+    assert all(len(set(part.names)) == 1 for part in plain)  # whatever is measured mixes its objects
+    assert [len(part.members) for part in labelled] == [10, 10]
+    assert max(len(part.members) for part in plain) <= 3
+    assert [part.path for part in parts] == [f"shard-{k:05d}.h5" for k in range(len(parts))]
     # an interaction has the same object whatever the batches are
-    other = batches(GenerateOptions(count=100, labelled=20, recordings=30))
+    other = batches(GenerateOptions(count=100, labelled=20))
     assert dict(sorted((i, n) for p in parts for i, n in zip(p.members, p.names))) == dict(
         sorted((i, n) for p in other for i, n in zip(p.members, p.names))
     )
-    assert parts[0].path == "shard-00000.h5" and role["recorded"][0].path == "recordings/shard-00000.h5"
 
 
 def test_readings_follow_a_ramp():
@@ -410,7 +390,6 @@ def test_example(repo, tmp_path):
         (dict(count=0), "count is 0"),
         (dict(measured_batch=0), "measured_batch is 0"),
         (dict(labelled=9), "labelled is 9: give a whole number from 0 to 3"),
-        (dict(recordings=-1), "recordings is -1"),
         (dict(rate=0.0), "rate is 0.0 Hz"),
         (dict(seed=-1), "seed is -1"),
         (dict(tier="fast"), "unknown tier 'fast': choose full or condensed"),

@@ -24,7 +24,6 @@ def stand_in(
     liquid: bool | None = None,
     element: str | None = None,
     device: str = "cpu",
-    options: dict | None = None,
 ) -> Indentation:
     """The indentation with forces and displacements of a known skin.
 
@@ -36,17 +35,16 @@ def stand_in(
       noise: standard deviation added to each force component [N].
       seed: of the noise.
       liquid, element: see SkinOptions; None takes the material's choice.
-      options: {"skin": ..., "modulus": ...}, further ones, see `skin.settings.read_settings`.
 
     Raises:
       ValueError: negative noise, or a path that the skin cannot follow.
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ValueError(f"noise is {noise}: pass a standard deviation in newtons, 0 or more")
-    rubber, options, modulus = read_settings(
-        material, options, liquid=liquid, element=element, tolerance=1e-4, max_newton=100
+    rubber, options, _ = read_settings(
+        material, None, liquid=liquid, element=element, tolerance=1e-4, max_newton=100
     )
-    answer = simulate(named_skin(skin), options, [rubber], indentation, device, modulus=modulus)
+    answer = simulate(named_skin(skin), options, [rubber], indentation, device)
     if answer.nonconverged[0]:
         raise ValueError(
             f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not "

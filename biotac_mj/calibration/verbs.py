@@ -27,14 +27,8 @@ _TRUTH = {
     "truth_skin": "default",
     "noise": 0.01,
     "truth_liquid": None,
-    "truth_options": None,
 }
-_REFERENCE = {
-    "reference_material": "rubber",
-    "reference_skin": "coarse",
-    "reference_element": "quadratic",
-    "reference_options": None,
-}
+_REFERENCE = {"skin": "coarse", "element": "quadratic"}  # of the stand-in
 _NO_SETTINGS = (
     "configurations",
     "out",
@@ -84,7 +78,6 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
             args.seed,
             args.truth_liquid,
             device=args.device,
-            options=read_dict(args.truth_options, "truth-options"),
         )
         write_indentation(data, out / "synthetic.csv")
         truth = read_material(args.truth)
@@ -124,7 +117,7 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     """
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
-    _complete(args, _REFERENCE, not args.data, "leave it out, or --data")
+    _complete(args, {"reference_material": "rubber"}, not args.data, "leave it out, or --data")
     chosen = [
         _body(
             name,
@@ -143,8 +136,8 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
         if isinstance(v, (str, int, float, list, tuple, type(None))) and k not in _NO_SETTINGS
     }
     files = [pathlib.Path(text.partition("=")[2]) for text in args.data or ()]
-    inputs = [settings, given, truth_material, load_skin(args.skin), load_skin(args.reference_skin)]
-    inputs += [read_dict(text, "options") for text in (args.options, args.reference_options)]
+    inputs = [settings, given, truth_material, load_skin(args.skin), load_skin(_REFERENCE["skin"])]
+    inputs.append(read_dict(args.options, "options"))
     kept = Kept(out / "compare.kept", [*inputs, *(file.read_bytes() for file in files if file.is_file())])
     if kept.names and not args.quiet:
         print(
@@ -155,13 +148,7 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
         calibration, cases = (None, cases) if given else (cases[0], cases[1:])
         reference = "measured data"
     else:
-        truth = dict(
-            material=args.reference_material,
-            skin=args.reference_skin,
-            element=args.reference_element,
-            device=args.device,
-            options=read_dict(args.reference_options, "reference-options"),
-        )
+        truth = {"material": args.reference_material, "device": args.device, **_REFERENCE}
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:
             cases = kept.get("reference", list, lambda: references(plans, bar.update, **truth))
@@ -172,10 +159,8 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
                 "reference of the calibration", Indentation, lambda: stand_in(plan_shear(), **truth)
             )
         )
-        reference = (
-            f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, "
-            f"skin {args.reference_skin})"
-        )
+        element, skin = _REFERENCE["element"], _REFERENCE["skin"]
+        reference = f"{STAND_IN} ({args.reference_material}, {element} elements, skin {skin})"
     results = []
     for body in chosen:
         results.append(

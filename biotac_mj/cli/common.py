@@ -126,11 +126,11 @@ class _Drawn(argparse.Action):
         setattr(namespace, self.dest, values[0] if len(values) == 1 else values)
 
 
-def add_options(verb: argparse.ArgumentParser, name: str = "--options", of: str = "the skin") -> None:
+def add_options(verb: argparse.ArgumentParser) -> None:
     """Adds further settings as JSON."""
     verb.add_argument(
-        name,
+        "--options",
         metavar="JSON",
-        help=f"further settings of {of}, JSON or a file of it: "
+        help="further settings of the skin, JSON or a file of it: "
         '{"skin": {"contact_law": {"adhesion": 0.05}}, "modulus": "factors.npy"} (docs/features.md)',
     )

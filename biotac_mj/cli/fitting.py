@@ -76,7 +76,6 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help=f"law and starting values: {', '.join(MATERIALS)}, or a material's or calibration's .json",
     )
     add_options(verb)
-    add_options(verb, "--truth-options", "the synthetic skin")
     verb.add_argument(
         "--liquid",
         action=argparse.BooleanOptionalAction,
@@ -154,12 +153,6 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--reference-material", help="of the reference: a preset, including its liquid (default: rubber)"
     )
-    verb.add_argument("--reference-skin", help="mesh of the reference (default: coarse)")
-    verb.add_argument(
-        "--reference-element",
-        choices=("linear", "quadratic"),
-        help="elements of the reference (default: quadratic)",
-    )
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
     verb.add_argument(
         "--material",
@@ -167,7 +160,6 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         "each is calibrated first)",
     )
     add_options(verb)
-    add_options(verb, "--reference-options", "the stand-in")
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
     )

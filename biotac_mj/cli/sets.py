@@ -26,12 +26,6 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         help="number with counts of the synthetic measured sensor too (default: 359)",
     )
     verb.add_argument(
-        "--recordings",
-        type=whole(0, 10_000_000),
-        default=0,
-        help="further interactions with only the synthetic sensor's counts",
-    )
-    verb.add_argument(
         "--objects",
         nargs="+",
         default=list(OBJECTS),

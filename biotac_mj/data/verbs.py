@@ -24,8 +24,6 @@ def generate_verb(args: argparse.Namespace) -> None:
         f"{report.interactions} interactions, {report.steps} time steps, "
         f"{report.nonconverged} of them not converged"
     )
-    if report.recordings:
-        print(f"{report.recordings} recordings of the synthetic measured sensor beside them")
     print(
         f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.devices} x "
         f"{report.device}"

@@ -26,10 +26,8 @@ from ..store import TactileSet, shard_path
 from .plan import KINDS
 from .vary import check_vary
 
-__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "GenerateReport", "batches", "generate", "made_already"]
+__all__ = ["Batch", "GenerateOptions", "GenerateReport", "batches", "generate", "made_already"]
 
-# folder in a set's folder for interactions with only the synthetic measured sensor's readings
-RECORDINGS = "recordings"
 _MOST_STEPS = 2000  # a batch is in memory with all its nodes
 
 
@@ -41,8 +39,6 @@ class GenerateOptions:
     Attributes:
       count: interactions. labelled: number of them with readings of the synthetic measured sensor; the
         paper's indenters only.
-      recordings: number of further interactions, with pegs and table, with readings of the synthetic measured
-        sensor only, as if logged by hand; a separate set in the folder `recordings`.
       steps: time steps of each. rate: of them [Hz].
       seed: of everything.
       objects, kinds: to draw from.
@@ -72,7 +68,6 @@ class GenerateOptions:
 
     count: int = 2600
     labelled: int = 359
-    recordings: int = 0
     steps: int = 20
     rate: float = 20.0
     seed: int = 0
@@ -131,7 +126,7 @@ class GenerateOptions:
         as_whole("steps", self.steps, 8, _MOST_STEPS)
         for name in ("count", "batch", "measured_batch"):
             as_whole(name, getattr(self, name), 1)
-        for name in ("recordings", "seed", "measured_seed"):
+        for name in ("seed", "measured_seed"):
             as_whole(name, getattr(self, name), 0)
         as_whole("labelled", self.labelled, 0, self.count)
         kinds = {name.split(":")[0] for name in self.devices}
@@ -170,7 +165,7 @@ class GenerateReport:
     """Result of a run.
 
     Attributes:
-      interactions, steps: in the set. recordings: in its subset. nonconverged: of these steps.
+      interactions, steps: in the set. nonconverged: of these steps.
       made: shards made by this run; existing ones are kept.
       seconds: wall time of this run, in total and per stage (summed over devices). bytes: of the shards.
         device: its name.
@@ -179,7 +174,6 @@ class GenerateReport:
 
     interactions: int
     steps: int
-    recordings: int
     nonconverged: int
     made: int
     seconds: dict
@@ -194,34 +188,28 @@ class Batch:
 
     Attributes:
       names: object of each member. members: numbers of the interactions.
-      simulated, measured: whether the simulator and the synthetic measured sensor take part.
+      measured: whether the synthetic measured sensor takes part.
       path: of the shard in the set's folder.
     """
 
     names: list
     members: list
-    simulated: bool
     measured: bool
     path: str
 
 
 def batches(options: GenerateOptions) -> list[Batch]:
-    """Labelled interactions first, then the others, then recordings. Objects alternate, so that a part of a
-    set is representative."""
-    indenters = [name for name in options.objects if name in INDENTERS]
-    others = [name for name in options.objects if name not in INDENTERS] or indenters
-    ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
-    roles = ((indenters, True, True), (options.objects, True, False), (others, False, True))
-    out, number = [], {True: 0, False: 0}
-    for first, end, (names, simulated, measured) in zip([0, *ends], ends, roles):
+    """Labelled interactions first, then the others. Objects alternate, so that a part of a set is
+    representative."""
+    indenters, out = [name for name in options.objects if name in INDENTERS], []
+    roles = (0, options.labelled, indenters, True), (options.labelled, options.count, options.objects, False)
+    for first, end, names, measured in roles:
         size = options.measured_batch if measured else options.batch
         for k in range(1 if measured else len(names)):
             members = np.arange(first + k, end, 1 if measured else len(names))
             for chunk in np.array_split(members, -(-len(members) // size)) if len(members) else ():
-                path = shard_path("" if simulated else RECORDINGS, number[simulated])
                 objects = [names[(i - first) % len(names)] for i in chunk]
-                out.append(Batch(objects, chunk.tolist(), simulated, measured, path.as_posix()))
-                number[simulated] += 1
+                out.append(Batch(objects, chunk.tolist(), measured, shard_path("", len(out)).as_posix()))
     return out
 
 
@@ -252,7 +240,7 @@ def generate(
     out = pathlib.Path(out)
     read_settings(options.material, options.options, ("film",))  # raise for invalid or missing ones
     skin, measured = (design_of(name) for name in (options.skin, options.measured_skin))
-    if (options.labelled or options.recordings) and measured != skin:
+    if options.labelled and measured != skin:
         raise ValueError(
             f"the measured sensor is a {measured.title} and the simulated one a {skin.title}: "
             "take --measured-skin of the same, or leave it out"
@@ -276,7 +264,6 @@ def generate(
         report = GenerateReport(
             interactions=len(data),
             steps=data.nstep,
-            recordings=options.recordings,
             nonconverged=int((~data["converged"][:]).sum()),
             made=len(todo),
             seconds={name: round(value, 1) for name, value in seconds.items()},

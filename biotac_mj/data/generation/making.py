@@ -56,7 +56,7 @@ def make_shards(
     own_gpu = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
     cores = workers if ray is not None else -(-workers // len(options.devices))
     processes = one_per_gpu(options.devices) if several else None
-    steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
+    steps = [options.steps * len(batch.members) * (1 + batch.measured) for batch in todo]
     tasks = [Task(batch, size, batch.path) for batch, size in zip(todo, steps)]
     if not cuda and ray is None and min(workers, len(tasks)) > 1:  # each core solves, reads and stores
         processes = {f"process {k}": dict.fromkeys(THREADS, "1") for k in range(min(workers, len(tasks)))}
@@ -157,13 +157,10 @@ class Maker:
             self.modes = skin_modes(model)
             self.few = Modes(self.modes.rate, self.modes.static_pressure)
         self.time = np.arange(options.steps) / options.rate
-        ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
-        subsets = [
-            assign(end - first, [options.seed, k]) for k, (first, end) in enumerate(zip([0, *ends], ends))
-        ]
-        self.split = np.concatenate(subsets)
+        counts = options.labelled, options.count - options.labelled
+        self.split = np.concatenate([assign(n, [options.seed, k]) for k, n in enumerate(counts)])
         self.measured = None
-        if options.labelled or options.recordings:
+        if options.labelled:
             from .synthetic_sensor import SyntheticSensor
 
             self.measured = SyntheticSensor(options.measured_seed, options.measured_skin, model.device)
@@ -224,37 +221,36 @@ class Maker:
         noise = [
             int(np.random.SeedSequence([o.seed, i, 1]).generate_state(1, np.uint64)[0]) for i in batch.members
         ]
-        if batch.simulated:
-            walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
-            skins = None, {}
-            if self.vary:
-                *skins, drawn = draw_worlds(
-                    self.vary, self.model.material, [[o.seed, i, 2] for i in batch.members]
-                )
-                for motion, one in zip(motions, drawn):
-                    motion.parameters["skin"] = one
-            senses = []
-            for i, motion in zip(batch.members, motions):
-                sense, drawn = draw_sense(o, [o.seed, i, 3], self.few, self.geometry.design)
-                senses.append(sense)
-                motion.parameters.update(drawn)
-            fields = running.fields = walk(
-                self.model, batch.names, motions, say, self.time, *skins, modes=self.modes
+        walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
+        skins = None, {}
+        if self.vary:
+            *skins, drawn = draw_worlds(
+                self.vary, self.model.material, [[o.seed, i, 2] for i in batch.members]
             )
-            clock = self._count("skin", clock)
-            running.reads = [
-                pool.submit(
-                    readings.read_in_worker,
-                    fields.displacement[k],
-                    self.time,
-                    fields.pressure[k],
-                    noise[k],
-                    senses[k],
-                    fields.touch(k),
-                    None if fields.rest is None else fields.rest[k],
-                )
-                for k in range(len(motions))
-            ]
+            for motion, one in zip(motions, drawn):
+                motion.parameters["skin"] = one
+        senses = []
+        for i, motion in zip(batch.members, motions):
+            sense, drawn = draw_sense(o, [o.seed, i, 3], self.few, self.geometry.design)
+            senses.append(sense)
+            motion.parameters.update(drawn)
+        fields = running.fields = walk(
+            self.model, batch.names, motions, say, self.time, *skins, modes=self.modes
+        )
+        clock = self._count("skin", clock)
+        running.reads = [
+            pool.submit(
+                readings.read_in_worker,
+                fields.displacement[k],
+                self.time,
+                fields.pressure[k],
+                noise[k],
+                senses[k],
+                fields.touch(k),
+                None if fields.rest is None else fields.rest[k],
+            )
+            for k in range(len(motions))
+        ]
         if batch.measured:
             self._free()
             answer = running.answer = self.measured.simulate(batch.names, motions, say)
@@ -297,13 +293,8 @@ class Maker:
         batch, ones = running.batch, []
         clock = time.perf_counter()
         for k, (number, name, motion) in enumerate(zip(batch.members, batch.names, running.motions)):
-            columns = {
-                "indenter_pos": motion.pos,
-                "indenter_quat": quaternion(motion.mat),
-                "converged": np.ones(len(self.time), bool),
-            }
-            if batch.simulated:
-                columns |= running.fields.columns(self.model, k, running.reads[k].result())
+            columns = {"indenter_pos": motion.pos, "indenter_quat": quaternion(motion.mat)}
+            columns |= running.fields.columns(self.model, k, running.reads[k].result())
             if batch.measured:
                 counts, pac = running.labels[k].result()
                 columns |= {
@@ -325,10 +316,4 @@ class Maker:
                 )
             )
         self._count("waiting for readings", clock)
-        return pool.submit(
-            write_shard,
-            out / batch.path,
-            ones,
-            self.geometry if batch.simulated else None,
-            self.attributes,
-        )
+        return pool.submit(write_shard, out / batch.path, ones, self.geometry, self.attributes)
