@@ -25,7 +25,7 @@ LAYERS = {
     "triangles": "",
     "units": "short_repr",
     "versions": "biotac_mj",
-    "geometry": "cache short_repr files reading quiet",
+    "geometry": "cache short_repr files reading quiet triangles",
     "skin": "cache short_repr lazy geometry fields files reading threads quiet launches",
     "quiet": "",
     "sensor": "short_repr lazy fields files geometry threads quiet launches",
