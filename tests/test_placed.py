@@ -9,11 +9,13 @@ import biotac_mj
 
 BODY = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><site name="mount" quat="1 -1 0 0"/>
 <body name="body"><freejoint/><geom name="body" type="{shape}" mass=".02"/></body></worldbody></mujoco>"""
-BALL, BOX = 'sphere" size=".005', 'box" size=".004 .004 .004'
+BALL, BOX = 'sphere" size=".005', 'box" size=".004 .004 .005'
 INTO = (-0.009, 0.0, 0.0126), (0.0, 0.0, 0.0)  # a position [m] in the skin, at rest
 OVER = (-0.009, 0.0, 0.0137), (0.3, 0.0, -0.3)  # a position just above it, and a velocity [m/s]
-# from the side, from above, from a few millimetres away, from half a metre away
+# from the side, from above, from a few millimetres away, from half a metre away, and from a place where it
+# presses the skin
 FROM = (0.0, 0.015, 0.016), (-0.009, 0.0, 0.1), (-0.006, 0.002, 0.0145), (0.3, 0.2, 0.4)
+FROM += ((-0.006, 0.001, 0.0124),)
 
 
 def scene(shape, attach, **settings):

@@ -106,12 +106,14 @@ class Batch(Skins):
         self._launch(*self._bodies.jacobians(m, d, *start, self._jacobian))
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, taking_part)
         if self.moving:
-            by = [self.dt, 0.0, self._delay, self._solid, self.model]
-            self._launch(rounds.choose_gamma, self.groups, by, [r])
             self._find_drift(m, d)
             self._correction_force.zero_()
             r.amiss.zero_()
-            self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
+            known = [self.rest.awake, self.skin.by_mocap]
+            self._launch(rounds.begin_rounds, self.nworld, known, [r, self._last, self.model])
+            by = [self.dt, 0.0, self._delay, self._solid, self.model]
+            self._launch(rounds.choose_gamma, self.groups, by, [r])
+            self._find_drift(m, d)
             self._put_bodies(m)
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]

@@ -62,6 +62,7 @@ class BatchSkin:
         energy norm, estimated.
       bodies: `skin.bodies.Bodies`, of skins with tangents: how what touches gives way, for the caller to
         write.
+      by_mocap: (ngroup,) bool, bodies that a mocap body leads.
       kind: "full" or "condensed". tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond
         what that was measured for.
       reason: (nworld,) int: 0, or why the last step failed (`skin.newton.worlds`). iterations: (nworld,) int
@@ -114,7 +115,9 @@ class BatchSkin:
             self.fraction, self._path = (
                 wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)
             )
-            self._by_mocap = wp.array(touching.by_mocap, dtype=bool)
+            self.by_mocap = wp.array(touching.by_mocap, dtype=bool)
+            self._touched, self._any_bare = wp.zeros(nworld, dtype=int), wp.zeros(1, dtype=int)
+            self._bare = wp.zeros(nworld, dtype=bool)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
         self.release = Release(model, self.data, self.geoms)
@@ -167,16 +170,23 @@ class BatchSkin:
 
     def put_bodies(self, placed: wp.array, began: wp.array, where: wp.array) -> None:
         """Lets bodies that were placed begin where the geoms are now, without contact, as `SkinStepper.put`
-        does for one world. Launches only.
+        does for one world, on skins at rest where nothing else touches them. Launches only.
 
         Args:
           placed: (ngroup, nworld) int, which bodies. began: (nworld,) int, whether a step was made.
           where: (nworld,) int, in which worlds there are any.
         """
         outer, geoms, nsample = self.data.outer, self.geoms.struct, len(self.model.sample)
-        self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self._by_mocap], [geoms])
+        self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self.by_mocap], [geoms])
         faces = len(self.model.outer.face), self.nworld
-        self._launch(kernels.forget_contacts, faces, [where, nsample, geoms], [outer.anchor_geom])
+        self._touched.zero_()
+        self._any_bare.zero_()
+        left = [outer.anchor_geom, self._touched]
+        self._launch(kernels.forget_contacts, faces, [where, nsample, geoms], left)
+        if self.release.possible:
+            known, bare = [where, self._touched, began], [self._bare, self._any_bare]
+            self._launch(kernels.find_bare, self.nworld, known, bare)
+            wp.capture_if(self._any_bare, lambda: self.state.reset_skin(self._bare))
         self._come_from_outside(where)
 
     def _come_from_outside(self, where):

@@ -11,6 +11,7 @@ __all__ = [
     "begin_at_rest",
     "begin_frames",
     "come_from_outside",
+    "find_bare",
     "forget_contacts",
     "forget_poses",
     "read_outputs",
@@ -109,8 +110,18 @@ def forget_poses(
 
 
 @wp.kernel
-def forget_contacts(on: wp.array(dtype=int), nsample: int, geoms: Geoms, anchor_geom: wp.array2d(dtype=int)):
-    """Clears the contact of the samples of face f with geoms whose last poses are not known."""
+def forget_contacts(
+    # In:
+    on: wp.array(dtype=int),
+    nsample: int,
+    geoms: Geoms,
+    # In and out:
+    anchor_geom: wp.array2d(dtype=int),
+    # Out:
+    touched_out: wp.array(dtype=int),
+):
+    """Clears the contact of the samples of face f with geoms whose last poses are not known; whether other
+    contact is left."""
     f, w = wp.tid()
     if on[w] == 0:
         return
@@ -118,6 +129,25 @@ def forget_contacts(on: wp.array(dtype=int), nsample: int, geoms: Geoms, anchor_
         g = anchor_geom[i, w]
         if g >= 0 and not wp.isfinite(geoms.pos_last[g, w][0]):
             anchor_geom[i, w] = -1
+        elif g >= 0:
+            touched_out[w] = 1
+
+
+@wp.kernel
+def find_bare(
+    # In:
+    on: wp.array(dtype=int),
+    touched: wp.array(dtype=int),
+    began: wp.array(dtype=int),
+    # Out:
+    bare_out: wp.array(dtype=bool),
+    any_out: wp.array(dtype=int),
+):
+    """Skins that nothing touches any more since bodies were placed."""
+    w = wp.tid()
+    bare_out[w] = on[w] == 1 and began[w] == 1 and touched[w] == 0
+    if bare_out[w]:
+        any_out[0] = 1
 
 
 @wp.kernel

@@ -128,7 +128,7 @@ class SkinStepper(Protocol):
     ) -> np.ndarray:
         """The state after the user placed some geoms, (ngeom,) of bool, at poses (ngeom, 3), (ngeom, 3, 3):
         they have no contact, and their path begins there, or where they just leave the skin at rest if they
-        are inside it."""
+        are inside it. A skin that nothing else touches is at rest, unless it has inertia or memory."""
 
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""

@@ -52,6 +52,7 @@ class Coupled:
         self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.passed = self.jacobian = instance.kinematics.jacobians()
         self.arrays = arrays = instance.begin_arrays()
+        self.touching = _touching(arrays.tangent0)  # without bodies that were placed
         self._rows = self.jacobian.reshape(6 * len(self.jacobian), self.jacobian.shape[2])
         self.square, self.tangent, self.moved = arrays.square, arrays.tangent0, arrays.moved
         self.compliance = arrays.compliance

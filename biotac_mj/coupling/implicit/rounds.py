@@ -211,8 +211,10 @@ def choose_gamma(step: real, ahead: real, delay: real, solid: Solid, last: Model
 
 
 @wp.kernel
-def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
-    """What is known of a step before it is made: which bodies were put where they are from outside."""
+def begin_rounds(awake: wp.array(dtype=int), led: wp.array(dtype=bool), r: Rounds, last: Model, model: Model):
+    """What is known of a step before it is made: which bodies were put where they are from outside. They have
+    left their contact, so that nothing of the last step's models holds for them; not so bodies that a mocap
+    body has led there."""
     w = wp.tid()
     r.inside[w] = 1 - r.began[w]
     for g in range(r.pos.shape[0]):
@@ -225,6 +227,12 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
         if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.straight[g, w])):
             r.placed[g, w] = 1
             r.inside[w] = 1
+            if not led[g]:
+                last.wrench0[g, w] = vec6()
+                last.tangent0[g, w] = mat66()
+                model.wrench0[g, w] = vec6()
+                model.tangent0[g, w] = mat66()
+                r.frequency[g, w] = real(0.0)
         if r.passed[w] == 1:  # where it ended is only about known, and nobody touched it
             r.end_pos[g, w] = r.here_pos[g, w]
             r.end_mat[g, w] = r.here_mat[g, w]

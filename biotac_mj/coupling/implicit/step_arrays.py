@@ -71,6 +71,7 @@ class StepArrays:
             self._compliance = wp.zeros((setup.ngroup, *shape), dtype=wp.spatial_matrixd)
             self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
             self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
+            self._led = wp.array(setup.touching.by_mocap, dtype=bool)
         self._one.fill_(1)
         self._tangent, self._keep_held = _seen(tangent), row((keep_held, shape, [tangent]))
         self.wrench, self.left_out = _seen(self._wrench), _seen(self._left_out)
@@ -114,9 +115,10 @@ class StepArrays:
         drift = k.bodies.drift(k.m, k.d, step, k.jacobian, r)
         self.begin = row(
             k.bodies.here(k.d, r.here_pos, r.here_mat),
+            *drift,
+            (rounds.begin_rounds, 1, [*one, self._led, r, self._last, self._model]),
             (rounds.choose_gamma, (n, 1), [step, ahead, delay, self._solid, self._last, r]),
             *drift,
-            (rounds.begin_rounds, 1, [*one, r]),
         )
         self.use_euler = row((rounds.use_euler, 1, [step, ahead, *one, r]), *drift)
         self.find_wrenches = row(forces)

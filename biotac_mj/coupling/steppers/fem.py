@@ -153,6 +153,10 @@ class FemStepper:
         pos[placed], mat[placed] = geom_pos[placed], geom_mat[placed]
         stays = ~placed[saved.contacts[:, 1].astype(int)]
         out = state.copy()
+        if not stays.any() and not (self.inertial or self._material.remembers):
+            self.reset(out)  # as a skin is that nothing touches any more
+            self._place_geoms(out, pos, mat)
+            return out
         known = {"geom_pos": pos, "geom_mat": mat, "started": 1.0}
         self._layout.write(saved.replace(contacts=saved.contacts[stays], **known), out)
         return out
