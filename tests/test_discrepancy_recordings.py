@@ -46,7 +46,7 @@ def session_of(counts):
 def test_a_few_seconds_of_a_fast_log_are_read():
     """Parts of 857 rows at 300 Hz are shorter than the windows of a second that models are fitted on."""
     counts, force, rng = pressed(seconds=8.57)
-    counts[500:] = counts[500:][:, np.r_[1, 0, 2:19]]  # two channels exchanged, so that parts are compared
+    counts[500:] = counts[500:][:, np.r_[1, 0, 2:19]]  # two channels exchanged
     found = diagnose_recording(PlainRecording(noisy(counts, rng), force, rate=300.0))
     assert found.to_dict()["verdict"]
 
@@ -262,16 +262,6 @@ def test_order_under_load():
     d = diagnose_recording(PlainRecording(mixed))
     assert ids(d)[0] == "swap" and set(d.findings[0].channels) == {2, 9, 14}, d.verdict
     assert abs(d.findings[0].start - start / RATE) < 0.5
-
-
-def test_a_cycle_of_channels_is_found_in_a_short_recording():
-    """By their levels: ten seconds without load, and four channels of which none has its own place."""
-    e, rng = unloaded(4, seconds=10)
-    mixed = noisy(e, rng)
-    mixed[300:, [2, 9, 14, 17]] = mixed[300:, [17, 2, 9, 14]]
-    d = diagnose_recording(PlainRecording(mixed))
-    assert ids(d) == ["swap"] and set(d.findings[0].channels) == {2, 9, 14, 17}, d.verdict
-    assert np.abs(d.session.filled()[~d.session.fit] - e[0]).mean() < 5
 
 
 def turned(counts):
@@ -490,7 +480,7 @@ def test_what_a_few_electrodes_do_at_rest_is_no_load():
     assert d.rest.kind == "still" and d.rest.significant, d.verdict
 
 
-@pytest.mark.slow  # quick: what has no name of connected electrodes, overflows and clocks
+@pytest.mark.slow  # quick: what has no name of overflows and clocks
 def test_what_has_no_name_is_called_unknown_under_load_too():
     e, rng = unloaded(7)
     t = np.arange(len(e)) / len(e)

@@ -27,7 +27,6 @@ class Detector:
 
     Attributes:
       name: key of the confidence's weights.
-      single: finds what the level of one electrode does by itself.
       pair: finds faults that a connector gives to two electrodes: the other of a pair is no argument against
         either.
       sudden: finds what happens between two rows, by these rows alone: several findings of one row are one
@@ -37,7 +36,6 @@ class Detector:
     """
 
     name: str
-    single: bool = False
     pair: bool = False
     sudden: bool = False
     beside_load: bool = False

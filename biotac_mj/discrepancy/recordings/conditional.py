@@ -74,10 +74,6 @@ class Conditional:
         """(n, c) electrodes of rows (n, q) less what all others say of them."""
         return rows @ self.precision[:, : self.number] * self.noise**2
 
-    def misfit(self, rows: np.ndarray) -> np.ndarray:
-        """(n,) squares of rows (n, q) in units of the Gaussian, mean over columns."""
-        return ((rows @ self.precision) * rows).mean(1)
-
     def along(self, pattern: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """(n,) amplitude of a pattern (c,) of the electrodes in rows (n, q)."""
         filtered = self.precision[:, : self.number] @ pattern

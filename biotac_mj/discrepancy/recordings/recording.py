@@ -119,8 +119,7 @@ class PlainRecording:
             return []
         out = [
             f"the electrodes are {self.unit}, their rest is assumed: the ends of the converter, words that "
-            "overflow, exchanges told by levels, gain and offset of all against a warm-up, the amended "
-            "sensor's rest"
+            "overflow, gain and offset of all against a warm-up, the amended sensor's rest"
         ]
         if not self.signed:
             out.append(

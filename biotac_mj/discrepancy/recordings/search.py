@@ -13,11 +13,10 @@ from ...recordings import Recording
 from ...recordings.protocol import Protocol
 from ..evidence import discoveries
 from .confidence import NAMED, confidence
-from .connected import part_connected
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
-from .detectors.order import ORDER, exchanged, slipped
+from .detectors.order import slipped
 from .diagnosis import RecordingDiagnosis, concluded
 from .faults import as_candidates, as_log
 from .proof import prove
@@ -30,7 +29,6 @@ __all__ = ["diagnose_recording"]
 _MOST = 8  # of trends over time
 _LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
-_FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _LOST = 0.2  # of an electrode's samples, beyond which they tell nothing of its noise
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
@@ -66,7 +64,6 @@ def diagnose_recording(
         recording = dataclasses.replace(recording, electrodes=checked.log.counts)
         session = Session(recording, np.arange(n) < round(n * (1 - locked)))
         _adopt(session, checked.faults, checked.weak)
-        part_connected(session)
         bar.update()
         _levels(session, named)
         bar.update()
@@ -93,9 +90,8 @@ def _adopt(session, faults, weak):
 
 def _levels(session, named):
     """Channels that are exchanged, jumps, and trends over time, the strongest first."""
-    for find in (slipped, exchanged):
-        if (finding := find(session)) is not None:
-            _take(session, finding, named)
+    if (finding := slipped(session)) is not None:
+        _take(session, finding, named)
     for finding in jumped(session):
         _take(session, finding, named)
     refused = set()
@@ -108,7 +104,6 @@ def _levels(session, named):
         if jumps or _refined(session, finding, same) or not _take(session, finding, named):
             refused.add((None,) if finding.of_all else finding.channels)
     settle(session)
-    _withdraw_many(session)
 
 
 def _beside(session, checked, named):
@@ -153,21 +148,6 @@ def _sure(session, finding):
     return confidence(finding, sum(not f.detector.sudden or f.start != finding.start for f in same))
 
 
-def _withdraw_many(session):
-    """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
-    behind the load, for instance, moves each by its own share."""
-    single = [f for f in session.findings if f.detector.single]
-    # jumps that are too little each, but as many as there are
-    jumps = [f for f in session.weak if f.detector.single and f.detector.sudden and f.p < _P]
-    channels = sorted({f.channels[0] for f in (*single, *jumps)})
-    if session.loaded and len(channels) > _FEW:
-        session.take_back(*single)
-        moved = ", ".join(f"e{k + 1}" for k in channels)
-        session.unnamed.append(
-            f"{moved} each drift or jump beside the load, more of them than faults of single ones"
-        )
-
-
 def _refined(session, finding, same):
     """Whether a trend refines one of the same electrodes: both are then fitted together (`settle`)."""
     known = [f for f in same if f.trend is not None]
@@ -203,10 +183,6 @@ def _checkup(session, protocol, named):
     parts = [
         (rows, diagnose_recording(r.part(rows), named=named).findings) for rows in stretches(r, protocol)
     ]
-    if parts:  # a side that was touched and one that was not say nothing of places
-        own = [f for _, some in parts for f in some]
-        ordered = [f for f in session.findings if f.detector == ORDER]
-        session.take_back(*(f for f in ordered if not any(f.id == o.id and _alike(f, o) for o in own)))
     known, found = list(session.findings), []
     for rows, some in parts:
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
@@ -257,7 +233,7 @@ def _late(session, named):
     less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
-    whole = Session(r, np.ones(len(r), bool), session.findings, session.unsearched)
+    whole = Session(r, np.ones(len(r), bool), session.findings)
     found, refused = [], set()
     for _ in range(4):
         finding = levels(whole, refused)

@@ -15,27 +15,19 @@ class Session:
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
       findings; weak: those that are too little to be named, or contradicted; unnamed: sentences on what is
-      there and has no name; unsearched (n, 19) bool: samples that are no measurement of their electrode by
-      something without a name.
+      there and has no name.
     """
 
-    def __init__(
-        self,
-        recording: PlainRecording,
-        fit: np.ndarray,
-        findings: tuple | list = (),
-        unsearched: np.ndarray | None = None,
-    ):
+    def __init__(self, recording: PlainRecording, fit: np.ndarray, findings: tuple | list = ()):
         self.recording, self.fit = recording, fit
         self.findings, self.weak, self.unnamed = list(findings), [], []  # the last a list of str
-        self.unsearched = np.zeros(recording.electrodes.shape, bool) if unsearched is None else unsearched
         self.fresh = 1 - recording.repeated.mean()
         self.replay()
 
     def replay(self) -> None:
         """Counts and mask from the recording and the findings."""
         r = self.recording
-        self.counts, self.masked = r.electrodes.copy(), self.unsearched.copy()
+        self.counts, self.masked = r.electrodes.copy(), np.zeros(r.electrodes.shape, bool)
         for finding in self.findings:
             self._take_out(finding)
         self._model = None
@@ -53,16 +45,9 @@ class Session:
         if findings:
             self.replay()
 
-    def leave_out(self, unsearched: np.ndarray) -> None:
-        """Samples (n, 19) bool that are no measurement, by something that has no name."""
-        self.unsearched = self.unsearched | unsearched
-        self.replay()
-
     def without(self, *left_out: Candidate) -> "Session":
         """A session in which some findings are not taken out."""
-        out = Session(
-            self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unsearched
-        )
+        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out])
         out.weak, out.unnamed = list(self.weak), list(self.unnamed)
         return out
 

@@ -41,7 +41,7 @@ _CURVED = 0.18
 _SURE, _UNSURE = 0.2, 0.5
 
 
-JUMP = Detector("jump", single=True, sudden=True)
+JUMP = Detector("jump", sudden=True)
 
 
 class Edge:

@@ -39,8 +39,8 @@ _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _MOSTLY = 0.6  # of a trend that what all do explains, which may be a share of it
 
 
-ONE = Detector("one", single=True, pair=True)
-PROCESS = Detector("process", single=True, beside_load=True)
+ONE = Detector("one", pair=True)
+PROCESS = Detector("process", beside_load=True)
 
 
 def levels(session: Session, refused: set) -> Candidate | None:
