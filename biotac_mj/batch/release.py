@@ -119,7 +119,10 @@ def measure_clearance(
             x[t[0], own], x[t[1], own], x[t[2], own], sample, w, geoms, ALL, margin, contact_range(laws, w)
         )
         if least >= margin:
-            least = wp.max(least, face_clearance(x[t[0], own], x[t[1], own], x[t[2], own], w, geoms, ALL))
+            ball, _beyond, _count, _within = face_clearance(
+                x[t[0], own], x[t[1], own], x[t[2], own], w, geoms, ALL, margin
+            )
+            least = wp.max(least, ball)
         if least < clearance[w][0]:
             wp.atomic_min(clearance, w, wp.vec2d(least, real(wp.inf)))
     else:

@@ -40,6 +40,7 @@ _MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
 _STILL = wp.constant(real(2e-4))  # so far, where the core's may be nearer than these tell [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
+_SEEN = wp.constant(real(4e-3))  # a view says of each face which geoms are nearer than this [m]
 _NEARLY = wp.constant(real(3e-5))  # more than the core's spline is off the distance [m]
 ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
 
@@ -88,9 +89,11 @@ def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
     sync()
     for f in range(t, c.face.shape[0], threads):
         face = c.face[f]
-        s.far[w, view, f] = face_clearance(
-            c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms, near
+        clearance, _beyond, _count, within = face_clearance(
+            c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms, near, _SEEN
         )
+        s.far[w, view, f] = clearance
+        s.seen[w, view, f] = within
     depth = _depth(w, t, threads, near, geoms, c)
     for g in range(t, geoms.count, threads):
         s.seen_pos[view, g, w] = geoms.pos[g, w]
@@ -146,6 +149,25 @@ def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=v
         i = face[f][k]
         most = wp.max(most, wp.length_sq(x[i, w] - c.rest[i, 0]))
     return most
+
+
+@wp.func
+def _seen_from(
+    f: int,
+    w: int,
+    reach: real,
+    view: int,
+    travel: real,
+    near: wp.int64,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Which of the near geoms a face may be within reach of [m], by a view and by how far it has moved."""
+    room = _SEEN - reach - ROOT3 * travel
+    if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, x, c):
+        return near & s.seen[w, view, f]
+    return near
 
 
 @wp.func
@@ -258,7 +280,8 @@ def find_faces(
             f = s.look[w, begin + t]
             face = c.face[f]
             center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-            left, within = geoms_within(center, radius + reach, w, geoms, near)
+            within = _seen_from(f, w, reach, view, travel, near, x, c, s)
+            left, within = geoms_within(center, radius + reach, w, geoms, within)
         rank = block_rank(wp.min(left, 1))  # its barriers are between reading and writing
         if left > 0:
             s.look[w, close + rank[0]] = f
@@ -287,7 +310,8 @@ def find_faces(
         f = s.face[w, k]
         face = c.face[f]
         center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-        _count, within = geoms_within(center, radius + wp.max(reach, real(0.0)), w, geoms, near)
+        within = _seen_from(f, w, wp.max(reach, real(0.0)), view, travel, near, x, c, s)
+        _count, within = geoms_within(center, radius + wp.max(reach, real(0.0)), w, geoms, within)
         if within & s.close_to[w, f] != within:
             s.close_to[w, f] = within | s.close_to[w, f]
             new += 1

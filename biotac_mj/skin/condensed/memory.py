@@ -36,6 +36,11 @@ class Memory(SavedState):
         """Forces (k,) on these coordinates [N]."""
         return self.forces[:, 1]
 
+    def contents(self) -> tuple:
+        """All variables, to be compared."""
+        values = sorted(vars(self).items())
+        return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for _, v in values)
+
     def key(self) -> tuple:
         """All variables on which the nodes depend."""
         return self.forces.tobytes(), self.pressure, self.solved.tobytes()

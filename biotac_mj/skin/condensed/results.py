@@ -11,7 +11,7 @@ from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
 from .lanes import dot_columns, eliminate, sum_rows
 from .states import Linear
-from .structs import Constants, F, G, Remembered, Scratch
+from .structs import DU, Constants, F, G, Remembered, Scratch
 from .system import fill_contact, gather_blocks
 
 __all__ = ["conclude", "correct", "place_nodes", "recall"]
@@ -227,14 +227,15 @@ def find_tangents(
         most = real(0.0)
         if room == 1:
             for k in range(t, outer, threads):
-                most = wp.max(most, fraction_of(w, s.touched[w, k], group, geoms, touch, c, s))
+                fraction = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                s.vector[w, DU, k] = fraction  # which nobody needs any more
+                most = wp.max(most, fraction)
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
             fill_contact(w, t, threads, outer, inner, nnode, nin, wide, 1.0, 1, l, c, s)
             for k in range(t, outer, threads):
-                part = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
-                D = part * widen(s.block[w, k, 0])
+                D = s.vector[w, DU, k] * widen(s.block[w, k, 0])
                 turned = -D * wp.skew(x[c.node[s.node[w, s.touched[w, k]]], w])
                 for a in range(3):
                     begin = (3 * k + a) * wide + equations
@@ -253,7 +254,7 @@ def find_tangents(
                 left = vec3()
                 right = vec3()
                 for k in range(t, outer, threads):
-                    fraction = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                    fraction = s.vector[w, DU, k]
                     at = x[c.node[s.node[w, s.touched[w, k]]], w]
                     v = vec3()
                     for b in range(3):

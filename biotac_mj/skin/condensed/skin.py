@@ -68,6 +68,7 @@ class CondensedSkin:
         self._recall = Program("cpu", step.recall).run
         self._state = StateArrays(self._data, geoms, CONDENSED, **step.holders)
         self._nodes, self._views = {}, self._view()
+        self._held = None  # contents of the state that the arrays hold
         g = geoms.struct
         free = [wp.zeros_like(g.pos), wp.zeros_like(g.mat)]
         known = [step.bodies, g.group, g.pos, g.mat]
@@ -179,6 +180,7 @@ class CondensedSkin:
         load_factor = float(v["load_factor"][0])
         if load_factor > 0:
             memory = self._read()
+            self._held = memory.contents()
             self._keep(memory, v["x"].copy())
         out = Outcome(
             memory=memory,
@@ -196,8 +198,10 @@ class CondensedSkin:
 
     def _load(self, memory):
         """Loads a state."""
-        nodes, v = self.nodes(memory), self._views
-        self._state.load(memory)
+        nodes, v, before = self.nodes(memory), self._views, memory.contents()
+        if before != self._held:  # as a rule a step begins where the last one of this skin has ended
+            self._state.load(memory)
+        self._held = None
         v["x"][:] = v["x_last"][:] = nodes
         if not memory.started:
             v["pos_last"][:] = np.nan
@@ -243,6 +247,7 @@ class CondensedSkin:
         found = self._nodes.get(memory.key())
         if found is None:
             self._state.load(memory)
+            self._held = None
             self._views["x"][:] = self.rest
             self._recall()
             found = self._views["x"].copy()

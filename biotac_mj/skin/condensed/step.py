@@ -228,6 +228,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
     s.seen_mat = wp.zeros((room.views, ngeom, nworld), dtype=mat33)
     s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near
+    s.seen = wp.zeros((nworld, room.views, nface), dtype=wp.int64)
     s.seen_depth, s.turn = wp.zeros((nworld, room.views), dtype=real), wp.zeros(nworld, dtype=int)
     s.most, s.spent = (wp.zeros(nworld, dtype=real) for _ in range(2))
     s.deep, s.most_contacts = wp.zeros(nworld, dtype=int), room.contacts

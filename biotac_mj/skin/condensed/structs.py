@@ -136,10 +136,12 @@ class Scratch:
     held_pos: wp.array2d(dtype=vec3)  # where they were at the balance from which another is foretold
     held_mat: wp.array2d(dtype=mat33)
     # of `broadphase.choose_view` [view, geom, world]: where geoms were when it was taken; [world, view]: how
-    # far faces of the resting skin were from them at least, how deep they were in the core [m]; the next view
+    # far faces of the resting skin were from them at least [m], which geoms were near each; how deep they
+    # were in the core [m]; the next view
     seen_pos: wp.array3d(dtype=vec3)
     seen_mat: wp.array3d(dtype=mat33)
     far: wp.array3d(dtype=real)
+    seen: wp.array3d(dtype=wp.int64)
     seen_depth: wp.array2d(dtype=real)
     turn: wp.array(dtype=int)
     most_contacts: int  # samples that may touch

@@ -47,16 +47,24 @@ def has(geom_set: wp.int64, g: int):
 
 
 @wp.func
+def bit_of(g: int):
+    """Set of geom g alone."""
+    if g >= 63:
+        return wp.int64(0)
+    return wp.int64(1) << wp.int64(g)
+
+
+@wp.func
 def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms, geom_set: wp.int64):
     """Number and set of the geoms of a set that may be closer to a point than `reach` [m]."""
     count = int(0)
     found = wp.int64(0)
     for g in range(geoms.count):
-        y = place_on(geoms, g, w, center)
-        if has(geom_set, g) and touch_bound(geoms, g, y, bound_to(geoms, g, center, y), reach) < reach:
-            count += 1
-            if g < 63:
-                found = found | (wp.int64(1) << wp.int64(g))
+        if has(geom_set, g):
+            y = place_on(geoms, g, w, center)
+            if touch_bound(geoms, g, y, bound_to(geoms, g, center, y), reach) < reach:
+                count += 1
+                found = found | bit_of(g)
     return count, found
 
 
@@ -71,16 +79,25 @@ def face_ball(x0: vec3, x1: vec3, x2: vec3):
 
 
 @wp.func
-def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms, geom_set: wp.int64):
-    """Lower bound of a face's distance from all geoms of a set [m], from its ball."""
+def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms, geom_set: wp.int64, reach: real):
+    """Lower bound of a face's distance from all geoms of a set [m], from its ball; of those that are not
+    within reach [m]; number and set of those that may be."""
     center, radius = face_ball(x0, x1, x2)
     clearance = FREE
+    beyond = FREE
+    count = int(0)
+    within = wp.int64(0)
     for g in range(geoms.count):
         if has(geom_set, g):
             y = place_on(geoms, g, w, center)
-            bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius)
-            clearance = wp.min(clearance, bound - radius)
-    return clearance
+            bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) - radius
+            clearance = wp.min(clearance, bound)
+            if bound > reach:
+                beyond = wp.min(beyond, bound)
+            else:
+                count += 1
+                within = within | bit_of(g)
+    return clearance, beyond, count, within
 
 
 @wp.func
@@ -300,7 +317,7 @@ def list_near(
         x0 = x[t[0], w]
         x1 = x[t[1], w]
         x2 = x[t[2], w]
-        clearance = face_clearance(x0, x1, x2, w, geoms, ALL)
+        clearance, _beyond, _count, _within = face_clearance(x0, x1, x2, w, geoms, ALL, real(0.0))
         if clearance < contact_range(contact.laws, w):
             near_out[f, w] = 1
             cache.near[wp.atomic_add(cache.count, 1, 1)] = cache.unknown[k]

@@ -415,18 +415,20 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
         free: wp.array2d(dtype=real),
     ):
         """Evaluates the first `count` faces listed[w], each with its set of geoms near[w, face], by a block
-        with one sample for each thread, or on the CPU by a single thread, which leaves out faces whose ball
-        touches nothing. free[w, face] becomes travel plus a lower bound of the face's clearance, less than
-        travel where it touches [m]."""
+        with one sample for each thread, or on the CPU by a single thread, which leaves out geoms that the
+        face's ball does not touch. free[w, face] becomes travel plus a lower bound of the face's clearance,
+        less than travel where it touches [m]."""
         if one_thread() == 1:
             for n in range(count):
                 f = listed[w, n]
                 v = c.face[f]
-                clearance = face_clearance(x[v[0], w], x[v[1], w], x[v[2], w], w, geoms, near[w, f])
-                if clearance > contact_range(c.laws, w):
+                _least, clearance, met, within = face_clearance(
+                    x[v[0], w], x[v[1], w], x[v[2], w], w, geoms, near[w, f], contact_range(c.laws, w)
+                )
+                if met == 0:
                     write_face(f, w, 0, FaceSum(), c)
                 else:
-                    clearance = touch_face(f, w, geoms, x, c, friction_mode, near[w, f])
+                    clearance = wp.min(clearance, touch_face(f, w, geoms, x, c, friction_mode, within))
                 free[w, f] = travel + clearance
             return
         nsample = c.sample.shape[0]
