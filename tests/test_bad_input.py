@@ -884,8 +884,8 @@ def numbers():
     yield Row("diagnose shard.h5 --electrodes electrodes.txt", both)
     for option in ("skin coarse", "effects sensor.yaml", "material default", "repeatability 1mm", "in-skin"):
         for words in ("diagnose --electrodes electrodes.txt", "diagnose electrodes.txt"):
-            idle = f"--{option.split()[0]} act on what is simulated along poses, and electrodes.txt has none"
-            yield Row(f"{words} --quiet --{option}", idle)
+            idle = f"--{option.split()[0]} can act only on a simulation along poses, and electrodes.txt"
+            yield Row(f"{words} --quiet --{option}", f"{idle} has none")
     yield Row("data generate --count 4 --labelled 9", "labelled is 9")
     yield Row("data generate --skin nowhere.npz", "no skin at nowhere.npz")
     yield Row("data generate --count 2 --labelled 1 --measured-skin nowhere.npz", "no skin at nowhere.npz")

@@ -344,7 +344,7 @@ def test_what_leaves_for_more_than_a_sample_is_a_contact():
     for n, row in enumerate(range(300, 5700, 450)):
         counts[row : row + 1 + n % 3, 5] -= 300
     (found,) = faults(counts)
-    assert (found.id, found.channels) == ("contact", (5,)) and "e6 leaves its trace" in found.message
+    assert (found.id, found.channels) == ("contact", (5,)) and "e6 jumps away and returns" in found.message
 
 
 def test_rows_where_all_electrodes_jump_are_common_spikes():

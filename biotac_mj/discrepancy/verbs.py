@@ -54,8 +54,9 @@ def diagnose_verb(args: argparse.Namespace) -> None:
     idle = [name for name in _OF_POSES if getattr(args, name)] if args.electrodes else []
     if idle:
         raise ValueError(
-            f"{' and '.join('--' + name.replace('_', '-') for name in idle)} act on what is simulated along "
-            f"poses, and {args.electrodes} has none: leave out, or give a recording with the object's poses"
+            f"{' and '.join('--' + name.replace('_', '-') for name in idle)} can act only on a simulation "
+            f"along poses, and {args.electrodes} has none: leave out, or give a recording with the object's "
+            "poses"
         )
     if args.protocol and not args.electrodes:
         raise ValueError(

@@ -91,7 +91,8 @@ def _loose_contact(log, k, bad):
     """Fault of channel k, whose samples bad (n,) leave the signal for more than one row."""
     rows = np.flatnonzero(bad)
     message = (
-        f"{log.name([k])} leaves its trace {len(rows)} times, often for more than one row: no spikes are"
+        f"{log.name([k])} jumps away and returns {len(rows)} times, often for more than one row: spikes last "
+        "one row, look for a loose contact"
     )
     return Fault("contact", (k,), rows[0] / log.rate, rows[-1] / log.rate, message)
 

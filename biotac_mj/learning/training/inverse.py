@@ -8,6 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
+from ...geometry.design import BIOTAC
 from ...sensor.channels import NELECTRODE, check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
@@ -190,7 +191,8 @@ def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:
     counts, tare = np.asarray(counts, float), np.asarray(tare, float)
     if counts.shape[-1:] != (NELECTRODE,) or tare.shape[-1:] != (NELECTRODE,):
         raise ValueError(
-            f"counts have shape {counts.shape} and the tare {tare.shape}: 19 electrodes e1..e19 are needed"
+            f"counts have shape {counts.shape} and the tare {tare.shape}: these weights are of a "
+            f"{BIOTAC.title}, give e1..e{NELECTRODE}"
         )
     for name, value in (("counts", counts), ("tare", tare)):
         check_counts(np.atleast_2d(value), name)
