@@ -646,7 +646,7 @@ def configs():
     yield Row(TRAIN, "did you mean 'steps'?", "config.json", text('{"stps": 3}'))
     yield Row(TRAIN, "config.json is no config", "config.json", text("no"))
     yield Row(TRAIN, "it holds list", "config.json", text("[]"))
-    yield Row(TRAIN, "choose from mse, l1", "config.json", text('{"reconstruction": "odd"}'))
+    yield Row(TRAIN, "choose from latent, decoded", "config.json", text('{"projection_loss": "odd"}'))
     yield Row(TRAIN.replace("config.json", "nowhere"), "no config at nowhere")
 
 

@@ -17,10 +17,9 @@ class VAE(nn.Module):
         z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
         return self.decode(z), mean, log_variance
 
-    def loss(self, x: torch.Tensor, weight: float, kind: str = "mse") -> torch.Tensor:
-        """Error of the reconstruction of x (n, ...), summed over a sample, and divergence of the codes times
-        `weight`; kind: "mse", or "l1" of absolute errors."""
+    def loss(self, x: torch.Tensor, weight: float) -> torch.Tensor:
+        """Squared error of the reconstruction of x (n, ...), summed over a sample, and the codes' divergence
+        times `weight`."""
         got, mean, log_variance = self(x)
-        error = (got - x).abs() if kind == "l1" else (got - x).square()
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1)
-        return error.flatten(1).sum(1).mean() + weight * divergence.mean()
+        return (got - x).square().flatten(1).sum(1).mean() + weight * divergence.mean()

@@ -9,7 +9,14 @@ from ...fields import check_types
 __all__ = ["LearningConfig", "without_obsolete"]
 
 # fields in files of earlier versions that had a single value
-_OBSOLETE = {"hierarchy": "geodesic", "tare": "row 0", "mirror": True, "window": [0.5, 4.0]}
+_OBSOLETE = {
+    "hierarchy": "geodesic",
+    "tare": "row 0",
+    "mirror": True,
+    "window": [0.5, 4.0],
+    "reconstruction": "mse",
+    "graphs": True,
+}
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
@@ -21,7 +28,6 @@ class LearningConfig:
       mesh_order: K of the Chebyshev convolutions: 6, as in COMA and ACROSS.
       mesh_scale: displacements are divided by this length [m] instead of node-wise z-scores, which would
         amplify solver noise at fixed nodes.
-      reconstruction: "mse" or "l1" for the VAEs: MSE matches the RMS metric.
       mesh_kl, electrode_kl: weight of the divergence, summed over the code, relative to the squared error
         summed over the field (in units of its scale), without annealing.
       mesh_points: number of points of the coarse skin at which the paper's networks read any skin.
@@ -45,12 +51,10 @@ class LearningConfig:
         touch.
       pod: number of principal components of the mesh. width: of our networks.
       members: networks that are averaged in our model.
-      graphs: on a GPU, replay training steps as CUDA graphs.
     """
 
     mesh_order: int = 6
     mesh_scale: float = 1e-3
-    reconstruction: str = "mse"
     mesh_kl: float = 1e-3
     electrode_kl: float = 1e-5
     mesh_points: int = 686
@@ -79,7 +83,6 @@ class LearningConfig:
     pod: int = 128
     width: int = 128
     members: int = 3
-    graphs: bool = True
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
@@ -98,12 +101,8 @@ class LearningConfig:
         for name in ("mesh_scale", "learning_rate", "scale", "decay"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is 0: it must be positive")
-        for name, allowed in (
-            ("reconstruction", ("mse", "l1")),
-            ("projection_loss", ("latent", "decoded")),
-        ):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} is {getattr(self, name)!r}: choose from {', '.join(allowed)}")
+        if self.projection_loss not in ("latent", "decoded"):
+            raise ValueError(f"projection_loss is {self.projection_loss!r}: choose from latent, decoded")
         if len(self.mesh_channels) != len(self.mesh_factors):
             raise ValueError(
                 f"mesh_channels {self.mesh_channels} and mesh_factors {self.mesh_factors} must be equally "

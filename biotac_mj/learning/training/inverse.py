@@ -110,11 +110,10 @@ def train_inverse(
     def symmetric(r):
         return error(r, source=film) + 0.5 * error(r, True, film)
 
-    more = dict(seed=seed, graph=config.graphs)
-    options = TrainingOptions(2 * config.batch, 2 * config.steps, 2 * config.learning_rate, **more)
+    options = TrainingOptions(2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed)
     fitting.train(head, symmetric, every, options, checkpoints=checkpoints)
     rate = 0.5 * config.learning_rate
-    options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, **more)
+    options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, seed=seed)
     fitting.train(head, error, rows, options, lambda: error(check), checkpoints)
     return head
 

@@ -130,11 +130,10 @@ def train_head(
         value = root_mean_square(output(rows) - target[rows])
         return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
 
-    more = dict(seed=seed, graph=config.graphs)
-    options = TrainingOptions(2 * config.batch, config.steps, 2 * config.learning_rate, **more)
+    options = TrainingOptions(2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed)
     fitting.train(head, teacher_loss, a.rows(train), options, checkpoints=checkpoints)
     rate = 0.5 * config.learning_rate
-    options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, **more)
+    options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, seed=seed)
     error = lambda: root_mean_square(predict(check) - a.change(check))  # noqa: E731
     fitting.train(head, loss, labelled, options, error, checkpoints)
 

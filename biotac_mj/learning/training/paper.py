@@ -117,7 +117,7 @@ def train_latent_projection(
         return sum(float((vae(field(r))[0] - field(r)).square().sum()) for r in mesh_check.split(64))
 
     def mesh_loss(rows):
-        return vae.loss(field(rows), config.mesh_kl, config.reconstruction)
+        return vae.loss(field(rows), config.mesh_kl)
 
     options = TrainingOptions(config.mesh_batch, config.mesh_steps, config.learning_rate, decay=config.decay,
                               seed=seed, graph=False)  # fmt: skip
@@ -128,10 +128,10 @@ def train_latent_projection(
     y = torch.zeros_like(arrays.counts)
     y[both] = network_target(arrays, both, config)
     options = TrainingOptions(config.batch, config.paper_steps, config.learning_rate, decay=config.decay,
-                              seed=seed, graph=config.graphs)  # fmt: skip
+                              seed=seed)  # fmt: skip
 
     def electrode_loss(r):
-        return electrode.loss(y[r], config.electrode_kl, config.reconstruction)
+        return electrode.loss(y[r], config.electrode_kl)
 
     error = lambda: (electrode(y[check])[0] - y[check]).square().mean()  # noqa: E731
     fitting.train(electrode, electrode_loss, rows, options, error, checkpoints, curves["electrode"])
