@@ -197,6 +197,8 @@ def _set_gamma(r: Rounds, g: int, w: int, step: real, ahead: real, gamma: real):
 @wp.kernel
 def choose_gamma(step: real, ahead: real, delay: real, solid: Solid, last: Model, r: Rounds):
     """Newmark's gamma of the step of each body. A skin with inertia steps itself to the end of the step.
+    Where contact begins the skin is solved for the step's end, too: how stiff it will be is not known, and a
+    body must not go deep unseen, nor be pushed before it comes.
 
     Args:
       ahead: by how many steps positions are ahead of those with the velocity after a step: half of one, where
@@ -204,9 +206,8 @@ def choose_gamma(step: real, ahead: real, delay: real, solid: Solid, last: Model
     """
     g, w = wp.tid()
     gamma = real(EULER) - ahead
-    if solid.inertial == 0:
-        touches = wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0)
-        gamma = _gamma_of(r.frequency[g, w] * step, delay, touches)
+    if solid.inertial == 0 and wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0):
+        gamma = _gamma_of(r.frequency[g, w] * step, delay)
     _set_gamma(r, g, w, step, ahead, gamma)
 
 

@@ -35,18 +35,14 @@ _UNKNOWN = math.inf  # [J] of energy
 _LESS = 0.99  # of the push that gives a body what it may get: batches have single precision
 
 
-def gamma_of(pace: Any, delay: Any, touches: Any) -> Any:
-    """Newmark's gamma of a step of a skin's bodies.
+def gamma_of(pace: Any, delay: Any) -> Any:
+    """Newmark's gamma of a step of bodies that touched a skin in the last one.
 
     Args:
       pace: angular frequency [rad/s] at which they bounce on it, times the step. Above 2 a step does not
         resolve it, and damps it the more, up to backward Euler.
       delay: of the rubber's force, that is its loss, in steps.
-      touches: whether the skin had contact in the last step. Where it begins backward Euler looks ahead: how
-        stiff it will be is not known, and a body must not go deep unseen.
     """
-    if not touches:
-        return type(pace)(1.5)
     unresolved = type(pace)(0.0)
     if pace > type(pace)(2.0):
         unresolved = type(pace)(1.0) - type(pace)(2.0) / pace
