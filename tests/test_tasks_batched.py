@@ -1,6 +1,7 @@
 """The tasks in batches: what a policy gets, when episodes end, what the libraries are handed; that the truth
 solves them and chance does not. The hand is MuJoCo Menagerie's."""
 
+import copy
 import dataclasses
 import json
 import os
@@ -201,11 +202,26 @@ def test_libraries_get_what_they_ask_for():
     seen, reward, ended, over, told = vector.step(vector.action_space.sample())
     assert vector.observation_space.contains(seen) and reward.shape == ended.shape == over.shape == (2,)
     assert told["success"].shape == (2,)
+    with pytest.raises(ValueError, match="all worlds are reset"):
+        vector.reset(options={"reset_mask": [True, False]})
+    for one in (env, vector, other):
+        with pytest.raises(TypeError, match="make another"):
+            copy.deepcopy(one)
     pytest.importorskip("rsl_rl", reason="needs RSL-RL: pip install rsl-rl-lib")
     worlds = rsl_rl_env(env)
     observations, reward, done, extras = worlds.step(torch.zeros(2, 4))
     assert observations["touch"].shape == (2, 20) and reward.shape == done.shape == (2,)
     assert done.dtype == torch.long and "time_outs" in extras
+
+
+def test_a_seed_repeats_an_episode_with_its_random_sensor():
+    env = make("follow_edge", 2, device="cpu", sensor="random")
+    touch = []
+    for seed in (3, 4, 3):
+        env.reset(seed=seed)
+        touch.append([env.step(torch.zeros(2, 4))[0]["touch"].clone() for _ in range(3)])
+    first, other, again = (torch.stack(one) for one in touch)
+    assert torch.equal(first, again) and not torch.equal(first, other)
 
 
 def learn_a_line(learner, updates, lessons=None):

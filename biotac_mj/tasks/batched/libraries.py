@@ -44,6 +44,8 @@ def rsl_rl_env(env: BatchTask) -> "rsl_rl.env.VecEnv":
             found = TensorDict(observations, batch_size=[env.num_envs])
             return found, reward, (terminated | truncated).long(), extras
 
+        __reduce__ = BatchTask.__reduce__
+
     return Worlds()
 
 
@@ -91,15 +93,20 @@ def skrl_env(env: BatchTask) -> object:
         def close(self):
             env.close()
 
+        __reduce__ = BatchTask.__reduce__
+
     return Worlds()
 
 
 def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
     """A `gymnasium.vector.VectorEnv` with NumPy arrays: observations (num_envs, n), body and touch. Worlds
-    that end begin anew in the same step.
+    that end begin anew in the same step. One seed is for all worlds, and all are reset at once; it can be
+    neither copied nor pickled, like the batch.
 
     Raises:
       ModuleNotFoundError: Gymnasium is not there: pip install gymnasium.
+      ValueError: of `reset`: a seed for each world, or options.
+      TypeError: of a copy.
     """
     import gymnasium
     from gymnasium.vector import AutoresetMode
@@ -114,6 +121,8 @@ def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
         observation_space, action_space = (batch_space(one, env.num_envs) for one in (space, act))
 
         def reset(self, *, seed=None, options=None):
+            if options:
+                raise ValueError(f"options of reset are {sorted(options)}: pass none, all worlds are reset")
             return _policy(env.reset(seed=seed)[0]).cpu().numpy(), {}
 
         def step(self, actions):
@@ -121,5 +130,7 @@ def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
             observations, *others, extras = env.step(given)
             info = {name: extras[name].cpu().numpy() for name in ("success", "error")}
             return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in others), info)
+
+        __reduce__ = BatchTask.__reduce__
 
     return Worlds()

@@ -378,6 +378,9 @@ class BatchTask(abc.ABC):
         self._sense(self._everyone)
         return len(self.good)
 
+    def __reduce__(self):
+        raise TypeError("a batch can be neither copied nor pickled: make another with the same arguments")
+
     def close(self) -> None:  # noqa: B027
         """Does nothing; part of the interface."""
 
@@ -423,10 +426,11 @@ class BatchTask(abc.ABC):
         self.episode_length_buf[which] = 0
         gain = self._touch.draw_gains(self.num_envs, self.model_error, self._draw)
         self._gain = gain.where(which[:, None, None], self._gain)
+        worlds = which.nonzero()[:, 0]
         if self._bank:
-            worlds = which.nonzero()[:, 0]
             self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])
-            self._touch.reseed(worlds, self._integers(2**31))
+        self._touch.reseed(worlds, self._integers(2**31))
+        if self._bank:
             self._draw_goals(which)
             return
         mask, some = wp.from_torch(which), which[:, None]

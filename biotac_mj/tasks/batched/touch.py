@@ -70,6 +70,7 @@ class Touch:
         self._force = tensor(WeightedElectrodes(geometry).force(-each), dtype=torch.float32)
         acquired = [batch.senses.acquisition for batch in batches.values()]
         self._seeds = [_as_int64(a.seed) for a in acquired]
+        self._drawn = [wp.to_torch(a.drawn) for a in acquired]
         self._noise = [wp.to_torch(a.state)[:, a.place.pdc_noise] for a in acquired]
         self.tare = torch.zeros(self.channels.shape, device=sensordata.device)
 
@@ -118,9 +119,11 @@ class Touch:
         return torch.cat(parts, dim=3).flatten(2)
 
     def reseed(self, worlds: torch.Tensor, seed: torch.Tensor) -> None:
-        """Gives the noise of worlds (k,) other seeds, of seed (nworld,): states that were kept have one."""
-        for i, seeds in enumerate(self._seeds):
+        """Gives worlds (k,) other seeds, of seed (nworld,): of their noise, and of the sensor that the next
+        reset draws. States that were kept have one."""
+        for i, (seeds, drawn) in enumerate(zip(self._seeds, self._drawn, strict=True)):
             seeds[worlds] = seed[worlds] + i
+            drawn[worlds] = 1
 
 
 def _as_int64(array):
