@@ -10,7 +10,7 @@ from biotac_mj.discrepancy.evidence import asked
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.likelihood import kernel, of
 from biotac_mj.discrepancy.trajectories.model.fields import Curve
-from biotac_mj.discrepancy.trajectories.search import _beside_alike, found, screened
+from biotac_mj.discrepancy.trajectories.search import found, screened
 from biotac_mj.discrepancy.trajectories.settings import SETTINGS
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
@@ -123,25 +123,3 @@ def test_a_curve_has_no_turns_that_what_was_solved_lacks():
     assert hinge.at(0, -1.0).max() == 0 and hinge.slope(0, -0.5).max() == 0  # what does not touch yet
     rows = straight.at(0, np.arange(5.0))
     np.testing.assert_allclose(rows, np.tile(2 * np.arange(5.0)[:, None], (1, 2)))
-
-
-def test_evidence_beside_what_looks_alike_is_an_integral(plain):
-    """Of one number with a likelihood that is quadratic, against the integral."""
-    comparison, null, chosen = plain
-    latency = by_id("latency")
-    fit = fit_effects(comparison, [(latency, {**latency.default(), "delay": 0.05})], chosen, null)
-    fit = dataclasses.replace(fit, effects=[(latency, {**latency.default(), "delay": 0.05})])
-    raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in (fit.effects, [])]
-    K = kernel(comparison.trajectories, [np.arange(len(t.time)) for t in comparison.trajectories])
-    change = np.abs(np.concatenate([a - b for a, b in zip(*raw)])) / np.sqrt(np.diag(K))[:, None]
-    square = (np.quantile(change, 0.98, axis=0) / null.size) ** 2
-    share = np.sqrt((1 - (square**2).sum() / square.sum() ** 2) / square.max())
-    for gain in (5.0, 50.0, 5000.0):
-        t = np.linspace(-12, 12, 200001)
-        log = -gain * ((1 - t) ** 2 - 1) - 0.5 * (t / share) ** 2  # likelihood over that at none, and prior
-        top = log.max()
-        mass = np.exp(log - top).sum() * (t[1] - t[0]) / np.sqrt(2 * np.pi) / share
-        alike = top + np.log(mass)
-        assert _beside_alike(comparison, fit, null, gain, chosen) == pytest.approx(
-            gain - alike, abs=0.02 * gain**0.5
-        )

@@ -10,7 +10,7 @@ from test_discrepancy_workflow import Springs, measured
 from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
-from biotac_mj.discrepancy.trajectories.proof import _closed, _Off, proved
+from biotac_mj.discrepancy.trajectories.proof import _closed, _Off, borne_out, proved
 from biotac_mj.discrepancy.trajectories.workflow import about_rests
 from biotac_mj.effects.catalogue import by_id
 
@@ -39,6 +39,17 @@ def test_an_effect_that_helps_is_accepted_by_its_residuals(late):
     written = dataclasses.replace(found, nuisance=null.nuisance.written).raw(comparison, exact=ASIDE)
     for i, residual in zip(ASIDE, proof.residuals[1]):
         np.testing.assert_array_equal(residual, comparison.unposed(i, written[i]))
+
+
+def test_another_law_is_borne_out_and_a_wrong_effect_is_not(late):
+    """Electrodes that are late are told in part by a low-pass; PDC needs no gain."""
+    comparison, null = late
+    law, other = by_id("lowpass"), by_id("pdc_gain")
+    near = fit_effects(comparison, [(law, {"tau": 0.05})], np.arange(8), null)
+    assert borne_out(comparison, null, near, ASIDE)
+    wrong = dataclasses.replace(null, effects=[(other, {**other.default(), "gain": 0.05})])
+    assert not borne_out(comparison, null, wrong, ASIDE)
+    assert not borne_out(comparison, near, null, ASIDE)
 
 
 def test_what_makes_one_group_worse_is_not_taken(late):

@@ -109,7 +109,7 @@ def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
             ",".join(["time", *(f"e{i}" for i in range(1, 20))]) + "\n0" + ",2000" * 19 + "\n",
             "1 rows are too few to fit on one part",  # of which no clock is known
         ),
-        ((" ".join(["nan"] * 19) + "\n") * 500, "cut the recording there"),
+        ((" ".join(["nan"] * 19) + "\n") * 500, "cut the file there"),
     ],
 )
 def test_bad_recordings_are_refused_with_the_reason(tmp_path, text, message):

@@ -615,11 +615,11 @@ def test_the_skin_is_solved_until_a_fit_has_found_its_end(gain, more, times, mon
 
 @pytest.mark.parametrize(
     "late, gain, alone, left",
-    [("gain", 39.0, 0.0, True), ("gain", 41.0, 0.0, False)]
+    [("gain", 39.0, 50.0, True), ("gain", 41.0, 50.0, False), ("gain", 39.0, 30.0, False)]
     + [("creep", 150.0, alone, alone > 150) for alone in (140.0, 390.0)],
 )
 def test_what_the_laws_of_others_lack_is_no_effect(monkeypatch, late, gain, alone, left):
-    """A tenth of what relaxation explains; and more than another law of relaxation explains by itself."""
+    """Less than a tenth of what relaxation explains, and than alone; another law of it: less than alone."""
     from biotac_mj.discrepancy.trajectories import search
 
     def fit(score, *ids):

@@ -10,7 +10,6 @@ import tqdm
 from ..evidence import ODDS, asked
 from .base.channels import narrowed
 from .fitting import Fit, fit_effects, sizes
-from .likelihood import of
 from .model.in_skin import FOLLOWS, remember
 from .settings import SETTINGS
 from .signatures import Signatures
@@ -102,7 +101,7 @@ def found(
         out.rounds.append(step)
         able = [c for c in step if not c.refused]
         # others are not what their names say
-        little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance", "resolution"}]
+        little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance"}]
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         able = [c for c in able if not _left_by_laws(comparison, c, out, chosen)]
         if not able:
@@ -137,14 +136,13 @@ def _tied(best, other) -> bool:
 
 def _left_by_laws(comparison, one, search, chosen) -> bool:
     """Whether what an effect explains beside those found may be what their laws lack: less than is expected
-    of all laws, or, beside another law of the same thing, less than it explains alone."""
+    of all laws, and less than it explains alone; beside another law of the same thing, less than that."""
     if not search.found:
         return False
     null = search.fits[frozenset()]
-    if one.gain < _LEFT * (search.fit.score - null.score):
-        return True
     same = {i for c in search.found for i in (c.effect.id, *c.effect.equivalents)}
-    if one.effect.id not in same and not same & {*one.effect.equivalents}:
+    another = one.effect.id not in same and not same & {*one.effect.equivalents}
+    if another and one.gain >= _LEFT * (search.fit.score - null.score):
         return False
     item = next(pair for pair in one.fit.effects if pair[0].id == one.effect.id)
     alone = fit_effects(comparison, [item], chosen, null)
@@ -222,33 +220,11 @@ def _candidate(comparison, effect, fit, current, chance, usable, chosen):
     # as much again of every further effect: laws of other forms leave something
     least = len(fit.effects) * asked(len(usable))
     refused = ["evidence"] if gain < least else []
-    refused += ["resolution"] if gain >= least > _beside_alike(comparison, fit, current, gain, chosen) else []
     refused += ["chance"] if p > SETTINGS.rate else []
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
     refused += ["little"] if _little(comparison, effect, theta) else []
     return Candidate(effect, fit, float(gain), p, refused)
-
-
-def _beside_alike(comparison, fit, current, gain, chosen) -> float:
-    """Evidence [nats] of the last effect of a fit over a model that is off by the same pattern.
-
-    By as much as is expected of the model without it, row by row, that may be off in several channels
-    together, where the likelihood has each by itself: by a share of this effect, of prior
-    N(0, e^2 (1 - 1 / m)) in m channels, e as large as that where the effect is largest. With a likelihood
-    that is quadratic in the effect's size, and has `gain` at it, that leaves
-    gain / (1 + 2 gain e^2 (1 - 1 / m)) and an Occam factor."""
-    effect, theta = fit.effects[-1]
-    if effect.wiring or effect.per_channel:  # read in another's place, or not; of each channel by itself
-        return gain
-    models = fit.effects, fit.effects[:-1]
-    raw = [comparison.raw(some, fit.nuisance, offsets=fit.offsets) for some in models]
-    likelihood = of(comparison, chosen)
-    change = np.abs(likelihood.stacked([a - b for a, b in zip(*raw)])) / likelihood.expected[:, None]
-    square = (np.maximum(np.quantile(change, 0.98, axis=0), 1e-12) / current.size) ** 2
-    single = float((square**2).sum() / square.sum() ** 2)  # 1 / m
-    alike = 2 * max(gain, 0.0) * (1 - single) / float(square.max())
-    return gain / (1 + alike) + 0.5 * float(np.log1p(alike))
 
 
 def _little(comparison, effect, theta) -> bool:

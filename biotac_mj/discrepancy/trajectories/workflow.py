@@ -11,7 +11,6 @@ import tqdm
 from ...effects.catalogue import CATALOGUE
 from ...effects.sensor_file import SensorFile
 from ...geometry.design import check_nelectrode
-from ..evidence import ODDS
 from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, of_electrodes
 from .base.channels import noisy_electrodes
 from .base.findings import BaseCandidate, base_findings
@@ -228,11 +227,6 @@ def _named(comparison, null, search):
     if not found:
         return current, found, explained, []
     nearest = " and ".join(one.effect.name for one in found)
-    best, *_ = sorted(search.fits.values(), key=lambda fit: -fit.score)
-    rivals = {e.id: e.name for e, _ in best.effects}
-    if best.score - current.score > np.log(ODDS) and not rivals.keys() & {c.effect.id for c in found}:
-        why = f"{nearest} would explain it, and {' and '.join(rivals.values())}, no more than a model may be"
-        return null, [], 0.0, [f"{why} off by, would explain more"]
     if explained < SETTINGS.explained and _wrong(comparison, current):
         return null, [], 0.0, [f"{nearest} would explain {explained:.0%} of it: too little for a name"]
     return current, found, explained, []
