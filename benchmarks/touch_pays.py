@@ -170,7 +170,7 @@ def _learn(options, tasks, own, written):
             begin = time.perf_counter()
             env = of_runs(task, runs, options.worlds, options.device, own.get(task, {}).get("hand"))
             about = {"setup_s": round(time.perf_counter() - begin, 1)}
-            where = options.minutes, options.policies, about, options.taught
+            where = options.minutes, options.policies, about, options.resume, options.taught
             cards += train(env, task, runs, *where)
             written(cards)
             del env
@@ -203,6 +203,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--taught", type=float, default=0.7, help="part of it in which policies imitate")
     parser.add_argument("--device", help="of Warp")
     parser.add_argument("--policies", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="go on from what is in --policies")
     parser.add_argument("--hand", type=pathlib.Path, help="shadow_hand/right_hand.xml of MuJoCo Menagerie")
     parser.add_argument("--transfer", type=int, default=0, help="worlds of another skin and sensor")
     options = parser.parse_args(arguments)

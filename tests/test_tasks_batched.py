@@ -314,10 +314,17 @@ def test_a_policy_learns_and_is_played_as_its_card_says(tmp_path, capsys):
     settings = dataclasses.replace(settings, substeps=1, decisions=3)
     env = make("follow_edge", 4, device="cpu", settings=settings, sensor="random")
     runs = [("electrodes", 0), ("none", 1)]
+    with pytest.raises(FileNotFoundError, match="leave out --resume"):
+        train(env, "follow_edge", runs, 0.0, tmp_path, resume=True)
     cards = train(env, "follow_edge", runs, 0.01, tmp_path)
     assert [(c["observe"], c["seed"], c["episodes"]) for c in cards] == [("electrodes", 0, 2), ("none", 1, 2)]
     assert all(0 <= c["low"] <= c["success"] <= c["high"] <= 1 for c in cards)
     path = tmp_path / "follow_edge-none-1.safetensors"
+    before = cards[0]["decisions"]
+    again = train(env, "follow_edge", runs, 0.0, tmp_path, resume=True)
+    assert again[0]["decisions"] == before > 0
+    assert train(env, "follow_edge", runs, 0.01, tmp_path, resume=True)[0]["decisions"] > before
+    cards = train(env, "follow_edge", runs, 0.0, tmp_path, resume=True)
     assert read_card(path) == json.loads(json.dumps(cards[1])) and cards[1]["decisions"] > 0
     capsys.readouterr()
     assert main(["play", "follow_edge", "--policy", str(path), "--episodes", "3", "--json"]) == 0

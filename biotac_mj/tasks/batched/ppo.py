@@ -183,6 +183,18 @@ class Learner:
             elif 0 < divergence < s.divergence / 2:
                 group["lr"] = min(1e-2, group["lr"] * 1.5)
 
+    def state(self) -> dict:
+        """State of the training."""
+        parts = {"policy": self.policy, "critic": self.critic, "optimiser": self._optimiser}
+        return {name: part.state_dict() for name, part in parts.items()} | {"draw": self._draw.get_state()}
+
+    def resume(self, state: dict) -> None:
+        """Continues from a `state`."""
+        self.policy.load_state_dict(state["policy"])
+        self.critic.load_state_dict(state["critic"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._draw.set_state(state["draw"].cpu())
+
 
 def _log_density(mean, deviation, actions):
     scaled = (actions - mean) / deviation

@@ -4,10 +4,10 @@ batch.
     python -m biotac_mj.tasks.batched.training insert_peg --observe electrodes none --minutes 5 --out out/peg
 
 Each policy has its own fraction of the worlds. Every half minute it is written to
-`TASK-OBSERVE-SEED.safetensors` with a card (observations, scores); so a training may be stopped at any time.
-At the end each policy plays an episode in each of its worlds, from unseen states, without exploration and
-without `BatchTask.model_error`: the success on its card. Needs the extras `batch` and `learning`; takes
-minutes on a GPU, a day on a CPU."""
+`TASK-OBSERVE-SEED.safetensors` with a card (observations, scores), with a second file for `--resume`; so a
+training may be stopped at any time. At the end each policy plays an episode in each of its worlds, from
+unseen states, without exploration and without `BatchTask.model_error`: the success on its card. Needs the
+extras `batch` and `learning`; takes minutes on a GPU, a day on a CPU."""
 
 import argparse
 import dataclasses
@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import torch
 import warp as wp
 
+from ...files import replacing
 from ...versions import versions
 from . import OBSERVE, TASKS, make
 from .playing import play, seen_by
@@ -91,13 +92,35 @@ class Run:
         rows = self.rows[-last:]
         return sum(r["success"] for r in rows) / max(1, sum(r["ended"] for r in rows))
 
+    def files(self, folder: pathlib.Path, task: str) -> tuple[pathlib.Path, pathlib.Path]:
+        """Files of the policy, and of the state of its training."""
+        name = f"{task}-{self.observe}-{self.seed}"
+        return folder / f"{name}.safetensors", folder / f"{name}.resume"
+
     def keep(self, folder: pathlib.Path, task: str, about: dict) -> dict:
-        """Writes the policy; returns the card."""
+        """Writes both files; returns the card."""
         own = {"observe": self.observe, "seed": self.seed, "decisions": self.decisions}
         learned = {"minutes": round(self.seconds / 60, 2), "success_in_learning": round(self.rate(), 3)}
         card = {"task": task, **own, **learned, **about}
-        save_policy(folder / f"{task}-{self.observe}-{self.seed}.safetensors", self.learner.policy, card)
+        policy, resume = self.files(folder, task)
+        save_policy(policy, self.learner.policy, card)
+        with replacing(resume) as temporary:
+            more = {"decisions": self.decisions, "seconds": self.seconds, "rows": self.rows}
+            torch.save(self.learner.state() | more, temporary)
         return card
+
+    def resume(self, folder: pathlib.Path, task: str) -> None:
+        """Continues from the files.
+
+        Raises:
+          FileNotFoundError: there is none.
+        """
+        path = self.files(folder, task)[1]
+        if not path.is_file():
+            raise FileNotFoundError(f"no {path}: leave out --resume to begin")
+        state = torch.load(path, map_location=self.env.device, weights_only=True)
+        self.decisions, self.seconds, self.rows = (state.pop(k) for k in ("decisions", "seconds", "rows"))
+        self.learner.resume(state)
 
 
 def train(
@@ -107,6 +130,7 @@ def train(
     minutes: float,
     out: pathlib.Path,
     about: dict | None = None,
+    resume: bool = False,
     taught: float = Numbers.taught,
 ) -> list[dict]:
     """Trains policies in parallel; returns their cards.
@@ -115,6 +139,7 @@ def train(
       env: the worlds, divided evenly. task: its name. runs: [(observe, seed)].
       minutes: of learning, without the episodes at the end. out: folder of the files.
       about: further entries of the cards.
+      resume: continue from files of an earlier call, without the teacher.
       taught: fraction of the minutes with imitation of the teacher.
 
     Raises:
@@ -129,14 +154,17 @@ def train(
         Run(env, slice(i * each, (i + 1) * each), observe, seed, numbers)
         for i, (observe, seed) in enumerate(runs)
     ]
+    if resume:
+        for run in learners:
+            run.resume(out, task)
     about = _about(env) | (about or {})
-    env.reset(seed=0)
+    env.reset(seed=sum(run.decisions for run in learners))
     env.stagger()
     lessons = Lessons(numbers.remembered, 0, env.device)
     begin = last = kept = time.perf_counter()
     # decisions in which a teacher acts, and by which a policy scales what it sees
-    first = env.max_episode_length
-    of_teacher = 60 * minutes * numbers.taught  # [s]
+    first = 0 if resume else env.max_episode_length
+    of_teacher = 0.0 if resume else 60 * minutes * numbers.taught  # [s]
     since = 0  # decisions since states were kept
     while last < begin + 60 * minutes:
         learns = last < begin + of_teacher
@@ -226,6 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=5.0, help="of learning; more to compile and to play")
     parser.add_argument("--device", help="of Warp")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="go on from what is in --out")
     parser.add_argument("--hand", type=pathlib.Path, help="shadow_hand/right_hand.xml of MuJoCo Menagerie")
     options = parser.parse_args(arguments)
     begin = time.perf_counter()
@@ -233,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         env = of_runs(options.task, runs, options.worlds, options.device, options.hand)
         print(f"{time.perf_counter() - begin:.0f} s of setting up", flush=True)
-        cards = train(env, options.task, runs, options.minutes, options.out)
+        cards = train(env, options.task, runs, options.minutes, options.out, resume=options.resume)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     for card in cards:
