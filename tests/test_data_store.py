@@ -17,10 +17,21 @@ from biotac_mj.data import (
     split_by_object,
     write_shard,
 )
+from biotac_mj.data.lerobot import export_lerobot
 from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.data.splits import assign
+from biotac_mj.data.trajectories import export_mujoco
 from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.design import Design, read_design
 
+PAD = Design(
+    "pad",
+    "pad (2 electrodes)",
+    [[0, 0, -5], [3, 0, -5]],
+    [[0, 5, 0]],
+    sensor="a",
+    sensors={"a": {"rest": [3000.0, 3000.0]}},
+)
 OBJECTS = ("sphere_7mm", "ring_7mm", "peg_round_6mm")
 
 
@@ -241,3 +252,21 @@ def test_the_papers_fractions():
     assert (assign(359, seed=0) == part).all() and (assign(359, seed=1) != part).any()
     with pytest.raises(ValueError, match="add up to 1"):
         assign(10, fractions=(0.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize("design", [read_design("biotac_sp"), PAD], ids=lambda design: design.name)
+def test_a_set_has_the_frame_of_its_design(tmp_path, design):
+    n, counts = 3, np.full((3, len(design.channels)), 2000.0)
+    pac = np.arange(n * design.npac).reshape(n, design.npac)
+    pose = {"indenter_pos": np.zeros((n, 3)), "indenter_quat": np.tile([1.0, 0, 0, 0], (n, 1))}
+    columns = pose | {"wrench": np.zeros((n, 6)), "counts": counts, "pac": pac, "measured_pac": pac}
+    one = Interaction("a", "ball", "press", "train", 0, {}, 0.01 * np.arange(n), **columns)
+    write_shard(shard_path(tmp_path / "set", 0), [one], design=design)
+    with TactileSet(tmp_path / "set") as data:
+        np.testing.assert_array_equal(data["pac"][:], pac)
+        with pytest.raises(ValueError, match="the exported model is a BioTac"):
+            export_mujoco(data, tmp_path / "models")
+        pytest.importorskip("pyarrow")
+        export_lerobot(data, tmp_path / "export", progress=False)
+    features = json.loads((tmp_path / "export" / "meta" / "info.json").read_text())["features"]
+    assert features["observation.tactile.pac"]["shape"] == [design.npac]

@@ -7,8 +7,10 @@ import pytest
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.geometry.design import read_design
-from biotac_mj.recordings import load, load_one
+from biotac_mj.recordings import Recording, load, load_one
+from biotac_mj.recordings import write as write_recordings
 from biotac_mj.recordings.inspection import findings
+from biotac_mj.recordings.picture import pac_spectrum
 from biotac_mj.sensor.presets import sensors_of
 
 SP = read_design("biotac_sp")
@@ -83,3 +85,25 @@ def test_diagnose_takes_one_finger_and_says_which_it_is(tmp_path):
     said = diagnose_recording(second, progress=False)
     assert said.data.startswith("BioTac SP (24 electrodes), 400 rows")
     assert said.details["recording"]["design"] == "biotac_sp"
+
+
+@pytest.mark.parametrize("given", [2, 31])
+def test_pac_has_the_frame_of_an_sp(tmp_path, given):
+    pac = RNG.integers(2000, 2100, (200, given))
+    header = [*(f"e{k + 1}" for k in range(24)), *(f"pac{k + 1}" for k in range(given))]
+    one, _ = load_one(write(tmp_path / "log.csv", header, np.c_[COUNTS, pac]))
+    assert one.pac.shape == (200, SP.npac) and np.isnan(one.pac[:, :-given]).all()
+    np.testing.assert_array_equal(one.pac[:, -given:], pac)
+    assert any("PAC has 2 of 31 samples of a frame" in note for note in one.notes) == (given == 2)
+    write_recordings(tmp_path / "log.h5", [one])
+    np.testing.assert_array_equal(load_one(tmp_path / "log.h5")[0].pac, one.pac)
+
+
+def test_the_spectrum_of_pac_counts_no_sample_twice():
+    """Rows 10 ms apart, frames of 14 ms: a tone of 300 Hz is one line."""
+    time = 0.01 * np.arange(1, 201)
+    sample = np.floor(time[:, None] * 2200 + 1e-6) + np.arange(1 - SP.npac, 1)
+    pac = np.round(2047 + 40 * np.sin(2 * np.pi * 300 / 2200 * sample))
+    one = Recording(time, electrodes=COUNTS, pac=pac)
+    frequency, power, _ = pac_spectrum(one)
+    assert frequency[power.argmax()] == 300 and power.max() > 1e3 * np.sort(power)[-4]

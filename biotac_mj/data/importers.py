@@ -21,7 +21,7 @@ class Measured(typing.NamedTuple):
     """Rows of a recording as a set's columns.
 
     Attributes:
-      counts: (n, nchannel), NaN if a channel was not recorded. pac: (n, 22), None without raw counts.
+      counts: (n, nchannel), NaN if a channel was not recorded. pac: (n, npac), None without raw counts.
       wrench: (n, 6) in the recording's frame, None without forces. notes: assumptions.
     """
 

@@ -13,7 +13,6 @@ import tqdm
 
 from ..files import replacing
 from ..geometry.design import SINGLES
-from ..sensor.channels import NPAC
 from .schema import SPLITS
 
 __all__ = ["VERSION", "export_lerobot", "interactions_to_export"]
@@ -28,7 +27,6 @@ _CONTACT = {
     "area": ("area",),
 }
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
-PAC = tuple(f"pac{i + 1}" for i in range(NPAC))
 _REAL = ("recorded", "resimulated")  # kinds with measured counts of a real sensor
 _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
@@ -43,9 +41,8 @@ def export_lerobot(
 ) -> pathlib.Path:
     """Writes the folder `out` (built under another name, then renamed).
 
-    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19; other
-    designs have
-      their own number), .pdc, .tdc, .tac (1 each), .pac (22, or the latest if the set has no more) [counts],
+    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (those of the
+      design), .pdc, .tdc, .tac (1 each), .pac (of a frame, or the latest if the set has no more) [counts],
       observation.force (6, of the skin on the object), observation.contact.pos, .normal (3), .depth and .area
       (1; all 0 without contact) and action (7), the pose at the next time step.
     The task names action and object: "press with ring_7mm". `source.json` maps each episode to its
@@ -119,13 +116,14 @@ class _Export:
         self.pac = {"counts": "pac", "measured_counts": "measured_pac"}[counts]
         whole = self.pac in data.columns and np.isfinite(data[self.pac][self.data.steps(chosen)]).all()
         self.pac = self.pac if whole else None
+        pac = [f"pac{i + 1}" for i in range(data.design.npac)]
         self.features = {
             "observation.state": _feature(_POSE),
             "observation.force": _feature(self._axes()),
             **{f"observation.contact.{name}": _feature(axes) for name, axes in self._contact().items()},
             "observation.tactile.electrodes": _feature(data.design.electrodes),
             **{f"observation.tactile.{name}": _feature((name,)) for name in SINGLES},
-            **({"observation.tactile.pac": _feature(PAC)} if self.pac else {}),
+            **({"observation.tactile.pac": _feature(pac)} if self.pac else {}),
             "action": _feature(_POSE),
         }
         index = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDEX[1:]}

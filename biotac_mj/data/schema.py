@@ -7,7 +7,6 @@ import numpy as np
 
 from ..geometry.design import BIOTAC, Design
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import NPAC
 
 __all__ = [
     "COLUMNS",
@@ -27,7 +26,7 @@ SPLITS = ("train", "validation", "test")
 DISPLACEMENT_SCALE = 2.5e-7  # [m] per stored integer: rounding of at most 0.125 um, range of 8.19 mm
 
 # Per time step: name -> (shape, stored type, unit). "nvert" and "nouter" are the skin's numbers of nodes,
-# "nelectrode" and "nchannel" those of its design. PAC covers the 10 ms before a row.
+# "nelectrode", "npac" and "nchannel" those of its design. PAC covers the frame before a row.
 COLUMNS = {
     "time": ((), "f8", "s"),
     "displacement": (("nvert", 3), "i2", "m"),  # times DISPLACEMENT_SCALE
@@ -40,12 +39,12 @@ COLUMNS = {
     "pressure": ((), "f4", "Pa"),
     "impedance": (("nelectrode",), "f4", "ohm"),
     "counts": (("nchannel",), "f4", "count"),
-    "pac": ((NPAC,), "u2", "count"),
+    "pac": (("npac",), "u2", "count"),
     "indenter_pos": ((3,), "f8", "m"),
     "indenter_quat": ((4,), "f8", "w x y z"),
     "converged": ((), "u1", "0 or 1"),
     "measured_counts": (("nchannel",), "f4", "count"),
-    "measured_pac": ((NPAC,), "f4", "count"),
+    "measured_pac": (("npac",), "f4", "count"),
     "measured_wrench": ((6,), "f4", "N, N m"),
 }
 # NaN without contact or measurement
@@ -75,12 +74,13 @@ class Interaction:
       pressure: (n,) of the liquid above rest [Pa].
       impedance: (n, nelectrode) e1, e2, ... of the simulated film [ohm].
       counts: (n, nchannel) simulated readings in the order of the design's `channels` [counts].
-      pac: (n, 22) of these, PAC of the last 10 ms in the order of time [counts].
+      pac: (n, npac) of these, PAC of the last frame in the order of time [counts].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
       converged: (n,) whether the skin's step converged.
       measured_counts: (n, nchannel) readings of the target sensor, real or synthetic; NaN for channels that
         it does not have.
-      measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN if missing.
+      measured_pac: (n, npac) of these, PAC of the frame before the row, the latest sample last; NaN if
+        missing.
       measured_wrench: (n, 6) measured with it; NaN if missing.
     """
 
@@ -117,7 +117,7 @@ class Interaction:
     def check(
         self, nvert: int | None = None, nouter: int | None = None, design: Design = BIOTAC
     ) -> "Interaction":
-        """Returns itself. design: of the sensor, for the number of its channels.
+        """Returns itself. design: of the sensor, for the numbers of its channels.
 
         Raises:
           ValueError: a wrong kind, split or shape, a time that does not increase, or an invalid NaN; the text
@@ -156,8 +156,8 @@ class Interaction:
 
 
 def channel_sizes(design: Design) -> dict[str, int]:
-    """Sizes for "nelectrode" and "nchannel" in COLUMNS."""
-    return {"nelectrode": design.nelectrode, "nchannel": len(design.channels)}
+    """Sizes for "nelectrode", "npac" and "nchannel" in COLUMNS."""
+    return {"nelectrode": design.nelectrode, "npac": design.npac, "nchannel": len(design.channels)}
 
 
 def nodes_of(geometry: SkinGeometry) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 import tqdm
 
 from ..files import replacing
+from ..geometry.design import BIOTAC
 from ..press.indenter import add_indenter
 from ..sensor.channels import CHANNELS, NELECTRODE, NPAC
 from .lerobot import interactions_to_export
@@ -48,9 +49,15 @@ def export_mujoco(
       counts: "counts", or "measured_counts" for those interactions that have measured ones.
 
     Raises:
-      ValueError: no poses or counts in the set, nothing to export, or an existing folder.
+      ValueError: no poses or counts in the set, nothing to export, an existing folder, or another design than
+        the BioTac, whose model this is.
     """
     out = pathlib.Path(out)
+    if data.design != BIOTAC:
+        raise ValueError(
+            f"{data.path} is of a {data.design.title}, and the exported model is a {BIOTAC.title}: export it "
+            "as a LeRobotDataset, --form lerobot"
+        )
     chosen = interactions_to_export(data, out, counts, ("indenter_pos", "indenter_quat"))
     with replacing(out, folder=True) as building:
         (building / "assets").mkdir()

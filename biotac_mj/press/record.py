@@ -35,7 +35,7 @@ class PressRecord:
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4), pose of the indenter's frame.
       indenter_vert, indenter_face: (p, 3) [m], (q, 3), its surface in that frame, for pictures.
       seconds: wall time of the steps [s].
-      pac: (n, 22) samples of each row's latest frame [counts], or None.
+      pac: (n, npac) samples of each row's latest frame [counts], or None.
       contact_pressure: (n, nvert) float32 of the indenter on the nodes [Pa], or None.
     """
 

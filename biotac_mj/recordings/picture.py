@@ -5,15 +5,15 @@ import pathlib
 import numpy as np
 
 from ..files import check_output_file, picture_kind, save_figure
-from ..quality.clock import BUS_RATE
-from ..sensor.channels import NPAC
+from ..sensor.acquisition import SLOT_RATE
 from ..sensor.colors import change_map, line_color
 from .recording import Recording, check_recording
 
 __all__ = ["draw", "pac_spectrum"]
 
 _REST = 0.02  # fraction of rows at the start whose median is the baseline
-_WINDOW = 8 * NPAC  # samples of a spectrum: 12.5 Hz apart
+_RATE = SLOT_RATE / 2  # [Hz] of samples
+_WINDOW = 176  # samples of a spectrum: 12.5 Hz apart
 _AXES = ("x", "y", "z")
 _SHORT = {
     "tared counts": "counts, tared",
@@ -32,16 +32,18 @@ def pac_spectrum(recording: Recording) -> tuple[np.ndarray, np.ndarray, int] | N
     good = np.isfinite(recording.pac).all(1) & ~recording.repeated
     if good.sum() < 2:
         return None
-    frames, time = recording.pac[good], recording.time[good]
-    step = np.diff(time)
+    step = np.diff(recording.time[good])
+    new = max(1, round(_RATE * float(np.median(step))))  # rows may be less than a frame apart
+    frames = recording.pac[good][:, -new:]
     ends = np.flatnonzero(step > 1.5 * np.median(step)) + 1
     stretches = [part.ravel() for part in np.split(frames, ends)]
     size = min(_WINDOW, int(np.median([len(one) for one in stretches])))
-    if size < NPAC:
+    if size < frames.shape[1]:
         return None
-    rate = NPAC * BUS_RATE
     made = [
-        (len(one), *welch(one, rate, nperseg=size, detrend="linear")) for one in stretches if len(one) >= size
+        (len(one), *welch(one, _RATE, nperseg=size, detrend="linear"))
+        for one in stretches
+        if len(one) >= size
     ]
     weight = np.array([n for n, _, _ in made], float)
     return made[0][1], np.average([power for _, _, power in made], axis=0, weights=weight), len(frames)

@@ -16,7 +16,6 @@ from ..quality.clock import BUS_RATE, usual_step
 from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import (
-    NPAC,
     check_counts,
     check_force,
     log_impedance,
@@ -55,9 +54,9 @@ class Field(typing.NamedTuple):
 
 
 FIELDS = {
-    "electrodes": Field(BIOTAC.nelectrode, UNITS, "e1, e2, ...; others have more"),
+    "electrodes": Field(BIOTAC.nelectrode, UNITS, "e1, e2, ...; other designs have their own number"),
     "pdc": Field(0, UNITS, "pressure of the liquid"),
-    "pac": Field(NPAC, UNITS, "its vibration in the frame before the row, the latest sample last"),
+    "pac": Field(BIOTAC.npac, UNITS, "its vibration in a frame before the row, the latest sample last"),
     "tdc": Field(0, UNITS, "temperature"),
     "tac": Field(0, UNITS, "its change"),
     "force": Field(3, ("N",), "Fx Fy Fz, in the frame that `frame` names"),
@@ -78,9 +77,8 @@ class Recording:
 
     Attributes:
       time: (n,) increasing [s].
-      electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`,
-      default
-        raw counts.
+      electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), of a BioTac SP (n, 31), tdc (n,), tac
+        (n,): in `units`, default raw counts.
       force, torque: (n, 3) [N], [N m].
       contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
       name: unique in its file. object: what touched, "" if unknown.
@@ -142,8 +140,8 @@ class Recording:
     def _check_field(self, name):
         value, (width, units, _) = as_numbers(f"{self.name}: {name}", getattr(self, name)), FIELDS[name]
         setattr(self, name, value)
-        if name == "electrodes" and value.ndim == 2 and design_of_channels(value.shape[1]) is not None:
-            width = value.shape[1]
+        if name in ("electrodes", "pac"):
+            width = (self.design or BIOTAC).widths[name]
         shape = (len(self.time), width) if width else (len(self.time),)
         if value.shape != shape:
             raise ValueError(f"{self.name}: {name} has shape {value.shape}, {shape} is needed, row by row")
@@ -167,7 +165,7 @@ class Recording:
     @property
     def design(self) -> Design | None:
         """The fingertip with this number of electrodes; None without electrodes."""
-        return None if self.electrodes is None else design_of_channels(self.electrodes.shape[1])
+        return None if np.ndim(self.electrodes) != 2 else design_of_channels(self.electrodes.shape[1])
 
     def unit(self, name: str) -> str:
         """Of a field."""
@@ -334,7 +332,7 @@ def _read_group(path, name, group):
         raise Unfit(f"{where} has no attribute {', '.join(missing)}: {_REMEDY}")
     wanted = {"time": Array(("n",))}
     for field in (key for key in FIELDS if key in group):
-        width = "nelectrode" if field == "electrodes" else FIELDS[field].width
+        width = {"electrodes": "nelectrode", "pac": "npac"}.get(field, FIELDS[field].width)
         wanted[field] = Array(("n", width) if width else ("n",), "number")
     check_arrays(where, group, wanted, _REMEDY)  # before reading
     found = {field: group[field][()] for field in wanted}

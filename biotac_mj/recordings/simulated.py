@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .recording import FIELDS, Recording
+from .recording import Recording
 
 __all__ = ["force_on_object", "of_simulation"]
 
@@ -14,8 +14,7 @@ _NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
 def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **about: object) -> Recording:
     """Makes a recording, for `write`, `write_bag` and other functions, of readings from the user's own loop.
 
-    A real sensor's rows are 10 ms apart, and PAC's 22 samples are those of the last 10 ms; earlier ones of a
-    BioTac SP's frame are dropped.
+    A real sensor's rows are a frame apart: 10 ms of a BioTac, 14 ms of a BioTac SP.
 
     Args:
       time: (n,) of the rows [s]. reads: n results of `Handle.read(data)`.
@@ -37,7 +36,6 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
         raise ValueError(f"{times} times for {len(reads)} rows: give one for each, and one at least")
     read = {name: np.array([row[name] for row in reads]) for name in _NEEDED}
     force = force_on_object(read.pop("contact_force"))
-    read["pac"] = read["pac"][:, -FIELDS["pac"].width :]
     flat = {name: value if value.shape[1] > 1 else value[:, 0] for name, value in read.items()}
     fields = {"name": "simulated", "source": "simulated", "frame": "BioTac", "force": force} | about
     return Recording(time, **flat, **fields)

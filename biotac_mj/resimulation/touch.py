@@ -28,7 +28,7 @@ class Touch:
     """One contact of m rows; row 0 is at rest, and its readings are the sensor's tare.
 
     Attributes:
-      motion: of the object. time: (m,) [s]. counts: (m, 23). pac: (m, 22) or None.
+      motion: of the object. time: (m,) [s]. counts: (m, nchannel). pac: (m, npac) or None.
       wrench: (m, 6) of the skin on the object, BioTac frame, NaN if unknown.
     """
 

@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 from ...geometry.design import BIOTAC, SINGLES, Design
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.acquisition import SLOT_RATE, Acquisition
-from ...sensor.channels import NPAC
 from ...sensor.film import FilmConduction
 from ...sensor.materials import Material
 from ...sensor.presets import SENSORS, Sensor, read_sensor
@@ -47,7 +46,7 @@ class Readings:
 
     Attributes:
       impedance: (n, nelectrode) [ohm]. counts: (n, nchannel) in the order of the design's channels. pac:
-        (n, 22) counts of the last 10 ms in the order of time.
+        (n, npac) counts of the last frame in the order of time.
       failed: (n,) bool, steps without a solution of the film, which keep the last one.
     """
 
@@ -96,10 +95,10 @@ def in_order(pac: np.ndarray, time: float) -> np.ndarray:
 
 
 def _row(readings, time):
-    """(nchannel,) counts in the order of the channels, the latest of PAC, and PAC of 10 ms (22,)."""
+    """(nchannel,) counts in the order of the channels, the latest of PAC, and PAC of a frame (npac,)."""
     pac = in_order(readings["pac"], time)
     singles = [pac[-1] if name == "pac" else readings[name] for name in SINGLES]
-    return [*readings["electrodes"], *singles], pac[-NPAC:]
+    return [*readings["electrodes"], *singles], pac
 
 
 def sample(
@@ -112,7 +111,7 @@ def sample(
     design: Design = BIOTAC,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, nchannel) counts of the multiplexer at each time, in the order of the design's channels, with the
-    latest of PAC, and (n, 22) all PAC samples of the last 10 ms in order of time.
+    latest of PAC, and (n, npac) all PAC samples of the last frame in order of time.
 
     Args:
       time: (n,) [s]; impedance: (n, nelectrode) [ohm]; pressure: (n,) above rest [Pa]; linear between
@@ -134,7 +133,7 @@ def sample(
 
 
 def _rows(time, design, advance):
-    """Counts (n, nchannel) and PAC (n, 22) at times (n,), from the readings after `advance(row, start,
+    """Counts (n, nchannel) and PAC (n, npac) at times (n,), from the readings after `advance(row, start,
     length)` of each step; one frame before row 0 gives it noise."""
     frame = round(design.slots / SLOT_RATE + 1e-3, 6)  # [s], plus one sample
     steps = [(time[0] - frame, frame), *zip(time[:-1], np.diff(time))]

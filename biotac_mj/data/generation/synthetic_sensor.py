@@ -225,7 +225,7 @@ class Meter:
     def measure(
         self, vert_xpos: np.ndarray, time: np.ndarray, pressure: np.ndarray, start: float, seed: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, nchannel) counts, in the order of the design's channels, and (n, 22) PAC of the last 10 ms,
+        """(n, nchannel) counts, in the order of the design's channels, and (n, npac) PAC of the last frame,
         of one contact that begins `start` seconds into the session.
 
         Row 0 is the mean of 50 frames before the contact, so it is fractional; the others are whole numbers

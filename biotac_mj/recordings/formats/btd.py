@@ -13,7 +13,6 @@ import numpy as np
 
 from ...geometry.design import designs
 from ...quality.clock import BUS_RATE
-from ...sensor.channels import NPAC
 from .streams import Stream
 
 __all__ = ["is_btd", "read_btd"]
@@ -95,7 +94,7 @@ def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> lis
         failed = table[:, k + 1][there] != 0
         fields = {
             "electrodes": np.stack([word[channel == _E1 + i] for i in range(n)], 1),
-            "pac": word[channel == _PAC].reshape(len(starts), -1)[:, -NPAC:],
+            "pac": word[channel == _PAC].reshape(len(starts), -1),
             **{name: word[channel == c] for name, c in (("pdc", _PDC), ("tac", _TAC), ("tdc", _TDC))},
         }
         more = [f"parity failed in {failed.sum()} of {failed.size} samples"] if failed.any() else []

@@ -7,7 +7,6 @@ import numpy as np
 
 from ...geometry.design import SINGLES
 from ...reading import Array, read_hdf5
-from ...sensor.channels import NPAC
 from ..recording import Recording
 
 __all__ = ["KEYS", "read_press", "settings_of"]
@@ -35,7 +34,7 @@ def read_press(path: pathlib.Path) -> list[Recording]:
         Recording(
             found["time"],
             electrodes=found["counts"][:, :n],
-            pac=found["pac"][:, -NPAC:],
+            pac=found["pac"],
             **{name: counts[name] for name in ("pdc", "tdc", "tac")},
             force=found["force"],
             object_pos=found["indenter_pose"][:, :3],

@@ -6,10 +6,9 @@ import re
 
 import numpy as np
 
-from ...geometry.design import designs
+from ...geometry.design import BIOTAC, designs
 from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
-from ...sensor.channels import NPAC
-from ..recording import CHANNELS, FIELDS, Recording
+from ..recording import CHANNELS, FIELDS, Recording, designed
 from .names import is_stamp, is_time, place_of, unit_of
 
 __all__ = ["Stream", "join", "make_streams"]
@@ -229,12 +228,8 @@ def _whole(source, field, pieces):
         return _oriented(source, field, value, width)
     place = {p.column: v.ravel() for p, v in pieces.items() if p.column is not None}
     base = 0 if 0 in place else 1
-    if field == "pac":  # drivers keep some samples of a frame; the last is the latest
-        out = np.full((len(value), NPAC), np.nan)
-        order = sorted(place)[-NPAC:]
-        for k, number in enumerate(order, NPAC - len(order)):
-            out[:, k] = place[number]
-        return out, [] if len(order) == NPAC else [f"{source}: PAC has {len(order)} of 22 samples of a frame"]
+    if field == "pac":
+        return np.stack([place[number] for number in sorted(place)], 1), []
     if field == "electrodes":
         last, known = max(place) - base + 1, sorted(design.nelectrode for design in designs())
         if last > known[0] and last not in known:  # the electrodes cannot be identified
@@ -264,14 +259,9 @@ def _oriented(source, field, value, width):
     if not width or (field == "pac" and value.ndim == 1):
         if value.ndim > 1:
             raise ValueError(f"{source}: {field} has shape {value.shape}: one number a row is needed")
-        value = value.reshape(-1)
-        if field != "pac":
-            return value, []
-        out = np.full((len(value), NPAC), np.nan)
-        out[:, -1] = value
-        return out, [f"{source}: PAC has 1 of 22 samples of a frame"]
-    if field == "electrodes":  # rows of time first
-        counts = [design.nelectrode for design in designs()]
+        return value.reshape(-1, 1) if field == "pac" else value.reshape(-1), []
+    if field in ("electrodes", "pac"):  # rows of time first
+        counts = [design.widths[field] for design in designs()]
         width = next((n for n in reversed(value.shape) if value.ndim == 2 and n in counts), width)
     if value.ndim == 2 and value.shape[1] == width:
         return value, []
@@ -404,6 +394,10 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
             notes.append(f"{other.source}: left out {', '.join(twice)}, which is in another file too")
         fields |= {key: value for key, value in placed.items() if key not in twice}
         sources += [other.source]
+    if "pac" in fields:
+        design = designed(fields["electrodes"]) if "electrodes" in fields else BIOTAC
+        fields["pac"], more = _frame_of_pac(stream.source, fields["pac"], design.npac)
+        notes += more
     there = [key for key in CHANNELS if key in fields]
     if scale is not None:
         fields |= {key: fields[key] * scale for key in there}
@@ -424,6 +418,15 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
         notes=tuple(dict.fromkeys(notes)),
         units=units,
     )
+
+
+def _frame_of_pac(source, value, npac):
+    """((n, npac), notes) of PAC (n, k): drivers keep some samples of a frame; the last is the latest."""
+    given = value.shape[1]
+    if given >= npac:
+        return value[:, -npac:], []
+    missing = np.full((len(value), npac - given), np.nan)
+    return np.hstack([missing, value]), [f"{source}: PAC has {given} of {npac} samples of a frame"]
 
 
 def guess_unit(electrodes: np.ndarray) -> str:
