@@ -58,10 +58,12 @@ DESIGN_ROWS = {
     'sensors as measured; `"random"`': ("eight; yes", "three; yes", "one, what the film conducts; no"),
     "`import`, `show`, `diagnose` of logs": ("yes", "yes", "no: logs are told by 19 or 24 electrodes"),
     "calibrate, compare (forces alone)": ("yes", "yes", "yes"),
-    "data sets (`generate`, `import`, LeRobot), `resimulate`, `estimate`": (
+    "data sets (`generate`, LeRobot), `estimate`": ("yes", "yes", "yes, where it has electrodes"),
+    "`data import`, `resimulate`": ("yes", "yes", "no: recordings are told by 19 or 24 electrodes"),
+    "models and states of MuJoCo (`data export --form mujoco`)": (
         "yes",
-        "yes",
-        "yes, of Python's Recordings; where it has electrodes",
+        "no: the model is a BioTac",
+        "no, likewise",
     ),
     "diagnosis of data with poses; `next`": ("yes", "yes", "yes, in Python"),
     "flat presses against states (`diagnose --simulate`, `resimulate --poses fitted`)": (
@@ -272,8 +274,9 @@ _READINGS = (
      "attach, condensed (those of the rubber and the contact's law: full), batch, tasks; press and generate: "
      "`--effects`. Effects of the set-up are left out by name"),
     ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, tasks, generate"),
-    ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
-     "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
+    ("PAC", "all values of a frame, 22 of a BioTac and 31 of a BioTac SP",
+     "attach, condensed, batch, tasks, generate, imported recordings, resimulate and the LeRobot export of "
+     "all three; `readings.csv` of a press has the latest"),
     ("electrodes from a network", '`signal=` "latent_projection" (every BioTac skin), "learned" (the default '
      "skin), or a file of `biotac learn train`",
      "attach, condensed, batch, tasks, press and generate (`--signal`); diagnose: by physics alone"),
