@@ -52,6 +52,8 @@ class Parser(argparse.ArgumentParser):
             for given in (word.split("=")[0] for word in args if word.startswith("--") and word != "--"):
                 if given not in known:
                     meant = [name for name in known if name.startswith(given)]
+                    if given == "--design" and "--skin" in known:  # of Python
+                        meant = ["--skin biotac_sp/coarse"]
                     near = (meant + difflib.get_close_matches(given, known, 1))[:1]
                     self.error(f"no option {given}{f': did you mean {near[0]}?' if near else ''}")
         if self._subparsers and not (sys.argv[1:] if args is None else args):
@@ -127,10 +129,10 @@ def quantity(
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
         if not least <= value <= most:
-            asked = question(number_of(text), most, kind, least)
-            limits = f"{least / factor:.4g} to {most / factor:.4g} {usual}"
+            asked = question(number_of(text), most, kind, least).rstrip()
+            limits = f"{least / factor:.4g} to {most / factor:.4g} {usual} can be given"
             raise argparse.ArgumentTypeError(
-                f"{text!r} is {value:g} {SI[kind]}: {asked}{limits} can be given"
+                f"{text!r} is {value:g} {SI[kind]}: {limits}{asked and f'; {asked}'}"
             )
         if abs(value) > plain and not text.strip()[-1].isalpha():
             raise argparse.ArgumentTypeError(

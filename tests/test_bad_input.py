@@ -831,7 +831,7 @@ def numbers():
         ("--location -12mm 17", "location's angle is 17 rad: did you mean 17deg?"),
         ("--slide 2", "slide is 2 m: did you mean 2mm?"),
         ("--speed 10", "speed is 10 m/s: did you mean 10mm/s?"),
-        ("--timestep 4", "'4' is 4 s: did you mean 4ms?"),
+        ("--timestep 4", "'4' is 4 s: 0 to 100 ms can be given; did you mean 4ms?"),
         ("--depth 2deg", "it is '2deg': give a number with a unit, as in 2mm (of m, mm, cm, um)"),
         ("--location here", "give a number with a unit, as in 2deg"),
         ("--location -12mm 3mm", "location is '3mm': give a number with a unit, as in 2deg"),

@@ -111,10 +111,18 @@ def test_units_mean_the_same_on_the_command_line_and_in_python():
         ("press --hold 20s", 20.0, None),
         ("press --hold 0.5", 0.5, None),
         ("view --seconds 500ms", 0.5, None),
-        ("view --seconds 300", None, "'300' is 300 s: did you mean 300ms? 0 to 6e+04 ms can be given"),
+        ("view --seconds 300", None, "'300' is 300 s: 0 to 6e+04 ms can be given; did you mean 300ms?"),
         ("data import log.txt --out set --block 10s", 10.0, None),
-        ("design new pad --block 0.02mm 9mm 9mm", None, "'0.02mm' is 2e-05 m: did you mean 0.02m? 0.1 to"),
-        ("design new pad --block 20 9mm 9mm", None, "'20' is 20 m: did you mean 20mm? 0.1 to 100 mm can"),
+        (
+            "design new pad --block 0.02mm 9mm 9mm",
+            None,
+            "'0.02mm' is 2e-05 m: 0.1 to 100 mm can be given; did you mean 0.02m?",
+        ),
+        (
+            "design new pad --block 20 9mm 9mm",
+            None,
+            "'20' is 20 m: 0.1 to 100 mm can be given; did you mean 20mm?",
+        ),
         ("design new pad --block 200mm 9mm 9mm", None, "'200mm' is 0.2 m: 0.1 to 100 mm can be given"),
     ],
 )
@@ -171,6 +179,7 @@ def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):
     ("words", "text"),
     [
         (["press", "--indentor", "cone"], "no option --indentor: did you mean --indenter? (`biotac press -"),
+        (["press", "--design", "biotac_sp"], "no option --design: did you mean --skin biotac_sp/coarse?"),
         (["press", "--dep=1"], "no option --dep: did you mean --depth? (`biotac press --help`"),
         (
             ["hand", "mount", "hand.xml", "--bodi", "ff"],

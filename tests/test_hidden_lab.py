@@ -1,6 +1,8 @@
 """The laboratory with a hidden sensor: sealed, apart from the engine, carrying out the plan it is given."""
 
+import dataclasses
 import pathlib
+import warnings
 
 import numpy as np
 import pytest
@@ -55,6 +57,15 @@ def test_hidden_sensors_are_drawn_again_by_their_seed_and_sealed(lab):
         "wrong-base": 2,
     }
     assert b"latency" not in b"".join(map(lab.seal, first))
+
+
+def test_a_picture_of_a_plan_has_room_for_long_reasons(tmp_path):
+    wanted = plan()
+    reason = "it would tell one from the other; " * 20
+    one = Plan([dataclasses.replace(wanted.contacts[0], reason=reason)], {}, [])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_plan(one, tmp_path / "plan.csv")
 
 
 def test_a_laboratory_reads_the_plan_that_was_written(lab, tmp_path):

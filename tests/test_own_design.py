@@ -1,16 +1,21 @@
 """Pads of one's own: `biotac design new`, and what they give in a simulation."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from meshing import write_obj
 from readers_files import GROUND, SIX
 
 import biotac_mj
 from biotac_mj.cli import main
-from biotac_mj.geometry.design import read_design
+from biotac_mj.geometry.design import Design, read_design
 from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
+from biotac_mj.press import PressOptions, build_scene, plan_path, press, report
+from biotac_mj.press.indenter import make_indenter
 from biotac_mj.sensor.own_design import PadShape, new_design
 
 DOMED = {"dome": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}
@@ -80,6 +85,69 @@ def test_a_flat_pad_without_electrodes_gives_force_and_depth(tmp_path, capsys):
     assert "electrodes" not in pad.read(data) and biotac_mj.load_skin(tmp_path / "flat").name == skin.name
     with pytest.raises(ValueError, match="a pad flat .0 electrodes. has no channel 'electrodes': choose one"):
         pad.read(data, "electrodes")
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pads") / "flat"
+    new_design(folder, PadShape(block=(20.0, 14.0, 6.0), edge=3.0))
+    return folder
+
+
+def test_a_press_on_a_pad_without_electrodes_shows_what_it_has(flat, tmp_path):
+    options = PressOptions(
+        design=flat, liquid=False, tier="condensed", location=(0.0, 0.0), depth=5e-4, timestep=2e-2
+    )
+    record = press(options, progress=False).record
+    text = report.table(record)
+    assert "skin moved" in text and "kPa at most" in text and "E1" not in text and "PDC" not in text
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report.write_picture(record, tmp_path / "press.png")
+    axes = Figure().add_subplot()
+    report.draw_pressure(axes, record, record.deepest)
+    assert axes.get_xlim() == pytest.approx((-10, 10)) and axes.get_ylim() == pytest.approx((-7, 7))
+
+
+def test_a_block_lies_on_a_backing_of_its_shape(flat):
+    skin = biotac_mj.load_skin(flat)
+    backing = skin.core_vert if len(skin.core_face) else skin.nail_vert
+    corners = np.unique(np.abs(backing[:, [0, 2]]).round(6), axis=0)
+    np.testing.assert_allclose(corners, [[0, 0], [10.5e-3, 7.35e-3]], atol=1e-6)
+
+
+def test_a_map_of_a_dome_has_one_scale():
+    angle = np.linspace(0, 2 * np.pi, 9)
+    ring = 1e-3 * np.stack([3 * np.cos(angle), np.full(9, -5.0), 3 * np.sin(angle)], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(report.unroll(ring, Design("a", "b")), axis=1), 3)
+
+
+@pytest.mark.parametrize("indenter", ["sphere_7mm", "geom:sphere:0.05"])
+def test_the_picture_of_a_press_shows_pad_and_indenter(flat, indenter):
+    options = PressOptions(design=flat, liquid=False, location=(0.0, 0.0), indenter=indenter)
+    skin, shape = biotac_mj.load_skin(flat), make_indenter(indenter)
+    path = plan_path(skin, shape, options)
+    model = build_scene(shape, path, options)[0].compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    camera = data.camera("press")
+    ball = shape.vert + path.start if indenter == "sphere_7mm" else skin.vert  # the other is too large
+    seen = (np.concatenate([skin.vert, ball]) - camera.xpos) @ camera.xmat.reshape(3, 3)
+    half = np.tan(np.radians(model.camera("press").fovy / 2))
+    assert (np.abs(seen[:, 1]) < -half * seen[:, 2]).all()
+    assert (np.abs(seen[:, 0]) < -900 / 640 * half * seen[:, 2]).all() and seen[:, 2].min() > -0.15
+
+
+def test_composer_takes_a_design_s_own_skin(flat, tmp_path):
+    pytest.importorskip("dm_control")
+    from biotac_mj.tasks import BioTac
+
+    new_design(tmp_path / "dome", DOME, SIX, GROUND)
+    entity = BioTac(design=str(tmp_path / "dome"))
+    assert entity.handle.design.name == "dome" and len(entity.sensor.rest) == 6
+    with pytest.raises(ValueError, match="a pad flat .0 electrodes. has no readings to observe"):
+        BioTac(design=str(flat), liquid=False)
 
 
 def written(path, vert, elem):

@@ -34,7 +34,8 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
     verb.add_argument(
         "--skin",
         default="default",
-        help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac lab mesh`",
+        help=f"mesh of the skin: {', '.join(SKINS)}, of a BioTac SP biotac_sp/coarse and so on, a folder of "
+        "`biotac design new`, or a file made by `biotac lab mesh`",
     )
     verb.add_argument(
         "--tier",

@@ -115,7 +115,9 @@ def check_size(size: float, what: str = "skin", least: float = 5e-3) -> None:
         return
     meant = {1e-3: "is it in millimetres? ", 1e-6: "is it in micrometres? ", 1e3: "was it scaled twice? "}
     factor = next((factor for factor in meant if least <= factor * size <= 0.1), None)
-    remedy = f"{meant[factor]}multiply it by {factor:g}" if factor else "scale it to metres"
+    remedy = "make it smaller" if size > 0.1 else "scale it to metres"
+    if factor:
+        remedy = f"{meant[factor]}multiply it by {factor:g}"
     raise ValueError(
         f"the {what}'s largest dimension is {1e3 * size:.4g} mm, not between {1e3 * least:g} and 100 mm: "
         f"{remedy}"

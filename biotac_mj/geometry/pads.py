@@ -84,8 +84,9 @@ def dome_core(shape: tuple, rings: int, facet: tuple | None = None) -> tuple[np.
 
 
 def plate(half_x: float, half_z: float, thickness: float, sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """An elliptical plate on the plane y = 0, upwards: vert (n, 3), face (m, 3), closed."""
-    angle = 2 * np.pi * np.arange(sides) / sides
+    """An elliptical plate on the plane y = 0, upwards, or a square one of four sides whose corners lie on the
+    ellipse: vert (n, 3), face (m, 3), closed."""
+    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     ring = np.stack([half_x * np.cos(angle), np.zeros(sides), half_z * np.sin(angle)], axis=1)
     up = np.array([0.0, thickness, 0.0])
     vert = np.vstack([ring, ring + up, [np.zeros(3), up]])

@@ -11,6 +11,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..coupling.show import OBJECT, SKIN
 from ..files import save_figure
+from ..geometry.design import BIOTAC, Design
 from ..geometry.rigid import matrix
 from ..sensor.colors import FULL_CHANGE, change_map
 from .record import PressRecord
@@ -19,6 +20,8 @@ __all__ = [
     "draw_electrodes",
     "draw_force",
     "draw_map",
+    "draw_peak_pressure",
+    "draw_pressure",
     "draw_surface",
     "draw_traces",
     "table",
@@ -28,35 +31,61 @@ __all__ = [
 
 _CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
 _HARD = np.array([0.75, 0.75, 0.78])
+_PLACES = {"aspect": "equal", "xlabel": "along the finger, tip on the left [mm]"}
 # BioTac frame to a frame whose z leaves the pad
 _TO_PAD_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
-def unroll(points: np.ndarray) -> np.ndarray:
+def unroll(points: np.ndarray, design: Design = BIOTAC) -> np.ndarray:
     """Unrolls points (n, 3) [m] of the BioTac frame to (n, 2) [mm]: along the finger, and around it as an arc
-    on the core from the pad's midline."""
-    return 1e3 * np.stack([points[:, 0], _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])], axis=1)
+    on the core from the pad's midline. Other designs, on a flat backing, are seen from above."""
+    across = points[:, 2]
+    if design == BIOTAC:
+        across = _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])
+    return 1e3 * np.stack([points[:, 0], across], axis=1)
 
 
 def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
-    """Draws the unrolled core, tip on the left, E1..E6 below: electrodes with numbers and changes, in the
-    colours of all pictures, over contours of the skin's displacement."""
+    """Draws the unrolled core (`unroll`), tip on the left, E1..E6 of a BioTac below: electrodes with numbers
+    and changes, in the colours of all pictures, over contours of the skin's displacement."""
     geometry = record.geometry
-    outer = np.unique(geometry.outer_face)
-    outer = outer[np.abs(np.arctan2(geometry.vert[outer, 2], -geometry.vert[outer, 1])) < 2.0]
-    moved = 1e3 * np.linalg.norm(record.vert_xpos[step, outer] - geometry.vert[outer], axis=1)
+    outer, moved = _outer_motion(record, step)
     if np.ptp(moved) > 0:
-        place = unroll(geometry.vert[outer])
+        place = unroll(geometry.vert[outer], geometry.design)
         lines = axes.tricontour(*place.T, moved, levels=6, colors="0.6", linewidths=0.8, zorder=1)
         axes.clabel(lines, fmt="%g", fontsize=7, zorder=1)
-    draw_map(axes, geometry.electrode_pos, record.electrode_change[step])
+    draw_map(axes, geometry.electrode_pos, record.electrode_change[step], geometry.design)
     axes.set_title(f"{axes.get_title()}; lines: how far the skin moved [mm]")
 
 
-def draw_map(axes: Axes, electrode_pos: np.ndarray, change: np.ndarray) -> None:
-    """Draws electrodes at their places (nelectrode, 3) [m] on the unrolled core with their changes
-    (nelectrode,) from the reference counts, tip on the left, E1..E6 below."""
-    place, scale = unroll(electrode_pos), dict(vmin=-FULL_CHANGE, vmax=FULL_CHANGE)
+def draw_pressure(axes: Axes, record: PressRecord, step: int) -> None:
+    """Draws a pad without electrodes from above: the indenter's pressure under contours of the skin's
+    displacement."""
+    geometry = record.geometry
+    outer, moved = _outer_motion(record, step)
+    place = unroll(geometry.vert[outer], geometry.design)
+    if record.contact_pressure is not None:
+        pressure = 1e-3 * record.contact_pressure[step, outer]
+        fill = axes.tricontourf(*place.T, pressure, levels=12, cmap="YlOrRd")
+        axes.figure.colorbar(fill, ax=axes, label="pressure of the indenter [kPa]", shrink=0.85)
+    if np.ptp(moved) > 0:
+        lines = axes.tricontour(*place.T, moved, levels=6, colors="0.4", linewidths=0.8)
+        axes.clabel(lines, fmt="%g", fontsize=7)
+    axes.set(**_PLACES, ylabel="across [mm]", title="Lines: how far the skin moved [mm]")
+
+
+def _outer_motion(record, step):
+    """Nodes (n,) of the outer skin that a map shows, and how far each has moved (n,) [mm]."""
+    geometry = record.geometry
+    outer = np.unique(geometry.outer_face)
+    outer = outer[np.abs(np.arctan2(geometry.vert[outer, 2], -geometry.vert[outer, 1])) < 2.0]
+    return outer, 1e3 * np.linalg.norm(record.vert_xpos[step, outer] - geometry.vert[outer], axis=1)
+
+
+def draw_map(axes: Axes, electrode_pos: np.ndarray, change: np.ndarray, design: Design = BIOTAC) -> None:
+    """Draws electrodes at their places (nelectrode, 3) [m], see `unroll`, with their changes (nelectrode,)
+    from the reference counts, tip on the left, E1..E6 of a BioTac below."""
+    place, scale = unroll(electrode_pos, design), dict(vmin=-FULL_CHANGE, vmax=FULL_CHANGE)
     dots = axes.scatter(*place.T, c=change, cmap=change_map(), **scale, s=480, edgecolors="0.3", zorder=2)
     for i, (x, y) in enumerate(place):
         ink = "white" if abs(change[i]) > 0.6 * FULL_CHANGE else "black"
@@ -68,9 +97,8 @@ def draw_map(axes: Axes, electrode_pos: np.ndarray, change: np.ndarray) -> None:
     label = "change [counts]; red: less liquid over it"
     axes.figure.colorbar(dots, ax=axes, label=label, shrink=0.85, extend="both")
     axes.set(
-        aspect="equal",
-        xlabel="along the finger, tip on the left [mm]",
-        ylabel="around the core [mm]",
+        **_PLACES,
+        ylabel="around the core [mm]" if design == BIOTAC else "across [mm]",
         title=f"Electrodes E1..E{len(change)}",
     )
     axes.margins(0.12)
@@ -98,6 +126,13 @@ def draw_traces(axes: Axes, record: PressRecord, named: int = 6) -> None:
         axes.plot(record.time, change[:, i], lw=1.5, label=f"E{i + 1}")
     axes.set(xlabel="time [s]", ylabel="change [counts]", title="Electrodes over time")
     axes.legend(fontsize=8, ncols=2)
+    axes.grid(alpha=0.3)
+
+
+def draw_peak_pressure(axes: Axes, record: PressRecord) -> None:
+    """Draws the indenter's largest pressure on the skin over time."""
+    axes.plot(record.time, 1e-3 * record.contact_pressure.max(1), lw=1.5)
+    axes.set(xlabel="time [s]", ylabel="largest pressure [kPa]", title="Pressure over time")
     axes.grid(alpha=0.3)
 
 
@@ -150,7 +185,8 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
 
 
 def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndarray | None = None) -> None:
-    """Writes press.png: rendering, electrode map, force over depth, electrode traces.
+    """Writes press.png: rendering, electrode map, force over depth, electrode traces; of a pad without
+    electrodes pressure in their place.
 
     Args:
       record: the press.
@@ -169,13 +205,17 @@ def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndar
         axes.imshow(render)
         axes.set_axis_off()
     axes.set_title(f"Skin at {1e3 * record.depth[step]:.2f} mm")
-    draw_electrodes(figure.add_subplot(2, 2, 2), record, step)
     draw_force(figure.add_subplot(2, 2, 3), record)
-    draw_traces(figure.add_subplot(2, 2, 4), record)
-    figure.suptitle(
-        f"{record.parameters.get('indenter', 'indenter')} on a BioTac, skin {record.geometry.name}",
-        fontsize=13,
-    )
+    design = record.geometry.design
+    if design.nelectrode:
+        draw_electrodes(figure.add_subplot(2, 2, 2), record, step)
+        draw_traces(figure.add_subplot(2, 2, 4), record)
+    else:
+        draw_pressure(figure.add_subplot(2, 2, 2), record, step)
+        if record.contact_pressure is not None:
+            draw_peak_pressure(figure.add_subplot(2, 2, 4), record)
+    indenter = record.parameters.get("indenter", "indenter")
+    figure.suptitle(f"{indenter} on a {design.title}, skin {record.geometry.name}", fontsize=13)
     save_figure(path, figure)
 
 
@@ -185,11 +225,20 @@ def table(record: PressRecord, files: tuple | list = ()) -> str:
     change = record.electrode_change[record.deepest]
     pdc = record.counts[:, len(change)]
     order = np.argsort(-np.abs(change))[:5]
+    felt = [
+        ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts"),
+        ("PDC", f"{pdc[record.deepest] - pdc[0]:+.0f} counts"),
+    ]
+    if not len(change):
+        felt = [("skin moved", f"{_outer_motion(record, record.deepest)[1].max():.3f} mm at most")]
+        if record.contact_pressure is not None:
+            felt.append(
+                ("pressure", f"{1e-3 * record.contact_pressure[record.deepest].max():.1f} kPa at most")
+            )
     rows = [
         ("depth", f"{1e3 * record.depth.max():.3f} mm"),
         ("peak force", f"{force.max():.3f} N at {1e3 * record.depth[force.argmax()]:.3f} mm"),
-        ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts"),
-        ("PDC", f"{pdc[record.deepest] - pdc[0]:+.0f} counts"),
+        *felt,
         ("steps", f"{len(record.time)} saved, {int(record.nonconverged[-1])} did not converge"),
         ("steps took", f"{record.seconds:.2f} s"),
         *[("wrote" if not i else "", str(file)) for i, file in enumerate(files)],

@@ -5,6 +5,7 @@ import numpy as np
 
 from ..coupling.handle import Handle
 from ..coupling.show import OBJECT
+from ..geometry import load_skin
 from ..geometry.rigid import matrix, quaternion
 from ..view.offscreen import stage
 from .indenter import Indenter, add_indenter
@@ -13,6 +14,7 @@ from .path import LEAD, Path, PressOptions
 __all__ = ["build_scene", "see_through"]
 
 _PREFIX = "biotac_"
+_FOVY, _ASPECT = 40.0, 1.4  # of the camera [deg], width over height
 
 
 # The servo of a two-way press: 50 kN/m deflects by 0.02 mm per newton; with this mass its frequency is 200
@@ -42,7 +44,6 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = np.zeros(3)
     stage(spec)
-    _add_camera(spec)
     spec.worldbody.add_body(name="finger")
 
     body = spec.worldbody.add_body(
@@ -77,6 +78,9 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
         on_error="raise",
     )
     see_through(spec, handle)
+    skin = load_skin(handle.config.skin)
+    finger = np.concatenate([skin.vert, skin.nail_vert, skin.clamp_vert])
+    _add_camera(spec, finger, indenter.vert @ matrix(path.quat).T + path.start)
     return spec, handle
 
 
@@ -88,10 +92,18 @@ def see_through(spec: mujoco.MjSpec, handle: Handle) -> None:
         spec.site(handle.prefix + name).size[0] = 7e-4
 
 
-def _add_camera(spec):
+def _add_camera(spec, finger, indenter):
+    """A camera that sees all of a finger (n, 3), and of an indenter (m, 3) [m] what is near it."""
     # from the side of the pad, which points up in the picture
     eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
     z = eye / np.linalg.norm(eye)
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
     quat = quaternion(np.stack([x, np.cross(z, x), z], axis=1))
-    spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
+    low, high = finger.min(0), finger.max(0)
+    reach = np.linalg.norm(high - low) / 2
+    shown = np.concatenate([finger, np.clip(indenter, low - reach, high + reach)])
+    middle = (shown.min(0) + shown.max(0)) / 2
+    right, above, ahead = ((shown - middle) @ np.stack([x, np.cross(z, x), z], axis=1)).T
+    slope = np.tan(np.radians(_FOVY / 2))
+    away = (ahead + np.maximum(np.abs(above), np.abs(right) / _ASPECT) / slope).max()
+    spec.worldbody.add_camera(name="press", pos=middle + 1.05 * away * z, quat=quat, fovy=_FOVY)

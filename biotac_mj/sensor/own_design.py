@@ -99,7 +99,7 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
         mesh = TetMesh(1e3 * mesh.vert, mesh.elem)
         _check_mesh(mesh)
     wide = 1.05 * np.abs(mesh.vert[:, [0, 2]]).max(0)
-    backing = plate(*wide * (np.sqrt(2) if shape.block else 1.0), _BACKING)
+    backing = plate(*np.sqrt(2) * wide, _BACKING, sides=4) if shape.block else plate(*wide, _BACKING)
     core = EMPTY
     if isinstance(shape.core, tuple):
         core = dome_core((np.array(_xyz(shape.core)), 0.0), 30)

@@ -13,6 +13,7 @@ from .. import plugin
 from ..coupling.handle import SENSORS
 from ..effects.sensors import take_sensor
 from ..fields import refuse_unknown
+from ..geometry.design import DESIGNS
 from ..sensor.channels import FULL_SCALE
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
@@ -101,8 +102,8 @@ class BioTac(composer.Entity):
             from the environment's random state, like sensor="random" and the effects of `randomise`.
 
         Raises:
-          ValueError, FileNotFoundError: as `biotac_mj.attach`, or a placement argument (site, body, pos,
-            quat, prefix).
+          ValueError, FileNotFoundError: as `biotac_mj.attach`, a design without electrodes, or a placement
+            argument (site, body, pos, quat, prefix).
         """
         from ..coupling import SettingKeywords, Settings, SkinSettings, attach
 
@@ -118,7 +119,8 @@ class BioTac(composer.Entity):
                 )
         refuse_unknown(keywords, SettingKeywords.__annotations__, "the settings of a BioTac")
         if settings is None:
-            settings = Settings(skin=SkinSettings(mesh="coarse", tier="condensed"), on_error="raise")
+            mesh = "coarse" if keywords.get("design") in (None, *DESIGNS) else None  # a pad has one mesh
+            settings = Settings(skin=SkinSettings(mesh=mesh, tier="condensed"), on_error="raise")
         chosen = Settings.of(settings, keywords, "BioTac")
         sensor, own = chosen.sensor, chosen.sensor.options
         check_geoms("thermal", sensor.thermal, read_thermal)
@@ -136,6 +138,10 @@ class BioTac(composer.Entity):
         )
         spec = mujoco.MjSpec()
         self.handle = attach(spec, body="world", prefix=_PREFIX, slots=slots, settings=without_geoms)
+        if not self.handle.design.nelectrode:
+            raise ValueError(
+                f"a {self.handle.design.title} has no readings to observe: use biotac_mj.attach for its force"
+            )
         with plugin.explained():
             spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())

@@ -2,6 +2,7 @@
 
 import csv
 import pathlib
+import textwrap
 
 from ...files import replacing
 from .design import Plan
@@ -9,6 +10,7 @@ from .design import Plan
 __all__ = ["COLUMNS", "write_plan"]
 
 COLUMNS = "contact object time object_pos_x object_pos_y object_pos_z object_qw object_qx object_qy object_qz"
+_WIDTH = 170  # letters in a line of the picture
 
 
 def write_plan(plan: Plan, path: pathlib.Path | str) -> list[pathlib.Path]:
@@ -68,8 +70,13 @@ def _ros(plan, path):
 def _picture(plan, path):
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 3.5 + 0.22 * len(plan.contacts)), layout="constrained")
-    grid = figure.add_gridspec(2, 2, height_ratios=[3.0, max(0.22 * len(plan.contacts), 0.5)])
+    lines = []
+    for k, one in enumerate(plan.contacts):
+        said = f"{k + 1}. {one.contact.text} ({one.reason})"
+        lines += textwrap.wrap(said, _WIDTH, subsequent_indent="    ")
+    words_height = 0.22 * len(lines)  # [inches]
+    figure = Figure(figsize=(11, 3.5 + words_height), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=[3.0, max(words_height, 0.5)])
     place, time = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     for k, one in enumerate(plan.contacts):
         t = one.trajectory
@@ -80,7 +87,6 @@ def _picture(plan, path):
         place.annotate(str(k + 1), (x[0], z[0]), xytext=(4, 4), textcoords="offset points")
     place.set(xlabel="x along the finger, tip at -x [mm]", ylabel="z across [mm]", title="where")
     time.set(xlabel="time of a contact [s]", ylabel="depth [mm]", title="how deep", xscale="symlog")
-    lines = [f"{k + 1}. {one.contact.text} ({one.reason})" for k, one in enumerate(plan.contacts)]
     words = figure.add_subplot(grid[1, :])
     words.axis("off")
     words.text(0, 1, "\n".join(lines), va="top", fontsize=7)
