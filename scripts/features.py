@@ -51,7 +51,8 @@ _DESIGN = """A fingertip is a `Design` (`biotac_mj/geometry/design.py`, `docs/ho
 channels and the frame of the multiplexer are from there. Data of one fingertip and a skin of another
 are refused by name."""
 DESIGN_ROWS = {
-    "`attach`, both tiers, one-way and two-way; `press`; tasks": ("yes", "yes", "yes"),
+    "`attach`, both tiers, one-way and two-way; `press`": ("yes", "yes", "yes"),
+    "tasks, `BioTac` of dm_control's composer": ("yes", "yes", "where it has electrodes"),
     "batches": ("yes", "yes", "yes"),
     "every feature of skin and sensor above": ("yes", "yes", "yes; film and liquid where there is a core"),
     "effects of a running sensor, `randomise`": ("yes", "yes", "yes"),
