@@ -155,7 +155,7 @@ def test_a_set_of_sps_holds_their_channels(generated):
     with TactileSet(generated) as data:
         assert data.design == SP == data.geometry.design and data.attributes["settings"]["sensor"] == "sp_mf"
         counts, pac, impedance = (data[name][:] for name in ("counts", "pac", "impedance"))
-    assert counts.shape == (16, 28) and pac.shape == (16, 22) and impedance.shape == (16, 24)
+    assert counts.shape == (16, 28) and pac.shape == (16, SP.npac) and impedance.shape == (16, 24)
     rest = sensors_of(SP)["sp_mf"]
     np.testing.assert_allclose(counts[[0, 8], :24], np.tile(rest.rest, (2, 1)), atol=5 * max(rest.noise))
     assert abs(counts[0, 24] - rest.pdc_rest) < 5 and np.ptp(counts[:8, :24], axis=0).max() > 100
@@ -242,7 +242,7 @@ def logged(rows=3):
 
 
 def test_logs_of_sps_become_a_set_of_their_own(tmp_path):
-    assert logged().design == SP and logged().pac.shape == (3, 22)
+    assert logged().design == SP and logged().pac.shape == (3, SP.npac)
     write(tmp_path / "sp.h5", [logged()])
     import_recordings([tmp_path / "sp.h5"], tmp_path / "set")
     with TactileSet(tmp_path / "set") as data:
@@ -265,7 +265,7 @@ def test_messages_with_room_for_an_sp_are_written_and_read(tmp_path):
 def test_a_press_of_an_sp_is_a_recording_of_one(pressed, tmp_path):
     write_skin(pressed, tmp_path / "skin.h5")
     read = load_one(tmp_path / "skin.h5")[0]
-    assert read.design == SP and read.pac.shape[1] == 22
+    assert read.design == SP and read.pac.shape[1] == SP.npac
     np.testing.assert_allclose(read.pdc, pressed.counts[:, 24])
 
 

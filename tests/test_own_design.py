@@ -123,9 +123,10 @@ def test_a_map_of_a_dome_has_one_scale():
 
 
 @pytest.mark.parametrize("indenter", ["sphere_7mm", "geom:sphere:0.05"])
-def test_the_picture_of_a_press_shows_pad_and_indenter(flat, indenter):
-    options = PressOptions(design=flat, liquid=False, location=(0.0, 0.0), indenter=indenter)
-    skin, shape = biotac_mj.load_skin(flat), make_indenter(indenter)
+def test_the_picture_of_a_press_shows_pad_and_indenter(tmp_path, indenter):
+    new_design(tmp_path / "high", PadShape(block=(12.0, 12.0, 14.0), edge=4.0))
+    options = PressOptions(design=tmp_path / "high", liquid=False, location=(0.0, 0.0), indenter=indenter)
+    skin, shape = biotac_mj.load_skin(tmp_path / "high"), make_indenter(indenter)
     path = plan_path(skin, shape, options)
     model = build_scene(shape, path, options)[0].compile()
     data = mujoco.MjData(model)
