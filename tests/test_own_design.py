@@ -11,6 +11,7 @@ from readers_files import GROUND, SIX
 
 import biotac_mj
 from biotac_mj.cli import main
+from biotac_mj.data.generation.synthetic_sensor import SensorVariation
 from biotac_mj.geometry.design import Design, read_design
 from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
@@ -211,3 +212,9 @@ def test_pads_that_cannot_be_are_refused(tmp_path, shape, places, said):
     with pytest.raises(ValueError, match=said):
         new_design(tmp_path / "pad", PadShape(**shape), *places)
     assert not (tmp_path / "pad").exists()
+
+
+def test_a_synthetic_sensor_of_a_pad_rests_at_the_pad_s_counts(tmp_path):
+    design = new_design(tmp_path / "dome", DOME, SIX, GROUND)
+    variation = SensorVariation.draw(0, design)
+    assert list(variation.sensor.rest) == design.sensors["ideal"]["rest"] and variation.mixing.shape == (6, 6)

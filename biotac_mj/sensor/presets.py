@@ -250,8 +250,11 @@ SENSORS, NAMES = sensors_of(BIOTAC), sensor_names(BIOTAC)
 def draw_sensor(rng: np.random.Generator, design: Design = BIOTAC) -> Sensor:
     """A sensor drawn from the spread of the measured ones. Rest counts: mean pattern in ln Z plus a common
     and an individual deviation; noise: that of one of them, times a factor up to 1.2; scalars: uniform
-    between the measured extremes; gains: 1 +- 0.1."""
+    between the measured extremes; gains: 1 +- 0.1. The design's own sensor where fewer than two were
+    measured."""
     n, known = design.nelectrode, sensors_of(design)
+    if len(design.patterns) < 2:
+        return known[design.sensor]
     measured = {name: fields for name, fields in design.sensors.items() if name not in design.published}
     log_z = np.array([log_impedance(known[name].rest) for name in design.patterns])
     common = log_z.mean(1).std(ddof=1)
