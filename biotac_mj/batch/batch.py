@@ -195,7 +195,7 @@ class Batch(Skins):
         self.place_geoms(r.here_pos, r.here_mat, m.geom_pos, m.geom_quat)
         clearance.found.fill_(wp.vec2d(math.inf, math.inf))
         wp.copy(clearance.close, r.inside)
-        skin.put_bodies(r.placed, self.began, clearance.close)
+        skin.put_bodies(r.placed, self.began, self.rest.awake, clearance.close)
         clearance.measure(geoms, laws, skin.data.rest_vert)
         self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
 

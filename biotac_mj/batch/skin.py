@@ -168,16 +168,17 @@ class BatchSkin:
         else:
             launch_step(m, d, self.geoms)
 
-    def put_bodies(self, placed: wp.array, began: wp.array, where: wp.array) -> None:
+    def put_bodies(self, placed: wp.array, began: wp.array, awake: wp.array, where: wp.array) -> None:
         """Lets bodies that were placed begin where the geoms are now, without contact, as `SkinStepper.put`
         does for one world, on skins at rest where nothing else touches them. Launches only.
 
         Args:
           placed: (ngroup, nworld) int, which bodies. began: (nworld,) int, whether a step was made.
-          where: (nworld,) int, in which worlds there are any.
+          awake: (nworld,) int, which skins this step may solve. where: (nworld,) int, in which worlds bodies
+            were placed.
         """
         outer, geoms, nsample = self.data.outer, self.geoms.struct, len(self.model.sample)
-        self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self.by_mocap], [geoms])
+        self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self.by_mocap, awake], [geoms])
         faces = len(self.model.outer.face), self.nworld
         self._touched.zero_()
         self._any_bare.zero_()

@@ -98,14 +98,16 @@ def forget_poses(
     placed: wp.array2d(dtype=int),
     began: wp.array(dtype=int),
     by_mocap: wp.array(dtype=bool),
+    awake: wp.array(dtype=int),
     # In and out:
     geoms: Geoms,
 ):
     """Forgets the last poses of geoms on bodies that were placed [group, world]. After the first step the
-    poses of a body that a mocap body moves are its motion."""
+    poses of a body that a mocap body moves are its motion. Near a skin that this step leaves at rest they are
+    those at its end already."""
     g, w = wp.tid()
     h = geoms.group[g]
-    if placed[h, w] == 1 and not (by_mocap[h] and began[w] == 1):
+    if awake[w] == 1 and placed[h, w] == 1 and not (by_mocap[h] and began[w] == 1):
         geoms.pos_last[g, w] = vec3(real(wp.nan), real(wp.nan), real(wp.nan))
 
 
