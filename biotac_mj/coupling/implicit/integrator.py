@@ -26,9 +26,6 @@ _NO_DAMPER, _NO_EULERDAMP = (
 )
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _NEGLIGIBLE = 1e-9  # h D relative to M
-# the same of the velocity products that implicitfast has in D for lone free bodies: a body that turns by so
-# much in a step goes elsewhere by 0.3 um at 10 mm, a tenth of what the skin is solved for
-_TURNS = 0.05
 
 
 class Integrator:
@@ -80,10 +77,9 @@ class Integrator:
         inertia = np.zeros((size, size))
         inertia[row, column] = inertia[column, row] = data.M[entry]
         scale = 1 / np.sqrt(inertia.diagonal())
-        if self.model.opt.integrator == _FAST and self._lone.any() and data.qvel[self.dofs[self._lone]].any():
-            turning = np.where(self._lone[:, None], self._derived(data, True), derivative)
-            if h * np.abs(scale[:, None] * (turning - derivative) * scale).max() > _TURNS:
-                derivative = turning
+        if self.model.opt.integrator == _FAST and data.qvel[self.dofs[self._lone]].any():
+            # of lone free bodies implicitfast has the velocity products in D, too
+            derivative = np.where(self._lone[:, None], self._derived(data, True), derivative)
         if h * np.abs(scale[:, None] * derivative * scale).max(initial=0.0) < _NEGLIGIBLE:
             return False
         self._step = np.linalg.solve(inertia - h * derivative, inertia)
