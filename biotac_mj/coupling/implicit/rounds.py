@@ -212,10 +212,17 @@ def choose_gamma(step: real, ahead: real, delay: real, solid: Solid, last: Model
 
 
 @wp.kernel
-def begin_rounds(awake: wp.array(dtype=int), led: wp.array(dtype=bool), r: Rounds, last: Model, model: Model):
-    """What is known of a step before it is made: which bodies were put where they are from outside. They have
-    left their contact, so that nothing of the last step's models holds for them; not so bodies that a mocap
-    body has led there."""
+def begin_rounds(
+    # In:
+    awake: wp.array(dtype=int),
+    by_mocap: wp.array(dtype=bool),
+    # In and out:
+    r: Rounds,
+    last: Model,
+    model: Model,
+):
+    """Begins a step: finds which bodies were placed by the user. These have left their contact, so their
+    models of the last step are cleared; not so those of bodies that a mocap body has moved there."""
     w = wp.tid()
     r.inside[w] = 1 - r.began[w]
     for g in range(r.pos.shape[0]):
@@ -228,7 +235,7 @@ def begin_rounds(awake: wp.array(dtype=int), led: wp.array(dtype=bool), r: Round
         if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.straight[g, w])):
             r.placed[g, w] = 1
             r.inside[w] = 1
-            if not led[g]:
+            if not by_mocap[g]:
                 last.wrench0[g, w] = vec6()
                 last.tangent0[g, w] = mat66()
                 model.wrench0[g, w] = vec6()

@@ -29,8 +29,8 @@ _KINS, _SOME = (
     0.15,
 )  # effects whose rubber is solved for; share of the best one's evidence that is worth it
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
-# Of the evidence of what was found, that its laws leave: they are off by a third, since they close 73 % of
-# the gaps of 50 practice laboratories in the median.
+# Fraction of the evidence of what was found that its laws leave to another effect. They are off by a third,
+# since they close 73 % of the gaps of 50 practice laboratories in the median; evidence goes by the square.
 _LEFT = 0.1
 
 
