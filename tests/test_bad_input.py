@@ -692,7 +692,6 @@ def trained_models():
     yield Row("learn judge", "give one of a folder that")
     yield Row("learn judge trained --new-sensor shard.h5", "give one of a folder that")
     yield Row("learn judge trained --force force.txt", "--force goes with a recording")
-    yield Row("learn judge electrodes.txt --touches 9", "--touches goes with --known")
     for words in (
         "electrodes.txt --json electrodes.txt",
         "electrodes.txt --force force.txt --json force.txt",

@@ -183,20 +183,6 @@ def test_what_it_needs_is_told():
         diagnose_verb(types.SimpleNamespace(**given))
 
 
-def test_one_constant_for_all_sensors_on_rows_kept_aside(answers, repo, monkeypatch):
-    """On a synthetic sensor whose tip answers more, the model that has it errs less there than gains do."""
-    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
-    import real_tip
-
-    monkeypatch.setattr(models, "_ROWS", 100)
-    rows, aside = press_rows(synthetic(answers, AT_TIP, 4)[0])
-    whole = answers[0].amended(np.array(AT_TIP))
-    found = real_tip.locked({"base": answers[0].amended(np.zeros(2)), "tip": whole}, rows, aside)
-    assert found["tip, gains 1"]["tip"]["rms"] < 5, "3 counts are noise"
-    assert found["tip, gains 1"]["tip"]["rms"] < found["base, gains fitted"]["tip"]["rms"]
-    assert found["tip, gains 1"]["not seen"]["blocks_better"] > 12
-
-
 def test_the_example_says_what_it_needs(repo, monkeypatch):
     monkeypatch.syspath_prepend(str(repo / "examples"))
     import the_tip

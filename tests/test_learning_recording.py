@@ -1,7 +1,6 @@
 """`biotac learn judge --electrodes`: synthetic logs with known answers, leakage, and whatever files people
 have."""
 
-import dataclasses
 import json
 import pathlib
 
@@ -12,7 +11,6 @@ from biotac_mj.cli import main
 from biotac_mj.learning.instants.force import causal_average, fit_force
 from biotac_mj.learning.instants.linear import best_ridge, ridge, ridges
 from biotac_mj.learning.instants.real import evaluate_recording
-from biotac_mj.learning.instants.transfer import label, touches_of_force, transfer_force
 from biotac_mj.recordings import load_one
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
 
@@ -108,18 +106,13 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
     counts, force = synthetic_log(2400)
     counts[:, 5] = 4095  # a dead channel
     e, f = write(tmp_path, counts, force, ",")
-    other, _ = load_one(e, force=f)
-    result = evaluated(e, f, tmp_path / "r.json", network=False, known=other, touches=5)
+    result = evaluated(e, f, tmp_path / "r.json", network=False)
     assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 1680
     assert (tmp_path / "r.png").stat().st_size > 20_000
     # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less
     # what eight components take up
     assert result["reconstruction"]["models"]["pca8"]["test"]["rms"] < 1.2
     assert result["force_regression"]["models"]["drift_aware"]["rmse"][0] < 0.2
-    assert result["force_regression"]["models"]["transferred"]["rmse"][0] < 0.2
-    assert any("and 5 labelled touches" in note for note in result["notes"])
-    with pytest.raises(ValueError, match="both need forces; give them at"):
-        evaluated(e, None, tmp_path / "r2.json", network=False, known=other)
     assert any("e6 reads 0 or 4095 in 100.0 %" in note for note in result["notes"])
     result = evaluated(e, None, tmp_path / "r2.json", network=False)
     assert "force_regression" not in result and any("no force:" in note for note in result["notes"])
@@ -139,9 +132,6 @@ def test_a_force_that_does_not_change_is_not_judged(tmp_path):
     e, f = write(tmp_path, counts, 0 * force)
     with pytest.raises(ValueError, match="e: the force never changes, so that it cannot be learned"):
         evaluated(e, f, tmp_path / "r.json", network=False)
-    one, _ = load_one(e)
-    with pytest.raises(ValueError, match="the force never changes"):  # of the other sensor, before the work
-        evaluate_recording(dataclasses.replace(one, force=counts[:, :3] / 100), known=load_one(e, force=f)[0])
 
 
 def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
@@ -222,31 +212,3 @@ def test_real_press_beats_the_bars(tmp_path):
     assert (
         np.array(result["force_regression"]["models"]["drift_aware"]["rmse"]) < [0.235, 0.406, 0.340]
     ).all()
-
-
-@pytest.mark.slow
-def test_another_sensor_and_few_touches_teach_the_force():
-    """Two synthetic sensors that answer alike but for gains, rests and drift."""
-    counts, force = synthetic_log(3000, seed=1)
-    rng = np.random.default_rng(2)
-    gain, rest = rng.normal(1, 0.15, 19), rng.normal(0, 0.3, 19)
-    log_z = log_impedance(counts)
-    other = np.clip(counts_from_log_impedance(rest + log_z.mean(0) + gain * (log_z - log_z.mean(0))), 0, 4095)
-    touch = touches_of_force(force)
-    assert np.unique(touch).size > 10 and (np.diff(touch) >= 0).all()
-    half = 1500
-    labelled = np.full_like(force, np.nan)
-    labelled[:half] = label(force[:half] + rng.normal(0, 3, (half, 3)), touch[:half], 6)  # poor labels
-    assert len(np.unique(touch[np.isfinite(labelled[:, 0])])) == 6
-
-    def error(known_force):
-        found = transfer_force(counts, known_force, other, labelled, touch)
-        return np.sqrt(((found - force)[half:] ** 2).mean())
-
-    known = error(force)
-    assert known < 0.5 and known < 0.8 * error(0 * force)  # which teaches nothing
-    found = transfer_force(counts, force, other, labelled, touch)
-    sooner = transfer_force(counts, force, other[:2000], labelled[:2000], touch)
-    np.testing.assert_allclose(sooner, found[:2000])
-    with pytest.raises(ValueError, match="3 labelled touches: at least 5"):
-        label(force, touch, 3)

@@ -190,14 +190,6 @@ def _add_judge(verbs, verb):
     v.add_argument("--force", metavar="FILE", help="of a recording: text, 3 columns of force [N] row by row")
     add_which(v)
     v.add_argument(
-        "--known",
-        metavar="FILE",
-        help="another sensor's recording with force; evaluates its transfer with few touches of this one",
-    )
-    v.add_argument(
-        "--touches", type=whole(5, 10_000), help="number of labelled ones for --known (default: 20)"
-    )
-    v.add_argument(
         "--new-sensor",
         metavar="SET",
         help="labelled set of another sensor: error of the film and of --weights, after a mixing of their "
@@ -233,11 +225,9 @@ def _judge(args):
         )
     bag = args.source and os.path.isfile(os.path.join(args.source, "metadata.yaml"))  # of ROS 2
     recorded = bool(args.source) and (bag or not os.path.isdir(args.source))
-    for name, given in (("force", args.force), ("recording", args.which), ("known", args.known)):
+    for name, given in (("force", args.force), ("recording", args.which)):
         if given and not recorded:
             raise ValueError(f"--{name} goes with a recording: give both, or neither")
-    if args.touches is not None and not args.known:
-        raise ValueError("--touches goes with --known: give both, or neither")
     for name in ("weights", "sensor"):
         if getattr(args, name) and not args.new_sensor:
             raise ValueError(f"--{name} goes with --new-sensor: give both, or neither")
@@ -397,8 +387,6 @@ def _judge_recording(args):
         args.fraction,
         args.seed,
         progress=not args.quiet,
-        known=load_one(args.known)[0] if args.known else None,
-        touches=args.touches or 20,
     )
     table = result["reconstruction"]
     print(

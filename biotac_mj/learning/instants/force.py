@@ -15,7 +15,7 @@ from ...sensor.channels import log_impedance
 from .linear import held_out_errors, of_strengths
 from .terms import KINDS, Terms
 
-__all__ = ["TRIALS", "ForceModel", "causal_average", "columns_of", "fit_force"]
+__all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force"]
 
 _WARM_UP = 2.5  # time constant, in lengths of the training rows
 _BLOCKS, _FOLDS = 40, 5  # rows are correlated in time
@@ -30,12 +30,6 @@ def causal_average(x: np.ndarray, tau: float) -> np.ndarray:
     row."""
     a = 1 - np.exp(-1 / tau)
     return lfilter([a], [1, a - 1], x, axis=0, zi=x[:1] * (1 - a))[0]
-
-
-def columns_of(terms: Terms, log_z: np.ndarray) -> np.ndarray:
-    """(n, k) terms of ln Z (n, nelectrode) and causal averages of the electrodes."""
-    now = terms(log_z)
-    return np.hstack([now, causal_average(now[:, : log_z.shape[1]], _WINDOW)])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,7 +57,7 @@ def fit_force(
     rise = 1 - np.exp(-np.arange(len(log_z)) / (_WARM_UP * ntrain))
     prediction, total, trials = 0.0, 0.0, {}
     for kind in KINDS:
-        columns = columns_of(Terms.fit(log_z[:ntrain], **kind), log_z)
+        columns = _columns(Terms.fit(log_z[:ntrain], **kind), log_z)
         for warm_up, x in (("", columns), (" and warm-up", np.column_stack([columns, rise]))):
             error = held_out_errors(x[:ntrain], force, block, _RIDGE, _FOLDS)
             weight, offset = of_strengths(x[:ntrain], force, _RIDGE, error.argmin(0))
@@ -74,3 +68,9 @@ def fit_force(
             if progress:
                 progress()
     return ForceModel(prediction / total, trials)
+
+
+def _columns(terms: Terms, log_z: np.ndarray) -> np.ndarray:
+    """(n, k) terms of ln Z (n, nelectrode) and causal averages of the electrodes."""
+    now = terms(log_z)
+    return np.hstack([now, causal_average(now[:, : log_z.shape[1]], _WINDOW)])

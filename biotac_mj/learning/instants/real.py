@@ -13,7 +13,6 @@ from ..protocol import check_changes, is_better, quartiles
 from .examples import blocks
 from .force import TRIALS, fit_force
 from .linear import principal_components, ridge
-from .transfer import TOUCHES, label, touches_of_force, transfer_force
 
 __all__ = ["evaluate_recording"]
 
@@ -32,8 +31,6 @@ def evaluate_recording(
     seed: int = 0,
     network: bool = True,
     progress: bool = True,
-    known: Recording | None = None,
-    touches: int = TOUCHES,
 ) -> dict:
     """Evaluates one recording; writes `out` (JSON, described in docs/lab/learning.md) and a plot next to it.
 
@@ -42,8 +39,6 @@ def evaluate_recording(
       fraction: of the rows, in time, for training; everything is fitted on them only.
       seed: of the networks.
       network: False: PCA in place of networks (seconds, for tests).
-      known: another sensor with force: its transfer, adapted with `touches` of this sensor's training rows,
-        is compared with a model of all these rows.
 
     Returns:
       the written content.
@@ -56,12 +51,6 @@ def evaluate_recording(
 
     begun = time.time()
     recording, counts, notes = _usable(recording)
-    if known is not None and (known.force is None or recording.force is None):
-        raise ValueError(
-            f"{known.name} and {recording.name}: both need forces; give them at `biotac recording import`"
-        )
-    if known is not None:
-        _usable(known)  # fail before the work
     if not 0.2 <= fraction <= 0.95:
         raise ValueError(f"fraction {fraction} leaves too little on one side: take 0.2 to 0.95, as 0.7")
     n = len(counts)
@@ -91,10 +80,6 @@ def evaluate_recording(
         # separate progress bar: steps of networks and trials take different times
         with tqdm(total=TRIALS, desc="evaluate: force", disable=not progress or None, leave=False) as bar:
             result["force_regression"], predicted = _force(counts, recording.force, ntrain, bar)
-        if known is not None:
-            errors, notes = _transferred(known, counts, recording.force, ntrain, touches)
-            result["force_regression"]["models"]["transferred"] = errors
-            result["notes"] += notes
         result["notes"] += _unjudged(result["force_regression"]["models"], recording.force, ntrain)
         result["notes"] += _useless(predicted, recording.force, ntrain)
     else:
@@ -224,17 +209,6 @@ def _force(counts, force, ntrain, bar):
         "best": min(table, key=lambda name: np.sum(np.square(table[name]["rmse"]))),
         "details": {"left_out": model.trials},
     }, rows["drift_aware"]
-
-
-def _transferred(known, counts, force, ntrain, touches):
-    known, known_counts, notes = _usable(known)
-    touch = touches_of_force(force[:ntrain])
-    labelled = np.full_like(force, np.nan)
-    labelled[:ntrain] = label(force[:ntrain], touch, touches)
-    y = transfer_force(known_counts, known.force, counts, labelled, touch)
-    rows = np.flatnonzero(np.isfinite(labelled).all(1))
-    note = f"transferred: {known.name} and {len(np.unique(touch[rows]))} labelled touches, {len(rows)} rows"
-    return _errors(y[ntrain:], force[ntrain:]), [*notes, note]
 
 
 def _errors(predicted, truth):
