@@ -12,6 +12,7 @@ import warp as wp
 from biotac_mj import batch
 from biotac_mj.batch.ahead import _noted, kernels_of_step, launched_by
 from biotac_mj.batch.hook import Hook
+from biotac_mj.skin.program import Fork
 
 SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
 <body><freejoint/><geom type="cylinder" size=".1 .1"/></body>
@@ -88,7 +89,8 @@ def launched():
             setattr(wp, name, function)
 
 
-def test_all_launches_of_a_batch_step_are_found_data_unchanged():
+def touched(control=None):
+    """A condensed BioTac that a free ball touches, in two worlds: mjm, m, d, Batch."""
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     ball = spec.worldbody.add_body(pos=[-12e-3, -11.5e-3, 0])
@@ -98,11 +100,36 @@ def test_all_launches_of_a_batch_step_are_found_data_unchanged():
     mjm = spec.compile()
     mjd = mujoco.MjData(mjm)
     mujoco.mj_forward(mjm, mjd)
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
+    m.callback.control = control
+    return mjm, m, d, batch.attach(mjm, m, d, prefix=prefix, skin="coarse", tier="condensed")
+
+
+def test_what_is_launched_in_parallel_has_no_branch(monkeypatch):
+    """A stream that forks from a captured one can record launches, but not Warp's conditional nodes."""
+    run, forks = Fork.run, []
+
+    def refuse(*_, **__):
+        raise AssertionError("a branch or a loop in a Fork")
+
+    def run_without(self, *branches):
+        forks.append(len(branches))
+        with monkeypatch.context() as inside:
+            for name in ("capture_if", "capture_while"):
+                inside.setattr(wp, name, refuse)
+            run(self, *branches)
+
     with wp.ScopedDevice("cpu"):
-        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
+        mjm, m, _, _ = touched()
+        monkeypatch.setattr(Fork, "run", run_without)
+        Hook.of(m).kernels(mjm, m)
+    assert len(forks) > 10
+
+
+def test_all_launches_of_a_batch_step_are_found_data_unchanged():
+    with wp.ScopedDevice("cpu"):
         asked = []
-        m.callback.control = lambda m, d: asked.append(d.nworld)
-        skins = batch.attach(mjm, m, d, prefix=prefix, skin="coarse", tier="condensed")
+        mjm, m, d, skins = touched(control=lambda m, d: asked.append(d.nworld))
         found = {module for module, _ in Hook.of(m).kernels(mjm, m)}
         assert not asked and d.time.numpy().tolist() == [0, 0] and not skins.began.numpy().any()
         with launched() as needed:

@@ -116,8 +116,7 @@ class BatchSkin:
                 wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)
             )
             self.by_mocap = wp.array(touching.by_mocap, dtype=bool)
-            self._touched, self._any_bare = wp.zeros(nworld, dtype=int), wp.zeros(1, dtype=int)
-            self._bare = wp.zeros(nworld, dtype=bool)
+            self._touched, self._bare = wp.zeros(nworld, dtype=int), wp.zeros(nworld, dtype=bool)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
         self.release = Release(model, self.data, self.geoms)
@@ -181,13 +180,11 @@ class BatchSkin:
         self._launch(kernels.forget_poses, self.pos.shape, [placed, began, self.by_mocap, awake], [geoms])
         faces = len(self.model.outer.face), self.nworld
         self._touched.zero_()
-        self._any_bare.zero_()
         left = [outer.anchor_geom, self._touched]
         self._launch(kernels.forget_contacts, faces, [where, nsample, geoms], left)
         if self.release.possible:
-            known, bare = [where, self._touched, began], [self._bare, self._any_bare]
-            self._launch(kernels.find_bare, self.nworld, known, bare)
-            wp.capture_if(self._any_bare, lambda: self.state.reset_skin(self._bare))
+            self._launch(kernels.find_bare, self.nworld, [where, self._touched, began], [self._bare])
+            self.state.reset_skin(self._bare)
         self._come_from_outside(where)
 
     def _come_from_outside(self, where):

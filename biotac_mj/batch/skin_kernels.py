@@ -143,13 +143,10 @@ def find_bare(
     began: wp.array(dtype=int),
     # Out:
     bare_out: wp.array(dtype=bool),
-    any_out: wp.array(dtype=int),
 ):
     """Skins that nothing touches any more since bodies were placed."""
     w = wp.tid()
     bare_out[w] = on[w] == 1 and began[w] == 1 and touched[w] == 0
-    if bare_out[w]:
-        any_out[0] = 1
 
 
 @wp.kernel

@@ -11,7 +11,8 @@ __all__ = ["Transfer", "words_of"]
 
 wp.set_module_options({"enable_backward": False})
 
-_CHUNK = 8  # items that a thread writes on CUDA; on the CPU one thread writes an array
+_CHUNK = 8  # items that a thread writes at a time on CUDA; on the CPU one thread writes an array
+_THREADS = 2**17  # on CUDA, about: most launches find little to write, and ending threads takes time too
 
 
 @wp.struct
@@ -53,27 +54,33 @@ def write(pair: Pair, first: int, last: int, w: int):
 
 
 @wp.kernel
-def write_where(pairs: wp.array(dtype=Pair), task: wp.array(dtype=wp.vec3i), mask: wp.array(dtype=bool)):
-    """Copies the items of task t in world w, if its mask is set."""
+def write_where(
+    pairs: wp.array(dtype=Pair), task: wp.array(dtype=wp.vec3i), stride: int, mask: wp.array(dtype=bool)
+):
+    """Copies the items of every stride-th task from t on in world w, if its mask is set."""
     t, w = wp.tid()
     if mask[w]:
-        at = task[t]
-        write(pairs[at[0]], at[1], at[2], w)
+        for k in range(t, task.shape[0], stride):
+            at = task[k]
+            write(pairs[at[0]], at[1], at[2], w)
 
 
 @wp.kernel
 def write_wanted(
     pairs: wp.array(dtype=Pair),
     task: wp.array(dtype=wp.vec3i),
+    stride: int,
     wanted: wp.array(dtype=int),
     reason: wp.array(dtype=int),
 ):
-    """Copies the items of task t in a wanted world; guesses only if its last step did not converge."""
+    """Copies the items of every stride-th task from t on in a wanted world; guesses only if its last step did
+    not converge."""
     t, w = wp.tid()
     if wanted[w] == 1:
-        at = task[t]
-        if pairs[at[0]].guess == 0 or reason[w] != 0:
-            write(pairs[at[0]], at[1], at[2], w)
+        for k in range(t, task.shape[0], stride):
+            at = task[k]
+            if pairs[at[0]].guess == 0 or reason[w] != 0:
+                write(pairs[at[0]], at[1], at[2], w)
 
 
 class Transfer:
@@ -131,8 +138,11 @@ class Transfer:
         self._launch(write_wanted, wanted, reason)
 
     def _launch(self, kernel, *masks):
-        dim = len(self._task), self._nworld
-        wp.launch(kernel, dim, [self._table, self._task, *masks], device=self._device)
+        stride = len(self._task)
+        if self._device.is_cuda:
+            stride = min(stride, max(64, _THREADS // self._nworld))
+        dim = stride, self._nworld
+        wp.launch(kernel, dim, [self._table, self._task, stride, *masks], device=self._device)
 
 
 def words_of(array: wp.array, dtype: type) -> wp.array:
