@@ -182,8 +182,7 @@ class Effect(abc.ABC):
     Attributes:
       id, name: of the effect. stage: key of STAGES. physics: description.
       fits: data in which the effect is searched, a set of "poses" (trajectories with the object's poses),
-        "log" (recordings without), "checkup" (segments of a checkup's protocol) and "plate" (presses of a
-        flat plate). An id may have a form for each.
+        "log" (recordings without) and "plate" (presses of a flat plate). An id may have a form for each.
       params: {name: Param}. each: the parameter that every electrode has, in `params` by its name. design: of
         the electrodes.
       grid: values of the shape parameters that are tried.

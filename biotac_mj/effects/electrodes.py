@@ -81,7 +81,7 @@ class Noise(Effect):
 
     id, name, stage = "noise", "noise of single electrodes", "A"
     physics = "an electrode is noisier than the others: a bad contact, a leaking lead"
-    fits = frozenset({"checkup"})
+    fits = frozenset()
     per_channel = True
     each = Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)
     params = dict.fromkeys(BIOTAC.electrodes, each)

@@ -191,7 +191,6 @@ class Gain(Linear):
     physics = "an electrode's change from rest has its own factor (manufacturing)"
     each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
     params = dict.fromkeys(BIOTAC.electrodes, each)
-    fits = frozenset({"poses", "checkup"})
     equivalents, per_channel = ("inhomog",), True
     # Electrodes are 0.1 to 0.2 mm from their drawn positions, which looks like such gains. Gains found for
     # such positions were up to 4.2 % (docs/lab/discrepancy.md).
@@ -256,7 +255,6 @@ class CrossTalk(Linear):
         "V = (I + kappa K + scan S + common M + pairs) U: "
         "K decreases with distance, S is the channel sampled before, M the mean of all"
     )
-    fits = frozenset({"poses", "checkup"})
     params = {
         "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
         "scan": Param("1", -0.4, 0.4, "charge held by a multiplexer: CHOSEN, like kappa", 0.05),
@@ -315,7 +313,6 @@ class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
     physics = "electrodes follow their input with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
-    fits = frozenset({"poses", "checkup"})
     law, equivalents, alike = LAW, ("latency",), True
     confusable = {"latency": "two speeds a decade apart and a tap"}
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "Detector", "Candidate"]
 
 
-KINDS = {effect.id: effect for fits in ("checkup", "log") for effect in entries(fits)}
+KINDS = {effect.id: effect for effect in entries("log")}
 _MOST = 12  # electrodes: what more have is of the sensor
 
 

@@ -14,7 +14,6 @@ from .model import LEAST, WINDOW
 from .proof import views
 from .recording import FORCE_MOVED, PlainRecording
 from .rest import Rest, rest
-from .segments import memory_of
 from .session import Session
 
 __all__ = ["RecordingDiagnosis", "concluded"]
@@ -83,7 +82,7 @@ def concluded(
         where_note="electrodes that depart, from and to [s], RMS [counts]",
         remainder=left.text,
         unknown=left.significant,
-        notes=_notes(session, protocol),
+        notes=_notes(session),
         next_experiment=_next(session.findings, protocol),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(session),
@@ -161,7 +160,7 @@ def _amended(session):
     return lines
 
 
-def _notes(session, protocol):
+def _notes(session):
     """What the data cannot tell."""
     recording, loads, out = session.recording, "saturation", []
     if recording.force is None:
@@ -185,6 +184,4 @@ def _notes(session, protocol):
         out.append(
             "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
         )
-    if protocol is not None and (memory := memory_of(session, protocol)):
-        out.append(memory)
     return out

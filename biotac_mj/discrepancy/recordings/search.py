@@ -21,7 +21,7 @@ from .diagnosis import RecordingDiagnosis, concluded
 from .faults import as_candidates, as_log
 from .proof import prove
 from .recording import PlainRecording, as_plain
-from .segments import moved, segment_findings, stretches
+from .segments import moved, stretches
 from .session import Session
 
 __all__ = ["diagnose_recording"]
@@ -29,7 +29,6 @@ __all__ = ["diagnose_recording"]
 _MOST = 8  # of trends over time
 _LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
-_LOST = 0.2  # of an electrode's samples, beyond which they tell nothing of its noise
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -48,7 +47,7 @@ def diagnose_recording(
       progress: whether to show a bar.
       named: confidence from which a finding is named.
       protocol: when what was done with the sensor: each stretch in which it was touched, or not, is then
-        searched by itself too, and its segments for what they isolate (`segments.py`).
+        searched by itself too.
 
     Raises:
       ValueError: a share that leaves too little on one side; a recording without electrodes, or with too few
@@ -178,28 +177,18 @@ def _proved(session):
 
 
 def _checkup(session, protocol, named):
-    """What the segments of a protocol show beyond the log as a whole."""
-    r = session.recording
-    parts = [
-        (rows, diagnose_recording(r.part(rows), named=named).findings) for rows in stretches(r, protocol)
-    ]
-    known, found = list(session.findings), []
-    for rows, some in parts:
+    """What the stretches of a protocol show beyond the log as a whole."""
+    r, known, found = session.recording, list(session.findings), []
+    for rows in stretches(r, protocol):
+        some = diagnose_recording(r.part(rows), named=named).findings
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
         found += [moved(f, rows, r) for f in some if not f.kind.silent and not _told(f, known)]
-    isolated = segment_findings(session, protocol, _faulty([*known, *found]))
-    found += [f for f in isolated if not any(f.id == k.id and _alike(f, k) for k in known)]
     enough = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
     for finding, yes in zip(found, enough):
         if not yes or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
-            continue
-        if any(f.id == finding.id and _alike(f, finding) for f in session.findings):
-            continue  # another stretch has said it
-        session.accept(finding)
-        if finding in isolated:  # what a segment isolates speaks where the log mixes
-            mixed = [f for f in session.findings if finding.id in f.kind.confusable]
-            session.take_back(*(f for f in mixed if set(f.channels) <= set(finding.channels)))
+        elif not any(f.id == finding.id and _alike(f, finding) for f in session.findings):
+            session.accept(finding)  # no other stretch has said it
 
 
 def _told(finding, known):
@@ -216,16 +205,6 @@ def _told(finding, known):
 def _alike(one, other):
     """Whether two findings are of the same electrodes, or both of all."""
     return one.of_all == other.of_all and bool(set(one.channels) & set(other.channels))
-
-
-def _faulty(findings):
-    """Electrodes whose samples are mostly no measurement, or coarse: they say nothing of a sensor's noise."""
-    return {
-        k
-        for f in findings
-        for k in f.channels
-        if f.detector.of_log and not f.of_all and (f.mask is None or f.mask[:, k].mean() > _LOST)
-    }
 
 
 def _late(session, named):

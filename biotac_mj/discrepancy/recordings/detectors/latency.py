@@ -11,7 +11,7 @@ Delays of a frame are therefore part of the model that a latency is compared wit
 Where they do not even move at the same times, one of them was logged by another clock, or with another touch
 (`clock_offset`)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -74,12 +74,7 @@ class ForceView:
     def errors(self, act: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
         """(blocks, 3) logarithm of the mean square error of each block left out, where `act` is done to what
         the electrodes say (n, q)."""
-        return self._left_out(act(self.x)[:: self.step])[0]
-
-    def _left_out(self, x):
-        """`errors`, (rows, 3) force [N] as told without the block that the row is in, and the mean weights
-        (q, 3) of features x (rows, q)."""
-        t = self.target
+        x, t = act(self.x)[:: self.step], self.target
         A = np.concatenate([np.ones((len(x), 1)), x], axis=1)
         parts = [(A[a:b], t[a:b]) for a, b in zip(self.edges[:-1], self.edges[1:])]
         G = np.stack([a.T @ a for a, _ in parts])
@@ -88,24 +83,8 @@ class ForceView:
         ridge = _RIDGE * np.diag(total).copy()
         ridge[0] = 0  # in units of each column's variance, and none of the mean
         w = np.linalg.solve(total - G + np.diag(ridge + 1e-9), H.sum(0) - H)
-        told = [a @ of for (a, _), of in zip(parts, w)]
-        square = np.array([((v - said) ** 2).mean(0) for (_, v), said in zip(parts, told)])
-        return np.log(np.maximum(square, 1e-12)), np.concatenate(told), w[:, 1:].mean(0)
-
-    def with_memory(
-        self, memories: Sequence[Callable[[np.ndarray, float], np.ndarray]]
-    ) -> list[tuple[np.ndarray, float]]:
-        """(gain (blocks,), weight) of each memory: by how much the logarithm of the mean square error falls
-        where what it adds to the force (rows, 3) that the electrodes tell, at rows per second [Hz], is one
-        more feature; weight: of it, for the component of the force that changes most."""
-        x = self.x[:: self.step]
-        without, told, _ = self._left_out(x)
-        most, out = int(self.target.std(0).argmax()), []
-        for memory in memories:
-            more = memory(told, self.rate / self.step) - told
-            error, _, weights = self._left_out(np.concatenate([x, more], axis=1))
-            out.append(((without - error).mean(1), float(weights[x.shape[1] + most, most])))
-        return out
+        square = np.array([((v - a @ of) ** 2).mean(0) for (a, v), of in zip(parts, w)])
+        return np.log(np.maximum(square, 1e-12))
 
     def at_delay(self, delay: float) -> np.ndarray:
         """(blocks,) mean of `errors` over components where the electrodes are `delay` [s] late."""
