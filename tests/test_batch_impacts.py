@@ -274,6 +274,27 @@ def test_the_second_step_of_a_batch_has_the_force_of_the_plugin(integrator, boun
     np.testing.assert_allclose(batch.force, single.force, atol=bound * single.size.max())
 
 
+@pytest.mark.parametrize(
+    "timestep, integrator", [(0.004, "Euler"), (0.004, "implicitfast"), (0.002, "Euler")]
+)
+def test_two_light_balls_on_a_pad_have_the_force_of_the_plugin(timestep, integrator):
+    """They touch each other, too: which of that contact's rows hold changes within a step. Where the next
+    round takes them as they are, rounds converge as Newton's method does."""
+    balls = "".join(
+        f'<body pos="{x} 0 {z}"><freejoint/><geom size=".003" mass="{mass}"/></body>'
+        for x, z, mass in ((-0.0095, 0.0125, 0.005), (-0.01545, 0.0123, 0.008))
+    )
+    xml = scene(balls, timestep, f'integrator="{integrator}"')
+    qpos = mujoco.MjModel.from_xml_string(xml).qpos0.astype(np.float32)  # both begin at the same numbers
+    qvel = np.array([0, 0, -0.3, 1, 2, 0, 0, 0, -0.3, 0, -2, 1], np.float32)
+    steps, where = round(0.02 / timestep), {"site": "tip"}
+    single = in_plugin(xml, qpos, qvel, steps, where, skin="coarse", tier="condensed")
+    batch = in_batch(xml, qpos[None], qvel[None], steps, where, skin="coarse", tier="condensed")[0][0]
+    assert single.touched >= 4 and batch.lost + single.lost == 0
+    assert max(single.status[:, 5].max(), batch.status[:, 5].max()) <= 3
+    np.testing.assert_allclose(batch.force, single.force, atol=2e-5 * single.size.max())
+
+
 @pytest.mark.slow
 def test_a_ball_that_hits_and_leaves_settles_in_every_step():
     """Friction begins where the ball meets the skin in every round, not in the first alone; and one that

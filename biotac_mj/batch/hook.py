@@ -188,10 +188,14 @@ class Hook:
     def _go_on(self, m, d, moving):
         """Rounds of the worlds that are going, until all are settled or cannot be."""
 
+        def solve():
+            self._find_compliance(m, d, moving)
+            self._solve(moving, lambda batch: batch.solve_again(m, d))
+
         def go_on():
             self._accelerate(m, d, moving)
             self._choose(moving, lambda batch, found: batch.judge(self._going, found))
-            wp.capture_if(self._going.any, lambda: self._solve(moving, lambda batch: batch.solve_again(m, d)))
+            wp.capture_if(self._going.any, solve)
 
         wp.capture_while(self._going.any, go_on)
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, enums, structs
 
-__all__ = ["LIBRARY", "DataView", "ModelView", "c_structs"]
+__all__ = ["LIBRARY", "PGS", "DataView", "ModelView", "c_structs"]
 
 LIBRARY = ctypes.CDLL(
     str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
@@ -71,10 +71,11 @@ _DTYPES = {
 _ROWS = (
     *("efc_type", "efc_id", "efc_J", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_pos", "efc_margin"),
     *("efc_KBIP", "efc_D", "efc_R", "efc_aref", "efc_state", "efc_force"),
-    *("iefc_D", "iefc_R", "map_efc2iefc"),
+    *("iefc_D", "iefc_R", "iefc_state", "map_efc2iefc"),
 )
 _built = {}
 _TINY = np.finfo(float).tiny
+PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 # iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
 _ENOUGH = 99
@@ -231,6 +232,14 @@ class DataView(_View):
         if where != self._where:
             self._where, self._rows = where, types.SimpleNamespace(**{n: self.array(n) for n in _ROWS})
         return self._rows
+
+    def row_states(self) -> np.ndarray:
+        """(nefc,) states of the rows, mjtConstraintState, where MuJoCo's constraint solver left them. Where
+        it solves island by island it leaves `efc_state` as the warm start was, and writes `iefc_state`."""
+        option, rows = self.model.opt, self.rows()
+        if not self.struct.nisland or option.solver == PGS or option.noslip_iterations:
+            return rows.efc_state
+        return rows.iefc_state[rows.map_efc2iefc]
 
     def make_constraints(self) -> None:
         """Makes all constraint rows again, as mj_fwdPosition does: equalities were switched since."""

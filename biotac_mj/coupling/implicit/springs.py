@@ -68,7 +68,7 @@ class Springs:
             self._make_room(*(2 * n for n in needed))
         here["inertia"][0] = self._data.M if inertia is None else inertia
         here["rows"][0] = needed[0]
-        given = rows.efc_state, value, rows.efc_D, count, first, column
+        given = self._data.row_states(), value, rows.efc_D, count, first, column
         for copy, array in zip(self._copies.values(), given):
             copy[: array.size] = array
 

@@ -24,7 +24,7 @@ from ..instance import NO_PASSIVE, NO_SENSOR, STAGES, Instance
 from ..loads import Loads
 from ..solid import SOLVED
 from ..solid_contacts import SolidContacts
-from ..structs import DataView, ModelView
+from ..structs import PGS, DataView, ModelView
 from .coupled import Coupled
 from .group import SkinGroup
 from .integrator import Integrator
@@ -38,7 +38,6 @@ CORRECTED = 1e-6
 # [m] from where a skin was solved: there Runge-Kutta's stages may lead its bodies, other than the first says
 ASTRAY = 1e-4
 _FAR = 1.0  # [rad] that a body turns in a step
-_PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
 _RESETS = {
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name.upper()}")): name for name in ("qpos", "qvel", "qacc")
@@ -328,7 +327,7 @@ class World:
         return off
 
     def _rows_are_open(self, skins):
-        return self.model.opt.solver == _PGS and not all(map(self._rows_hold, skins))
+        return self.model.opt.solver == PGS and not all(map(self._rows_hold, skins))
 
     def _damp(self, skins, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
@@ -448,5 +447,5 @@ class World:
 
     def _project(self):
         option = self.model.opt
-        if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
+        if option.solver == PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
