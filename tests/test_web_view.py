@@ -24,13 +24,10 @@ import zstandard
 
 from biotac_mj import cli
 from biotac_mj.coupling.show import electrode_colors
-from biotac_mj.geometry import load_skin
-from biotac_mj.geometry.rigid import matrix
 from biotac_mj.press.record import write_skin
 from biotac_mj.view import web as web_view
 from biotac_mj.view import web_play
 from biotac_mj.view.web import FIELDS, Moment
-from biotac_mj.view.web_numbers import legible
 from biotac_mj.view.web_play import play_press
 
 
@@ -147,14 +144,6 @@ def test_a_browser_shows_the_finger_and_what_it_reads(page, shell, tmp_path):
         page.update(0.2, {"left": Moment(wide, counts, 50.0, 0.4, *pose)})
         window.until(lambda picture: len(green(picture)) > 1.15 * len(green(before)))
         text = window.evaluate("document.body.innerText")
-        ((client, labels),) = page._numbers._labels.values()
-        finger = page.fingers["left"]
-        pos = pose[0] + finger.electrode_pos @ matrix(pose[1]).T
-        seen = legible(client.camera.position, pos, finger.electrode_normal @ matrix(pose[1]).T)
-        assert 0 < seen.sum() < 19 and [label.visible for label in labels] == seen.tolist()
-        page._numbers.wanted = False
-        page._numbers.choose()
-        assert not any(label.visible for label in labels)
     assert (
         "t = 0.200 s" in text
         and "change [counts]" in text
@@ -163,22 +152,8 @@ def test_a_browser_shows_the_finger_and_what_it_reads(page, shell, tmp_path):
     )
 
 
-def test_numbers_of_electrodes_do_not_cover_each_other():
-    """From nine sides around a BioTac: none at its back, none over another, and as many as there is room."""
-    skin = load_skin("coarse")
-    pos, normal = skin.electrode_pos, skin.electrode_normal
-    for angle in np.linspace(-np.pi, np.pi, 9):
-        eye = np.array([-0.03, -0.05 * np.cos(angle), 0.05 * np.sin(angle)])
-        shown, sight = legible(eye, pos, normal), eye - pos
-        facing = (sight * normal).sum(1) / np.linalg.norm(sight, axis=1)
-        assert facing[shown].min(initial=1) > 0
-        way = sight.mean(0) / np.linalg.norm(sight.mean(0))
-        flat = pos - (pos @ way)[:, None] * way
-        apart = np.linalg.norm(flat[:, None] - flat[None], axis=2) + np.eye(19)
-        assert apart[np.ix_(shown, shown)].min(initial=1) > 1.8e-3  # wide as a box with two digits of 1 mm
-        left_out = ~shown & (facing > 0.3)
-        assert (apart[np.ix_(left_out, shown)].min(1, initial=1) < 2e-3).all()
-    assert legible(np.array([-0.01, -0.06, 0]), pos, normal).sum() > 10  # onto the pad
+def test_each_electrode_has_its_number(page):
+    assert len(page._numbers) == 19 * len(page.fingers)
 
 
 def test_the_skins_colour_is_a_quantity_with_a_legend(shell):

@@ -60,12 +60,10 @@ def on_ellipsoid(point: np.ndarray, semi_axes: ArrayLike, centre_y: float) -> np
     return out
 
 
-def dome_shell(outer: tuple, inner: tuple, rings: int, layers: int = 1) -> TetMesh:
+def dome_shell(outer: tuple, inner: tuple, rings: int) -> TetMesh:
     """The shell between two ellipsoids' caps, each given as (semi axes (3,), centre_y)."""
     (vert, face), (within, _) = (ellipsoid_cap(*shape, rings) for shape in (outer, inner))
-    depth = np.linspace(0, 1, layers + 1)[:, None, None]
-    columns = within + depth * (vert - within)
-    return TetMesh(columns.reshape(-1, 3), column_tetrahedra(face, len(vert), layers))
+    return TetMesh(np.concatenate([within, vert]), column_tetrahedra(face, len(vert), 1))
 
 
 def dome_core(shape: tuple, rings: int, facet: tuple | None = None) -> tuple[np.ndarray, np.ndarray]:

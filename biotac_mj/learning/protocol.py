@@ -10,7 +10,6 @@ from ..sensor.channels import NELECTRODE
 __all__ = [
     "check_changes",
     "conformal_width",
-    "coverage_curve",
     "interaction_errors",
     "is_better",
     "paired_test",
@@ -59,13 +58,6 @@ def quartiles(values: ArrayLike) -> tuple[float, float, float]:
     """Median, lower and upper quartile as floats."""
     q25, q50, q75 = np.percentile(values, [25, 50, 75])
     return float(q50), float(q25), float(q75)
-
-
-def coverage_curve(predicted: ArrayLike, truth: ArrayLike, levels: ArrayLike) -> np.ndarray:
-    """(len(levels),) fraction of all (row, electrode) pairs with an absolute error of at most each level
-    [counts]."""
-    error = np.sort(np.abs(np.asarray(predicted, float) - truth).ravel())
-    return np.searchsorted(error, levels, side="right") / len(error)
 
 
 def paired_test(a: ArrayLike, b: ArrayLike) -> dict:

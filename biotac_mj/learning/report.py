@@ -9,7 +9,7 @@ from ..fields import check_entries
 from ..files import save_figure, write_json
 from ..reading import Array, check_arrays, read_json, read_npz
 from ..sensor.channels import NELECTRODE, electrode_noise
-from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
+from .protocol import conformal_width, interaction_errors, paired_test, quartiles
 
 __all__ = ["PAPER", "draw_errors", "evaluate_models", "predictions_of", "report_of", "table"]
 
@@ -21,7 +21,6 @@ PAPER = {
 UNIT = 2048.0
 # rows to compare with, nothing that is served
 _REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae")
-_LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 
 def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None = None) -> dict:
@@ -199,8 +198,7 @@ def _objects(codes):
 
 
 def _split(folder, split, reports):
-    errors, pooled, seconds = {}, {}, {}
-    coverage, intervals, noise, example = {}, {}, [], None
+    errors, intervals, noise, example = {}, {}, [], None
     for report in reports:
         data = predictions_of(folder / f"{split}-{report['seed']}.npz")
         test = data["test"].astype(bool)
@@ -217,13 +215,9 @@ def _split(folder, split, reports):
             errors.setdefault(name, {}).setdefault("seed", []).append(float(np.median(value)))
             for k, v in zip(which.tolist(), value.tolist()):
                 errors[name].setdefault("each", {}).setdefault(k, []).append(v)
-            pooled.setdefault(name, []).append(np.sqrt(((got[test] - truth) ** 2).mean(1)))
-            coverage.setdefault(name, []).append(coverage_curve(got[test], truth, _LEVELS))
             width = conformal_width(got[~test] - data["truth"][~test], data["owner"][~test])
             inside = (np.abs(got[test] - truth) <= width).mean()
             intervals.setdefault(name, []).append((float(inside), float(np.mean(width))))
-        for name, value in report["seconds"].items():
-            seconds.setdefault(name, []).append(value)
         if report["seed"] == min(r["seed"] for r in reports):
             example = {k: data[k][test] for k in data if k.startswith("predicted_")} | {
                 "truth": truth, "owner": owner, "time": data["time"][test], "object": data["object"][test],
@@ -235,9 +229,7 @@ def _split(folder, split, reports):
         inside, width = np.mean(intervals[name], axis=0)
         models[name] = {
             "median": q50, "quartiles": [q25, q75], "median_2048": q50 / UNIT, "seed_medians": e["seed"],
-            "median_row": float(np.median(np.concatenate(pooled[name]))), "interval_coverage": inside,
-            "interval_half_width": float(width) if np.isfinite(width) else None,
-            "coverage_area": float(np.mean(np.mean(coverage[name], axis=0))),
+            "interval_coverage": inside, "interval_half_width": float(width) if np.isfinite(width) else None,
         }  # fmt: skip
     found = {
         "seeds": [r["seed"] for r in reports],
@@ -246,8 +238,6 @@ def _split(folder, split, reports):
         "noise_floor": float(np.median(np.concatenate(noise))),
         "mesh_mm": _average([r["mesh"] for r in reports]),
         "inverse_mm": _average([r["inverse"] for r in reports]),
-        "train_seconds": {k: float(np.mean(v)) for k, v in seconds.items()},
-        "device": reports[0]["device"],
     }
     return found, {"errors": {n: e["each"] for n, e in errors.items()}, "example": example}
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from ..coupling.show import CORE, FULL_SCALE, OBJECT, SKIN, electrode_colors
 from ..geometry.skin_geometry import SkinGeometry
-from .web_numbers import Numbers
 
 __all__ = ["FIELDS", "Field", "Finger", "Moment", "Page"]
 
@@ -18,6 +17,7 @@ _SCALE = 200  # width of the colour scale below
 _FROM = np.array([-0.45, -0.65, 0.7])  # direction of the camera: from the tip's side, with the pad in sight
 _SEEN_THROUGH, _COLOURED = 0.55, 0.85  # opacity of the skin
 _BANDS = 8  # colours of a quantity on the skin
+_LETTERS, _ABOVE = 1e-3, 3e-3  # height of the electrodes' numbers, and above the core, on the skin [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,9 +145,7 @@ class Page:
         )
         self._legend = gui.add_html("")
         numbers = gui.add_checkbox("numbers", True)
-        self._numbers = Numbers(
-            self.server, {name: (f.electrode_pos, f.electrode_normal) for name, f in fingers.items()}
-        )
+        self._numbers = []
         self._most = dict.fromkeys(FIELDS, 0.0)
         self._scene, self._gui, self._log = {}, {}, {}
         for i, (name, finger) in enumerate(fingers.items()):
@@ -157,8 +155,8 @@ class Page:
 
         @numbers.on_update
         def _(_):
-            self._numbers.wanted = numbers.value
-            self._numbers.choose()
+            for label in self._numbers:
+                label.visible = numbers.value
 
     def _add_body(self, name, finger):
         scene = self.server.scene
@@ -174,6 +172,11 @@ class Page:
         spheres = [
             scene.add_icosphere(f"/{name}/e{i}", radius=5e-4, color=(217, 217, 217), position=p)
             for i, p in enumerate(finger.electrode_pos, 1)
+        ]
+        look = dict(font_size_mode="scene", font_scene_height=_LETTERS, anchor="center-center")
+        self._numbers += [  # the skin covers those behind it
+            scene.add_label(f"/{name}/n{i}", str(i), position=p, depth_test=True, **look)
+            for i, p in enumerate(finger.electrode_pos + _ABOVE * finger.electrode_normal, 1)
         ]
         tool = None
         if finger.tool is not None:
@@ -249,7 +252,6 @@ class Page:
             for name, moment in state.items():
                 frame, skin, spheres, tool = self._scene[name]
                 frame.position, frame.wxyz = moment.pos, moment.quat
-                self._numbers.move(name, moment.pos, moment.quat)
                 self._paint(name, skin, moment.vert, values[name] / top, chosen)
                 change = np.asarray(moment.counts, float) - self.fingers[name].rest
                 for sphere, color in zip(spheres, electrode_colors(change)):
@@ -261,7 +263,6 @@ class Page:
                 rows = self._rows(name, [time, *change, moment.pdc, moment.force]).T
                 for plot, part in zip(plots, (slice(1, -2), slice(-2, -1), slice(-1, None))):
                     plot.data = (rows[0], *rows[part])
-        self._numbers.choose()
         self.server.flush()
 
     def _show_legend(self, chosen, most):

@@ -4,7 +4,6 @@ import pathlib
 import tempfile
 import time as clock
 import warnings
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -37,18 +36,14 @@ def play_model(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     handles: dict,
-    page: Page | None = None,
     seconds: float = np.inf,
-    control: Callable | None = None,
     **server: object,
 ) -> Page:
     """Steps a model and shows its BioTacs at 25 Hz of model time; returns the page.
 
     Args:
       handles: {name: Handle}.
-      page: an existing page to use.
       seconds: duration [s of the model].
-      control: f(data), called before each step.
     """
     from .. import plugin
     from ..geometry import load_skin
@@ -57,12 +52,11 @@ def play_model(
     skins = {name: load_skin(h.config.skin) for name, h in handles.items()}
     films = {name: _under(skin) for name, skin in skins.items()}
     mujoco.mj_forward(model, data)
-    if page is None:
-        fingers = {}
-        for name, h in handles.items():
-            known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
-            fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
-        page = _served(fingers, **server)
+    fingers = {}
+    for name, h in handles.items():
+        known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
+        fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
+    page = _served(fingers, **server)
     scene = Scene(page.server, model, [h.body for h in handles.values()])
     rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
 
@@ -84,8 +78,6 @@ def play_model(
     drawn_at = -np.inf
     while data.time < seconds:
         begin = clock.perf_counter()
-        if control is not None:
-            control(data)
         mujoco.mj_step(model, data)
         plugin.check()
         if data.time - drawn_at > _FRAME - 1e-9:
