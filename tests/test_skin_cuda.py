@@ -9,7 +9,7 @@ import warp as wp
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, launch_step, prepare_step, step
 from biotac_mj.skin.precondition.batched_inverse import invert
-from biotac_mj.skin.program import Fork, Launcher
+from biotac_mj.skin.program import Launcher
 
 CUDA = wp.is_cuda_available()
 pytestmark = pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
@@ -64,7 +64,7 @@ def test_small_systems_are_inverted_whatever_their_size(rows):
     given, found = wp.array(A, device="cuda:0"), wp.zeros(A.shape, dtype=float, device="cuda:0")
     size = wp.full(3, (rows - extra) // 3, dtype=int, device="cuda:0")
     on = wp.array([1, 0, 1], dtype=int, device="cuda:0")
-    invert(Launcher("cuda:0"), Fork("cuda:0").run, extra, size, on, given, found)
+    invert(Launcher("cuda:0"), extra, size, on, given, found)
     B = found.numpy()[:, :rows, :rows].astype(float)
     assert not B[1].any()
     for w in (0, 2):

@@ -36,8 +36,7 @@ from .forces import Forces, Vectors
 from .geoms import GeomSet
 from .model import SkinModel
 from .newton import convergence, krylov, line_search, load_path, nodes, worlds
-from .precondition import Residual
-from .precondition.batched_inverse import kernels_up_to
+from .precondition import Residual, batched_inverse
 from .program import Launcher, Program, compile_ahead, compile_kernels
 from .rubber.element_forces import module_for_cuda
 from .types import SINGLE, mat33, vec3
@@ -131,7 +130,7 @@ def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, in
     """Modules of a step's kernels on CUDA that take long to compile, with their block sizes, for
     `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
     found = [(contact_kernels(False, False, kind).by_sample.module, BLOCK) for kind in (CORE, shapes)]
-    found += [(kernel.module, threads) for kernel, threads in kernels_up_to()]
+    found.append((batched_inverse.invert_kernel.module, batched_inverse.THREADS))
     return [*found, (penetration, 256), (faces, 256), (broadphase, 256)]
 
 
@@ -220,8 +219,7 @@ class SkinStep:
         self._graph = None
         if model.device.is_cuda:
             compile_kernels(model.device, self._record)
-            if self.M.needs_torch:  # torch allocates its workspaces before a capture
-                self._warm_up()
+            self._warm_up()
         self._program = Program(model.device, self._record)
         self._evaluation = self._second_solve = self._normal_forces = None
 

@@ -138,7 +138,7 @@ class DissectedInverse:
             self.of_row, self.rows, self.start = (wp.array(a, dtype=int) for a in (of_row, rows, start))
 
     @functools.cached_property
-    def wide(self) -> list:
+    def matrices(self) -> list:
         """Matrices for products: blocks, G^T, and S, each column as often as a right-hand side is stored in
         `block_products.Product.side`. Torch tensors on CUDA, numpy arrays in single precision on the CPU."""
         made = [np.stack(c, -1).reshape(*c[0].shape[:-1], -1) for c in zip(*self._columns)]
@@ -147,13 +147,6 @@ class DissectedInverse:
         import torch
 
         return [torch.from_numpy(m).to(wp.device_to_torch(self.device)) for m in made]
-
-    @functools.cached_property
-    def narrow(self) -> list[wp.array]:
-        """The matrices of `wide` for vectors: each column once, and its rounding error."""
-        made = [np.stack(c[1:], -1).reshape(-1, *c[0].shape[-2:-1], (self.copies - 1) * c[0].shape[-1])
-                for c in zip(*self._columns)]  # fmt: skip
-        return [wp.array(m, dtype=wp.float16, device=self.device) for m in made]
 
     def _unpack(self, dissection, blocks, _lift, separator):
         """D and G of each piece, and S, from the rounded matrices."""

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds
-from ..program import Fork, Launcher
+from ..program import Launcher
 from ..types import SINGLE
 from . import Preconditioner, Residual, body_tangent, right_hand_sides, touching_nodes, woodbury
 from .inverse import Inverse
@@ -35,7 +35,6 @@ class DensePreconditioner(Preconditioner):
     """The dense preconditioner of all worlds of one SkinData, see `precondition.Preconditioner`.
 
     Attributes:
-      needs_torch: whether torch computes its products.
 
     Args:
       model: the SkinModel.
@@ -90,8 +89,6 @@ class DensePreconditioner(Preconditioner):
         inverse, entries = self._inverse.inverse, right_hand_sides.InverseEntries()
         entries.half, entries.rest, entries.scale = inverse.half, inverse.rest, inverse.scale
         entries.free_index, self._entries = self._free, entries
-        self.needs_torch = self._inverse.needs_torch
-        self._in_parallel = Fork(self.device, nworld <= FEW).run  # most sizes have no system
         self._outer, self._row_group = surfaces[0], None
         self._surfaces = [SurfaceForces() if s is None else s.forces for s in surfaces]
 
@@ -202,7 +199,7 @@ class DensePreconditioner(Preconditioner):
         if self.device.is_cuda:
             from .batched_inverse import invert
 
-            invert(program, self._in_parallel, self.liquid, self.size, on, self._A, self._W)
+            invert(program, self.liquid, self.size, on, self._A, self._W)
             return
         worlds, rows, A, W = (a.numpy() for a in (on, self.size, self._A, self._W))
 

@@ -31,7 +31,6 @@ class Inverse:
     Attributes:
       pushed: `PushForwardMatrices`, or None if the inverse of the undeformed skin is used.
       node_map: rows, matrices and scales by which kernels read and write the inverse's vectors.
-      needs_torch: see `block_products.Product`.
     """
 
     def __init__(
@@ -59,8 +58,7 @@ class Inverse:
             self.pushed = PushForwardMatrices(model.elements, nworld, model.device, lanes)
         self._undeformed = self._node_map(row, none, norm)
         self.node_map = self._node_map(row, self.pushed.matrix, norm) if self.pushed else self._undeformed
-        self._product = Product(self.inverse, nworld, two=bool(self._liquid))
-        self.needs_torch = self._product.needs_torch
+        self._product = Product(self.inverse, nworld)
 
     def _node_map(self, row, matrix, norm):
         out = right_hand_sides.NodeMap()
@@ -92,20 +90,17 @@ class Inverse:
         Args:
           touching: `node` and `size` of `DensePreconditioner`.
         """
-        product, nodes = self._product, [self.node_map, self._wet, gradient]
-        liquid, second = self._liquid, product.second
+        product, nodes, liquid = self._product, [self.node_map, self._wet, gradient], self._liquid
         if liquid and first:
-            side, answer = second or (product.side, product.answer)
-            self._launch(program, right_hand_sides.load_gradient, self._nodes, [*nodes, on], [side])
-            if not second:
-                product.run(program)
-                self._read_along(program, nodes, answer, st, on)
+            self._launch(program, right_hand_sides.load_gradient, self._nodes, [*nodes, on], [product.side])
+            product.run(program)
+            inputs = [self._chunk, *nodes, product.answer, st, on]
+            out = [self.along, self._partial]
+            self._launch(program, right_hand_sides.read_along, self._chunks, inputs, out)
         self._launch(
             program, right_hand_sides.load_residual, self._nodes, [self.node_map, r, on], [product.side]
         )
-        product.run(program, both=bool(liquid and first and second))
-        if liquid and first and second:
-            self._read_along(program, nodes, answer, st, on)
+        product.run(program)
         if liquid:
             inputs = [self._chunk, *nodes, product.answer, st, on]
             kernel = right_hand_sides.measure_volume_change
@@ -115,10 +110,6 @@ class Inverse:
         inputs = [liquid, self.node_map, *touching, product.answer, st, on]
         kernel = right_hand_sides.gather_displacements
         self._launch(program, kernel, touching[0].shape, inputs, [u_out, largest_out])
-
-    def _read_along(self, program, nodes, answer, st, on):
-        inputs = [self._chunk, *nodes, answer, st, on]
-        self._launch(program, right_hand_sides.read_along, self._chunks, inputs, [self.along, self._partial])
 
     def apply(
         self,

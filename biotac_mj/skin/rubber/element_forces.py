@@ -8,7 +8,6 @@ import warp as wp
 from ..program import Launcher
 from ..types import SINGLE, Precision, mat33, real, vec3
 from .element_kernels import element_kernels
-from .point_lanes import GROUPED_WORLDS, THREADS
 from .points import Rubber
 
 if typing.TYPE_CHECKING:
@@ -16,14 +15,14 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["ElementForces", "module_for_cuda"]
 
+_THREADS = 256  # of a block
+
 
 def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
     """Module of the kernels for many worlds, and its block size, for `program.compile_ahead`. options: as in
     `ElementForces`."""
     kernels = element_kernels(elements.corners, elements.law == 0, SINGLE, options)
-    if elements.npoint == 1:
-        return kernels.force_serial.module, 256
-    return kernels.force.module, THREADS
+    return kernels.force.module, _THREADS
 
 
 class ElementForces:
@@ -46,14 +45,10 @@ class ElementForces:
         self._elements, self._rubber, self.device = elements, rubber, elements.device
         self._nworld, self._count = len(rubber.mu), elements.nelem
         self.start, self.slot = elements.start, elements.slot
-        self._by_point = elements.npoint == 4 and self.device.is_cuda and precision.name == "single"
         self._kernels = element_kernels(elements.corners, elements.law == 0, precision, options)
-        group = GROUPED_WORLDS if self._nworld >= GROUPED_WORLDS else 1
-        self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
-        self._block_dim = THREADS if self._nworld >= GROUPED_WORLDS else 64
         # in double precision on CUDA they are for gradients of few worlds: small blocks use more
         # multiprocessors
-        self._serial_block_dim = 64 if self.device.is_cuda and precision.name == "double" else 256
+        self._block_dim = 64 if self.device.is_cuda and precision.name == "double" else _THREADS
         corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
         with wp.ScopedDevice(self.device):
             shape = np.ascontiguousarray(elements.mesh.shape.numpy())
@@ -68,13 +63,13 @@ class ElementForces:
     def evaluate_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
         """Computes the forces on the corners at x [nvert, nworld] in the worlds that are on. Marks worlds
         with a point that is inverted (2), flatter than its law allows (1), or both (3)."""
-        stored = [] if self._by_point else [self._deformation, self._rotation]
-        self._launch(program, "force", [x, on], [self._pressure, *stored, self.corner_force, inverted])
+        stored = [self._pressure, self._deformation, self._rotation]
+        self._launch(program, self._kernels.force, [x, on], [*stored, self.corner_force, inverted])
 
     def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
         """Computes the tangent at x, the nodes of the last `evaluate_corners`, times p, on the corners."""
-        stored = [] if self._by_point else [self._deformation, self._rotation]
-        self._launch(program, "product", [x, p, on, self._pressure, *stored], [self.corner])
+        stored = [self._pressure, self._deformation, self._rotation]
+        self._launch(program, self._kernels.product, [x, p, on, *stored], [self.corner])
 
     def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
         """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""
@@ -106,12 +101,6 @@ class ElementForces:
         wp.launch(self._kernels.point_slopes, (self._count, 1), inputs, out, device=self.device)
         return tuple(a.numpy().reshape(shape[: 2 if a.dtype is real else 4]) for a in out)
 
-    def _launch(self, program, which, inputs, outputs):
-        constants = [self._elements.cap, self._rubber, self._elements.mesh]
-        if self._by_point:
-            inputs = [self._group, self._nworld, *constants, *inputs]
-            program.launch(getattr(self._kernels, which), self._threads, inputs, outputs, self._block_dim)
-        else:
-            kernel = getattr(self._kernels, which + "_serial")
-            inputs = [*constants, self._shape, *inputs]
-            program.launch(kernel, (self._count, self._nworld), inputs, outputs, self._serial_block_dim)
+    def _launch(self, program, kernel, inputs, outputs):
+        inputs = [self._elements.cap, self._rubber, self._elements.mesh, self._shape, *inputs]
+        program.launch(kernel, (self._count, self._nworld), inputs, outputs, self._block_dim)

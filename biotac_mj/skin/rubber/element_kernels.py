@@ -3,11 +3,7 @@
 Positions and forces are in double precision: a filled skin under light contact balances forces far larger
 than its load, and their rounding errors would show. Tangents have the precision of directions. In double
 precision, deformation gradients and rotations are stored from force to product; in single, on CUDA, it is
-faster to compute them again than to read them.
-
-On CUDA the four integration points of an element are four threads of a warp. They exchange the mean
-dilatation and their stresses, and each computes the forces of two or three of the ten nodes. Otherwise one
-thread has an element."""
+faster to compute them again than to read them. A thread has an element."""
 
 import functools
 import types
@@ -16,18 +12,6 @@ import warp as wp
 
 from ..types import Precision, mat33, real, vec3
 from .element_points import Kind, material_functions
-from .point_lanes import (
-    THREADS,
-    any_lane,
-    corner_forces,
-    corner_forces_single,
-    deformation_of_ten,
-    deformation_of_ten_single,
-    gradient_of_ten,
-    place,
-    sum_of_points,
-    sum_of_points_single,
-)
 from .points import Mesh, Rubber, deformation_of
 
 __all__ = ["element_kernels"]
@@ -50,122 +34,21 @@ def element_kernels(
     """Kernels of one kind of element, law and rubber. The corotational law has kernels of its own, since the
     other laws need more registers."""
     kind = Kind(corners, corotational, precision, options)
-    found = {"force_serial": _serial_force(kind), "product_serial": _serial_product(kind)}
-    found |= _reading_kernels(kind)
-    if kind.averaged and kind.is_single:
-        found |= _kernels_by_point(kind)
+    found = {"force": _force_kernel(kind), "product": _product_kernel(kind), **_reading_kernels(kind)}
     return types.SimpleNamespace(gradients=kind.gradients, **found)
 
 
-def _kernels_by_point(kind: Kind) -> dict[str, wp.Kernel]:
-    """Forces and products of ten-node elements with a thread for each integration point, for CUDA."""
-    module, f = kind.module, material_functions(kind)
-    rotation, rotation_thin, theta, stress_of = f.rotation, f.rotation_thin, f.theta, f.stress_of
-    direction_of, change_of, weighted_volume, flaw = f.direction_of, f.change_of, f.weighted_volume, f.flaw
-
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 5))
-    def force(
-        # In:
-        group: int,
-        nworld: int,
-        cap: real,
-        rubber: Rubber,
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
-        on: wp.array(dtype=int),
-        # Out:
-        pressure_out: wp.array2d(dtype=real),
-        corner_out: wp.array2d(dtype=vec3),
-        inverted_out: wp.array(dtype=int),
-    ):
-        at = place(wp.tid(), group, nworld)
-        e = at[0]
-        q = at[1]
-        w = wp.min(at[2], nworld - 1)
-        active = wp.where(at[2] < nworld, on[w], 0)
-        if any_lane(active) == 0:
-            return
-        F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, e, q, x, w)
-        R = rotation(F)
-        bad = flaw(rubber.law, F)
-        if active == 1 and bad > 0:
-            wp.atomic_max(inverted_out, w, bad)
-        mu = rubber.mu[w]
-        lam = rubber.lam[w]
-        local = wp.min(lam, cap * mu)
-        mean = sum_of_points(mesh.weight[e, q] * theta(rubber.law, F, R), group)
-        pressure = real(0.0)
-        if lam > local:
-            pressure = (lam - local) * mean / mesh.volume[e]
-            if active == 1 and q == 0:
-                pressure_out[e, w] = pressure
-        back = -weighted_volume(rubber, mesh, e, q, w) * wp.transpose(mesh.inverse[e, q])
-        H = stress_of(rubber, e, 4 * e + q, w, mu, local, pressure, F, R) * back
-        push = corner_forces(H, mesh.shape, q, group)
-        if active == 1:
-            corner_out[10 * e + q, w] = push[0]
-            corner_out[10 * e + q + 4, w] = push[1]
-            if q < 2:
-                corner_out[10 * e + q + 8, w] = push[2]
-
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 6))
-    def product(
-        # In:
-        group: int,
-        nworld: int,
-        cap: real,
-        rubber: Rubber,
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
-        p: wp.array2d(dtype=wp.vec3),
-        on: wp.array(dtype=int),
-        pressure: wp.array2d(dtype=real),
-        # Out:
-        corner_out: wp.array2d(dtype=wp.vec3),
-    ):
-        at = place(wp.tid(), group, nworld)
-        e = at[0]
-        q = at[1]
-        w = wp.min(at[2], nworld - 1)
-        active = wp.where(at[2] < nworld, on[w], 0)
-        if any_lane(active) == 0:
-            return
-        F = deformation_of_ten_single(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, x, w)
-        dF = gradient_of_ten(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, p, w)
-        R = rotation_thin(F)
-        mu = rubber.mu[w]
-        lam = rubber.lam[w]
-        local = wp.min(lam, cap * mu)
-        mean_pressure = real(0.0)
-        if lam > local:
-            mean_pressure = pressure[e, w]
-        dP = change_of(rubber, e, 4 * e + q, w, mu, local, mean_pressure, F, R, dF)
-        G = direction_of(rubber.law, F, R)
-        mean = sum_of_points_single(float(mesh.weight[e, q]) * wp.ddot(G, dF), group)
-        if lam > local:
-            dP += float((lam - local) / mesh.volume[e]) * mean * G
-        H = float(weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(mesh.inverse_single[e, q])
-        push = corner_forces_single(H, mesh.shape_single, q, group)
-        if active == 1:
-            corner_out[10 * e + q, w] = push[0]
-            corner_out[10 * e + q + 4, w] = push[1]
-            if q < 2:
-                corner_out[10 * e + q + 8, w] = push[2]
-
-    return {"force": force, "product": product}
-
-
-def _serial_force(kind: Kind) -> wp.Kernel:
-    """Forces with a thread for each element."""
+def _force_kernel(kind: Kind) -> wp.Kernel:
+    """Forces of the elements."""
     corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
-    corotational, serial, gradients = kind.corotational, kind.serial_module, kind.gradients
+    corotational, module, gradients = kind.corotational, kind.module, kind.gradients
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     f = material_functions(kind)
     rotation, theta, stress_of, weighted_volume = f.rotation, f.theta, f.stress_of, f.weighted_volume
     local_lame, flaw = f.local_lame, f.flaw
 
-    @wp.kernel(module=serial, enable_backward=False)
-    def force_serial(
+    @wp.kernel(module=module, enable_backward=False)
+    def force(
         # In:
         cap: real,
         rubber: Rubber,
@@ -218,13 +101,13 @@ def _serial_force(kind: Kind) -> wp.Kernel:
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec3(C[0, a], C[1, a], C[2, a])
 
-    return force_serial
+    return force
 
 
-def _serial_product(kind: Kind) -> wp.Kernel:
-    """Products with a thread for each element."""
+def _product_kernel(kind: Kind) -> wp.Kernel:
+    """Tangents of the elements times a direction."""
     corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
-    corotational, serial, gradients = kind.corotational, kind.serial_module, kind.gradients
+    corotational, module, gradients = kind.corotational, kind.module, kind.gradients
     scalar, vec, thin = kind.precision.scalar, kind.precision.vec, kind.precision.narrow
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
@@ -265,8 +148,8 @@ def _serial_product(kind: Kind) -> wp.Kernel:
         else:
             return deformation_in[i, w], mat33()
 
-    @wp.kernel(enable_backward=False, **({"module": serial} if is_single else _deep_module()))
-    def product_serial(
+    @wp.kernel(enable_backward=False, **({"module": module} if is_single else _deep_module()))
+    def product(
         # In:
         cap: real,
         rubber: Rubber,
@@ -325,7 +208,7 @@ def _serial_product(kind: Kind) -> wp.Kernel:
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
 
-    return product_serial
+    return product
 
 
 def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:

@@ -57,11 +57,6 @@ class Kind(NamedTuple):
         return f"{__package__}.elements.{self.corners}_{law}_{self.precision.name}_{'_'.join(self.options)}"
 
     @property
-    def serial_module(self) -> str:
-        # in a module of their own where CUDA does not use them, since they take longest to compile
-        return f"{self.module}.serial" if self.averaged and self.is_single else self.module
-
-    @property
     def gradients(self) -> type:
         """Type of the shape functions' gradients by parent coordinates."""
         return wp.types.matrix(shape=(self.corners, 3), dtype=real)

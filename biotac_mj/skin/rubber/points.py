@@ -47,10 +47,6 @@ class Mesh:
     inverse: wp.array2d(dtype=mat33)  # of the parent's map [element, point]
     weight: wp.array2d(dtype=real)  # volume that a point stands for [element, point] [m^3]
     volume: wp.array(dtype=real)  # [element]
-    # for tangents in single precision: stored, since conversion is slower than multiplication
-    shape_single: wp.array2d(dtype=wp.vec3)
-    inverse_single: wp.array2d(dtype=wp.mat33)
-    of_element: wp.array2d(dtype=int)  # nodes of ten-node elements [element, 12], padded by two
 
 
 @wp.struct

@@ -104,10 +104,6 @@ class Tetrahedra:
             self.mesh.inverse = wp.array(inverse, dtype=mat33, ndim=2)
             self.mesh.weight = wp.array(weight, dtype=real, ndim=2)
             self.mesh.volume = wp.array(weight.sum(1), dtype=real)
-            padded = np.pad(elem, ((0, 0), (0, 12 - elem.shape[1])))
-            self.mesh.of_element = wp.array(padded, dtype=int, ndim=2)
-            self.mesh.shape_single = wp.array(shape, dtype=wp.vec3, ndim=2)
-            self.mesh.inverse_single = wp.array(inverse, dtype=wp.mat33, ndim=2)
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
 
     def _measure(self, vert):
@@ -135,7 +131,6 @@ class Tetrahedra:
         """
         inverse, weight = self._measure(vert)
         self.mesh.inverse.assign(inverse)
-        self.mesh.inverse_single.assign(inverse)
         self.mesh.weight.assign(weight)
         self.mesh.volume.assign(weight.sum(1))
 
