@@ -187,6 +187,12 @@ class Forces:
             sums = [2 * g.ngroup, d.nworld]
             program.launch_blocks(faces.sum_wrench, sums, [self._partial_wrench], [wrench], worlds.BLOCK)
 
+    def limit_contacts(self, program: Launcher, on: wp.array) -> None:
+        """Limits the contact forces of the last evaluation to those that the skin balances."""
+        outer = self.d.outer
+        inputs = [self.m.free_mask, self.d.force, outer.forces.node_force, on]
+        self.launch(program, faces.limit_contacts, outer.touching.shape, inputs, [self.contact])
+
     def commit_contacts(self, program: Launcher, on: wp.array) -> None:
         """Stores the friction anchors of an equilibrium."""
         self.launch(program, faces.commit_contacts, self.d.outer.touching.shape, [on], [self.contact])

@@ -477,6 +477,7 @@ class SkinStep:
             self._compliant.take_iterate(self._launcher)
             self._pose(self.st.load_factor, self.st.cut_off)
         self._forces.evaluate(self._launcher, self.st.moving)
+        self._forces.limit_contacts(self._launcher, self.st.cut_off)
         self._precondition()
 
     def _end_try(self):

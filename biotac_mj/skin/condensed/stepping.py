@@ -5,7 +5,7 @@ phases of `states`; `solve` launches them."""
 import warp as wp
 
 from ..block import sync
-from ..contact.faces import Contact, commit_face
+from ..contact.faces import Contact, balanced_fraction, commit_face
 from ..contact.posed import Geoms
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
@@ -98,17 +98,11 @@ def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
     """Limits forces that are not in equilibrium: those of the contact law at each node, which push and lie in
     the friction cone, but at most the forces that the skin balances at its displacements."""
     for k in range(t, nnode, threads):
-        square = real(0.0)
-        product = real(0.0)
+        push = vec3(s.vector[w, G, 3 * k], s.vector[w, G, 3 * k + 1], s.vector[w, G, 3 * k + 2])
+        balanced = vec3(s.vector[w, F, 3 * k], s.vector[w, F, 3 * k + 1], s.vector[w, F, 3 * k + 2])
+        fraction = balanced_fraction(push, balanced)
         for a in range(3):
-            g = s.vector[w, G, 3 * k + a]
-            square += g * g
-            product += g * s.vector[w, F, 3 * k + a]
-        fraction = real(0.0)
-        if square > real(0.0):
-            fraction = wp.clamp(product / square, real(0.0), real(1.0))
-        for a in range(3):
-            s.vector[w, F, 3 * k + a] = fraction * s.vector[w, G, 3 * k + a]
+            s.vector[w, F, 3 * k + a] = fraction * push[a]
     for k in range(t, nin, threads):
         j = 3 * nnode + k
         s.vector[w, F, j] = wp.clamp(s.vector[w, F, j], real(0.0), s.vector[w, G, j])

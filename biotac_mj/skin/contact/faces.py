@@ -16,12 +16,14 @@ __all__ = [
     "FaceSum",
     "Laws",
     "NormalForces",
+    "balanced_fraction",
     "block_index",
     "commit_contacts",
     "commit_face",
     "empty_laws",
     "face_samples",
     "clear_bounds",
+    "limit_contacts",
     "switch_off_touched",
     "partial_wrench",
     "normal_forces",
@@ -246,6 +248,50 @@ def sum_normal_forces(
     for k in range(start[i], start[i + 1]):
         total += corner[slot[k], w]
     laws.node_normal_force[i, w] = total
+
+
+@wp.func
+def balanced_fraction(push: vec3, balanced: vec3):
+    """Fraction of the contact law's force `push` at a node with which it is at most the force that the skin
+    balances there."""
+    square = wp.length_sq(push)
+    if square == real(0.0):
+        return real(0.0)
+    return wp.clamp(wp.dot(push, balanced) / square, real(0.0), real(1.0))
+
+
+@wp.kernel
+def limit_contacts(
+    # In:
+    mask: wp.array(dtype=real),
+    force: wp.array2d(dtype=vec3),
+    node_force: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # In and out:
+    contact: Contact,
+):
+    """Limits the forces on face f to those that the skin balances, where nodes are not in equilibrium.
+
+    force: residual of the nodes. node_force: force of contact on them."""
+    f, w = wp.tid()
+    if on[w] == 0 or contact.touching[f, w] == 0:
+        return
+    push = vec3()
+    balanced = vec3()
+    for a in range(3):
+        i = contact.face[f][a]
+        corner = contact.corner[3 * f + a, w]
+        push += corner
+        fraction = real(1.0)
+        if mask[i] > real(0.0):
+            fraction = balanced_fraction(node_force[i, w], node_force[i, w] - force[i, w])
+        balanced += fraction * corner
+    fraction = balanced_fraction(push, balanced)
+    for a in range(3):
+        contact.corner[3 * f + a, w] = fraction * contact.corner[3 * f + a, w]
+    nsample = contact.sample.shape[0]
+    for i in range(f * nsample, (f + 1) * nsample):
+        contact.sample_force[i, w] = fraction * contact.sample_force[i, w]
 
 
 @wp.kernel
