@@ -203,7 +203,7 @@ def picture_kind(path: pathlib.Path | str) -> str:
     """
     from matplotlib.backend_bases import FigureCanvasBase
 
-    kind, known = pathlib.Path(path).suffix[1:] or "png", FigureCanvasBase.filetypes
+    kind, known = pathlib.Path(path).suffix[1:].lower() or "png", FigureCanvasBase.filetypes
     if kind not in known:
         raise ValueError(f"{path} is no picture: give a name that ends in one of {', '.join(sorted(known))}")
     return kind

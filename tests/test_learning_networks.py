@@ -1,7 +1,6 @@
 """Graph convolutions, hierarchy, VAEs, PointNet++, features: against dense algebra, closed forms and finite
 differences."""
 
-import json
 
 import numpy as np
 import pytest
@@ -18,8 +17,7 @@ from biotac_mj.learning.networks.heads import LocalHead  # noqa: E402
 from biotac_mj.learning.networks.hierarchy import build_hierarchy  # noqa: E402
 from biotac_mj.learning.networks.mesh_vae import MeshVAE  # noqa: E402
 from biotac_mj.learning.networks.pointnet import PointNet  # noqa: E402
-from biotac_mj.learning.training.config import LearningConfig, without_obsolete  # noqa: E402
-from biotac_mj.learning.training.experiment import _refuse_others  # noqa: E402
+from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
 from biotac_mj.learning.training.fitting import TrainingOptions, _schedule, train  # noqa: E402
 
@@ -210,17 +208,6 @@ def test_config_names_what_is_wrong():
         LearningConfig(steps=-1)
     with pytest.raises(ValueError, match="equally many"):
         LearningConfig(mesh_factors=(4, 4))
-
-
-def test_settings_of_earlier_versions_are_still_read(tmp_path):
-    """Two of them had one choice each, and say nothing any more: a training goes on beside its results."""
-    old = {"hierarchy": "geodesic", "tare": "row 0", "steps": 120}
-    assert LearningConfig(**without_obsolete(old)) == LearningConfig(steps=120)
-    (tmp_path / "trajectory-0.json").write_text(json.dumps({"settings": {"config": old}}))
-    _refuse_others(tmp_path, {"config": {"steps": 120}})
-    with pytest.raises(ValueError, match=r"of other settings \(config\)"):
-        _refuse_others(tmp_path, {"config": {"steps": 121}})
-    assert "hierarchy" in without_obsolete({"hierarchy": "of my own"})  # and is refused as unknown
 
 
 def test_the_rate_is_one_cycle_or_falls_by_a_factor():

@@ -128,7 +128,7 @@ def _train_one(args):
 def _train_all(args):
     import dataclasses
 
-    from .training.config import LearningConfig, without_obsolete
+    from .training.config import LearningConfig
     from .training.experiment import train_all
 
     cpu = args.device == "cpu"
@@ -140,7 +140,6 @@ def _train_all(args):
     settings = (
         read_json(args.config, "config", "give a file of JSON (docs/lab/learning.md)") if args.config else {}
     )
-    settings = without_obsolete(settings)
     refuse_unknown(settings, [f.name for f in dataclasses.fields(LearningConfig)], args.config)
     if cpu:
         settings = {"members": 1} | settings

@@ -249,8 +249,6 @@ def _refuse_other(meta, path, geometry, direction):
             f"{_kind(meta)}"
         )
     check_entries(f"the description of {path}", meta, _DESCRIPTION | _DESCRIPTION_OF[stated])
-    if stated == "forward" and (meta.get("window") or _kind(meta) != "local"):
-        raise ValueError(f"{path} is of a model that earlier versions had, {_kind(meta)}: train again")
     if meta["channels"] != list(ELECTRODES):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
@@ -311,12 +309,12 @@ def check_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> None:
 def _points_model(path, meta, tensors, geometry):
     from .networks.points import SkinPoints
     from .predictor import PointsModel
-    from .training.config import LearningConfig, without_obsolete
+    from .training.config import LearningConfig
     from .training.paper import LatentProjection, make_pointnet
 
     graph = {k.removeprefix("points."): v for k, v in tensors.items() if k.startswith("points.")}
     with reading(path, "file of weights that fit together", _DAMAGED):
-        config = LearningConfig(**without_obsolete(meta["config"]))
+        config = LearningConfig(**meta["config"])
         points = SkinPoints.of_arrays({k: v.double().numpy() for k, v in graph.items()}, meta["reference"])
         make = LatentProjection if _kind(meta) == "latent_projection" else make_pointnet
         net = make(points, config)

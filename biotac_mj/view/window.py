@@ -14,7 +14,7 @@ import numpy as np
 from .. import plugin
 from ..coupling.handle import Handle
 from ..coupling.show import OBJECT, PAD_UP
-from ..files import replacing
+from ..files import picture_kind, replacing
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
@@ -23,9 +23,6 @@ from ..reading import reading
 from .offscreen import frame_bodies, show_bodies, stage
 
 __all__ = ["build_hand", "build_scene", "view"]
-
-# formats that matplotlib writes
-_PICTURES = ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".gif", ".pdf", ".svg"
 
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 _BALL = "biotac_ball"  # in a hand's model, which may have a ball of its own
@@ -205,7 +202,7 @@ def view(
         one = isinstance(recording, (str, os.PathLike))
         return play_file(*[recording] if one else recording, port=port)
     if render is not None:
-        _check_picture(render)
+        picture_kind(render)  # check before the work
     linux = sys.platform.startswith("linux")
     if (
         render is None
@@ -285,15 +282,6 @@ def _ancestors(model, body):
     return out
 
 
-def _check_picture(path):
-    """Checks the suffix of a picture before the work."""
-    suffix = pathlib.Path(path).suffix
-    if suffix.lower() not in _PICTURES:
-        raise ValueError(
-            f"the picture {path} ends in {suffix or 'nothing'}: give one of {', '.join(_PICTURES)}"
-        )
-
-
 def _render(model, data, path, seconds, point_camera):
     from matplotlib.image import imsave
 
@@ -307,5 +295,5 @@ def _render(model, data, path, seconds, point_camera):
         point_camera(model, data, camera)
         picture = screen.render(data, camera)
     with replacing(path) as temporary:
-        imsave(temporary, picture)
+        imsave(temporary, picture, format=picture_kind(path))
     print(f"  wrote {path}: {data.time:.2f} s after the ball was let go")

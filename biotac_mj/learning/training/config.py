@@ -6,17 +6,8 @@ import numpy as np
 
 from ...fields import check_types
 
-__all__ = ["LearningConfig", "without_obsolete"]
+__all__ = ["LearningConfig"]
 
-# fields in files of earlier versions that had a single value
-_OBSOLETE = {
-    "hierarchy": "geodesic",
-    "tare": "row 0",
-    "mirror": True,
-    "window": [0.5, 4.0],
-    "reconstruction": "mse",
-    "graphs": True,
-}
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
@@ -108,8 +99,3 @@ class LearningConfig:
                 f"mesh_channels {self.mesh_channels} and mesh_factors {self.mesh_factors} must be equally "
                 "many"
             )
-
-
-def without_obsolete(settings: dict) -> dict:
-    """Fields of a LearningConfig from a file, without obsolete ones of earlier versions."""
-    return {name: value for name, value in settings.items() if _OBSOLETE.get(name, ()) != value}

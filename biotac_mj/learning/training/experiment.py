@@ -23,7 +23,7 @@ from ..predictor import PointsModel
 from ..protocol import quartiles
 from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays, spread_rows
-from .config import LearningConfig, without_obsolete
+from .config import LearningConfig
 from .features import Pod
 from .fitting import Checkpoints
 from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_inverse
@@ -151,8 +151,6 @@ def _refuse_others(out, settings):
             path, "result of `biotac learn train`", f"remove it, or choose another folder than {out}"
         )
         found = found.get("settings", {})
-        if "config" in found:
-            found = found | {"config": without_obsolete(found["config"])}
         differ = [name for name, value in settings.items() if not found or found.get(name) != value]
         if differ:
             raise ValueError(

@@ -13,7 +13,6 @@ from .task import BatchTask
 
 __all__ = ["HELD_OUT", "acting", "agree", "env_of", "find_policy", "interval", "play", "seen_by"]
 
-_OBSOLETE = {"goal": "place", "actions": "pads"}  # settings of the rod in earlier cards, the only choice
 HELD_OUT = 54321  # seed of beginnings that no policy learns from
 
 
@@ -49,7 +48,6 @@ def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
     """
     full_card = {"biotac": {"sensor": "random"}} | card
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in full_card.get("settings", {}).items()}
-    settings = {k: v for k, v in settings.items() if _OBSOLETE.get(k) != v}
     if settings:
         changes = {"settings": type(TASKS[card["task"]].settings)(**settings)} | changes
     own = {name: card[name] for name in ("observe", "history") if name in card}
