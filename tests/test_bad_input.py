@@ -228,10 +228,13 @@ def files_of_skins():
         for said, change in (
             ("is not a manifold: ", lambda v: 0 * v),
             ("is open: 3 edges have one face only", lambda v: v[:1]),
-            ("encloses no volume, or its faces look inwards: import", lambda v: v[:, ::-1]),
+            ("is inside out: flip its faces", lambda v: v[:, ::-1]),
         ):
             wrong = arrays(**{f"{part}_face": change})
             yield Row(SKIN, f"the {part} of skin skin.npz {said}", "skin.npz", wrong)
+    for name in ("outer_face", "inner_face"):
+        inside_out = arrays(**{name: lambda v: v[:, ::-1]})
+        yield Row(SKIN, f"{name} of skin skin.npz is inside out: flip", "skin.npz", inside_out)
     for name in ("nail", "clamp"):
         said = f"the {name} of skin skin.npz encloses no volume"
         yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))
@@ -769,6 +772,14 @@ def meshes():
     yield Row(ball, "ball.obj is", "ball.obj", replaced("f ", "# "))
     yield Row(ball, "ball.obj", "ball.obj", text(""))
     yield Row(ball, "ball.obj is no indenter mesh", "ball.obj", cell(0, 1, "x"))
+    stl = ball.replace("ball.obj", "ball.stl")
+    for said, content in (
+        ("ball.stl is empty", b""),
+        ("ball.stl is text in which no face", b"solid ball\nfacet normal 0 0 1\nvertex 0 a 0\n"),
+        ("ball.stl has 94 of the 184 bytes that its 2 faces", bytes(80) + b"\2\0\0\0" + bytes(10)),
+        ("ball.stl has no faces", bytes(84)),
+    ):
+        yield Row(stl, said, "ball.stl", lambda path, content=content: path.write_bytes(content))
     yield Row(ball.replace("ball.obj", "nowhere.obj"), "no indenter mesh at nowhere.obj")
 
 

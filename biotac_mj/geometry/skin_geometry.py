@@ -9,7 +9,8 @@ from ..files import write_npz
 from ..reading import Array, read_npz
 from ..short_repr import short_repr
 from .design import BIOTAC, Design, read_design
-from .tet_mesh import check_closed, enclosed_volume, indices
+from .solid import close_rim, no_solid
+from .tet_mesh import TetMesh, check_closed, enclosed_volume, indices
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
@@ -167,10 +168,19 @@ class SkinGeometry:
             if not len(face):
                 continue
             check_closed(face, f"{part} of skin {name}")
-            if enclosed_volume(vert, face) < _SOLID:
+            wrong = no_solid(vert, face)
+            if wrong is None and enclosed_volume(vert, face) < _SOLID:
+                wrong = "encloses no volume: import the mesh again"
+            if wrong is not None:
+                raise ValueError(f"the {part} of skin {name} {wrong}")
+        if (TetMesh(self.vert, self.elem[:, :4]).volumes <= 0).any():
+            return  # inside and outside have no meaning; `SkinModel` names the tetrahedra
+        for surface, sign, where in (("outer", 1, "out of the finger"), ("inner", -1, "towards the core")):
+            face = close_rim(getattr(self, f"{surface}_face"))
+            if sign * enclosed_volume(self.vert, face) < -_SOLID:
                 raise ValueError(
-                    f"the {part} of skin {name} encloses no volume, or its faces look inwards: import the "
-                    "mesh again"
+                    f"{surface}_face of skin {name} is inside out: flip its faces, so that all normals point "
+                    f"{where}"
                 )
 
     def save(self, path: pathlib.Path | str) -> pathlib.Path:

@@ -4,6 +4,7 @@ The frame of an indenter has its origin at the tip and presses along +y, as in t
 """
 
 import dataclasses
+import pathlib
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ from ..units import read_quantity
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
 _LARGEST = 0.5  # [m] along any axis
+_STL_HEADER, _STL_FACE = 84, 50  # bytes of a binary STL, with the number of faces at the header's end
 _ALONG = ("radius", "half length")
 _SIZES = {
     "sphere": ("radius",), "capsule": _ALONG, "cylinder": _ALONG,
@@ -104,8 +106,8 @@ def _from_file(path):
         sound = len(getattr(raw, "faces", ())) and np.isfinite(raw.vertices).all()
         mesh = trimesh.Trimesh(raw.vertices, raw.faces) if sound else None
     if not sound:
-        wrong = "vertices that are not finite" if len(getattr(raw, "faces", ())) else "no faces"
-        raise ValueError(f"the indenter mesh {path} has {wrong}: give a closed surface in metres")
+        wrong = "has vertices that are not finite" if len(getattr(raw, "faces", ())) else _why_no_faces(path)
+        raise ValueError(f"the indenter mesh {path} {wrong}: give a closed surface in metres")
     if mesh.extents.max() > _LARGEST:
         raise ValueError(
             f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; "
@@ -118,6 +120,21 @@ def _from_file(path):
     if wrong is not None:
         raise ValueError(f"the indenter mesh {path} {wrong}")
     return Indenter(f"mesh:{path}", "mesh", (), 0.0, np.zeros(3), UPRIGHT, vert, face)
+
+
+def _why_no_faces(path):
+    """Of a file in which trimesh finds none."""
+    content = pathlib.Path(path).read_bytes()
+    if not content.strip():
+        return "is empty"
+    if b"\0" not in content:
+        return "is text in which no face can be read"
+    if str(path).lower().endswith(".stl") and len(content) >= _STL_HEADER:
+        count = int.from_bytes(content[_STL_HEADER - 4 : _STL_HEADER], "little")
+        whole = _STL_HEADER + _STL_FACE * count
+        if len(content) != whole:
+            return f"has {len(content)} of the {whole} bytes that its {count} faces need"
+    return "has no faces"
 
 
 def make_indenter(text: str) -> Indenter:

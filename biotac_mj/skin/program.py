@@ -120,10 +120,13 @@ def compile_ahead(
       Futures for `finish_compiling`.
     """
     device = wp.get_device(device)
-    if not device.is_cuda:
-        return []
+    return _compile(device, modules) if device.is_cuda else []
+
+
+def _compile(device, modules):
     wanted = {}
     for module, threads in modules:
+        threads = threads if device.is_cuda else 1
         module = wp.get_module(module.__name__) if isinstance(module, types.ModuleType) else module
         # a module may have got more kernels since
         wanted[module, len(module.kernels), device.alias, threads] = module, threads
@@ -142,10 +145,10 @@ def finish_compiling(futures: Iterable[concurrent.futures.Future] | None = None)
 
 
 def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -> None:
-    """Compiles the kernels that record(launcher) launches on a CUDA device, and waits for `compile_ahead`."""
+    """Compiles the kernels that record(launcher) launches, in parallel, and waits for `compile_ahead`."""
     modules = _Modules(device)
     record(modules)
-    compile_ahead(device, modules.found)
+    _compile(modules.device, modules.found)
     finish_compiling()
 
 

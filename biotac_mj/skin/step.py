@@ -217,8 +217,8 @@ class SkinStep:
             self._any_pending,
         ) = (flags[i : i + 1] for i in range(3, 9))
         self._graph = None
+        compile_kernels(model.device, self._record)
         if model.device.is_cuda:
-            compile_kernels(model.device, self._record)
             self._warm_up()
         self._program = Program(model.device, self._record)
         self._evaluation = self._second_solve = self._normal_forces = None
