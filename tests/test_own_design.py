@@ -123,6 +123,19 @@ def test_a_map_of_a_dome_has_one_scale():
     np.testing.assert_allclose(np.linalg.norm(report.unroll(ring, Design("a", "b")), axis=1), 3)
 
 
+def test_a_map_of_another_cylinder_is_unrolled_by_its_radius():
+    own = Design(
+        "c",
+        "d",
+        [[0, 0, -3.0], [0, 3.0, 0]],
+        [[0.0, -1.0]],
+        sensor="ideal",
+        sensors={"ideal": {"rest": [1, 2]}},
+    )
+    side = report.unroll(np.array([[0, 0, 3e-3]]), own)
+    np.testing.assert_allclose(side, [[0, 3 * np.pi / 2]])
+
+
 @pytest.mark.parametrize("indenter", ["sphere_7mm", "geom:sphere:0.05"])
 def test_the_picture_of_a_press_shows_pad_and_indenter(tmp_path, indenter):
     new_design(tmp_path / "high", PadShape(block=(12.0, 12.0, 14.0), edge=4.0))

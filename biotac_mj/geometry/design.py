@@ -148,6 +148,12 @@ class Design:
         place = np.array(self.electrodes_mm)
         return np.abs(place[:, None] * [1, -1, 1] - place).sum(-1).argmin(0)
 
+    @functools.cached_property
+    def radius(self) -> float | None:
+        """Distance of electrodes from the axis of a cylindrical core [m]; None on a flat backing."""
+        cylindrical = self.excitation and len(self.excitation[0]) == 2
+        return 1e-3 * float(np.median(np.hypot(*np.array(self.electrodes_mm).T[1:]))) if cylindrical else None
+
     def in_biotac_frame(self, position: np.ndarray) -> np.ndarray:
         """Transforms positions (n, 3) [mm] from the published frame to the BioTac frame: (origin - x, z,
         y)."""

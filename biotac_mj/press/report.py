@@ -29,7 +29,6 @@ __all__ = [
     "write_picture",
 ]
 
-_CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
 _HARD = np.array([0.75, 0.75, 0.78])
 _PLACES = {"aspect": "equal", "xlabel": "along the finger, tip on the left [mm]"}
 # BioTac frame to a frame whose z leaves the pad
@@ -38,11 +37,10 @@ _TO_PAD_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 def unroll(points: np.ndarray, design: Design = BIOTAC) -> np.ndarray:
     """Unrolls points (n, 3) [m] of the BioTac frame to (n, 2) [mm]: along the finger, and around it as an arc
-    on the core from the pad's midline. Other designs, on a flat backing, are seen from above."""
-    across = points[:, 2]
-    if design == BIOTAC:
-        across = _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])
-    return 1e3 * np.stack([points[:, 0], across], axis=1)
+    from the pad's midline, through the electrodes. Designs on a flat backing are seen from above."""
+    x, y, z = 1e3 * points.T
+    across = z if design.radius is None else 1e3 * design.radius * np.arctan2(z, -y)
+    return np.stack([x, across], axis=1)
 
 
 def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
@@ -98,7 +96,7 @@ def draw_map(axes: Axes, electrode_pos: np.ndarray, change: np.ndarray, design: 
     axes.figure.colorbar(dots, ax=axes, label=label, shrink=0.85, extend="both")
     axes.set(
         **_PLACES,
-        ylabel="around the core [mm]" if design == BIOTAC else "across [mm]",
+        ylabel="across [mm]" if design.radius is None else "around the core [mm]",
         title=f"Electrodes E1..E{len(change)}",
     )
     axes.margins(0.12)
