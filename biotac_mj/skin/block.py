@@ -5,7 +5,7 @@ import warp as wp
 
 from .types import real, vec3, vec6
 
-__all__ = ["block_max", "block_rank", "block_sum", "sum_of_lanes", "sync"]
+__all__ = ["block_max", "block_memory", "block_rank", "block_sum", "sum_of_lanes", "sync"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,6 +17,20 @@ wp.set_module_options({"enable_backward": False})
 """)
 def sync():
     """Waits until all threads of the block are here, and what they wrote can be read."""
+    ...
+
+
+# One buffer of 40 kB, which functions of a kernel use in turn: a block may declare 48 kB of shared memory
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ double memory[5120];
+    return (uint64_t)memory;
+#else
+    return 0;
+#endif
+""")
+def block_memory() -> wp.uint64:
+    """Address of shared memory of the block, on CUDA. Its contents last until another function takes it."""
     ...
 
 

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from ..block import block_memory
+
 __all__ = [
     "MOST_EQUATIONS",
     "add_row",
@@ -31,7 +33,8 @@ MOST_EQUATIONS = 1024  # that `eliminate` has room for
     float* a = A.data + (long long)world * A.shape[1];
 #if defined(__CUDA_ARCH__)
     const int t = threadIdx.x, threads = blockDim.x, lane = t % 32, warp = t / 32, warps = threads / 32;
-    __shared__ float panel[{MOST_EQUATIONS}][9];
+    typedef float nine[9];
+    nine* panel = (nine*)memory;
     __shared__ unsigned long long most[2][32];
     __shared__ float square[8][8];
     __shared__ unsigned short order[{MOST_EQUATIONS}];
@@ -274,10 +277,14 @@ MOST_EQUATIONS = 1024  # that `eliminate` has room for
 #endif
     return 1;
 """)
-def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
+def _eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int, memory: wp.uint64) -> int: ...
+
+
+@wp.func
+def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int):
     """Solves n equations for m right-hand sides, at most eight, which follow the matrix in each of the n rows
     of A[world] and become the solutions; 0 where the matrix is singular or no number."""
-    ...
+    return _eliminate(A, world, n, m, block_memory())
 
 
 # By one thread the compliance between the candidates is kept, contiguous: B has rows of length m, one for

@@ -1,12 +1,13 @@
-"""Kernels of a step, with a block of threads for each world: on CUDA one kernel for each phase of `states`,
-launched repeatedly until all worlds have finished; on the CPU one kernel with all phases, since a launch
-takes longer than most of them."""
+"""Kernels of a step, with a block of threads for each world: on CUDA three, launched repeatedly until all
+worlds have finished, since one of all phases takes minutes to compile; on the CPU one, since a launch takes
+longer than most phases."""
 
 import functools
 import types
 
 import warp as wp
 
+from ..block import sync
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds
@@ -21,6 +22,15 @@ __all__ = ["BLOCK", "whole_step", "phases"]
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256  # threads of a world, equal to `touch.BLOCK`
+
+
+@wp.func
+def phase_of(w: int, s: Scratch):
+    """The next phase of a world, for all threads of its block; none of them changes it before all know it."""
+    sync()
+    phase = s.solve.phase[w]
+    sync()
+    return phase
 
 
 @functools.cache
@@ -92,16 +102,16 @@ def _search(
     s: Scratch,
 ):
     w, t = wp.tid()
-    if s.solve.phase[w] == SEARCH:
+    while phase_of(w, s) == SEARCH:  # again where there was no room
         search(w, t, wp.block_dim(), geoms, x, touch, c, s, r, st)
 
 
 @functools.cache
-def _evaluate(shapes):
+def _balance(shapes):
     evaluate = evaluation(shapes)
 
-    @wp.kernel(module=f"{__name__}.evaluate.{shapes}", enable_backward=False, launch_bounds=(BLOCK, 2))
-    def _evaluate(
+    @wp.kernel(module=f"{__name__}.balance.{shapes}", enable_backward=False, launch_bounds=(BLOCK, 2))
+    def _balance(
         # In:
         geoms: Geoms,
         c: Constants,
@@ -110,26 +120,17 @@ def _evaluate(shapes):
         # Out:
         s: Scratch,
     ):
+        """Newton's method."""
         w, t = wp.tid()
-        if s.solve.phase[w] == EVALUATE:
-            evaluate(w, t, wp.block_dim(), geoms, x, touch, c, s)
+        phase = phase_of(w, s)
+        while phase == EVALUATE or phase == NEWTON:
+            if phase == EVALUATE:
+                evaluate(w, t, wp.block_dim(), geoms, x, touch, c, s)
+            else:
+                take_step(w, t, wp.block_dim(), geoms, x, touch, c, s)
+            phase = phase_of(w, s)
 
-    return _evaluate
-
-
-@wp.kernel(module=f"{__name__}.newton", enable_backward=False, launch_bounds=(BLOCK, 4))
-def _take_step(
-    # In:
-    geoms: Geoms,
-    c: Constants,
-    x: wp.array2d(dtype=vec3),
-    touch: Contact,
-    # Out:
-    s: Scratch,
-):
-    w, t = wp.tid()
-    if s.solve.phase[w] == NEWTON:
-        take_step(w, t, wp.block_dim(), geoms, x, touch, c, s)
+    return _balance
 
 
 @wp.kernel(module=f"{__name__}.conclude", enable_backward=False, launch_bounds=(BLOCK, 2))
@@ -160,8 +161,5 @@ def _conclude(
 
 
 def phases(shapes: str) -> types.SimpleNamespace:
-    """Kernels for CUDA: `begin` once, then `search`, `evaluate`, `conclude` and `newton` repeatedly; a world
-    can pass several phases in one round."""
-    return types.SimpleNamespace(
-        begin=_begin, search=_search, evaluate=_evaluate(shapes), newton=_take_step, conclude=_conclude
-    )
+    """Kernels for CUDA: `begin` once, then `search`, `balance` and `conclude` until all worlds are done."""
+    return types.SimpleNamespace(begin=_begin, search=_search, balance=_balance(shapes), conclude=_conclude)

@@ -1,5 +1,5 @@
-"""State of a solve of one skin between its phases. Each phase can thus be a kernel of its own, which skips
-worlds that have finished or are in another phase."""
+"""State of a solve of one skin between its phases. A kernel can thus have some of them, and skip worlds that
+have finished or are in another phase."""
 
 import warp as wp
 

@@ -137,7 +137,8 @@ class CondensedStep:
         )
 
     def go_on(self, going: wp.array, launcher: Launcher | None = None) -> None:
-        """One round of phases in the worlds that have not finished, on CUDA; sets going[0] if one has not."""
+        """One round on CUDA: broad phase, Newton's method to its end, decision about the load. Sets going[0]
+        if a world has not finished."""
         m, d, k = self._model, self._data, self._phases
         launcher = launcher or Launcher(m.device)
         known = [self._geoms.struct, self._constants, d.x, self.touch]
@@ -145,9 +146,8 @@ class CondensedStep:
         out = [self._scratch, *of_world, d.outer.node_force, self.tier, going]
         for kernel, inputs, outputs in (
             (k.search, [*known, *of_world], [self._scratch]),
-            (k.evaluate, known, [self._scratch]),
+            (k.balance, known, [self._scratch]),
             (k.conclude, [known[0], d.rest_pressure, *known[1:]], out),
-            (k.newton, known, [self._scratch]),
         ):
             launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=BLOCK)
 

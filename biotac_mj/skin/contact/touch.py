@@ -12,6 +12,7 @@ import types
 
 import warp as wp
 
+from ..block import block_memory
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
@@ -128,15 +129,17 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
 # Sums of a face over its samples, in their order: 9 numbers of its corners and, where it touches, 6 blocks of
 # 9 numbers. All threads of a block take part; f is negative in a thread without a sample. Returns the least
 # clearance of the face, -1 where a sample touches.
-@wp.func_native(f"""
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __shared__ double value[{BLOCK}][16];
-    __shared__ int item[{BLOCK}][3];
-    const int thread = threadIdx.x, faces = {BLOCK} / nsample;
-    for (int i = 0; i < 3; ++i) {{
+    typedef double numbers[16];
+    typedef int names[3];
+    numbers* value = (numbers*)memory;
+    names* item = (names*)(value + blockDim.x);
+    const int thread = threadIdx.x, faces = blockDim.x / nsample;
+    for (int i = 0; i < 3; ++i) {
         value[thread][i] = force[i];
         for (int j = 0; j < 3; ++j) value[thread][3 + 3 * i + j] = K.data[i][j];
-    }}
+    }
     for (int i = 0; i < 3; ++i) value[thread][12 + i] = at[i];
     value[thread][15] = free_;
     item[thread][0] = f;
@@ -147,24 +150,24 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
     for (int s = 0; s < nsample && own < faces * nsample; ++s) least = fmin(least, value[own + s][15]);
     item[thread][2] = least <= -1.0;
     __syncthreads();
-    for (int o = thread; o < 63 * faces; o += {BLOCK}) {{
+    for (int o = thread; o < 63 * faces; o += blockDim.x) {
         const int begin = o / 63 * nsample, column = o % 63;
         if (item[begin][0] < 0) break;
         double total = 0.0;
-        if (column < 9) {{
+        if (column < 9) {
             for (int s = 0; s < nsample; ++s)
                 total += value[begin + s][12 + column / 3] * value[begin + s][column % 3];
             const int row = 3 * item[begin][0] + column / 3;
             (*wp::address(corner, row, item[begin][1]))[column % 3] = total;
-        }} else if (item[begin][2]) {{
+        } else if (item[begin][2]) {
             const int block = column / 9 - 1, a = block < 3 ? 0 : block < 5 ? 1 : 2;
             const int b = block < 3 ? block : block < 5 ? block - 2 : 2, entry = column % 9;
             for (int s = 0; s < nsample; ++s)
                 total += value[begin + s][12 + a] * value[begin + s][12 + b] * value[begin + s][3 + entry];
             const int row = 6 * item[begin][0] + block;
             ((double*)wp::address(blocks, row, item[begin][1]))[entry] = total;
-        }}
-    }}
+        }
+    }
     __syncthreads();
     return least;
 #else
@@ -181,6 +184,7 @@ def add_samples(
     nsample: int,
     corner: wp.array2d(dtype=vec3),
     blocks: wp.array2d(dtype=mat33),
+    memory: wp.uint64,
 ) -> real: ...
 
 
@@ -448,7 +452,9 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
                 )
                 if touching == 1:
                     clearance = real(-1.0)
-            clearance = add_samples(mine, w, clearance, force, K, at, nsample, c.corner, c.block)
+            clearance = add_samples(
+                mine, w, clearance, force, K, at, nsample, c.corner, c.block, block_memory()
+            )  # fmt: skip
             if mine >= 0 and s == 0:
                 c.touching[mine, w] = wp.where(clearance > real(-1.0), 0, 1)
                 free[w, mine] = travel + clearance
@@ -507,7 +513,9 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
                 )
                 if touching == 1:
                     clearance = real(-1.0)  # evaluated again, for any range of adhesion
-            clearance = add_samples(f, w, clearance, force, K, push, nsample, contact.corner, contact.block)
+            clearance = add_samples(
+                f, w, clearance, force, K, push, nsample, contact.corner, contact.block, block_memory()
+            )  # fmt: skip
             if f >= 0 and s == 0:
                 contact.touching[f, w] = wp.where(clearance > real(-1.0), 0, 1)
                 store_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
