@@ -238,7 +238,7 @@ class Batch(Skins):
     def accept_models(self) -> None:
         """After `BatchSkin.end_solve`: takes the models of the skins."""
         r = self._of_step
-        self.accept(r.asked_pos, r.asked_mat, r.free_pos, r.free_mat)
+        self.accept(r.asked_pos, r.asked_mat)
 
     def solve_one_way(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Solves the skins that take part where the bodies go without acceleration."""

@@ -8,8 +8,6 @@ import warp as wp
 
 from ..coupling.implicit.rounds import Model
 from ..coupling.implicit.rows import hold_by_rows
-from ..coupling.implicit.rules import share_that_pushes
-from ..geometry.rigid_warp import LEVER, motion
 from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
@@ -29,7 +27,6 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 
-_share_that_pushes = wp.func(share_that_pushes)
 
 
 @wp.kernel
@@ -99,8 +96,6 @@ def accept_models(
     tangent: wp.array2d(dtype=mat66),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
-    free_pos: wp.array2d(dtype=vec3),
-    free_mat: wp.array2d(dtype=mat33),
     geoms: Geoms,
     last: Model,
     # Out:
@@ -108,7 +103,7 @@ def accept_models(
 ):
     """The linear models of skins that were asked for poses pos, mat: where their geoms came to; the last
     step's, where they came nowhere; of the first one, which came from outside, where it was to end; no force
-    on what is nowhere. free_pos, free_mat: where the bodies go without the skins."""
+    on what is nowhere."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return
@@ -134,10 +129,6 @@ def accept_models(
         model.tangent0[g, w] = hold_by_rows(tangent[g, w])
     model.pos0[g, w] = p
     model.mat0[g, w] = R
-    if reason[w] != CONVERGED:
-        way = motion(free_pos[g, w], free_mat[g, w], p, R)
-        share = _share_that_pushes(model.wrench0[g, w], model.tangent0[g, w], way, real(LEVER))
-        model.tangent0[g, w] = share * model.tangent0[g, w]
 
 
 @wp.kernel

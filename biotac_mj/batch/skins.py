@@ -159,14 +159,13 @@ class Skins:
         self.place_geoms(pos, mat, geom_pos, geom_quat)
         self.skin.release.begin()
         self.skin.solve_skins()
-        self.accept(pos, mat, pos, mat)
+        self.accept(pos, mat)
 
-    def accept(self, pos: wp.array, mat: wp.array, free_pos: wp.array, free_mat: wp.array) -> None:
-        """Takes the models of skins that were solved for bodies there; free_pos, free_mat: where these go
-        without the skins. Launches only."""
+    def accept(self, pos: wp.array, mat: wp.array) -> None:
+        """Takes the models of skins that were solved for bodies there. Launches only."""
         skin, st = self.skin, self.skin.data.worlds
         skin.come_to_rest()
-        where = [pos, mat, free_pos, free_mat, skin.geoms.struct]
+        where = [pos, mat, skin.geoms.struct]
         solved = [st.wanted, st.reason, st.load_factor, self.began, skin.wrench, skin.tangent]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
 

@@ -3,13 +3,11 @@ energy that it can give."""
 
 import numpy as np
 
-from ...geometry.rigid import displacement
 from ...geometry.rigid_warp import LEVER
 from ...skin.bodies import BodyMotion
 from ..instance import STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
-from .rules import share_that_pushes
 
 __all__ = ["Coupled", "size"]
 
@@ -103,7 +101,6 @@ class Coupled:
         self._solve(self.target)
 
     def _solve(self, pose, bodies=None):
-        self._solved_for = pose, bodies
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
         self.may_act = result.converged and self._cost < _MOST
@@ -127,12 +124,6 @@ class Coupled:
         arrays.asked_pos[:], arrays.asked_mat[:] = asked
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
         arrays.pos0[:], arrays.mat0[:] = result.pose
-        if not result.converged:
-            pose, bodies = self._solved_for
-            let_go = pose if bodies is None else bodies.without(np.arange(len(pose[0])), *pose)
-            model = result.wrench, result.tangent, displacement(*let_go, *result.pose)
-            shares = np.array([share_that_pushes(*each, LEVER) for each in zip(*model)])
-            arrays.tangent0 *= shares[:, None, None]
         self.written = False
         held = arrays.tangent0.any(axis=(1, 2))
         self.touching, self.correction[~held] = held.nonzero()[0], 0.0

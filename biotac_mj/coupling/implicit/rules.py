@@ -16,7 +16,6 @@ __all__ = [
     "in_store",
     "lacking",
     "poorly_corrected",
-    "share_that_pushes",
     "share_within",
     "spared",
     "stayed",
@@ -103,32 +102,6 @@ def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> An
     is to be corrected of wrenches `wrench`, all largest entries [N]. Not where the simulation has blown up:
     nothing is greater than nan."""
     return wrong > tolerance * max(excess, wrench)
-
-
-def share_that_pushes(wrench: Any, tangent: Any, way: Any, lever: Any) -> Any:
-    """Share of its stiffness with which a model of no balance still pushes where its body goes without the
-    skin, so that it holds nobody back who leaves: it knows nothing of skin that parts.
-
-    Args:
-      wrench: (6,) of the model. tangent: (6, 6) its stiffness. way: (6,) from where it holds to where the
-        body goes. lever: [m] at which turning compares with going.
-    """
-    share = type(lever)(1.0)
-    for direction in range(2):  # along the way, and along the wrench itself
-        push = type(lever)(0.0)
-        fall = type(lever)(0.0)
-        for i in range(6):
-            along = way[i]
-            if direction == 1:
-                along = wrench[i]
-                if i > 2:
-                    along = along / (lever * lever)
-            push += wrench[i] * along
-            for j in range(6):
-                fall += along * tangent[i, j] * way[j]
-        if push > type(lever)(0.0) and fall > push:
-            share = min(share, push / fall)
-    return share
 
 
 def stayed(before: Any, reached: Any) -> Any:
