@@ -200,8 +200,9 @@ def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
 
 
 def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
-    """What can touch, a function (tangents wanted) -> BatchSkin, the geometry, the settings of one BioTac,
-    and the skins' friction (nworld,). of_engine: modules that are compiled meanwhile, besides the skin's."""
+    """Returns the geoms that can touch, a function (tangents wanted) -> BatchSkin, the geometry, the settings
+    of one BioTac, and the skins' friction (nworld,). of_engine: modules that are compiled meanwhile, besides
+    the skin's."""
     mesh, geometry = skin_reference(skin_of_design(chosen.skin.design, chosen.skin.mesh))
     materials = _materials(chosen.skin.material, nworld)
     first = materials[0] if materials else read_material(chosen.skin.material)

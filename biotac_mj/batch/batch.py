@@ -148,7 +148,7 @@ class Batch(Skins):
 
     @property
     def nslot(self) -> int:
-        """How many slots of six rows it has."""
+        """Number of slots of six rows."""
         return len(self._slot)
 
     def take_part(

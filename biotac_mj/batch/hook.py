@@ -36,8 +36,8 @@ __all__ = ["Hook"]
 
 
 class Hook:
-    """What a mujoco_warp Model calls: all batches of the Model step together, after callbacks that were there
-    before."""
+    """Callback of a mujoco_warp Model. It steps all batches of the Model together, after the callbacks that
+    were there before."""
 
     def __init__(self, m: "mjw.Model"):
         self.batches = []
@@ -73,7 +73,7 @@ class Hook:
             self._taking_part, self._going, self._next = (Marks(d.nworld) for _ in range(3))
 
     def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
-        """Of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
+        """Kernels of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
         called."""
         before = self._passive, self._sensor, self._contactfilter
         self._passive = self._sensor = self._contactfilter = None
@@ -117,7 +117,7 @@ class Hook:
         self._fork.run(*(batch.end_step for batch in batches))
 
     def _take_memory(self, m, d):
-        """What the skins that move bodies share, of the first step with them."""
+        """Allocates the arrays shared by the skins that move bodies, at the first step with them."""
         from .loads import Loads
 
         device = d.qacc.device
@@ -142,8 +142,8 @@ class Hook:
             batch.take_part(m, self._slope.correction, int(first), rows, int(row))
 
     def _look_ahead(self, m, d, moving):
-        """Where the bodies go under the models of the last step; and, in worlds whose skins act or are
-        touched there, the balance."""
+        """Predicts the bodies' poses with the linear models of the last step and, in worlds whose skins act
+        or are touched there, finds the balance."""
         going, taking_part = self._going, self._taking_part
         going.copy(taking_part)
         _begin_dynamics(m, d)
@@ -179,7 +179,7 @@ class Hook:
         self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
 
     def _choose(self, moving, choose):
-        """Which worlds go on: those that any batch chooses."""
+        """Selects the worlds that continue: those that any batch chooses."""
         self._next.clear()
         for batch in moving:
             choose(batch, self._next)
@@ -255,7 +255,7 @@ class Hook:
             batch.add_forces(d)
 
     def _accelerate(self, m, d, moving, first=False):
-        """Where the bodies go under the present models, in the worlds that are going."""
+        """Computes the bodies' poses with the present models, in the worlds that continue."""
         going, correction, device = self._going.world, self._slope.correction, d.qacc.device
         self._find_accelerations(m, d, moving, going, first)
         if self._integrator.differs:
@@ -278,7 +278,7 @@ class Hook:
         self._fork.run(*(functools.partial(batch.evaluate, self._integrator.qacc) for batch in moving))
 
     def _find_accelerations(self, m, d, moving, going, first=False):
-        """Those of the constraint solver, in worlds that are going."""
+        """Computes the constraint solver's accelerations in the worlds that continue."""
         import mujoco_warp as mjw
 
         self._act(m, d, moving)

@@ -210,7 +210,8 @@ def _add_force(w: int, b: int, force: vec3, torque: vec3, xfrc: wp.array3d(dtype
 
 @wp.func
 def _force_on_biotac(wrench: wp.array2d(dtype=vec6), fraction: wp.array(dtype=real), w: int, i: int):
-    """A number of the opposite of all that it does to bodies; wrench has a share of it."""
+    """Component i of the force on the BioTac: the opposite of all wrenches on bodies. `wrench` holds a
+    fraction of each."""
     total = real(0.0)
     for g in range(wrench.shape[0]):
         total += wrench[g, w][i] / fraction[g]

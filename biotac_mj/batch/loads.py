@@ -1,6 +1,6 @@
-"""What mujoco_warp's own force quantities have of the skins, for all worlds at once (`coupling/loads.py` for
-one): `cfrc_ext` and `cfrc_int` where mujoco_warp computes them, and the sensors `<force>`, `<torque>`,
-`<touch>` and `<contact>`."""
+"""Adds the forces of the skins to mujoco_warp's own force quantities, for all worlds at once
+(`coupling/loads.py` for one): `cfrc_ext` and `cfrc_int` where mujoco_warp computes them, and the sensors
+`<force>`, `<torque>`, `<touch>` and `<contact>`."""
 
 import copy
 import typing
@@ -60,8 +60,8 @@ def find_touches(
     share_out: wp.array2d(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
 ):
-    """What each geom gets of what acts on its body (`Instance.touches`): centre of pressure, mean normal out
-    of the skin there, share of the body's wrench, force and torque about the centre."""
+    """Contact of each geom (`Instance.touches`): centre of pressure, mean normal out of the skin there,
+    fraction of the body's wrench, force and torque about the centre."""
     g, w = wp.tid()
     first = int(-1)
     for k in range(group.shape[0]):
@@ -179,7 +179,8 @@ def add_touch(
 
 @wp.struct
 class Contacts:
-    """Of mujoco_warp's contacts what its `<contact>` sensors read; `force` is of the constraint rows."""
+    """The fields of mujoco_warp's contacts that its `<contact>` sensors read; `force` is that of the
+    constraint rows."""
 
     dist: wp.array(dtype=float)
     pos: wp.array(dtype=wp.vec3)
@@ -279,7 +280,8 @@ def list_touches(
 
 
 class Loads:
-    """Of a mujoco_warp Model with batches; made before a capture begins. Delayed sensors lack the skins."""
+    """Force quantities of a mujoco_warp Model with batches; made before a capture begins. Sensors with a
+    delay lack the skins."""
 
     def __init__(self, m: "mjw.Model", d: "mjw.Data", batches: list):
         kind, late = m.sensor_type.numpy(), m.sensor_delay.numpy().max(axis=0, initial=0.0) > 0.0
@@ -333,7 +335,7 @@ class Loads:
             self._write_again(m, d, batches)
 
     def _write_again(self, m, d, batches):
-        """What mujoco_warp's own functions make of its contacts and the skins' touches."""
+        """Runs mujoco_warp's own functions on its contacts and those of the skins."""
         from mujoco_warp._src.sensor import sensor_acc
         from mujoco_warp._src.smooth import rne_postconstraint
 

@@ -31,13 +31,13 @@ AFAR, NEAR, TOUCHING = (wp.constant(i) for i in range(3))
 
 @wp.func
 def constants_of(st: Worlds, w: int):
-    """What moves a skin that nothing touches, where it is changed between steps."""
+    """Constants on which the motion of a skin without contact depends, if they are changed between steps."""
     return vec4(st.mu[w], st.lam[w], st.kappa[w], st.natural[w])
 
 
 @wp.func
 def margin_of(laws: Laws, w: int):
-    """How far geoms stay away that do not reach the skin in a step [m]."""
+    """Distance of a geom beyond which it cannot reach the skin within a step [m]."""
     margin = _CLEAR
     if laws.reach.shape[0] > 0:
         margin = wp.max(margin, laws.reach[w])
@@ -78,7 +78,8 @@ def begin_search(
     close_out: wp.array(dtype=int),
     clearance_out: wp.array(dtype=wp.vec2d),
 ):
-    """Which worlds may be put to rest, and which of them have a geom within the ball around their skin."""
+    """Finds the worlds that may be put to rest, and those of them with a geom within the ball around their
+    skin."""
     w = wp.tid()
     off = constants_of(st, w) - own[w]
     if filled == 0:  # rests where it was made, however stiff it is
@@ -206,8 +207,8 @@ def rest_worlds(
     wrench_out: wp.array2d(dtype=vec6),
     tangent_out: wp.array2d(dtype=mat66),
 ):
-    """What a step says of skins that come to rest, besides `StateArrays.reset_skin`; of one that begins anew,
-    nothing is known of how the geoms came to where they are."""
+    """Writes the results of a step for skins that come to rest, besides `StateArrays.reset_skin`. After a
+    reset, the earlier motion of the geoms is unknown."""
     w = wp.tid()
     if not reset[w]:
         return
@@ -251,7 +252,7 @@ def count_stays(
 
 
 class Clearance:
-    """How far geoms are from the skins of a batch.
+    """Distances of geoms from the skins of a batch.
 
     Attributes:
       ball: centre and radius [m] of a ball around the skin at rest.
@@ -281,8 +282,8 @@ class Clearance:
 
 
 class Release:
-    """Which skins of a solve are put to rest. Not those with inertia or with rubber that remembers: they
-    have more to lose.
+    """Selects the skins of a solve that are reset, but none with inertia or with viscoelastic rubber: their
+    state outlasts the contact.
 
     Attributes:
       possible: whether any can be.

@@ -103,7 +103,7 @@ def wake(
 
 @wp.func
 def _pass_by(w: int, geoms: Geoms, motion: wp.array2d(dtype=vec3), st: Worlds):
-    """What a step writes of a skin that is left at rest: where the geoms were last, no iterations."""
+    """Writes the results of a step for a skin that stays at rest: last poses of the geoms, no iterations."""
     st.iterations[w] = 0
     for g in range(geoms.count):
         last = geoms.pos_last[g, w]
@@ -162,8 +162,8 @@ def look_again(
     clearance_out: wp.array(dtype=wp.vec2d),
     taking_part_out: MarkedWorlds,
 ):
-    """Which of the skins that are awake for no other reason than that a geom is near may be touched; marks
-    worlds of the others that are awake."""
+    """Tests the skins that are awake only because a geom is near for possible contact; marks the worlds of
+    the others that are awake."""
     w = wp.tid()
     close_out[w] = 0
     if awake[w] == 0:
@@ -236,9 +236,9 @@ def fall_asleep(
     wrench_out: wp.array2d(dtype=vec6),
     tangent_out: wp.array2d(dtype=mat66),
 ):
-    """Which skins were in balance where they were, untouched. One that was let go and that a geom is near to
-    stays awake: when the geom leaves, `Release` puts it to rest. Those that rested touch nothing, whatever
-    the solves of other worlds wrote."""
+    """Puts untouched skins in balance to sleep. A released one with a geom nearby stays awake: when the geom
+    leaves, `Release` puts it to rest. Those that rested touch nothing, whatever the solves of other worlds
+    wrote."""
     w = wp.tid()
     if awake[w] == 0:
         for g in range(touched_by_out.shape[0]):
@@ -279,7 +279,7 @@ def reset_rest(
 
 
 class Rest:
-    """Which skins of a batch rest.
+    """Sleeping and awake skins of a batch.
 
     Attributes:
       awake: (nworld,) wp.array int, 1 where the skin takes part in this step.

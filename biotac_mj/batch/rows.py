@@ -15,8 +15,8 @@ __all__ = ["Draws", "Rows"]
 
 
 class Draws(NamedTuple):
-    """Of one BioTac: the word where its seed begins, and [(first word, words (n, k) of n sensors)] that
-    differ between the sensors which resets draw; none where these draw nothing."""
+    """Random draws of one BioTac: the word where its seed begins, and [(first word, words (n, k) of n
+    sensors)] that differ between the sensors drawn by resets; empty if these draw nothing."""
 
     seed: int
     pool: list[tuple[int, np.ndarray]]

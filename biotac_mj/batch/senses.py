@@ -28,7 +28,7 @@ _POOL = 256  # sensors that resets draw from, at least
 
 
 class Draw(NamedTuple):
-    """What one world's sensor is, and what the bodies that touch it are of; None without heat, vibration."""
+    """Properties of one world's sensor and of the bodies that touch it; None without heat, vibration."""
 
     sensor: Sensor
     bodies: list[Material] | None
@@ -45,7 +45,7 @@ def draws(
     geoms: list[Geom],
     design: Design = BIOTAC,
 ) -> tuple[list[Draw], bool]:
-    """What worlds begin with, or what their resets draw from.
+    """Draws the sensors with which worlds begin, or from which their resets draw.
 
     Args:
       nworld: number of worlds. seed: of world 0, world w has seed + w; or (nworld,).
@@ -120,8 +120,8 @@ def find_changed(
     changed_out: wp.array(dtype=int),
     any_out: wp.array(dtype=int),
 ):
-    """Which due worlds have another film than when it was solved last; `known` where it was since the skin
-    moved."""
+    """Finds due worlds whose film has changed since its last solution; `known` where it was solved since the
+    skin moved."""
     w = wp.tid()
     if awake[w] == 1:
         known[w] = 0
@@ -133,7 +133,7 @@ def find_changed(
 
 
 class Senses:
-    """Of the skins of a batch.
+    """Readings of the skins of a batch.
 
     Args:
       skin: BatchSkin. film: BatchFilm, or what stands for it.
@@ -224,7 +224,8 @@ class Senses:
 
     @property
     def pool(self) -> list[tuple[wp.array, np.ndarray]]:
-        """Where resets draw sensors: arrays of `lasting`, and what each has (n, ...) of sensor 0 .. n - 1."""
+        """Sensors from which resets draw: arrays of `lasting`, and the values (n, ...) of sensor 0 .. n -
+        1."""
         a = self.acquisition
         if not a.redraws:
             return []

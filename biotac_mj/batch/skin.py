@@ -134,7 +134,7 @@ class BatchSkin:
 
     @property
     def outcome(self) -> list[wp.array]:
-        """What a solve says of contact: which geoms touch, `wrench`, `tangent`."""
+        """Contact found by a solve: touching geoms, `wrench`, `tangent`."""
         return [self._touched_by, self.wrench, self.tangent]
 
     def solve_skins(self) -> None:
@@ -233,7 +233,7 @@ class BatchSkin:
         )
 
     def prepare_keep(self) -> None:
-        """Allocates what `keep` needs."""
+        """Allocates the arrays of `keep`."""
         memory, guesses = self.state.of_role(MEMORY), self.state.of_role(GUESS)
         # as they lie in memory, so that whole blocks of it are copied
         lying = [a if a.is_contiguous else a.transpose() for a in [*memory, *guesses]]

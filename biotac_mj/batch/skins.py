@@ -177,7 +177,7 @@ class Skins:
         )
 
     def look(self) -> None:
-        """What the sensors see of the step, before `solve_film`. Launches only."""
+        """Updates the sensors' inputs of the step, before `solve_film`. Launches only."""
         if self.senses:
             self.senses.look(self.model.wrench0, self.model.tangent0, self.rest.awake)
 

@@ -1,4 +1,4 @@
-"""What acts on a BioTac besides the contacts of its own skin: mujoco_warp's contacts of core, nail and clamp
+"""Forces on a BioTac other than the contacts of its own skin: mujoco_warp's contacts of core, nail and clamp
 (`coupling/solid.py` for all worlds at once), and the skins of other BioTacs."""
 
 import warp as wp

@@ -39,8 +39,8 @@ def amend_contacts(
     source_out: wp.array2d(dtype=int),
     any_out: wp.array(dtype=int),
 ):
-    """Takes the margins of a BioTac's parts away, and contacts with hulls of shapes that have hollows: the
-    last one of each pair [pair, world] says what is common to those that take their place."""
+    """Removes the margins of a BioTac's rigid parts, and contacts with convex hulls of non-convex shapes. The
+    last removed contact of each pair [pair, world] is the template of those that replace it."""
     i = wp.tid()
     if i >= count[0]:
         return
@@ -150,7 +150,7 @@ def _appending():
 
 
 class SolidContacts:
-    """Of one BioTac in every world."""
+    """Contacts of the rigid parts of one BioTac in every world."""
 
     def __init__(self, pairs: SolidPairs, nworld: int, device: wp.DeviceLike):
         self._core, self._nworld, self._device = pairs.core, nworld, wp.get_device(device)

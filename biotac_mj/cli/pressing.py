@@ -414,7 +414,7 @@ def _show_design(args):
 
 
 def _places(path):
-    """(n, 3) of a text file [mm], () without."""
+    """Positions (n, 3) in a text file [mm]; () without a file."""
     from ..recordings.formats.columns import read_columns
 
     return read_columns(path, ["x", "y", "z"]) if path else ()

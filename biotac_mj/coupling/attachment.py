@@ -94,7 +94,7 @@ def attach(
 
 
 def _check(config, geometry):
-    """What would fail in the plugin's first call, or on the way of the readings."""
+    """Raises errors that would otherwise occur in the plugin's first call or in the readings."""
     check_names(config)
     make_readings(config, geometry, [], None)
     if config.stepper == "fem":
@@ -127,7 +127,7 @@ def _check_device(name):
 
 
 def _check_rounding(spec, config):
-    """Of geoms that touch, solids whose sizes are known before the model is compiled."""
+    """Checks the rounding of touching solids whose sizes are known before the model is compiled."""
     from ..skin.geoms import SIZES, check_rounding
 
     for name, radius in config.rounding.items():

@@ -153,7 +153,7 @@ class Config:
 
     @property
     def rounds(self) -> int:
-        """How often the skin is solved in a step at most."""
+        """Largest number of solves of the skin in a step."""
         return self.options.get("rounds", ROUNDS)
 
     @property
@@ -169,7 +169,7 @@ class Config:
         return self.options.get("threads", 1)
 
     def own_seed(self, seed: int | None = None) -> list[int]:
-        """What this sensor is drawn by: a seed, by default its own, and its name."""
+        """Seed of this sensor's random draws: `seed`, or the configured one, and its name."""
         return [self.seed if seed is None else int(seed), zlib.crc32(self.name.encode())]
 
     def _set(self, name, value):

@@ -30,7 +30,7 @@ def sensor_widths(design: Design = BIOTAC) -> dict[str, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Handle:
-    """Where an attached BioTac is in its model.
+    """Names and addresses of an attached BioTac in its model.
 
     Attributes:
       prefix, suffix: of all its names. `MjSpec.attach` of another spec changes them: `handles` has the new
@@ -46,7 +46,7 @@ class Handle:
 
     @property
     def design(self) -> Design:
-        """Of the fingertip: names and numbers of its channels."""
+        """Design of the fingertip: names and numbers of its channels."""
         return design_of(self.config.skin)
 
     def sensor_name(self, channel: str) -> str:
@@ -150,11 +150,11 @@ class Handle:
     def linear_model(
         self, model: mujoco.MjModel, data: mujoco.MjData
     ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """How the skin answers to motions of the bodies that it may touch, as the last step had it: {number
-        of the body: (wrench, tangent)}. wrench: (6,) on the body, force [N] and torque about the BioTac
-        frame's origin [N m], in that frame. tangent: (6, 6) -d wrench / d (translation [m], rotation vector
-        about the origin [rad]), its symmetric positive part, as the step's implicit coupling takes it; zero
-        where nothing touches. All bodies keep still but one.
+        """Linear model of the skin's response to motions of the bodies that it may touch, from the last step:
+        {number of the body: (wrench, tangent)}. wrench: (6,) on the body, force [N] and torque about the
+        BioTac frame's origin [N m], in that frame. tangent: (6, 6) -d wrench / d (translation [m], rotation
+        vector about the origin [rad]), its symmetric positive part, as the step's implicit coupling takes it;
+        zero where nothing touches. All bodies keep still but one.
 
         Raises:
           ValueError, TypeError: see `draw`.

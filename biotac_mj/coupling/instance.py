@@ -108,7 +108,7 @@ class Instance:
 
     @property
     def horizon(self) -> float:
-        """How far ahead [s] the skin is solved: to the end of the step."""
+        """Time until the poses at which the skin is solved [s]: to the end of the step."""
         return self.model.opt.timestep
 
     @property
@@ -295,7 +295,7 @@ class Instance:
         return self.touching.body_pose(*self.setup.skin.stepper.came_to(state))
 
     def _as_far_as_known(self, result, before):
-        """Of a solve that found no balance: where the way to it ended, or the last step's model."""
+        """Result of a solve that did not converge: the end of its load path, or the last step's model."""
         stepper = self.setup.skin.stepper
         if result.load_factor > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
             return dataclasses.replace(result, pose=self._came_to(result.state))
@@ -425,8 +425,8 @@ class Instance:
         return self._result.wrench if acting is None else acting
 
     def touches(self, wrench: np.ndarray, by_place: bool) -> list:
-        """What the geoms get of wrenches (ngroup, 6) on the touching bodies: [(number of the geom, (4, 3) of
-        centre of pressure [m], normal out of the skin there, force, torque about the centre)].
+        """Distributes wrenches (ngroup, 6) on the touching bodies to their geoms: [(number of the geom, (4,
+        3) of centre of pressure [m], normal out of the skin there, force, torque about the centre)].
 
         A body's wrench is shared by its geoms as the skin pushes on them. Where no push is known, or not
         asked for, the first gets all, on the axis of the wrench."""
@@ -448,8 +448,8 @@ class Instance:
         return out
 
     def _pushes(self):
-        """Of the skin's normal push on each geom: its size (ngeom,) [N], size times place and size times
-        normal (ngeom, 3); zeros where it is not known."""
+        """Normal force of the skin on each geom: its size (ngeom,) [N], size times place and size times
+        normal (ngeom, 3); zeros if unknown."""
         skin, ngeom = self.setup.skin, len(self.touching.geoms)
         load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
         known = self._result is not None and self._result.state is not None

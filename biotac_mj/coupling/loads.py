@@ -1,5 +1,5 @@
-"""What MuJoCo's own force quantities have of the skins: `cfrc_ext`, `cfrc_int`, `<force>`, `<torque>`,
-`<touch>` and `<contact>`.
+"""Adds the forces of the skins to MuJoCo's own force quantities: `cfrc_ext`, `cfrc_int`, `<force>`,
+`<torque>`, `<touch>` and `<contact>`.
 
 A skin acts through `qfrc_passive` and through rows of constraints, which are no forces on bodies for MuJoCo.
 So after its constraint solver MuJoCo's own functions run once more while `mjData.contact` lists the skins
@@ -42,7 +42,8 @@ class _Touch(NamedTuple):
 
 
 class Loads:
-    """Of all two-way skins of one mjData. Sensors with a delay have MuJoCo's contacts alone."""
+    """Force quantities with all two-way skins of one mjData. Sensors with a delay have MuJoCo's contacts
+    alone."""
 
     def __init__(self, model: ModelView, data: DataView, coupled: list):
         self.model, self.data, self.coupled = model, data, coupled

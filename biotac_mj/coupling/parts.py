@@ -1,5 +1,5 @@
-"""What a BioTac adds to an MjSpec, for `attach` and for `batch.add`: body, meshes, sensors, and room for what
-touches it."""
+"""Elements that a BioTac adds to an MjSpec, for `attach` and for `batch.add`: body, meshes, sensors, and
+plugin state for what touches it."""
 
 import importlib.resources
 from collections.abc import Iterable
@@ -53,7 +53,7 @@ def check_place(
 
 
 def _listed(value, size):
-    """What a list or array (size,) holds, None of anything else."""
+    """Values of a list or array (size,); None for anything else."""
     try:
         return list(value) if np.shape(value) == (size,) else None
     except Exception:  # numpy refuses uneven lists, and others' arrays raise what they like

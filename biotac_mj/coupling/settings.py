@@ -58,7 +58,7 @@ class SkinSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ContactSettings:
-    """How a BioTac meets other bodies.
+    """Contact of a BioTac with other bodies.
 
     Attributes:
       coupling: "two-way"; or "one-way": the sensor reads, and pushes nothing.
@@ -87,7 +87,7 @@ class ContactSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SensorSettings:
-    """What a BioTac reads.
+    """Readings of a BioTac.
 
     Attributes:
       readings: False leaves the electrodes and the other channels out (force and status remain). As a keyword
@@ -229,7 +229,7 @@ class Settings:
 
     @property
     def options(self) -> dict:
-        """What is said of the parts, as the keyword `options` has it."""
+        """The settings that were given, as the keyword `options` takes them."""
         said = {name: self._at(place) for name, place in _OPTIONS.items()}
         return {**self.more, **{name: value for name, value in said.items() if value is not None}}
 
@@ -265,7 +265,7 @@ class Settings:
         return dataclasses.replace(self._with_options(model.options)._with(changes), effects=None)
 
     def config(self, name: str = "", mesh: str = "default", geometry: SkinGeometry | None = None) -> Config:
-        """What travels in a model, with the material's choices where nothing is said.
+        """The Config that travels in a model; the material's defaults apply where nothing is given.
 
         Args:
           name: of the sensor. mesh, geometry: see `geometry.skins.skin_reference`; a function for the modulus

@@ -1,5 +1,5 @@
-"""What the model says of a BioTac: settings, bodies, geoms, sensors, and the skin that it needs. Also how the
-numbers of its plugin state are laid out."""
+"""Reads the setup of a BioTac from a model: settings, bodies, geoms, sensors, and the skin that it needs.
+Also the layout of its plugin state."""
 
 import ctypes
 import functools
@@ -91,8 +91,8 @@ def forget_skins() -> None:
 
 
 class Setup:
-    """What a plugin instance's model says: settings, bodies, geoms, sensors. The same for every mjData of the
-    model.
+    """Setup of a plugin instance, read from the model: settings, bodies, geoms, sensors. The same for every
+    mjData of the model.
 
     Raises:
       ValueError: no body refers to the instance, or its settings do not fit the model.
@@ -155,8 +155,8 @@ class Setup:
 
 
 def state_size(model: ModelView, index: int) -> int:
-    """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the
-    model."""
+    """Upper bound of the plugin state of instance `index`, in doubles; MuJoCo asks for it while it compiles
+    the model."""
     global _asked
     forget_notes(model)
     if index <= _asked:

@@ -1,4 +1,4 @@
-"""What several BioTacs have in common: made once, and not freed before the last of them is gone."""
+"""Objects that several BioTacs share: made once, and freed with the last BioTac."""
 
 import ctypes
 import functools
@@ -57,7 +57,7 @@ class Shared:
         return value
 
     def turn(self) -> None:
-        """What lives on until now does so no longer than until something else is made."""
+        """Objects that are alive now may be freed as soon as something else is made."""
         with self._lock:
             self._past, self._last = [*self._past, *self._last][-self._keep :], []
 

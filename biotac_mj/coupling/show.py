@@ -1,5 +1,5 @@
-"""What a renderer sees: the deformed outer surface as a MuJoCo skin, the electrodes coloured by their change
-from rest."""
+"""Geometry for a renderer: the deformed outer surface as a MuJoCo skin, the electrodes coloured by their
+change from rest."""
 
 import numpy as np
 

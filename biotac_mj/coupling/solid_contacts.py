@@ -91,8 +91,8 @@ class SolidContacts(SolidPairs):
 
     @functools.cached_property
     def _known(self):
-        """Of each pair: pose of the shape, and a lower bound of its distance from the part there [m]; and how
-        far each shape reaches [m]."""
+        """For each pair the pose of the shape and a lower bound of its distance from the part there [m]; and
+        the radius of each shape [m]."""
         shape = len(self.part), len(self.shape)
         vert = (mesh_of(self.model, int(self.model.geom_dataid[g]))[0] for g in self.shape)
         reach = [np.linalg.norm(v, axis=1).max() for v in vert]

@@ -164,7 +164,7 @@ class Readings(Protocol):
         """The sensor feels how these geoms shake the stepper's skin; called first, it may change nstate."""
 
     def shaking(self, before: np.ndarray, result: SkinResult, dt: float) -> object:
-        """How the skin, in state `before`, is shaken by the step of dt [s]."""
+        """Excitation of the skin's modes, from state `before`, by the step of dt [s]."""
 
 
 class _NoReadings:

@@ -305,7 +305,7 @@ class DataView(_View):
         return out
 
     def _rounds_left(self):
-        """How often: not where each run begins anew."""
+        """Number of further rounds; none if each run starts anew."""
         option = self.model.opt
         if option.disableflags & _NO_WARMSTART:
             return 0

@@ -1,4 +1,4 @@
-"""Which geoms of a model can touch a BioTac, and where they will be at the end of the step."""
+"""Geoms of a model that can touch a BioTac, and their poses at the end of the step."""
 
 import functools
 import math
@@ -124,8 +124,8 @@ class Touching:
         return geom_pos, geom_mat
 
     def _apart(self, geom_mat):
-        """How far geoms are seen from where they are: out of the pad, planes against their normals. MuJoCo's
-        compiler, too, makes its one step without contact."""
+        """Displacement that removes geoms from the pad, planes against their normals. MuJoCo's compiler, too,
+        makes its one step without contact."""
         plane = np.array([[g.type == "plane"] for g in self.geoms], bool).reshape(-1, 1)
         return _APART * np.where(plane, geom_mat[:, :, 2], (0.0, 1.0, 0.0))
 
@@ -139,7 +139,7 @@ class Touching:
 
     @functools.cached_property
     def _first_geom(self):
-        """Of the first geom of each body: its place, and the rotation from it to the body."""
+        """Position of the first geom of each body, and the rotation from it to the body."""
         return self._geom_pos[self._first], self._geom_mat[self._first].transpose(0, 2, 1)
 
     def check(self, pos: np.ndarray, mat: np.ndarray) -> None:
@@ -207,7 +207,7 @@ def _refuse_flexes(model, core):
 
 
 def deformable(names: Iterable[str]) -> str:
-    """What is said of flexes that collide with a BioTac."""
+    """Error text for flexes that collide with a BioTac."""
     return (
         f"flex {', '.join(names)} collides with the BioTac, whose skin meets rigid geoms alone: set its "
         "contype and conaffinity to 0, or name the geoms that may touch with geoms=[...]"
@@ -245,7 +245,7 @@ def _pushes(model, body):
 
 
 def outside_geoms(name: str) -> str:
-    """What is said of the rounding of a geom that the settings do not name among those that touch."""
+    """Error text for the rounding of a geom that is not among the touching ones."""
     return f"rounding is of geom {name!r}, which is none of geoms: add it there, or leave it out"
 
 
@@ -294,7 +294,7 @@ def _resolve(model, name):
 
 
 def forget_notes(model: ModelView) -> None:
-    """Of a model that is being made, where another one may have been."""
+    """Forgets the warnings of an earlier model at the address of one that is being made."""
     _noted.pop(model.address, None)
 
 

@@ -29,7 +29,7 @@ def asked(count: int) -> float:
 
 
 def discoveries(p: np.ndarray) -> np.ndarray:
-    """Which of all that was tested, p (tests, ...), is discovered: of these a share of `RATE` may be false
+    """Discoveries among tests with p-values p (tests, ...), at a rate of false discoveries of `RATE`
     (Benjamini and Hochberg 1995)."""
     return false_discovery_control(np.asarray(p, float), axis=0) <= RATE
 

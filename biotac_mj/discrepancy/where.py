@@ -1,5 +1,5 @@
-"""Where measurement and model disagree: what is left of each channel under each condition, in each unit of
-evidence (a trajectory, a block of time)."""
+"""Locates the disagreement of measurement and model: residual of each channel under each condition, in each
+unit of evidence (a trajectory, a block of time)."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ class Cells:
         conditions: Mapping[str, Sequence[tuple[np.ndarray, float]]],
         channels: Mapping[str, slice],
     ) -> "Cells":
-        """Of units (n, width).
+        """Cells of residuals units (n, width).
 
         Args:
           conditions: name -> of each unit its rows (n,) bool and the weight of their mean. channels: name ->

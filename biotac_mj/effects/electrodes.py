@@ -62,7 +62,7 @@ class ElectrodeDrift(Effect):
         return out
 
     def unsearched(self, theta: dict) -> list[int]:
-        """Those that drift, unless all do: the remainder of a drift of another form is no offset."""
+        """Electrodes that drift, unless all do: the remainder of a drift of another form is no offset."""
         drifting = [k for k, e in enumerate(self.design.electrodes) if e in theta]
         return drifting if len(drifting) < self.design.nelectrode else []
 

@@ -104,7 +104,7 @@ class PlateEffect(Effect):
         return self.film is None
 
     def value(self, amount: float) -> float:
-        """Of the parameter."""
+        """Value of the parameter."""
         return self.base + amount * (self.other - self.base)
 
 

@@ -84,7 +84,8 @@ def _inside(vert, inner, outer):
 
 
 def winding(point: np.ndarray, corner: np.ndarray) -> float:
-    """How often closed triangles (m, 3, 3) surround a point: solid angle (van Oosterom, Strackee 1983)."""
+    """Winding number of closed triangles (m, 3, 3) around a point: solid angle (van Oosterom, Strackee
+    1983)."""
     a, b, c = np.moveaxis(corner - point, 1, 0)
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))

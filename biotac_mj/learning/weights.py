@@ -168,7 +168,7 @@ def write_tensors(path: pathlib.Path | str, tensors: dict[str, torch.Tensor], me
 
 
 def _checksum(tensors: dict[str, torch.Tensor]) -> str:
-    """Of names, shapes, types and numbers: permuted or exchanged tensors may have the same shape."""
+    """Checksum of names, shapes, types and numbers: permuted or exchanged tensors may have the same shape."""
     found = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name].contiguous().numpy()

@@ -104,7 +104,7 @@ class BioTacSensor:
 
     @property
     def device(self) -> str:
-        """Of `data`."""
+        """Device of `data`."""
         return self.cfg.device
 
     @property

@@ -1,4 +1,4 @@
-"""What goes wrong inside MuJoCo's step, and how it comes back to Python.
+"""Brings errors inside MuJoCo's step back to Python.
 
 A callback cannot raise: C lies between it and whoever called mj_step. Its error is kept and warned of, and
 `check` raises it; or it is raised as soon as MuJoCo has returned, where the model says on_error="raise", and
@@ -104,7 +104,7 @@ def check() -> None:
 
 @contextlib.contextmanager
 def explained() -> Iterator[None]:
-    """Where MuJoCo can only say that a BioTac cannot be made, raises what the BioTac says of it instead."""
+    """Replaces MuJoCo's error that a BioTac cannot be made by the BioTac's own."""
     before = _first
     try:
         yield

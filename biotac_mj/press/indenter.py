@@ -123,7 +123,7 @@ def _from_file(path):
 
 
 def _why_no_faces(path):
-    """Of a file in which trimesh finds none."""
+    """Reason why trimesh finds no faces in a file."""
     content = pathlib.Path(path).read_bytes()
     if not content.strip():
         return "is empty"

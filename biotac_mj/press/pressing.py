@@ -20,7 +20,7 @@ __all__ = ["PressResult", "press", "render"]
 
 
 class PressResult(typing.NamedTuple):
-    """What `press` returns: record, picture = press(...).
+    """Result of `press`: record, picture = press(...).
 
     Attributes:
       record: PressRecord.

@@ -1,4 +1,4 @@
-"""What a channel read beside a row: its last measurement, and lines on either side."""
+"""Readings of a channel around a row: its last measurement, and lines on either side."""
 
 import numpy as np
 

@@ -196,7 +196,7 @@ def _moving_range(moving):
 
 
 def _at_ends(values, ends):
-    """Which values (k,) are at or beyond the lower and the upper of two ends. Values far beyond the range are
+    """Masks of values (k,) at or beyond the lower and the upper of two ends. Values far beyond the range are
     no limit."""
     near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
     return near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)

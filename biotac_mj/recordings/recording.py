@@ -168,7 +168,7 @@ class Recording:
         return None if np.ndim(self.electrodes) != 2 else design_of_channels(self.electrodes.shape[1])
 
     def unit(self, name: str) -> str:
-        """Of a field."""
+        """Unit of a field."""
         return self.units.get(name, FIELDS[name].units[0])
 
     @property

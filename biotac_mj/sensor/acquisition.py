@@ -408,8 +408,7 @@ class BatchAcquisition:
         wp.launch(kernels.reset_states, self.nworld, inputs, outputs, device=self.device)
 
     def find_due(self, dt: float) -> wp.array:
-        """Finds the worlds that need a new impedance for the next step of dt [s]; writes and returns
-        `due`."""
+        """Marks the worlds that need a new impedance for the next step of dt [s]; returns `due`."""
         inputs = [self.time, dt, self._every, self.place.nelectrode, self.place.slots]
         wp.launch(kernels.find_due, self.nworld, inputs, [self.due], device=self.device)
         return self.due

@@ -1,4 +1,4 @@
-"""What the threads of a block do together: barriers, sums, the largest, ranks. On the CPU a block is one
+"""Collective operations of the threads of a block: barriers, sums, maxima, ranks. On the CPU a block is one
 thread."""
 
 import warp as wp

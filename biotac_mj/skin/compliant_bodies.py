@@ -122,7 +122,7 @@ class CompliantBodies:
         self._add_body_forces(program, 1.0, self._data.worlds.active, self._k.r, self._k.norms)
 
     def soften_product(self, program: Launcher) -> None:
-        """Subtracts from the product q the contact stiffness that the bodies' compliance takes away."""
+        """Subtracts from the product q the softening of the contact stiffness by the bodies' compliance."""
         on = self._data.worlds.running
         self._move_by_load(program, 0, self._k.p, on)
         self._add_body_forces(program, -1.0, on, self._k.q, self._k.partial)

@@ -183,7 +183,7 @@ def _blocks(variables, arrays):
 
 
 def _tables(blocks, host):
-    """Of each variable of each block its reset and its array in one world, a row for each item."""
+    """For each variable of each block its reset and its array in one world, a row for each item."""
     sizes = (host[block[0].name].size for block in blocks)
     return [[(v.reset, host[v.name].reshape(n, -1)) for v in block] for n, block in zip(sizes, blocks)]
 

@@ -51,8 +51,8 @@ def acting_wrenches(
     # Out:
     acting_out: wp.array2d(dtype=vec6),
 ):
-    """What the bodies get in the step: the forces of `add_forces`, and those of the rows of `write_rows` at
-    the accelerations that the constraint solver has found."""
+    """Total wrench on the bodies in the step: the forces of `add_forces`, and those of the rows of
+    `write_rows` at the accelerations of the constraint solver."""
     g, w = wp.tid()
     total = wrench[g, w] + correction[g, w]
     if reason[w] != NOT_FINITE:  # what is lost has no force, and no accelerations

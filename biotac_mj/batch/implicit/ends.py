@@ -1,5 +1,5 @@
-"""Where the integrator will take the bodies of a batch. Joints move along arcs, while the skin is solved
-along straight lines. `World._arrive` looks after the step; here mujoco_warp's own kernels find the end
+"""Predicts where the integrator will take the bodies of a batch. Joints move along arcs, while the skin is
+solved along straight lines. `World._arrive` looks after the step; here mujoco_warp's own kernels find the end
 before it integrates, since no callback comes after it."""
 
 import copy

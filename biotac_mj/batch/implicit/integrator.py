@@ -53,8 +53,8 @@ _ACTUATION, _SPRING, _DAMPER, _EULERDAMP = (
 
 @wp.struct
 class Correction:
-    """Of the forces of all skins [group, world]: what is added to them, and what they still lack
-    (`Coupled.amiss`). One search for all skins of a world, since they may hold one body."""
+    """Correction of the forces of all skins [group, world]: what is added to them, and their remaining error
+    (`Coupled.amiss`). One search for all skins of a world, since several may hold the same body."""
 
     force: wp.array2d(dtype=vec6)
     amiss: wp.array2d(dtype=vec6)
@@ -213,7 +213,7 @@ def write_slope(
     # In and out:
     c: Correction,
 ):
-    """The rows of the slope that are of one skin; nothing is corrected of one that does not act."""
+    """Writes the rows of the slope that belong to one skin; a skin that does not act is not corrected."""
     w, g, column = wp.tid()
     if c.going[w] == 0:
         return
@@ -286,8 +286,8 @@ class Slope:
 
 
 def _damping_inputs() -> list[str]:
-    """What mujoco_warp's kernel of joint damping reads, by name: 4.0 adds the damping by actuators to what
-    3.17 has."""
+    """Names of the inputs of mujoco_warp's kernel of joint damping: 4.0 adds the damping by actuators to
+    those of 3.17."""
     from mujoco_warp._src import forward
 
     return [arg.label for arg in forward._compute_damping_deriv.adj.args if arg.label != "deriv_out"]

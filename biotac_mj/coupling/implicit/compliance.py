@@ -1,5 +1,5 @@
-"""How the bodies that touch a skin give way to wrenches on them, beta h^2 J H^-1 J', and how fast they bounce
-on it, in one world or in all at once.
+"""Compliance of the bodies that touch a skin, beta h^2 J H^-1 J', and their frequencies on it, in one world
+or in all at once.
 
 H is M - h D, with D what the integrator treats implicitly, and the springs that MuJoCo's other constraints
 are where its solver left them: joints that friction holds, contacts, the rows of other skins.
@@ -228,8 +228,8 @@ def add_powers(
     # Out:
     power_out: wp.array2d(dtype=wp.vec2d),
 ):
-    """What each wrench on a skin's bodies [world, column] adds to the traces of the second and the fourth
-    power of the modes, in which the largest square of a frequency outweighs all others."""
+    """Contribution of each wrench on a skin's bodies [world, column] to the traces of the second and the
+    fourth power of the modal matrix, in which the highest frequency dominates."""
     w, c = wp.tid()
     g = c / 6
     second = vec6()
@@ -271,7 +271,7 @@ def find_frequencies(
 
 
 class Response:
-    """Of the bodies that one skin meets to wrenches on them, as launches (kernel, dim, arguments).
+    """Response of the bodies that touch one skin to wrenches on them, as launches (kernel, dim, arguments).
 
     Args:
       jacobian: (group, world, dof) of the bodies. model: of the skin.
@@ -285,9 +285,9 @@ class Response:
             self._power = wp.zeros(self._columns, dtype=wp.vec2d)
 
     def compliance(self, going: wp.array, L: wp.array, square: wp.array, out: wp.array) -> list[tuple]:
-        """Finds the compliance [group, group, world] with factors of `factor`, in worlds that are going
-        (nworld,). square: [group, world] by which an acceleration moves bodies to where the skin is solved [m
-        per m/s^2]."""
+        """Computes the compliance [group, group, world] with factors of `factor`, in the worlds marked in
+        going (nworld,). square: [group, world] factor from an acceleration to the bodies' displacement at the
+        pose where the skin is solved [m per m/s^2]."""
         groups, _, nworld = out.shape
         shape, where = (groups * groups, nworld, 6, 6), out.device
         entries = wp.array(ptr=out.ptr, shape=shape, dtype=real, device=where, copy=False)

@@ -112,7 +112,7 @@ class Coupled:
         return self.result is not None and self.result.converged
 
     def model(self) -> tuple:
-        """What `use` takes to come back to the present model."""
+        """Arguments with which `use` restores the present model."""
         return self.asked, self.result
 
     def use(self, asked: tuple | None, result: SkinResult) -> None:
@@ -187,7 +187,7 @@ class Coupled:
 
     @property
     def turning(self) -> float:
-        """How far its bodies turn in the step at most [rad]."""
+        """Largest rotation of its bodies in the step [rad]."""
         return np.abs(self.arrays.travel[:, 3:]).max(initial=0.0)
 
     def conclude(self, rounds: int) -> None:

@@ -51,8 +51,8 @@ def most_energy(r: Rounds, force: real, solid: Solid, w: int):
 
 @wp.func
 def draws(r: Rounds, w: int, slack: real):
-    """What the bodies of a skin lack together, and what they may leave to each other [J]. slack: of the most
-    that the skin can hold, by which each may get more."""
+    """Energy that the bodies of a skin lack together, and that they may give to each other [J]. slack:
+    fraction of the largest energy in the skin that each may get in addition."""
     lacks = real(0.0)
     spare = real(0.0)
     for g in range(r.pos.shape[0]):

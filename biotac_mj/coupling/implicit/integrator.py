@@ -53,8 +53,8 @@ class Integrator:
         self._lower = tuple(part[below] for part in self._derivative)
 
     def _entries(self, place, count, column):
-        """Where a sparse matrix has entries in the rows of `dofs`, and their rows and columns there; trees
-        have no entries in common."""
+        """Indices, rows and columns of a sparse matrix's entries in the rows of `dofs`; trees have no entries
+        in common."""
         row = place[np.repeat(np.arange(len(count)), count)]
         entry = np.flatnonzero(row >= 0)
         return entry, row[entry], place[column[entry]]

@@ -17,7 +17,8 @@ __all__ = ["Kinematics", "row"]
 
 
 class Kinematics:
-    """Of the bodies of a `Touching`, about the origin of the BioTac frame and in that frame.
+    """Poses and Jacobians of the bodies of a `Touching`, about the origin of the BioTac frame and in that
+    frame.
 
     Attributes:
       bodies: `poses.Bodies`. m, d: what it reads of mjModel and mjData: arrays of Warp on their memory.

@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class MarkedWorlds:
-    """Which are marked [world], and whether any is."""
+    """Marks [world], and whether any is set."""
 
     world: wp.array(dtype=int)
     any: wp.array(dtype=int)

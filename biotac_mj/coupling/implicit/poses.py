@@ -34,7 +34,7 @@ def _wide(A: Any):
 @wp.func
 def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=Any),
                com: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):  # fmt: skip
-    """Where a body is after h at its present velocity."""
+    """Position of a body after time h at its present velocity."""
     pos = _double(xpos[w, b])
     spin = _double(wp.spatial_top(cvel[w, b]))
     arm = pos - _double(com[w, rootid[b]])
@@ -149,7 +149,7 @@ def accelerate(
     # In and out:
     r: Rounds,
 ):
-    """Where the bodies go with accelerations (nworld, nv), see `rounds.follow`."""
+    """Moves the bodies by accelerations (nworld, nv), see `rounds.follow`."""
     g, w = wp.tid()
     gain = vec6()
     for i in range(jacobian.shape[2]):

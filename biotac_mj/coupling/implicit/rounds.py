@@ -102,7 +102,8 @@ class Rounds:
 
 @wp.struct
 class Solid:
-    """Of the skin: from its outside to the core at most [m]; its outer area [m^2], whether it has inertia."""
+    """Properties of the skin: largest distance from its outside to the core [m], its outer area [m^2],
+    whether it has inertia."""
 
     thickness: real
     area: real
@@ -118,8 +119,8 @@ def make_model(groups: int, nworld: int) -> Model:
 
 
 def make_rounds(groups: int, nworld: int, limit: int = 0) -> Rounds:
-    """Those of `groups` bodies, on Warp's default device; all zero but for what acts: all of the push, and
-    skins that settled in one round."""
+    """Rounds of `groups` bodies on Warp's default device. All fields are zero, but the fraction of the force
+    that acts is one and the skins have settled in one round."""
     r = Rounds()
     for name, variable in Rounds.vars.items():
         kind = getattr(variable.type, "dtype", None)
@@ -278,7 +279,7 @@ def tell_bodies(
     bodies: Bodies,
     r: Rounds,
 ):
-    """How the bodies of the wanted worlds go: with which wrenches, and where without them."""
+    """Writes the linear motion of the bodies of the wanted worlds: wrenches, and poses without them."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return
@@ -293,7 +294,7 @@ def tell_bodies(
 
 @wp.kernel
 def uncoupled_poses(wanted: wp.array(dtype=int), bodies: Bodies, r: Rounds):
-    """Where the bodies would go without the skin's wrenches."""
+    """Computes the bodies' poses without the skin's wrenches."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return
@@ -307,7 +308,8 @@ def uncoupled_poses(wanted: wp.array(dtype=int), bodies: Bodies, r: Rounds):
 
 @wp.kernel
 def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
-    """Where the skins are asked for: where their bodies go, or where these go that nothing holds any more."""
+    """Writes the poses at which the skins are solved: the bodies' predicted ones, or the free ones of bodies
+    that nothing holds any more."""
     g, w = wp.tid()
     if gone[w]:
         r.asked_pos[g, w] = r.free_pos[g, w]
@@ -319,7 +321,7 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 
 @wp.func
 def _distance_off(model: Model, r: Rounds, w: int):
-    """How far the bodies go from where the skin's model holds at most [m]."""
+    """Largest distance of the bodies from the poses of the skin's model [m]."""
     off = real(0.0)
     for g in range(r.pos.shape[0]):
         if is_finite(r.pos[g, w], r.mat[g, w]):  # what is lost takes no part

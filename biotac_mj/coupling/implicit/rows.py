@@ -29,8 +29,8 @@ def _pivot(S: mat66, whole: vec6, k: int):
 
 @wp.func
 def hold_by_rows(S: mat66):
-    """What rows hold of a stiffness: L D L' without the pivots that are not positive. A model has that alone,
-    so that what it says acts is what the rows do."""
+    """The part of a stiffness that constraint rows can represent: L D L' without the pivots that are not
+    positive. A model has only that part, so that its forces are those of the rows."""
     whole = wp.get_diag(S)
     left = S
     held = mat66()

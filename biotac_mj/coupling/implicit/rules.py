@@ -63,9 +63,9 @@ def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:
 
 
 def lacking(store: Any, given: Any) -> Any:
-    """What a body gets more from a skin than it has put in [J]. Of skins that several bodies touch each has
-    its own account: who presses a finger does not pay for what others get, except where his push moves
-    them. So this much may come from what others have put in during the step itself (`spared`)."""
+    """Energy that a body gets from a skin beyond what it has put in [J]. Each body of a skin has its own
+    account: a body that presses a finger does not pay for others, except where its push moves them. So this
+    much may come from what others have put in during the step itself (`spared`)."""
     lacks = given - max(store, type(store)(0.0))
     if lacks < type(store)(0.0):
         return type(store)(0.0)
@@ -73,7 +73,7 @@ def lacking(store: Any, given: Any) -> Any:
 
 
 def spared(left: Any, store: Any, given: Any) -> Any:
-    """By how much a body's account grows in a step [J], from `left` before it."""
+    """Growth of a body's energy account in a step [J], from `left` before it."""
     growth = store - given - left
     if growth > type(store)(0.0) and growth < type(store)(_UNKNOWN):
         return growth

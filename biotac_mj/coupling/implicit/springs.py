@@ -1,5 +1,5 @@
-"""What holds bodies in one mjData besides the skin that pushes them: their inertia, and MuJoCo's constraints
-where its solver left them."""
+"""Stiffness of bodies in one mjData other than that of the skin that pushes them: their inertia, and MuJoCo's
+constraints as its solver left them."""
 
 from collections.abc import Sequence
 

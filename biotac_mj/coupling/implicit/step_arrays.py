@@ -31,7 +31,7 @@ def find_off(
     # Out:
     off_out: wp.array(dtype=real),
 ):
-    """How far the bodies go at most from where the skin was solved [m]."""
+    """Largest distance of the bodies from where the skin was solved [m]."""
     w = wp.tid()
     off = real(0.0)
     for g in range(r.pos.shape[0]):
@@ -88,7 +88,7 @@ class StepArrays:
         self.models = [(_seen(getattr(self._last, name)), getattr(self, name)) for name in Model.vars]
 
     def held(self, tangent: np.ndarray) -> np.ndarray:
-        """What rows hold of tangents (ngroup, 6, 6), see `rows.hold_by_rows`."""
+        """The part of tangents (ngroup, 6, 6) that rows represent, see `rows.hold_by_rows`."""
         self._tangent[:] = tangent
         self._keep_held()
         return self._tangent.copy()

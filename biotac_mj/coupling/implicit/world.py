@@ -143,8 +143,8 @@ class World:
         self._loads.write({t: acting[t] if t in acting else t.acting_wrench() for t in self.coupled})
 
     def _next_stage(self):
-        """Which of Runge-Kutta's stages MuJoCo asks for: two in the middle and one at the end of the step
-        that the first begins."""
+        """Number of the Runge-Kutta stage that MuJoCo evaluates: two in the middle and one at the end of the
+        step that the first begins."""
         now, step = self.data.struct.time, self.model.opt.timestep
         if self._stage < 4 and now == self._began + (step if self._stage == 3 else 0.5 * step):
             return self._stage + 1
@@ -356,9 +356,9 @@ class World:
             self._act_by_force(skins, outside)
 
     def _act_by_force(self, skins, outside):
-        """Where MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too
-        little of what the passive forces push, or too much. Then forces act, without rows, and none where
-        others turn these into a gain."""
+        """If MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too little
+        of the passive forces, or too much. So only forces act, without rows, and none if they would gain
+        energy together with others."""
         self._solve_group(skins, outside)
         gains = self._gain(skins)
         if gains:

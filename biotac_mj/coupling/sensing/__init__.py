@@ -1,1 +1,1 @@
-"""What a solved skin is felt as: settings of the readings, counts of every channel, vibration."""
+"""From a solved skin to readings: settings of the readings, counts of every channel, vibration."""

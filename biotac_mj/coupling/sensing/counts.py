@@ -65,7 +65,7 @@ class SensorReadings:
         self.nstate += vibration_size(NMODE, len(self._textures))
 
     def shaking(self, before: np.ndarray, result: SkinResult, dt: float) -> tuple | None:
-        """What the step of the skin does to its modes, for `advance`; see `Shaking.of_step`."""
+        """Excitation of the skin's modes in the step, for `advance`; see `Shaking.of_step`."""
         return self._shaking.of_step(before, result, dt)
 
     def _rest(self):
@@ -146,7 +146,8 @@ def film_of(config: Config, geometry: SkinGeometry | None = None) -> dict:
 
 
 def materials_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Material]:
-    """Of each body, of names as `Config.thermal` has them; of a list one is drawn by the seed."""
+    """Thermal material of each body, from names as in `Config.thermal`; one of a list is drawn by the
+    seed."""
     return _by_body(geoms, wanted, read_thermal, "plastic", generator(seed, 0x4EA7))
 
 

@@ -13,7 +13,7 @@ __all__ = ["ReadingsOptions"]
 
 @dataclasses.dataclass(frozen=True)
 class ReadingsOptions:
-    """How the deformed skin becomes counts: settings of a BioTac's readings, not a sensor itself.
+    """Settings of a BioTac's readings, from the deformed skin to counts; not a sensor itself.
 
     For one BioTac `attach(signal=, sensor=, randomise=, readings={...})` says the same. This is for code that
     gives the same settings to several functions:
@@ -53,7 +53,7 @@ class ReadingsOptions:
         take_sensor(check_settings(given, what="ReadingsOptions"))
 
     def options(self) -> dict:
-        """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
+        """The value of `options["readings"]` of a model, or of `readings` of a batch."""
         out = {"noise": self.noise, "film_every_step": self.film_every_step}
         if self.sensor is not None:  # which leaves it to attach's own argument
             out["sensor"] = self.sensor

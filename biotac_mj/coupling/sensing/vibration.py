@@ -1,5 +1,5 @@
-"""How a solved step of the skin drives its modes: by forces of the contacts, by heights under the contacts,
-and how fast bodies slip."""
+"""Excitation of the skin's modes by a solved step: forces of the contacts, heights under the contacts, and
+speeds of slip."""
 
 import functools
 import math
@@ -16,7 +16,7 @@ __all__ = ["Shaking"]
 
 
 class Shaking:
-    """Of one skin.
+    """Excitation of the modes of one skin.
 
     Args:
       stepper: of the skin. geoms: that can touch it.
@@ -33,7 +33,7 @@ class Shaking:
 
     @property
     def modes(self) -> Modes:
-        """What the sensor needs of the skin's modes."""
+        """The skin's modes as the sensor takes them."""
         return Modes(self._modes.rate, self._modes.static_pressure)
 
     @functools.cached_property
@@ -87,8 +87,8 @@ class Shaking:
         return np.full(len(area) * nsample, -1)
 
     def _moved(self, old, new, sample):
-        """How far the anchors of the contacts (k, 5) went over their geoms (k, 3) [m], and where they were
-        contacts before: (k,) 1 or 0."""
+        """Distances of the contacts' anchors (k, 5) over their geoms (k, 3) [m], and a mask (k,) of those
+        that were contacts before."""
         if not len(old):
             return np.zeros((len(new), 3)), np.zeros(len(new))
         before = old[:, 0].astype(int)

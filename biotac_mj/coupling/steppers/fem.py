@@ -40,7 +40,7 @@ _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not m
 
 
 class FemStepper:
-    """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
+    """Finite elements (`biotac_mj.skin`) for one BioTac; those with the same settings share one model.
 
     The state holds what `skin.state.VARIABLES` has of the full tier."""
 
@@ -126,7 +126,7 @@ class FemStepper:
 
     @property
     def grids(self) -> list[DistanceGrid]:
-        """Of its meshes."""
+        """Distance grids of its meshes."""
         return [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type in ("mesh", "skin")]
 
     def used(self, state: np.ndarray) -> SavedState:
@@ -163,7 +163,7 @@ class FemStepper:
 
     @property
     def model(self) -> SkinModel:
-        """What of the skin does not change."""
+        """The constant SkinModel."""
         return self._model
 
     def contact_rows(self, state: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ class FemStepper:
 
     @functools.cached_property
     def sample_area(self) -> tuple[np.ndarray, int]:
-        """What a contact sample of each face stands for (nface,) [m^2], and how many a face has."""
+        """Area of a contact sample of each face (nface,) [m^2], and number of samples of a face."""
         nsample = len(self._model.sample)
         return self._model.outer.area.numpy() / nsample, nsample
 
@@ -327,7 +327,7 @@ class FemStepper:
         return 0.0 if law is None else law.adhesion * law.adhesion_hysteresis * float(area.numpy().sum())
 
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
-        """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
+        """Advances a skin at rest that no geom at these poses touches: writes `state` after the step."""
         moved = np.ravel(geom_pos) - self._part(state, "geom_pos")
         self._part(state, "motion")[:] = moved if self._part(state, "started")[0] else 0.0
         self._place_geoms(state, geom_pos, geom_mat)
@@ -388,7 +388,7 @@ class FemStepper:
     # --- the state as numbers  ---
 
     def _unpack(self, state, **instead):
-        """Of a state, or what is given instead of parts of it."""
+        """Loads a state; `instead`: values that replace parts of it."""
         self._arrays.load(self._layout.read(state).replace(**instead))
         self._geom_set.set_pose(*self.came_to(state))
         self._geom_set.advance()
@@ -401,8 +401,8 @@ class FemStepper:
 
 
 def _travel(pos0, mat0, pos, mat):
-    """How far geoms carry what of them is at the skin, from poses (n, 3), (n, 3, 3) to others [m]: the frame
-    of a large one may lie far away, and moves far where it turns a little."""
+    """Displacement of geoms at the skin, from poses (n, 3), (n, 3, 3) to others [m]: the frame of a large one
+    may lie far away, and moves far where it turns a little."""
     turn = mat @ np.swapaxes(mat0, 1, 2)
     shift = np.linalg.norm(pos - (turn @ pos0[:, :, None])[:, :, 0], axis=1)
     return (shift + _REACH * np.linalg.norm(turn - np.eye(3), axis=(1, 2))).max(initial=0.0)

@@ -90,6 +90,6 @@ def areas_at(vert: torch.Tensor, face: np.ndarray) -> torch.Tensor:
 
 
 def cavity_at(vert: torch.Tensor, face: np.ndarray) -> torch.Tensor:
-    """Volume inside inner faces (nface, 3), whose normals point inwards [m^3]."""
+    """Volume enclosed by inner faces (nface, 3), whose normals point inwards [m^3]."""
     a, b, c = vert[torch.from_numpy(face.astype(np.int64))].unbind(1)
     return -(a * torch.linalg.cross(b, c)).sum() / 6

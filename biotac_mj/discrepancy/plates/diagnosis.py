@@ -142,7 +142,8 @@ class Tried:
 
     @property
     def attached(self) -> list[dict] | None:
-        """What `biotac_mj.attach` takes to have it, by sensor; None where no running sensor can."""
+        """Arguments of `biotac_mj.attach` for a sensor with the effect, by sensor; None if no running sensor
+        can have it."""
         attach = self.model.effect.attach
         return attach and [attach(sum(t.value) / len(t.value)) for t in self.tested]
 
@@ -165,7 +166,7 @@ class PlateDiagnosis(Verdict):
 
     @property
     def acting(self) -> Tried | None:
-        """Of what is named and can act in a model, tied or not, that which has most evidence."""
+        """The named effect with most evidence that can act in a model, tied or not."""
         return max((f for f in self.named if f.attached), key=lambda f: f.evidence, default=None)
 
     def beside(self, first: RecordingDiagnosis) -> "PlateDiagnosis":
@@ -276,7 +277,7 @@ def _tried(some, tested, sensors):
 
 
 def _named(tried):
-    """What has most evidence in every sensor, and what no sensor tells from it."""
+    """The model with most evidence in every sensor, and those that no sensor distinguishes from it."""
     good = [f for f in tried if f.model.kind == "lacks" and f.whose in ("base model", "unknown")]
 
     def tied(other):
@@ -432,7 +433,7 @@ def _row(f, sensor, t):
 
 
 def _where(s):
-    """Of a sensor, in numbers."""
+    """Location of the disagreement of one sensor, as numbers."""
     return {
         "worst": electrode_names(s.worst),
         "rms": float(np.sqrt((s.judged.error**2).mean())),

@@ -1,5 +1,6 @@
-"""What may be said of presses of a flat plate: the base model, what it has left out of it, what it lacks
-added to it. Each model is fitted on one half of the blocks of time and judged on the other."""
+"""Candidate models of presses of a flat plate: the base model, the base model without one of its parts, the
+base model with one effect added. Each model is fitted on one half of the blocks of time and judged on the
+other."""
 
 import dataclasses
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Where a recording and simulated presses disagree: electrodes by phase, load and pitch."""
+"""Locates the disagreement of a recording and simulated presses: electrodes by phase, load and pitch."""
 
 import numpy as np
 
@@ -69,8 +69,8 @@ def leading(judged: Judged) -> list[int]:
 
 
 def missing(judged: Judged) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the electrodes' changes are too small (19,), as a share of them, and its standard error
-    over blocks: the slope of what is left over what is modelled."""
+    """Fraction by which the electrodes' changes are too small (19,), and its standard error over blocks: the
+    slope of the residual over the modelled change."""
     parts = [
         (-(judged.error[b] * judged.change[b]).sum(0), (judged.change[b] ** 2).sum(0))
         for b in blocks(len(judged.error))

@@ -1,5 +1,5 @@
-"""What can be named in a recording: effects of the catalogue; a candidate with its parameters, and how it is
-taken out of the counts."""
+"""Candidates of a recording: effects of the catalogue with their parameters, and their removal from the
+counts."""
 
 import dataclasses
 from collections.abc import Callable

@@ -29,7 +29,8 @@ def confidence(finding: Candidate, beside: int = 0) -> float:
 
 
 def farthest(features: dict, usual: dict) -> tuple[float, str]:
-    """How far the most unusual of a recording's features lies above what is usual, in spreads, and its name.
+    """Largest deviation of a recording's features above their usual values, in spreads, and the feature's
+    name.
 
     Args:
       features: with the logarithm of the recording's seconds. usual: name -> (median, its change with the

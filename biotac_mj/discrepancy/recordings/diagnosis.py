@@ -1,4 +1,4 @@
-"""What a plain recording's diagnosis has found, as a verdict with its figures and its sensor."""
+"""Diagnosis of a plain recording: its verdict with figures, and its sensor."""
 
 import dataclasses
 import math
@@ -47,7 +47,7 @@ class RecordingDiagnosis(Verdict):
 
     @property
     def rejected(self) -> list[Candidate]:
-        """Those that the part kept aside contradicts or that are too weak to be named."""
+        """Findings that held-out rows contradict or that are too weak to be named."""
         return self.session.weak
 
     def pictures(self) -> list[Picture]:
@@ -136,7 +136,8 @@ def _finding(f: Candidate) -> Finding:
 
 
 def _next(findings, protocol):
-    """What would tell names from those they are confused with, and what a checkup would add."""
+    """Measurements that distinguish the named effects from those they are confused with, and what a checkup
+    would add."""
     tied = [(f.kind, i) for f in findings for i in f.ties]
     rivals = [(kind, i) for kind in dict.fromkeys(f.kind for f in findings) for i in [*kind.confusable][:1]]
     out = {
@@ -161,7 +162,7 @@ def _amended(session):
 
 
 def _notes(session):
-    """What the data cannot tell."""
+    """Lines on effects that the data cannot show."""
     recording, loads, out = session.recording, "saturation", []
     if recording.force is None:
         out.append("no force: how late the electrodes follow it")

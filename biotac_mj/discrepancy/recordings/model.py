@@ -103,7 +103,7 @@ class Model:
 
     @property
     def parted(self) -> bool:
-        """Whether the rows fitted are long enough to tell load from drift."""
+        """Whether the fitted rows are long enough to separate load and drift."""
         return bool(self.inside.sum() * self.period >= LEAST)
 
     def alone(self, value: np.ndarray | None = None) -> np.ndarray:
@@ -127,8 +127,8 @@ class Model:
         return self.whole if value is None else np.concatenate([value, self.whole[:, c:]], axis=1)
 
     def moments(self, every: bool = False) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-        """Of windows of the bins fitted or of all: rows of one, moments (w, q, q) of changes within each, of
-        electrodes and products, floor (q,) of a window's noise, and middles (w,) [s]."""
+        """Moments of changes within windows of the fitted bins, or of all: rows of a window, moments (w, q,
+        q) of electrodes and products, floor (q,) of a window's noise, and centres (w,) [s]."""
         whole = self.whole if every else self.whole[self.inside]
         span = max(4, int(min(CHANGES / self.period, len(whole) // 32)))
         w = len(whole) // span

@@ -45,7 +45,8 @@ def worst(diagnosis: Verdict) -> list[int]:
 
 
 def _panels(d):
-    """Of the worst channels; simulated is rest and load, as the other electrodes say them."""
+    """Panels of the worst channels; "simulated" is baseline and load as predicted from the other
+    electrodes."""
     s, r, m = d.session, d.recording, d.session.model()
     said = counts_from_log_impedance(m.value - (m.alone() if m.dimensions else m.value) + m.mean)
     measured, effect = (

@@ -26,7 +26,8 @@ _MOST_OF = 0.5  # of the rows must have a force, one after another, or it takes 
 
 @dataclasses.dataclass
 class PlainRecording:
-    """What is diagnosed without poses: electrodes of one sensor, uniformly sampled, as raw counts. n rows.
+    """A recording without poses for diagnosis: electrodes of one sensor, uniformly sampled, as raw
+    counts.Attributes have n rows.
 
     `biotac_mj.recordings.Recording` is the general form, with times, poses, all channels and their units;
     `diagnose_recording` takes either.
@@ -114,7 +115,7 @@ class PlainRecording:
 
     @property
     def not_identifiable(self) -> list[str]:
-        """What a log from which a rest was subtracted does not tell, in words; nothing of raw counts."""
+        """Lines on effects that a log with subtracted baseline does not show; empty for raw counts."""
         if self.absolute:
             return []
         out = [

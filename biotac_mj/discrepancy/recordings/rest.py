@@ -1,5 +1,5 @@
-"""What is left once everything named is taken out: whether each electrode does what the others, and its own
-earlier blocks, say it should."""
+"""Residual after all named effects are removed: whether each electrode agrees with the prediction from the
+others and from its own earlier blocks."""
 
 import dataclasses
 
@@ -100,7 +100,7 @@ def _where(counts, time):
 
 
 def _contradicted(session):
-    """What is said of names that the rows kept aside contradict; a warm-up is none, every sensor has some."""
+    """Line on names that held-out rows contradict, except a warm-up, which every sensor has."""
     weak = [f for f in session.weak if f.verified is False and f.confidence >= NAMED and f.share is None]
     names = [f.kind.name + f.where for f in weak]
     if not names:

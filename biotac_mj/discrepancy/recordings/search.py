@@ -177,7 +177,7 @@ def _proved(session):
 
 
 def _checkup(session, protocol, named):
-    """What the stretches of a protocol show beyond the log as a whole."""
+    """Findings of single stretches of a protocol that the whole log does not show."""
     r, known, found = session.recording, list(session.findings), []
     for rows in stretches(r, protocol):
         some = diagnose_recording(r.part(rows), named=named).findings

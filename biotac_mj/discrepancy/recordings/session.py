@@ -1,4 +1,4 @@
-"""What the search on a plain recording knows: the recording less what was found so far."""
+"""State of the search on a plain recording: the recording without the effects found so far."""
 
 import numpy as np
 

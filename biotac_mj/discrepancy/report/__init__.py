@@ -1,1 +1,1 @@
-"""What a diagnosis says, whichever program made it: findings, a verdict, their text, figures and files."""
+"""Reports of all diagnoses: findings, a verdict, their text, figures and files."""

@@ -76,7 +76,7 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class Gap:
-    """How far simulation and measurement are apart on data that took no part in any fit.
+    """Difference between simulation and measurement on held-out data.
 
     Attributes:
       unit; before, after: RMS without and with what was found. noise: RMS that noise and the simulation's own
@@ -185,7 +185,7 @@ class Finding:
 
     @property
     def proof(self) -> str:
-        """What data kept aside say of it, in words."""
+        """Line on the test by held-out data."""
         sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[self.confirmed]
         if self.gap is None:
             return f"{sign} by data kept aside"
@@ -250,7 +250,7 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What is found in some data.
+    """Result of a diagnosis.
 
     Attributes:
       kind: of the data; name: of this one; data: what it consists of, a line. warnings: lines.
@@ -345,7 +345,7 @@ class Verdict:
         return f"{text}; {what} gains nothing there{there if other.gained else ''}{rest}."
 
     def to_dict(self) -> dict:
-        """What verdict.json holds: numbers, strings, lists and dicts only, no NaN."""
+        """Content of verdict.json: numbers, strings, lists and dicts only, no NaN."""
         document = {
             "schema": SCHEMA,
             "version": VERSION,

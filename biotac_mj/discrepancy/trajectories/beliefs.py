@@ -1,4 +1,4 @@
-"""How likely each explanation of a diagnosis is by trajectories left out, and what is known of its
+"""Probabilities of the explanations of a diagnosis by held-out trajectories, and intervals of their
 parameters: kept in the report's folder for the next experiment, and for the round that follows it."""
 
 import dataclasses
@@ -108,7 +108,7 @@ class Explanation:
 
 
 def _after(known):
-    """Where the parameters begin that are not known."""
+    """Index of the first unknown parameter."""
     return (0 if known is None else known[0][1].shape[1], None)
 
 
@@ -148,7 +148,8 @@ class Beliefs:
 
     @property
     def odds(self) -> float:
-        """Of the likeliest explanation, with more effects or without, against those that contradict it."""
+        """Odds of the likeliest explanation, including those that add effects to it or omit some, against all
+        that contradict it."""
         against = sum(one.weight for one in self.rivals[1:])
         return float((1 - against) / max(against, 1e-9))
 
@@ -164,8 +165,8 @@ class Beliefs:
 
     @property
     def against_none(self) -> str:
-        """What explains data that nothing is named in, in words, where the base model alone is excluded by
-        the odds that would decide: too little of any one for a name is not agreement."""
+        """Line on the likeliest explanations, if none is named although the odds exclude the base model
+        alone: too little evidence for any one name is no agreement."""
         alone = sum(one.weight for one in self.explanations if not one.effects)
         if alone * (1 + ODDS) >= 1:
             return ""
@@ -176,7 +177,7 @@ class Beliefs:
 
     @property
     def text(self) -> str:
-        """What is decided, in words."""
+        """The decision as text."""
         first, *others = self.rivals
         if self.told_apart:
             text = f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
@@ -259,8 +260,7 @@ def _effect(name, theta, extra, design):
 
 
 def believed(comparison: "Comparison", search: "Search", doubts: list[str], chosen: np.ndarray) -> Beliefs:
-    """What a diagnosis believes: the likeliest of all explanations that a search has tried, and the base
-    model alone.
+    """Probabilities of the likeliest explanations that a search has tried, and of the base model alone.
 
     Args:
       doubts: see Beliefs.

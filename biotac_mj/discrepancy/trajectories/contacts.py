@@ -29,7 +29,7 @@ _SAFE = 0.9  # of the largest force: effects may add to what the base model says
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """What a contact may do.
+    """Limits of a contact.
 
     Attributes:
       force: largest [N]. depth: largest [m]. reach: from and to along the finger, tip at -x [m]. around: the

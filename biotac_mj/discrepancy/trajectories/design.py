@@ -208,7 +208,7 @@ def _showing(t, run):
 
 
 def _reason(explanations, weight, gain):
-    """Which two explanations a contact tells apart most, by their weights (explanations,)."""
+    """The two explanations that a contact distinguishes best, by their weights (explanations,)."""
     a, b = np.unravel_index(np.argmax(np.outer(weight, weight) * gain), gain.shape)
     if gain[a, b] < _NOTHING:
         return "the base model's own parameters"

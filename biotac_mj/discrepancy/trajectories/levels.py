@@ -1,4 +1,4 @@
-"""Which trajectories are off."""
+"""Finds the trajectories that disagree with the model."""
 
 import numpy as np
 

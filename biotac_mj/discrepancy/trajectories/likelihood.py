@@ -1,4 +1,4 @@
-"""How likely data are under a model that is nearly right.
+"""Likelihood of data under a model that is nearly right.
 
 Measured less predicted is noise, the error of every trial's pose, and what the model misses: a Gaussian
 process per channel over where and how deep an object presses, for how long it has touched, and the session's
@@ -63,7 +63,7 @@ def _since_touch(t):
 
 
 class Likelihood:
-    """Of some trajectories of a Comparison.
+    """Likelihood of some trajectories of a Comparison.
 
     Attributes:
       chosen: their indices. size: (width,) by how much the base model is expected to be off [counts, N]

@@ -26,7 +26,7 @@ def pictures_of(diagnosis: Verdict) -> list[Picture]:
 
 
 def _curves(diagnosis):
-    """Of the two channels that are furthest off, in some of the trajectories kept aside."""
+    """Panels of the two channels with the largest error, in some of the held-out trajectories."""
     c, panels, proof = diagnosis.comparison, [], diagnosis.proof
     names = c.channels
     for channel in np.argsort(-np.array(proof.before["channels"]) / c.sigma)[:2]:

@@ -23,7 +23,7 @@ _LAW = 0.15
 
 @dataclasses.dataclass(frozen=True)
 class Proof:
-    """What trajectories kept aside say.
+    """Test of a fit on held-out trajectories.
 
     Attributes:
       fit: Fit that they do not contradict: with effects, with the base model's constants alone, or the base
@@ -97,8 +97,8 @@ def _measured(comparison, fit, rows):
 
 
 class _Off(typing.NamedTuple):
-    """By how much trajectories together are off, as sums over rows of mean squares, less what is expected:
-    channels: beyond noise; poses: beyond their scatter.
+    """Error of trajectories together, as sums over rows of mean squares minus their expectation:channels:
+    beyond noise; poses: beyond their scatter.
 
     What all poses are off by is as much a disagreement as what is left of the channels: the most probable
     error of a pose counts in units of its repeatability, and each of its three numbers as much as a row."""

@@ -91,8 +91,8 @@ def _in_sensor(recording):
 
 
 def _contacts(time, pos, gap):
-    """Of every contact its rows (k,), the last one before it, those of it and what follows near the skin; and
-    a row of the way there in which nothing touches, or None."""
+    """For every contact its rows (k,), the last one before it, those of it and the following ones near the
+    skin; and a row of the approach without touch, or None."""
     stride = np.linalg.norm(np.diff(pos, axis=0, prepend=pos[:1]), axis=1)
     touch = np.concatenate([[False], gap <= 0, [False]])
     change = np.diff(touch.astype(int))

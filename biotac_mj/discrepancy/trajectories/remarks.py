@@ -1,5 +1,5 @@
-"""What a report says beside effects: of the base model, of the poses, of data that cannot show something, and
-of trajectories and electrodes that are far off by themselves."""
+"""Remarks of a report: on the base model, on the poses, on effects that the data cannot show, and on
+trajectories and electrodes with large errors of their own."""
 
 import typing
 
@@ -23,9 +23,9 @@ __all__ = ["jumps", "next_experiment", "of_base", "of_data", "scattered", "stray
 
 
 def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, step: list) -> str:
-    """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
-    trajectories are what any base model may be off by, two more of those kept aside are not; and one press of
-    eleven that bears a load which no other has is all that there is of it.
+    """Remark on trajectories that disagree, if too few of their kind were fitted for evidence: two slides of
+    six trajectories are what any base model may be off by, two more of those kept aside are not; and one
+    press of eleven that bears a load which no other has is all that there is of it.
 
     Args:
       step: Candidates of a round."""
@@ -44,14 +44,14 @@ def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.
 
 
 def jumps(comparison: "Comparison", null: "Fit") -> str:
-    """What is said of electrodes whose rows are far off one by one, all others between them right."""
+    """Remark on electrodes with large errors in single rows while all others agree."""
     which = jumping(comparison, null)
     many = "s" if len(which) == 1 else ""
     return f"{', '.join(which)} jump{many} from row to row: look for a loose lead" if which else ""
 
 
 def _size(comparison, i, residual) -> str:
-    """By how much a trajectory is off in the group that stands out most, of how much."""
+    """Error of a trajectory and its largest value, in the channel group with the largest relative error."""
     loud = {g: np.mean((residual[:, s] / comparison.sigmas[i][s]) ** 2) for g, s in comparison.groups.items()}
     group = max(loud, key=loud.get)
     part = comparison.groups[group]
@@ -61,7 +61,7 @@ def _size(comparison, i, residual) -> str:
 
 
 def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[str]:
-    """What the fitted nuisance says of the base model and of the poses; it takes no effect's name."""
+    """Remarks on the base model and the poses by the fitted nuisance parameters; they name no effect."""
     nuisance, notes = fit.nuisance, []
     if abs(nuisance.log_modulus) > 0.2:
         notes.append(
@@ -93,7 +93,7 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
 
 
 def scattered(comparison: "Comparison") -> str:
-    """What is said of poses that scatter far more than is stated, or nothing."""
+    """Remark on poses that scatter far more than is stated; "" if they do not."""
     if comparison.repeatability <= 2 * max(comparison.stated, REPEATABILITY):
         return ""
     return (
@@ -104,7 +104,7 @@ def scattered(comparison: "Comparison") -> str:
 
 
 def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
-    """What trajectories like these cannot show."""
+    """Remarks on effects that trajectories like these cannot show."""
     notes = []
     if len(data) < 12:
         notes.append(
@@ -127,7 +127,7 @@ def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
 
 
 def next_experiment(effects: "list[Finding]", isolability: dict, unknown: bool, tier: str) -> str:
-    """What to do next, in words.
+    """Recommends the next experiment.
 
     Args:
       effects: Findings, the one that explains most first.

@@ -1,5 +1,6 @@
-"""Which effects together: one after another that which the data are likeliest with, as long as it is likelier
-than nothing by far, and by more than surrogates of the data without it show of any."""
+"""Searches for the effects that explain the data together, one after another: each is the one under which the
+data are likeliest, if it is far likelier than none and gains more than any effect does on surrogates of the
+data without it."""
 
 import dataclasses
 import typing
@@ -51,7 +52,7 @@ class Candidate:
     ties: list[str] = dataclasses.field(default_factory=list)
 
     def record(self) -> dict:
-        """What a file can hold of it."""
+        """The part of it that a file can hold."""
         theta = next(th for e, th in self.fit.effects if e.id == self.effect.id)
         return {
             "id": self.effect.id,
@@ -65,7 +66,7 @@ class Candidate:
 
 @dataclasses.dataclass
 class Search:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
       fit: Fit with all effects. found: Candidates in their order. rounds: lists of Candidate, best first.

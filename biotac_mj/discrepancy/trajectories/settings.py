@@ -1,4 +1,4 @@
-"""What a diagnosis of data with poses takes for granted: priors, one bound on effort and one rate of false
+"""Assumptions of a diagnosis of data with poses: priors, one bound on effort and one rate of false
 discoveries."""
 
 import dataclasses

@@ -18,8 +18,9 @@ SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
 
 
 class Signatures:
-    """Of effects beside a fit, in the likelihood's eigenvectors and over the standard deviation there; what
-    poses, the base model and the fit's effects can mimic is left to them, within their priors."""
+    """Signatures of effects beside a fit, in the likelihood's eigenvectors and divided by the standard
+    deviation there, without what poses, the base model and the fit's effects can mimic within their
+    priors."""
 
     def __init__(self, comparison: "Comparison", current: "Fit", chosen: np.ndarray):
         self.comparison, self.current = comparison, current

@@ -1,4 +1,4 @@
-"""Where the residual stands out, and where a remainder does that has no name."""
+"""Locates the largest residuals, and the remainder without a name."""
 
 import typing
 
@@ -79,7 +79,8 @@ def channel_groups(comparison: "Comparison") -> dict:
 def residual_cells(
     comparison: "Comparison", null: "Fit", chosen: np.ndarray, channels: dict[str, slice]
 ) -> Cells:
-    """Of the residuals of the chosen trajectories over noise and resolution; channels: name -> columns."""
+    """Cells of the chosen trajectories' residuals, divided by noise and resolution; channels: name ->
+    columns."""
     white = null.posed(comparison)
     asked = conditions([comparison.trajectories[i] for i in chosen])
     return Cells.of([white[i] for i in chosen], asked, channels)
@@ -107,7 +108,7 @@ def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dic
 
 
 def left_over(comparison: "Comparison", current: "Fit", chosen: np.ndarray) -> str:
-    """Where what a fit leaves stands out most, in words."""
+    """Line on the largest residuals of a fit."""
     cells = where(comparison, current, chosen)[:_SAID]
     if not cells:
         return "no channel stands out under any condition"

@@ -104,14 +104,15 @@ class Comparison:
         )
 
     def _prepare(self):
-        """Of every trajectory an orthonormal basis u of its whitened pose columns, u s v' = J."""
+        """Computes, for every trajectory, an orthonormal basis u of its whitened pose columns, u s v' = J."""
         self._basis = []
         for i in range(len(self.trajectories)):
             J = np.stack([(c / self.sigmas[i]).ravel() for c in self.moved(i)], axis=1)
             self._basis.append(np.linalg.svd(J * self.repeatability, full_matrices=False))
 
     def moved(self, i: int, offset: np.ndarray | float = 0.0) -> list[np.ndarray]:
-        """What poses do to trajectory i, (n, width) per metre along x, y and z, about an offset (3,) [m]."""
+        """Derivative of trajectory i by its pose, (n, width) per metre along x, y and z, about an offset (3,)
+        [m]."""
         scale = self.modulus * self.sim.modulus
         z = np.exp(self.fields.base[i]["log_z"]) / 1e4
         counts_per_log = -4095 * z / (z + 1) ** 2
@@ -122,8 +123,8 @@ class Comparison:
         return out
 
     def _split(self, i, residual):
-        """Of the whitened residual (n, width) of trajectory i the part along what its pose does (3,), and the
-        rest (n width,)."""
+        """Splits the whitened residual (n, width) of trajectory i: the part along its pose's derivatives
+        (3,), and the rest (n width,)."""
         r, u = (residual / self.sigmas[i]).ravel(), self._basis[i][0]
         along = u.T @ r
         return along, r - u @ along

@@ -207,8 +207,8 @@ def _explained(stated, usable, chosen, seed, bar):
 
 
 def _off(comparison, fit) -> tuple[float, float]:
-    """How many times more than is expected of a model data are off: by the group of channels, and by the
-    channel, that is worst."""
+    """Ratio of the residual to what is expected of a model: in the worst group of channels, and in the worst
+    channel."""
     log = np.log(fit.amplitude)
     groups = [np.exp(log[part].mean()) for part in comparison.groups.values()]
     return float(max(groups)), float(fit.amplitude.max())
@@ -233,7 +233,7 @@ def _named(comparison, null, search):
 
 
 def _tie_aliases(current, found, names):
-    """Adds to the ties of Candidates what with their parameters is as likely."""
+    """Adds to the ties of Candidates the effects that are as likely with their parameters."""
     for item in found:
         theta = next(th for e, th in current.effects if e.id == item.effect.id)
         known = {*item.ties, *(one.effect.id for one in found)}
@@ -241,8 +241,8 @@ def _tie_aliases(current, found, names):
 
 
 def _in_words(comparison, current, effects, named, chosen, refuted):
-    """Verdict, and what is said of the remainder, where something disagrees; refuted: what is said of effects
-    that have no name."""
+    """Verdict, and a line on the remainder where something disagrees; refuted: line on effects that have no
+    name."""
     parts = [
         e.name + (f" (or {' or '.join(e.ties.values())}: not told apart)" if e.ties else "") for e in effects
     ]
@@ -274,7 +274,7 @@ def _upheld(comparison, null, current, found, search, chosen, aside):
 
 
 def _refuted(found):
-    """What is said of effects that trajectories kept aside do not bear out; nothing without any."""
+    """Line on effects that held-out trajectories do not confirm; "" if there are none."""
     if not found:
         return ""
     what = " and ".join(one.effect.name for one in found)

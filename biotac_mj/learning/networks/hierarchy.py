@@ -120,7 +120,7 @@ def _dual(graph, owner, vert):
 
 
 def _interpolation(graph, vert, keep):
-    """(n, m) weights of moving least squares on the nearest kept nodes; identity at kept ones."""
+    """Weights (n, m) of moving least squares on the nearest kept nodes; the identity at kept ones."""
     n, m = len(vert), len(keep)
     k = min(_NEIGHBOURS, m)
     distance = dijkstra(graph, indices=keep)  # (m, n)

@@ -47,7 +47,7 @@ class Table:
 
     @property
     def width(self) -> int:
-        """How many columns."""
+        """Number of columns."""
         return len(self.cells[0])
 
     def numbers(self, columns: list[int], names: list[str], gaps: bool = False) -> np.ndarray:

@@ -347,7 +347,7 @@ def join(
 
 
 def _owners(one, sensors):
-    """Those of several sensors that a force or pose is named after: `ff_wrench` belongs to `ff_biotac`."""
+    """The sensors that a force or pose is named after: `ff_wrench` belongs to `ff_biotac`."""
     words = {id(s): set(f"{s.sensor}_{s.called}".lower().split("_")) for s in sensors}
     common = set.intersection(*words.values()) if len(sensors) > 1 else set()
     own = {word for word in set(one.sensor.lower().split("_")) - common if word and not word.isdigit()}

@@ -59,7 +59,8 @@ def find_groups(
     c: Constants,
     s: Scratch,
 ):
-    """Where each candidate node is, and to which group of geoms it answers, until another one touches it."""
+    """Finds the position of each candidate node, and its group of geoms, kept until another one touches
+    it."""
     groups = s.bodies.compliance.shape[0]
     for k in range(t, wp.where(groups > 0, nnode, 0), threads):
         s.arm[w, k] = x[c.node[s.node[w, k]], w]

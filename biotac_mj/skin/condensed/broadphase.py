@@ -47,8 +47,7 @@ ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than p
 
 @wp.func
 def _moved_since(w: int, k: int, near: wp.int64, geoms: Geoms, c: Constants, s: Scratch):
-    """How far at most what near geoms have at the skin has moved since view k was taken [m]; nan: it never
-    was."""
+    """Bound of the motion of near geoms at the skin since view k was taken [m]; nan: it never was."""
     most = real(0.0)
     for g in range(geoms.count):
         if has(near, g):
@@ -72,9 +71,9 @@ def _is_clear(w: int, view: int, travel: real, near: wp.int64, geoms: Geoms, c: 
 
 @wp.func
 def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
-    """Which view of the skin at rest to use, how far what geoms have there has moved since it was taken [m],
-    and which geoms are near the skin; where that is far, one is taken now. A skin that is several BioTacs' by
-    turns has several views."""
+    """Chooses the view of the undeformed skin; returns it, the motion of the geoms there since it was taken
+    [m], and the geoms near the skin. A view that is too old is renewed. A skin that serves several BioTacs in
+    turn has several views."""
     least = _REGION
     view = int(-1)
     _count, near = geoms_within(c.center, c.radius + _AWAY, w, geoms, ALL)
@@ -107,7 +106,7 @@ def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
 
 @wp.func
 def largest_displacement(w: int, t: int, threads: int, x: wp.array2d(dtype=vec3), c: Constants):
-    """How far a node is from where it rests at most [m]."""
+    """Largest displacement of a node [m]."""
     largest = real(0.0)
     for i in range(t, c.free.shape[0], threads):
         largest = wp.max(largest, wp.length_sq(x[c.free[i], w] - c.rest[c.free[i], 0]))
@@ -143,7 +142,7 @@ def forget_faces(
 
 @wp.func
 def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=vec3), c: Constants):
-    """How far a face's nodes are from where they rest at most, squared [m^2]."""
+    """Largest squared displacement of a face's nodes [m^2]."""
     most = real(0.0)
     for k in range(3):
         i = face[f][k]
@@ -163,7 +162,7 @@ def _seen_from(
     c: Constants,
     s: Scratch,
 ):
-    """Which of the near geoms a face may be within reach of [m], by a view and by how far it has moved."""
+    """The near geoms that may be within reach [m] of a face, by a view and the face's displacement."""
     room = _SEEN - reach - ROOT3 * travel
     if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, x, c):
         return near & s.seen[w, view, f]
@@ -462,8 +461,8 @@ def measure_core(
 
 @wp.func
 def _depth(w: int, t: int, threads: int, near: wp.int64, geoms: Geoms, c: Constants):
-    """How deep a geom of a set is in the core, or has a vertex of it inside; less than nothing: it is clear
-    [m]."""
+    """Largest penetration of the core by a geom of a set, or by one of its vertices [m]; negative if there is
+    none."""
     deep = real(-1.0)
     n = c.core_vert.shape[0]
     for i in range(t, wp.where(n > 0, n + 1, 0), threads):

@@ -1,5 +1,5 @@
-"""What a balance of one skin means for the whole of it, by the threads of a block: nodes, the liquid's
-volume, corrections, wrenches on bodies and their tangents."""
+"""Results of a balanced skin, by the threads of a block: nodes, the liquid's volume, corrections, wrenches on
+bodies and their tangents."""
 
 import warp as wp
 
@@ -174,7 +174,7 @@ def find_wrenches(
 
 @wp.func
 def fraction_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
-    """Of a candidate node, what a group of geoms touches."""
+    """Fraction of a candidate node that a group of geoms touches."""
     i = c.node[s.node[w, k]]
     nsample = c.sample.shape[0]
     mine = real(0.0)
@@ -310,8 +310,7 @@ def recall(
     s: Scratch,
     x_out: wp.array2d(dtype=vec3),
 ):
-    """Where the forces that are remembered have the nodes; to the last digit what `place_nodes` found, and by
-    one thread."""
+    """Nodes under the remembered forces; equal to the last digit to `place_nodes`, by one thread."""
     w = wp.tid()
     count = int(0)
     for i in range(c.node.shape[0]):

@@ -1,4 +1,4 @@
-"""What the threads of a block know of a skin, remember of its world, and write while they solve it."""
+"""Structs of a condensed solve: constants of a skin, memory of a world, scratch arrays."""
 
 import warp as wp
 
@@ -13,8 +13,9 @@ __all__ = ["Constants", "Remembered", "Scratch"]
 
 @wp.struct
 class Constants:
-    """Of a skin, the same in all worlds. Contact coordinates are three for each free outer node, then one for
-    each inner node that can meet the core, away from it. Compliances are those of Young's modulus one."""
+    """Constants of a skin, the same in all worlds. Contact coordinates are three for each free outer node,
+    then one for each inner node that can meet the core, away from it. Compliances are those of Young's
+    modulus one."""
 
     node: wp.array(dtype=int)  # free outer nodes
     number: wp.array(dtype=int)  # of each node among them; -1: it is held, or not there
@@ -86,7 +87,8 @@ NVECTOR = 7
 
 @wp.struct
 class Scratch:
-    """Of a solve [world, item]: candidates, nodes and faces that may touch, and what was found of them."""
+    """Scratch arrays of a solve [world, item]: candidates, nodes and faces that may touch, and their
+    results."""
 
     near: wp.array2d(dtype=int)  # which faces are candidates, by their place among them plus one; 0: none
     near_core: wp.array2d(dtype=int)  # which inner ones

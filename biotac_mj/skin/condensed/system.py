@@ -162,7 +162,7 @@ def gather_blocks(
 
 @wp.func
 def count_contacts(w: int, t: int, threads: int, nface: int, touch: Contact, c: Constants, s: Scratch):
-    """How many samples of the candidates touch."""
+    """Number of touching samples of the candidates."""
     nsample = c.sample.shape[0]
     own = int(0)
     for k in range(t, nface * nsample, threads):

@@ -287,7 +287,7 @@ TRILINEAR = wp.constant(real(0.5 * 3.0**0.5))
 
 @wp.func
 def _spline_row(grids: Grids, at: int, value: vec3, slope: vec3):
-    """Value and slope from three coefficients, starting with index `at`."""
+    """Value and slope of a spline along one row of three coefficients from index `at`."""
     c = vec3(real(grids.coefficient[at]), real(grids.coefficient[at + 1]), real(grids.coefficient[at + 2]))
     return wp.vec2d(wp.dot(c, value), wp.dot(c, slope))
 

@@ -249,8 +249,8 @@ def _update_kernels(precision):
         # Out:
         partial_out: wp.array3d(dtype=real),
     ):
-        """dx += alpha p and r -= alpha (q + pressure_response gradient) in a chunk of nodes, and the square
-        of r."""
+        """Updates dx += alpha p and r -= alpha (q + pressure_response gradient) in a chunk of nodes, and sums
+        the square of r."""
         c, w = wp.tid()
         if st.active[w] == 0:
             return

@@ -112,7 +112,7 @@ def row_tangents(
     # Out:
     partial_out: wp.array2d(dtype=wp.spatial_matrixd),
 ):
-    """Part R_s' sum_t G_st R_t of row s in the tangent of its body [row, world]."""
+    """Contribution R_s' sum_t G_st R_t of row s to the tangent of its body [row, world]."""
     s, w = wp.tid()
     if s >= size[w]:
         return

@@ -58,7 +58,8 @@ def read_node(x: wp.array2d(dtype=float), row: int, column: int):
 
 @wp.struct
 class NodeMap:
-    """How vectors of nodes become right-hand sides of the block inverse, and its answers vectors of nodes."""
+    """Maps vectors of nodes to right-hand sides of the block inverse, and its solutions to vectors of
+    nodes."""
 
     row: wp.array(dtype=int)  # first row of each node; -1: the node is fixed
     matrix: wp.array2d(dtype=wp.mat33)  # M of `pushed_forward` [node, world]; empty: the identity

@@ -85,7 +85,7 @@ def deformation_of(corners: int) -> wp.Function:
 
 @wp.func
 def remembering(law: int, lam: real):
-    """Second constant of the part of the law with history."""
+    """Constant lambda of the part of the law with history."""
     if law == 2:
         return real(0.0)
     return lam

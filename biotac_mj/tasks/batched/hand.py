@@ -39,7 +39,7 @@ class Rod:
 
 @dataclasses.dataclass(frozen=True)
 class Pinch:
-    """Where hand and rod begin, and how fingers close.
+    """Start of hand and rod, and closing of the fingers.
 
     Attributes:
       qpos: (nq,) pads `_GAP` away from the rod.

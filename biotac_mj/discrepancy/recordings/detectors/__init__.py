@@ -1,2 +1,2 @@
-"""What can be wrong with a plain recording beside faults of the log (`quality`): each module finds and fits
-one class of effects; `trends` is what several compare levels with."""
+"""Detectors for plain recordings, beside those for faults of the log (`quality`): each module finds and fits
+one class of effects. Several compare levels with `trends`."""

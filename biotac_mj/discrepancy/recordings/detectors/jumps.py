@@ -114,7 +114,7 @@ def edges(session: Session) -> dict[int, list[Edge]]:
 
 
 def _together(row, electrodes, found, design):
-    """Which of some electrodes jump at a row: most of them, and they are no patch, or none."""
+    """The electrodes that jump together at a row: most of the given ones, if they form no patch; or none."""
     mine = {int(k) for k in electrodes} & {k for i, k in found if abs(i - row) <= 2}
     return mine if len(mine) >= max(2, len(electrodes) / 2) and not neighbours(electrodes, design) else set()
 

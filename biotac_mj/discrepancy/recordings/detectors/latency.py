@@ -1,4 +1,4 @@
-"""How much later the electrodes follow the force that is logged beside them.
+"""Delay of the electrodes behind the force that is logged beside them.
 
 The force is regressed on what the electrodes say (ln Z and products of its principal components: they know
 the place of the contact, force alone does not) by ridge regression on blocks of time left out. A delay acts
@@ -168,7 +168,7 @@ def _vertex(x, y):
 
 
 def clock_offset(session: Session) -> str | None:
-    """What is wrong between force and electrodes of a loaded sensor, None if nothing is seen."""
+    """Finds the delay between force and electrodes of a loaded sensor; None if there is none."""
     r = session.recording
     n = len(r)
     if r.force is None or not session.loaded or r.force.std(0).max() < FORCE_MOVED or n / r.rate < _LEAST:

@@ -272,8 +272,9 @@ def _energy_of_all(options: list) -> float:
 
 
 def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarray:
-    """(c,) of a drift, about one: generalised least squares on the cells' levels, drawn towards their mean;
-    where an electrode has a change of its own (c,) bool, the mean of its three neighbours'."""
+    """Relative drift of each electrode (c,), about one: generalised least squares on the cells' levels,
+    shrunk towards their mean. An electrode with a change of its own, in `own` (c,), gets the mean of its
+    three neighbours."""
     number = len(m.used)
     level, time = m.levels(m.value)
     g = trend(time)
@@ -306,7 +307,7 @@ def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarr
 
 
 def _name_shared(session, finding, trend, change):
-    """Which of the shared effects it is: temperature if TDC follows it, else by pattern, sign and trend."""
+    """Identifies the shared effect: temperature if TDC follows it, else by pattern, sign and trend."""
     m = session.model()
     middle = np.clip(np.median(session.counts[session.fit][:, m.used], axis=0), 1, FULL_SCALE - 1)
     misfit = _misfits(m, middle, trend)

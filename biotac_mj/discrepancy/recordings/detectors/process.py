@@ -1,4 +1,4 @@
-"""What one electrode does over time beside a load: a Gaussian process of what the others say and of time.
+"""Change of one electrode over time under load, by a Gaussian process of the other electrodes and of time.
 
 An electrode is a linear map of the others, a smooth function of where the load is (their principal
 components), a memory of about a second, and noise; what a load does comes back where the load does. A drift
@@ -99,8 +99,8 @@ class Process:
         return max(drift) - without, without, y, scale, _DRIFT[int(np.argmax(drift))], K, load
 
     def trend(self, i: int) -> Trend:
-        """What used electrode i does over time [ln Z], as the bins fitted alone say it; its gain, of all,
-        is told block by block, each from those before."""
+        """Change of used electrode i over time [ln Z], from the fitted bins alone. Its overall gain is
+        predicted block by block, each from the earlier ones."""
         _, _, y, scale, amount, K, _ = self._of(i)
         both = K + amount * self._smooth
         n = max(2, int((self._time <= self._model.time[self._model.inside][-1]).sum()))

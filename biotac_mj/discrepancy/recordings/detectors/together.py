@@ -33,8 +33,8 @@ def neighbours(electrodes: np.ndarray, design: Design = BIOTAC) -> bool:
 
 
 def ahead(size: np.ndarray, used: np.ndarray, k: int, design: Design = BIOTAC) -> float:
-    """How far the logarithm of a size of electrode k lies above the largest of those that do not change; of
-    electrodes used (c,), logarithms of sizes (c,). Two may change; more do if they are no patch."""
+    """Logarithm of the size of electrode k over the largest one of the electrodes that do not change; size:
+    logarithms (c,) of the electrodes used (c,). Two may change, more if they are no patch."""
     mine, others = float(size[used == k][0]), np.sort(size[used != k])[::-1]
     with_it = used[size > beyond(size[None])[0]]
     if k in with_it and len(with_it) > 2 and not neighbours(with_it, design):

@@ -136,8 +136,8 @@ def trends(
 
 
 def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
-    """How much the change of level at a time stands out of those at other times, in robust standard
-    deviations; 0 where it goes on, as a ramp's does that is flat elsewhere."""
+    """Change of the level at a time over those at other times, in robust standard deviations; 0 where it
+    continues, as in a ramp that is flat elsewhere."""
     total = np.concatenate([[0.0], np.cumsum(level)])
     at = np.arange(3, len(level) - 2)
     change = (total[at + 3] - 2 * total[at] + total[at - 3]) / 3
@@ -189,8 +189,9 @@ def _with_step(level, basis, time, rows):
 
 @functools.lru_cache(maxsize=256)
 def _steps(basis, shape):
-    """Of a basis (cells, k), in bytes since every electrode of a session has the same: an orthonormal one,
-    steps (cells, candidates) less what it says of them, one projection for all onsets, and their squares."""
+    """For a basis (cells, k), passed as bytes since all electrodes of a session share it: an orthonormal
+    basis, the steps (cells, candidates) orthogonal to it (one projection for all onsets), and their squared
+    norms."""
     q = np.linalg.qr(np.frombuffer(basis).reshape(shape))[0]
     steps = np.tri(shape[0], shape[0] - 1, -1)[:, 2:-2]
     steps = steps - q @ (q.T @ steps)

@@ -1,1 +1,1 @@
-"""What the base model itself is off by: what is fitted with every effect, and what has a name."""
+"""Errors of the base model itself: nuisance parameters fitted with every effect, and named ones."""

@@ -130,8 +130,8 @@ def _following(residual, trend, chosen):
 
 
 def standing(other: np.ndarray) -> tuple[np.ndarray, float]:
-    """Of rests (nelectrode,) about those of the model, and about their median [counts]: which stand off,
-    none where many do; and by how much at least."""
+    """Baselines that deviate from the model's, by differences (nelectrode,) about their median [counts]: a
+    mask, empty if many do, and the threshold."""
     limit = max(_FAR * _ROBUST * np.median(np.abs(other)), _LEAST)
     return _few(np.abs(other) > limit, _FEW_OFFSETS), limit
 

@@ -1,5 +1,5 @@
-"""What the base model itself is off by and no effect is charged with: the rubber's modulus, which is
-calibrated before anything is looked for, and where single electrodes rest, about which they are compared."""
+"""Errors of the base model itself that are attributed to no effect: the rubber's modulus, calibrated before
+the search, and the baselines of single electrodes, about which counts are compared."""
 
 import dataclasses
 import typing

@@ -1,5 +1,5 @@
-"""What is never quite known about the base model and is fitted with every effect, so that none of it takes an
-effect's name.
+"""Nuisance parameters: uncertain constants of the base model, fitted with every effect so that they are not
+mistaken for one.
 
 Modulus and friction; the width of the contact's footprint on the electrodes; how far the answer lies between
 this mesh and another one, between the full tier and the condensed one; how thick the film stays where the
@@ -59,7 +59,7 @@ class Nuisance:
 
     @property
     def written(self) -> "Nuisance":
-        """What of it a sensor file holds: the modulus, and where electrodes rest."""
+        """The part that a sensor file holds: the modulus, and the baselines of electrodes."""
         return Nuisance(log_modulus=self.log_modulus, stands_off=self.stands_off)
 
     def vector(self) -> np.ndarray:

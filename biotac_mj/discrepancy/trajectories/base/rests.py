@@ -1,4 +1,4 @@
-"""Where a sensor's electrodes rest: an electrode answers by ln Z, so of two that rest at other counts one
+"""Baselines of a sensor's electrodes: an electrode measures ln Z, so of two that rest at other counts one
 shows more of the same touch. At 3150 counts 90 counts more are a gain of -7 %."""
 
 import copy

@@ -41,7 +41,7 @@ _STIFFER = 0.3  # c2 of `effects.rubber.Stiffening`
 
 
 class Solver(typing.Protocol):
-    """Of a `Simulator`, what solves the skin: its settings, which are described there."""
+    """The part of a `Simulator` that solves the skin; its settings are described there."""
 
     skin: typing.Any
     tier: str
@@ -108,8 +108,7 @@ def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool 
 
 
 def _deeper(sim, trajectories, base, tick):
-    """What shifts along the press change: load rises faster than depth, and begins where the object
-    touches."""
+    """Changes by displacements along the press: load rises faster than depth, and starts at first contact."""
     changes = []
     for by in _DEEPER:
         offset = [np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories]
@@ -136,8 +135,8 @@ def _shifts(sim, trajectories, base, deeper, tick):
 
 
 def _films(sim, trajectories, base, tick):
-    """What another least thickness of the film changes, about rest: it does not act on the skin, which is
-    solved once for all of them."""
+    """Changes by another minimum thickness of the film, about the baseline. It does not act on the skin,
+    which is solved once for all of them."""
     from ....effects.in_film import SeveralFilms
 
     model, own = sim.skin_and_film(0.0, 0.0)

@@ -1,5 +1,5 @@
-"""What the skin does in trajectories as they are, and how that changes with what effects move: solved once,
-these differences make every effect affordable."""
+"""Fields of the skin in trajectories, and their derivatives by the quantities that effects change: solved
+once, these make every effect cheap."""
 
 import dataclasses
 
@@ -113,8 +113,8 @@ class Fields:
 
 
 class Curve:
-    """What one number of the base changes: a cubic between the values that were solved, straight beyond them.
-    It has no more turns than they have (Fritsch and Carlson 1980): an object that does not touch yet changes
+    """Change by one number of the base: a cubic between the values that were solved, straight beyond them. It
+    has no more turns than they have (Fritsch and Carlson 1980): an object that does not touch yet changes
     nothing, and a film matters only where the skin lies on the core."""
 
     def __init__(self, at: np.ndarray, changes: list[np.ndarray]):
@@ -162,7 +162,7 @@ def _tangents(at, changes):
 
 
 def unlike(effect: Effect, theta: dict, there: dict) -> float:
-    """How far apart an effect's shapes are: the largest logarithm of their ratios."""
+    """Distance between an effect's shapes: the largest logarithm of their ratios."""
     shapes = [name for name, p in effect.params.items() if p.shape]
     return max((abs(float(np.log(theta[n] / there[n]))) for n in shapes), default=0.0)
 
@@ -178,7 +178,7 @@ def sizes(effects: list) -> dict:
 
 
 def square(there: dict) -> float:
-    """Of the size of parameters as of `sizes`, but for shapes."""
+    """Squared size of parameters, in the units of `sizes`, without shapes."""
     return sum(v**2 for k, v in there.items() if len(k) == 2)
 
 
@@ -188,7 +188,7 @@ def apart(now: dict, there: dict) -> float:
 
 
 def nearest(solved: list, now: dict) -> tuple:
-    """Of [(parameters, curve, tangents)] that whose parameters are nearest."""
+    """The one of [(parameters, curve, tangents)] with the nearest parameters."""
     return min(solved, key=lambda one: apart(now, one[0]))
 
 

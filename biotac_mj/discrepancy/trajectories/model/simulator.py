@@ -102,7 +102,7 @@ class Simulator:
 
     @property
     def design(self) -> Design:
-        """Of the skin."""
+        """Design of the skin."""
         return design_of(self.skin)
 
     def with_effects(self, effects: list, modulus: float | None = None) -> "Simulator":
@@ -194,7 +194,7 @@ class Simulator:
         return out
 
     def _entry(self, trajectory, tool, pos, log_friction, bubble):
-        """Where a solution is kept; poses are rounded, so that another order of sums leaves no trace."""
+        """Cache entry of a solution; poses are rounded, so that another order of sums has no influence."""
         material = read_material(self.material)
         inputs = [load_skin(self.skin), self.tier, material, plain(self.options), self._like]
         inputs += [make_object(tool), round(log_friction, 9), round(bubble * 1e12, 6)]
@@ -297,7 +297,7 @@ class Simulator:
         offsets: list | None = None,
         nuisance: Nuisance = KNOWN,
     ) -> list[Run]:
-        """What the sensor would read, without noise and rounding.
+        """Simulates the readings of the sensor, without noise and rounding.
 
         Args:
           fields: Fields of the trajectories; None solves them.
