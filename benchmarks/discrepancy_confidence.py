@@ -67,7 +67,7 @@ def fit(rows: list) -> dict:
 
 
 def _candidates(rows):
-    """What neither sign flips nor the part kept aside contradict, each with the number of others of its
+    """What neither sign flips nor the held-out part contradict, each with the number of others of its
     detector in the piece, but for faults of the log, whose weights are in `quality.confidence`."""
     out = []
     for i, row in enumerate(rows):

@@ -88,7 +88,7 @@ def table(rows) -> str:
     closed = [r["closed"] for r in single + pair if answer(r) not in ("unknown", "no disagreement")]
     if closed:
         lines.append(
-            f"gap closed on trajectories kept aside: median {np.median(closed):.0%}, quartiles "
+            f"gap closed on held-out trajectories: median {np.median(closed):.0%}, quartiles "
             f"{np.quantile(closed, 0.25):.0%} .. "
             f"{np.quantile(closed, 0.75):.0%}, of {len(closed)} cases with a name"
         )

@@ -7,7 +7,7 @@ CASES holds truth.json, a list of {"file": "case_01/...", "effects": [{"id": ...
 without effect and noise, files of the same names. An id of the truth counts as found where an effect's id or
 one of its ties is among those of MEANT. What is missing in VERDICTS is not judged.
 
-The gap, with CLEAN: of what the hidden effect does to the trajectories that were kept aside (recording less
+The gap, with CLEAN: of what the hidden effect does to the held-out trajectories (recording less
 clean one, in units of their noise, and less it), the share that the amended simulator repeats (with its
 effects, less without), as 1 - RMS left / RMS before. Only where the effect is larger than half the noise.
 

@@ -3,7 +3,7 @@
 python benchmarks/reader.py --out DIR --json OUT
 
 Ordinary touches are divided by whole touches, several times: the model is fitted, its intervals are sized on
-those kept aside, and sets of other seeds, of other objects and of sensors drawn at random say how many rows
+the held-out ones, and sets of other seeds, of other objects and of sensors drawn at random say how many rows
 they cover. What training did not
 have is told from those unseen touches by the mean logarithm of a touch's novelty: a skin that was filled
 further, two balls at once, an electrode that stays at rest or reads nothing. Every touch finds the sensor as

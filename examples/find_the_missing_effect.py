@@ -79,7 +79,7 @@ def measure(sim, trajectories, effect, seed):
 
 
 def picture(report, truth, path):
-    """Left: evidence of the first round; right: residual per channel on the presses kept aside, before and
+    """Left: evidence of the first round; right: residual per channel on the held-out presses, before and
     after."""
     from matplotlib.figure import Figure
 
@@ -104,7 +104,7 @@ def picture(report, truth, path):
     )
     right.set_xticks(x, [*(f"e{k + 1}" for k in range(19)), "pdc", "Fx", "Fy", "Fz"], fontsize=7)
     right.set_ylabel("RMS / (noise, resolution)")
-    right.set_title(f"presses kept aside; hidden: {truth} (synthetic); {report.verdict}", fontsize=9)
+    right.set_title(f"held-out presses; hidden: {truth} (synthetic); {report.verdict}", fontsize=9)
     right.legend(fontsize=8)
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
@@ -131,7 +131,7 @@ def main(argv=None):
             print(f"  {name} {size}")
     force, electrodes = report.gap["force"], report.gap["electrodes"]
     print(
-        f"gap closed on presses kept aside: {report.closed:.0%}; force {force.before:.4f} -> "
+        f"gap closed on held-out presses: {report.closed:.0%}; force {force.before:.4f} -> "
         f"{force.after:.4f} N, electrodes {electrodes.before:.2f} -> {electrodes.after:.2f} counts RMS"
     )
     picture(report, truth, args.out)

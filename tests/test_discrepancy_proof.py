@@ -1,4 +1,4 @@
-"""The proof: what is written as a sensor file is what is judged, group by group, on data kept aside."""
+"""The proof: what is written as a sensor file is what is judged, group by group, on held-out data."""
 
 import dataclasses
 import types

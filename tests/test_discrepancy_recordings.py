@@ -301,8 +301,8 @@ def test_channels_that_only_jump_at_once_are_not_exchanged():
 
 
 def test_a_wave_that_all_channels_have_is_taken_out():
-    """One that is no sine and wanders is one finding. Against the known clean counts, on the rows kept
-    aside."""
+    """One that is no sine and wanders is one finding. Against the known clean counts, on the held-out
+    rows."""
     e, _, rng = pressed(7, 40)
     clean, t = noisy(e, rng), np.arange(len(e)) / RATE
     wave = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t + 0.5 * np.sin(0.1 * t)))
@@ -417,7 +417,7 @@ def test_two_drifting_electrodes_are_named_and_four_are_likely():
 
 
 def test_what_begins_with_the_last_rows_fitted_is_said():
-    """A jump for which these rows are too few, and which began before those kept aside."""
+    """A jump for which these rows are too few, and which began before the held-out ones."""
     e, rng = unloaded(3, 30)
     e[1770:, 6] += 40  # of 1800 rows fitted
     d = diagnose_recording(PlainRecording(noisy(e, rng)))

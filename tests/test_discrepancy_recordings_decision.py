@@ -48,4 +48,4 @@ def test_what_the_part_kept_aside_contradicts_is_unknown(monkeypatch):
     monkeypatch.setattr(search, "prove", lambda session, finding: setattr(finding, "verified", False))
     d = diagnose_recording(coarse)
     assert not d.findings and d.verdict.startswith("unknown: coarse quantisation")
-    assert "those kept aside contradict it" in d.verdict
+    assert "the held-out ones contradict it" in d.verdict

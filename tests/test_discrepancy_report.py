@@ -167,7 +167,7 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
     both = dataclasses.replace(VERDICT, effects=[WARM, other], unknown=True)
     assert both.headline.count("temperature") == 1 and "for the rest no cause is known" in both.headline
     doubtful = dataclasses.replace(VERDICT, effects=[dataclasses.replace(WARM, confirmed=False)])
-    assert "data kept aside contradict it" in doubtful.headline and "added" not in doubtful.headline
+    assert "held-out data contradict it" in doubtful.headline and "added" not in doubtful.headline
     assert "no known cause" in dataclasses.replace(VERDICT, effects=[]).headline
     assert "is in the force, 0.3 N RMS; warm-up" in dataclasses.replace(VERDICT, lead="force").headline
     agree = dataclasses.replace(VERDICT, effects=[], significant=False)

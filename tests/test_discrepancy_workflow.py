@@ -353,8 +353,8 @@ def test_nothing_is_named_where_nothing_is():
     "more, effects", [(0, FEW), *(pytest.param(m, CATALOGUE, marks=pytest.mark.slow) for m in (None, 0, 5))]
 )
 def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more, effects):
-    """A quarter may be off whatever is named; where those that were fitted look well but those kept aside are
-    off, or with them more than a quarter, it is unknown."""
+    """A quarter may be off whatever is named; where the fitted ones look well but the held-out ones are off,
+    or with them more than a quarter, it is unknown."""
     data = measured([])
     n = len(data)
     order = np.random.default_rng(0).permutation(n)  # as `diagnose` splits them
@@ -375,7 +375,7 @@ def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more, effects):
 
 
 def test_what_trajectories_kept_aside_contradict_has_no_name():
-    """As where a law of another form fits those that were fitted: here those kept aside do not relax."""
+    """As where a law of another form fits those that were fitted: here the held-out ones do not relax."""
     effect = by_id("relax")
     data, plain = measured([(effect, {**effect.default(), "g": 0.25, "tau": 0.5})]), measured([])
     n = len(data)
@@ -391,7 +391,7 @@ def test_what_trajectories_kept_aside_contradict_has_no_name():
 @pytest.mark.parametrize(
     "fitted, aside, off",
     [
-        ("......", "xx", [6, 7]),  # all that was kept aside
+        ("......", "xx", [6, 7]),  # all that was held out
         ("......", ".x", []),
         ("xx....", "x.", [0, 1, 6]),  # more than a quarter of all
         ("xx......", "..", []),
@@ -671,7 +671,7 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, effects,
     amended = report.apply(Springs())
     assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
     files = write_report(report, tmp_path)
-    assert all(f.exists() for f in files) and "kept aside" in summary(report)
+    assert all(f.exists() for f in files) and "held out" in summary(report)
     check_verdict(json.loads(files[1].read_text()))
     assert load_simulator(tmp_path / "sensor_amended.yaml").effects[0][0].id == name
 

@@ -276,7 +276,7 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys):
     write(tmp_path / "rec.h5", [one])
     rec, model = str(tmp_path / "rec.h5"), str(tmp_path / "m.safetensors")
     assert cli.main(["learn", "train", rec, "--out", model]) == 0
-    assert "kept aside" in capsys.readouterr().out
+    assert "held out" in capsys.readouterr().out
     assert cli.main(["learn", "predict", model, rec, "--out", str(tmp_path / "p.csv")]) == 0
     table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
     assert len(table) == len(one) and {"time", "fz", "fz_half", "e19", "novelty"} <= set(table.dtype.names)

@@ -267,7 +267,7 @@ def _judge_networks(args):
 
 def _save_reader(args, reader, scores):
     reader.save(args.out)
-    print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} kept aside")
+    print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} held out")
     useless = []
     for name, row in scores["targets"].items():
         covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"

@@ -36,7 +36,7 @@ class Sensor:
     """One recording with the base model.
 
     Attributes:
-      recording; rows: of the first 70 %; locked: those kept aside; judged; noise: (19,) [counts]; cells: see
+      recording; rows: of the first 70 %; locked: the held-out ones; judged; noise: (19,) [counts]; cells: see
         `press_cells`; worst: electrodes that lead, from 0; slope, error: (19,) see `missing`.
     """
 
@@ -70,7 +70,7 @@ class Tested:
 
     Attributes:
       gain: (blocks,) [nats] by which the larger model makes each block likelier.
-      rms: "worst" or "all" electrodes -> (smaller, larger) [counts]; locked: the same on rows kept aside,
+      rms: "worst" or "all" electrodes -> (smaller, larger) [counts]; locked: the same on held-out rows,
         None where that was not asked.
       value: of the parameter by the constants of either half; modulus: their mean Young's modulus [Pa].
     """
@@ -287,7 +287,7 @@ def _named(tried):
 
 
 def _proved(tried, sensors, base):
-    """With what it does on the rows kept aside by constants of all others."""
+    """With what it does on the held-out rows by constants of all others."""
     model, tested = tried.model, []
     for s, t in zip(sensors, tried.tested):
         rows, locked = (model.of(s.recording, r) for r in (s.rows, s.locked))
@@ -406,7 +406,7 @@ def _finding(f, named, sensors):
         p=max(t.p for t in f.tested),
         confirmed=bool((locked[:, 1] < locked[:, 0]).all()),
         ties={one.id: one.name for one in named if one is not f},
-        gap=Gap("counts", before, after, name="worst electrodes, RMS on rows kept aside"),
+        gap=Gap("counts", before, after, name="worst electrodes, RMS on held-out rows"),
         note=f"of the {f.whose}" if f.whose == "base model" else "",
     )
 

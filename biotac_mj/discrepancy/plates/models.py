@@ -19,14 +19,14 @@ from ..recordings.recording import PlainRecording
 __all__ = ["BASE", "Judged", "Model", "blocks", "judge", "models", "press_rows"]
 
 BASE = Setup(gains=0.0)
-_DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chosen; the rest is kept aside
+_DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chosen; the rest is held out
 _ROWS = 300  # loaded rows that are looked at: time to fit goes with them
 _BLOCKS = 16  # of time: rows of one press are one piece of evidence
 _MEMORY = 0.5, 5.0  # [s] of a grip's relaxation, as measured on holds (docs/lab/memory.md)
 
 
 def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
-    """Loaded rows of a recording with what pressed before: of the first 70 %, and those kept aside.
+    """Loaded rows of a recording with what pressed before: of the first 70 %, and the held-out ones.
 
     Raises:
       ValueError: no force, or too few loaded rows.

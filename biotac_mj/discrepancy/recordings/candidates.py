@@ -30,7 +30,7 @@ class Detector:
       pair: finds faults that a connector gives to two electrodes: the other of a pair is no argument against
         either.
       sudden: finds what happens between two rows, by these rows alone: several findings of one row are one
-        event, and rows kept aside say nothing more of it.
+        event, and held-out rows say nothing more of it.
       beside_load: compares an electrode with the others while a load moves them.
       of_log: finds faults of the log itself, by their own rows and those beside them.
     """
@@ -58,7 +58,7 @@ class Candidate:
       beyond: of what is masked, 1: it lay above what was recorded, -1: below, 0: nothing is known of it.
       trend: of levels over time, or None; share: (19,) of it that each electrode has, None of a single one.
       places: [s], where it happens at some times.
-      gap: on the rows kept aside, None where nothing there measures it; verified: whether they confirm it,
+      gap: on the held-out rows, None where nothing there measures it; verified: whether they confirm it,
         None where they cannot.
     """
 

@@ -26,8 +26,8 @@ class RecordingDiagnosis(Verdict):
     """A verdict on a plain recording.
 
     Attributes:
-      session: counts without the effects; locked: share kept aside at the end; late: named, and begun in
-        the part kept aside; rest: what is left.
+      session: counts without the effects; locked: fraction held out at the end; late: named, and begun in
+        the held-out part; rest: what is left.
     """
 
     session: Session
@@ -70,7 +70,7 @@ def concluded(
     return RecordingDiagnosis(
         kind="plain recording",
         name=r.name,
-        data=f"{data}; last {locked:.0%} kept aside",
+        data=f"{data}; last {locked:.0%} held out",
         warnings=list(r.warnings),
         verdict=_in_words(found, left),
         significant=bool(found) or left.significant,

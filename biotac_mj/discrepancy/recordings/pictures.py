@@ -17,7 +17,7 @@ def pictures_of(diagnosis: Verdict) -> list[Picture]:
     d, r = diagnosis, diagnosis.recording
     views = {"as measured": r.electrodes, "without the effects found": d.session.filled()}
     bars = [
-        plots.Bars(f"{name}, kept aside", g.unit, g.channels, g.channels_before, g.channels_after, g.noise)
+        plots.Bars(f"{name}, held out", g.unit, g.channels, g.channels_before, g.channels_after, g.noise)
         for name, g in d.gap.items()
         if g.unit == "counts"
     ]
@@ -35,7 +35,7 @@ def _aside(d):
 
 
 def worst(diagnosis: Verdict) -> list[int]:
-    """Electrodes that the effects change most on the part kept aside, by number from 0; of an empty verdict
+    """Electrodes that the effects change most on the held-out part, by number from 0; of an empty verdict
     those with the largest residual."""
     s = diagnosis.session
     change = np.sqrt(((s.recording.electrodes - s.filled())[~s.fit] ** 2).mean(0))

@@ -1,4 +1,4 @@
-"""Before and after, on the part kept aside: of every finding by its own number in raw units, and of the
+"""Before and after, on the held-out part: of every finding by its own number in raw units, and of the
 whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
@@ -43,7 +43,7 @@ def prove(session: Session, finding: Candidate) -> None:
 
 
 def _aside(session):
-    """Model of the session, and which of its bins were kept aside."""
+    """Model of the session, and which of its bins were held out."""
     m = session.model()
     return m, m.time > _aside_from(session)
 
@@ -110,7 +110,7 @@ def _samples(session, finding):
 
 
 def _force(session, finding):
-    """RMS error of force from electrodes [N]: map and error both from the part kept aside, by blocks left
+    """RMS error of force from electrodes [N]: map and error both from the held-out part, by blocks left
     out."""
     view = force_view(session, ~session.fit)
     if view is None:
@@ -124,7 +124,7 @@ def _force(session, finding):
 
 
 def views(session: Session) -> dict[str, Gap]:
-    """Numbers that the whole model says of the part kept aside without having been given them, before and
+    """Numbers that the whole model says of the held-out part without having been given them, before and
     after the findings."""
     bare = session.without(*session.findings)
     out = {}

@@ -20,7 +20,7 @@ __all__ = ["FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
 
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
-MIN_ROWS = 400  # fewer leave no part to keep aside
+MIN_ROWS = 400  # fewer leave no rows to hold out
 _MOST_OF = 0.5  # of the rows must have a force, one after another, or it takes no part
 
 

@@ -47,9 +47,8 @@ class Rest:
 
 
 def rest(session: Session) -> Rest:
-    """Compares what every electrode does with what the others say of it, in the rows fitted and in those
-    kept aside, in units of what the load does to it; and the rows left with those of recordings without an
-    effect."""
+    """Compares every electrode with its prediction from the others, in the fitted and the held-out rows, in
+    units of its change by the load; and the residual rows with those of recordings without an effect."""
     m = session.model()
     cells, time = m.levels(m.alone(), every=True)
     counts = np.abs(cells) * m.slope
@@ -105,7 +104,7 @@ def _contradicted(session):
     names = [f.kind.name + f.where for f in weak]
     if not names:
         return []
-    return [f"{' and '.join(names)} would explain the rows fitted, and those kept aside contradict it"]
+    return [f"{' and '.join(names)} would explain the rows fitted, and the held-out ones contradict it"]
 
 
 def _of_rows(session):

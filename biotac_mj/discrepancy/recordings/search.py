@@ -1,5 +1,5 @@
-"""Diagnosis of plain recordings: what the sensor's model misses, found on the first part, checked on the part
-kept aside."""
+"""Diagnosis of plain recordings: effects beyond the sensor's model, found on the first part, checked on the
+held-out part."""
 
 import dataclasses
 
@@ -57,7 +57,7 @@ def diagnose_recording(
     locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
     n = len(recording)
     if not 0.1 <= locked <= 0.6:
-        raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
+        raise ValueError(f"locked is {locked}: hold out between 0.1 and 0.6 of the rows")
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
         checked = sample_faults(as_log(recording), named)
         recording = dataclasses.replace(recording, electrodes=checked.log.counts)
@@ -160,7 +160,7 @@ def _refined(session, finding, same):
 
 
 def _proved(session):
-    """The session without the findings that the rows kept aside contradict, or that are one too many of all
+    """The session without the findings that the held-out rows contradict, or that are one too many of all
     that was tested."""
     for finding in session.findings:
         prove(session, finding)
@@ -208,7 +208,7 @@ def _alike(one, other):
 
 
 def _late(session, named):
-    """Effects of single electrodes or all that begin in the part kept aside: searched in the whole record,
+    """Effects of single electrodes or all that begin in the held-out part: searched in the whole record,
     less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
@@ -230,6 +230,6 @@ def _late(session, named):
 
 
 def _taken(finding):
-    """Counts RMS that a candidate takes away from rows kept aside, 0 of what is measured in another unit."""
+    """Counts RMS that a candidate takes away from held-out rows, 0 of what is measured in another unit."""
     gap = finding.gap
     return gap.taken if gap is not None and gap.unit == "counts" and np.isfinite(gap.after) else 0.0

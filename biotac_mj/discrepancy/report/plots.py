@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 _UNAMENDED, _AMENDED = "0.6", "tab:blue"
-_ASIDE = "0.92"  # grey behind rows that were kept aside
+_ASIDE = "0.92"  # grey behind held-out rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Panel:
 
     Attributes:
       title; unit of the values. time: (n,) [s]. measured: (n,). simulated, amended: (n,) or None.
-      aside: from and to [s] of what was kept aside, or None.
+      aside: from and to [s] of what was held out, or None.
     """
 
     title: str
@@ -88,7 +88,7 @@ def curves(panels: Sequence[Panel], columns: int = 1, simulated: str = "simulate
     axes[0, 0].legend(fontsize=7, ncols=3 if columns == 1 else 1)
     for ax in axes[-1]:
         shaded = any(one.aside is not None for one in panels)
-        ax.set_xlabel("time [s]" + ("; grey: kept aside" if shaded else ""), fontsize=8)
+        ax.set_xlabel("time [s]" + ("; grey: held out" if shaded else ""), fontsize=8)
     return figure
 
 
@@ -139,7 +139,7 @@ def overview(
         axes[-1].legend(fontsize=7, ncols=3)
     for ax in axes:
         ax.axvspan(*aside, color=_ASIDE, zorder=0)
-    axes[-1].set_xlabel("time [s]; grey: kept aside", fontsize=8)
+    axes[-1].set_xlabel("time [s]; grey: held out", fontsize=8)
     return figure
 
 

@@ -13,7 +13,7 @@ _HIDDEN = {"id", "stage", "unit", "attach"}  # columns of tables that are for pr
 
 
 def summary(verdict: Verdict) -> str:
-    """The headline, effects, the proof on data kept aside, where it disagrees, and what the data cannot
+    """The headline, effects, the proof on held-out data, where it disagrees, and what the data cannot
     tell."""
     v = verdict
     lines = [v.headline, "", f"{v.name}: {v.data}"]
@@ -22,7 +22,7 @@ def summary(verdict: Verdict) -> str:
     for f in v.effects:
         lines += _effect(f)
     lines += [
-        f"  not confirmed by data kept aside, left out: {f.name}, {f.where}"
+        f"  not confirmed by held-out data, left out: {f.name}, {f.where}"
         for f in v.not_named
         if f.confirmed is False
     ]

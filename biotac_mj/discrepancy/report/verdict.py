@@ -143,9 +143,9 @@ class Finding:
       parameters: name -> Estimate.
       evidence: mean log likelihood that data left out gain by it [nats], nan where it is not so measured.
       p: of as much by chance. confidence: probability that the name is right, None where it is not known.
-      confirmed: whether data kept aside bear it out, None where they cannot say.
+      confirmed: whether held-out data confirm it, None where they cannot.
       ties: id -> name of effects that explain the data as well.
-      gap: what it closes by itself on data kept aside, or None. note: what was seen, in words.
+      gap: what it closes by itself on held-out data, or None. note: what was seen, in words.
       start, end: when it acts [s], None where it has no time.
     """
 
@@ -188,7 +188,7 @@ class Finding:
         """Line on the test by held-out data."""
         sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[self.confirmed]
         if self.gap is None:
-            return f"{sign} by data kept aside"
+            return f"{sign} by held-out data"
         g = self.gap
         return f"{g.name}: {g.before:.3g} -> {g.after:.3g} {g.unit}, noise {g.floor} ({sign})"
 
@@ -256,7 +256,7 @@ class Verdict:
       kind: of the data; name: of this one; data: what it consists of, a line. warnings: lines.
       verdict: one line. significant: whether simulation and measurement disagree.
       effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
-      gap: what is compared -> Gap, on data kept aside. lead: which of them the headline is about; empty: the
+      gap: what is compared -> Gap, on held-out data. lead: which of them the headline is about; empty: the
         one that is most above noise. aside: what these data are, in words.
       closed: share that all effects close of their own part of the gap, nan where there is none.
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
@@ -330,7 +330,7 @@ class Verdict:
         added = [f for f in self.effects if f.confirmed is not False]
         if not added:
             what = " and ".join(f.title for f in self.effects)
-            return f"{text}; {what} would explain what was fitted, and data kept aside contradict it."
+            return f"{text}; {what} would explain what was fitted, and held-out data contradict it."
         names, told = {}, set()
         for f in added:  # one of several that tie speaks for all
             if f.id not in told:

@@ -12,9 +12,9 @@ _OFF = 2.5  # mean square from which on a trajectory is off
 
 
 def astray(fitted: np.ndarray, aside: np.ndarray) -> np.ndarray:
-    """Indices of trajectories that are off, of mean squares of those that were fitted and then of those kept
-    aside: where these are more than `steady` leaves out, or more than half of those kept aside; else those
-    that are very far off."""
+    """Indices of trajectories that disagree, by mean squares of the fitted ones and then of the held-out
+    ones: where these are more than `steady` leaves out, or more than half of the held-out ones; else those
+    with very large errors."""
     square = np.concatenate([fitted, aside])
     off = square > _OFF
     many = off.mean() > _ASTRAY or off[len(fitted) :].mean() > 0.5

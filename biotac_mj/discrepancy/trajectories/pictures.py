@@ -14,7 +14,7 @@ _SHOWN = 4  # trajectories, of each of two channels
 
 
 def pictures_of(diagnosis: Verdict) -> list[Picture]:
-    """Curves and channels on trajectories kept aside, where the model is off, evidence, what can be told."""
+    """Curves and channels on held-out trajectories, where the model is off, evidence, what can be told."""
     drawn = {
         "curves": ("curves", _curves),
         "channels": ("gap", _channels),
@@ -47,7 +47,7 @@ def _curves(diagnosis):
 def _channels(diagnosis):
     c, proof = diagnosis.comparison, diagnosis.proof
     each = [np.array(gap["channels"]) / c.sigma for gap in (proof.before, proof.after)]
-    title, unit = "trajectories kept aside", "times noise and resolution"
+    title, unit = "held-out trajectories", "times noise and resolution"
     return plots.channels([plots.Bars(title, unit, c.channels, *each, 1.0)])
 
 

@@ -41,7 +41,7 @@ class Proof:
 
 
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
-    """Whether trajectories kept aside are likelier by `ODDS` with one Fit than with another that has fewer
+    """Whether held-out trajectories are likelier by `ODDS` with one Fit than with another that has fewer
     effects, the skin solved again, parameters as they were fitted: by the one likelihood, so that what the
     law of an effect lacks counts as what a model misses, and does not contradict the effect."""
     first, last = (_density(comparison, fit, aside) for fit in (smaller, larger))
@@ -49,7 +49,7 @@ def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np
 
 
 def _density(comparison, fit, aside):
-    """Logarithm of the likelihood of trajectories kept aside, by as much as the model misses of them."""
+    """Logarithm of the likelihood of held-out trajectories, by as much as the model misses of them."""
     own = likelihood.of(comparison, aside)
     y = own.turned(own.stacked(fit.raw(comparison, exact=list(aside))))
     pose = own.poses(np.zeros((len(comparison.trajectories), 3)))

@@ -24,7 +24,7 @@ __all__ = ["jumps", "next_experiment", "of_base", "of_data", "scattered", "stray
 
 def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, step: list) -> str:
     """Remark on trajectories that disagree, if too few of their kind were fitted for evidence: two slides of
-    six trajectories are what any base model may be off by, two more of those kept aside are not; and one
+    six trajectories are what any base model may be off by, two more of the held-out ones are not; and one
     press of eleven that bears a load which no other has is all that there is of it.
 
     Args:

@@ -50,7 +50,7 @@ class TrajectoryDiagnosis(Verdict):
 
     Attributes:
       given: the simulator that was compared. fit: Fit, with the effects that are named and added.
-      beside: BaseCandidates, which `effects` names too. proof: on trajectories kept aside, the skin solved
+      beside: BaseCandidates, which `effects` names too. proof: on held-out trajectories, the skin solved
         again. comparison, selection, locked: what it was made of. beliefs: how likely which explanation is.
       trace: numbers that thresholds are set on, as a file can hold them.
     """
@@ -117,11 +117,11 @@ def diagnose(
     n = len(data)
     if n < FEWEST:
         raise ValueError(
-            f"{n} trajectories are too few: the trajectory is the unit of evidence and some are kept aside; "
+            f"{n} trajectories are too few: the trajectory is the unit of evidence and some are held out; "
             f"measure at least {FEWEST}, better 24"
         )
     if not 0 < locked < 0.6:
-        raise ValueError(f"locked is {locked}: keep a share between 0 and 0.6 of the trajectories aside")
+        raise ValueError(f"locked is {locked}: hold out a fraction between 0 and 0.6 of the trajectories")
     order = np.random.default_rng(seed).permutation(n)
     aside = np.sort(order[: max(2, round(locked * n))])
     chosen = np.sort(order[len(aside) :])
@@ -256,8 +256,8 @@ def _in_words(comparison, current, effects, named, chosen, refuted):
 
 
 def _upheld(comparison, null, current, found, search, chosen, aside):
-    """Fit and Candidates of what trajectories kept aside bear out, one effect after another, and the other
-    Candidates: what explains the fitted ones alone has no name."""
+    """Fit and Candidates of the effects that held-out trajectories confirm, one effect after another, and the
+    other Candidates: an effect that explains the fitted ones alone has no name."""
     best, upheld = null, []
     for k in range(1, len(found) + 1):
         some = found[:k]
@@ -278,7 +278,7 @@ def _refuted(found):
     if not found:
         return ""
     what = " and ".join(one.effect.name for one in found)
-    return f"{what} would explain what was fitted, and trajectories kept aside do not bear it out"
+    return f"{what} would explain what was fitted, and held-out trajectories do not confirm it"
 
 
 def _settle(given, comparison, null, search, chosen, aside, notes, usable):
@@ -334,7 +334,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     return TrajectoryDiagnosis(
         kind="trajectories",
         name="trajectories",
-        data=f"{len(chosen)} fitted, {len(aside)} kept aside",
+        data=f"{len(chosen)} fitted, {len(aside)} held out",
         verdict=verdict,
         significant=bool(seen or stray),
         effects=[_proved(one, proof, beside, gaps) for one in effects],
@@ -399,7 +399,7 @@ def _amended(added, named):
 
 
 def _gaps(comparison, proof):
-    """Group of channels -> Gap on trajectories kept aside."""
+    """Group of channels -> Gap on held-out trajectories."""
     out = {}
     for group, part in comparison.groups.items():
         each = [tuple(gap["channels"][part]) for gap in (proof.before, proof.after)]
@@ -416,7 +416,7 @@ def _gaps(comparison, proof):
 
 
 def _proved(finding, proof, beside, gaps):
-    """A Finding, which trajectories kept aside bear out, with the gap that it closes most of where it alone
+    """A Finding, confirmed by held-out trajectories, with the gap that it closes most of where it alone
     was added."""
     if any(finding.id == one.finding.id for one in beside):
         return finding  # of the base model, which both sides have

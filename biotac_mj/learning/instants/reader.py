@@ -223,7 +223,7 @@ def fit_reader(
     least = _least_aside(level)
     if len(kept) < least or len(train) < _FOLDS:
         raise ValueError(
-            f"{len(train)} trajectories train and {len(kept)} are kept aside: intervals of "
+            f"{len(train)} trajectories train and {len(kept)} are held out: intervals of "
             f"{100 * level:.0f} % need {least} aside and at least {_FOLDS} to train; record more touches"
         )
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
@@ -275,7 +275,7 @@ def fit_reader(
         half = conformal_width(error[there], data.owner[aside][there], 1 - level)
         if not np.isfinite(half).all():
             raise ValueError(
-                f"{len(np.unique(data.owner[aside][there]))} trajectories kept aside have {name}: intervals "
+                f"{len(np.unique(data.owner[aside][there]))} held-out trajectories have {name}: intervals "
                 f"of {100 * level:.0f} % need {least}; record more touches"
             )
         tensors[f"{name}.half"] = half

@@ -107,7 +107,7 @@ def _beside(session, refused, common):
 
 
 def _drifting(session):
-    """Electrodes that drift beside a load: what they do in the rows kept aside is not taken out."""
+    """Electrodes that drift beside a load: what they do in the held-out rows is not taken out."""
     return frozenset(f.channels[0] for f in session.findings if f.detector.beside_load)
 
 
