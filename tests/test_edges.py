@@ -34,8 +34,12 @@ def shape(name):
         quat, half = turned(45 + float(name[4:])), "{} {} {}".format(*HALF)
         kind = 'type="mesh" mesh="box"' if name.startswith("mesh") else f'type="box" size="{half}"'
         return kind, quat, lowest(HALF, quat)
-    if name == "corner":  # the diagonal points down
-        return 'type="box" size=".004 .004 .004"', turned(125.2644, (0.5**0.5, -(0.5**0.5), 0)), 4e-3 * 3**0.5
+    if name.startswith("corner"):  # the diagonal points down; turned about it, and tilted
+        spin, tilt = (float(angle) for angle in name[6:].split(",")) if name[6:] else (0.0, 0.0)
+        quat = turned(125.2644, (0.5**0.5, -(0.5**0.5), 0))
+        for turn in (turned(spin, (0, 0, 1)), turned(tilt, (0, 1, 0))):
+            mujoco.mju_mulQuat(quat, turn, quat.copy())
+        return 'type="box" size=".004 .004 .004"', quat, lowest(np.full(3, 4e-3), quat)
     if name == "rim":
         return 'type="cylinder" size=".004 .004"', turned(45), 4e-3 * 2**0.5
     if name == "thin":  # an ellipsoid of 0.17 mm radius where it is sharpest
@@ -97,7 +101,10 @@ def apparent_friction(force):
 EDGES = ["edge0", "edge20", "edge30", "edge45", "mesh0", "mesh20", "corner", "rim"]
 
 
-@pytest.mark.parametrize("name", ["edge0", "edge20", "edge45", "corner", "rim"])
+TILTED = ["corner30,0", "corner0,10", "corner0,20", "corner30,20"]
+
+
+@pytest.mark.parametrize("name", ["edge0", "edge20", "edge45", "corner", "rim", *TILTED])
 def test_a_cycle_without_friction_gives_back_its_work(name):
     force, errors, unsettled = cycle(name, "condensed", "coarse")
     assert unsettled == 0 and force[:, 1].min() > 0.2
