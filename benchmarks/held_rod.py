@@ -52,7 +52,8 @@ def record(hand: pathlib.Path, decisions: int, seed: int) -> tuple[dict, tuple]:
         step()
         for name, batch in env.batches.items():
             pos, mat, force = seen[name]
-            pos.append(batch.model.pos0.numpy()[0, 0].copy())  # where its body has given way to
+            # where its body has given way to; zeros until it has come near
+            pos.append(batch.model.pos0.numpy()[0, 0].copy())
             mat.append(batch.model.mat0.numpy()[0, 0].copy())
             force.append(batch.skin.wrench.numpy()[0, 0, :3].copy())
 
@@ -72,10 +73,12 @@ def record(hand: pathlib.Path, decisions: int, seed: int) -> tuple[dict, tuple]:
 def replay(
     pos: np.ndarray, mat: np.ndarray, friction: float, size: tuple, tier: str, skin: str = "coarse"
 ) -> tuple:
-    """Forces (n, 3) [N] and {channel: counts (n, k)} of a BioTac on which a capsule goes along."""
+    """Forces (n, 3) [N] and {channel: counts (n, k)} of a BioTac on which a capsule goes along; while its
+    rotation is zero it is a metre away."""
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep=".004" gravity="0 0 0"/><worldbody><body name="finger"/>'
-        f'<body name="rod" mocap="true"><geom name="rod" type="capsule" size="{size[0]} {size[1]}"/></body>'
+        '<body name="rod" mocap="true" pos="0 0 1">'
+        f'<geom name="rod" type="capsule" size="{size[0]} {size[1]}"/></body>'
         "</worldbody></mujoco>"
     )
     handle = biotac_mj.attach(
@@ -88,8 +91,9 @@ def replay(
     frame, origin = core.xmat.reshape(3, 3).copy(), core.xpos.copy()
     force, counts = [], {name: [] for name in ("electrodes", "pdc", "pac")}
     for p, R in zip(pos, mat):
-        data.mocap_pos[0] = origin + frame @ p
-        mujoco.mju_mat2Quat(data.mocap_quat[0], (frame @ R).ravel())
+        if R.any():
+            data.mocap_pos[0] = origin + frame @ p
+            mujoco.mju_mat2Quat(data.mocap_quat[0], (frame @ R).ravel())
         mujoco.mj_step(model, data)
         force.append(handle.read(data, "contact_force")[:3])
         for name, rows in counts.items():
