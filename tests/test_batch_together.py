@@ -53,30 +53,21 @@ def corrected(steps):
         factors += [wp.array(mass[:, *entries], dtype=float)]
         factors += [wp.array(a.astype(np.int32), dtype=int) for a in (count + 1, count * (count + 1) // 2)]
         factors += [wp.array(entries[1].astype(np.int32), dtype=int)]
-        own, models = [], []
-        for k in range(SKINS):
-            own.append(wp.array(np.ascontiguousarray(jacobian[None, :, k]), dtype=wp.spatial_vectord))
-            models.append(rounds.Model())
-            tangent = np.ascontiguousarray(stiffness[None, :, k])
-            models[k].tangent0 = wp.array(tangent, dtype=wp.spatial_matrixd)
-            models[k].wrench0 = wp.zeros((1, WORLDS), dtype=wp.spatial_vectord)
-        again, square = wp.zeros(1, dtype=int), wp.full((1, WORLDS), H2, dtype=wp.float64)
+        c.jacobian.assign(np.ascontiguousarray(jacobian.swapaxes(0, 1)))
+        c.model.tangent0.assign(np.ascontiguousarray(stiffness.swapaxes(0, 1)))
+        c.square.fill_(H2)
+        again = wp.zeros(1, dtype=int)
         wp.launch(integrator.begin_correction, WORLDS, [wp.ones(WORLDS, dtype=int), c])
         for left in range(steps, -1, -1):
             force = np.einsum("wkni,kwi->wn", jacobian, c.force.numpy())
             found = first + np.linalg.solve(held, force[:, :, None])[:, :, 0]
             moved = np.linalg.solve(damped, mass @ found[:, :, None])[:, :, 0]
             both = [wp.array(x, dtype=float) for x in (found, moved)]
-            for k in range(SKINS):
-                wp.launch(integrator.find_amiss, WORLDS, [k, square, own[k], *both, models[k]], [c])
+            wp.launch(integrator.find_amiss, WORLDS, [*both, c, again])
             if left == 0:
                 break
-            wp.launch(integrator.judge, WORLDS, [c, again])
-            for k in range(SKINS):
-                wp.launch(integrator.respond, (WORLDS, 6), [k, own[k], *factors, c])
-            for k in range(SKINS):
-                dim = WORLDS, 1, 6 * SKINS
-                wp.launch(integrator.write_slope, dim, [k, square, own[k], models[k], 1, c])
+            wp.launch(integrator.respond, (WORLDS, 6 * SKINS), [*factors, c])
+            wp.launch(integrator.write_slope, (WORLDS, SKINS, 6 * SKINS), [c])
             wp.launch(integrator.step, (WORLDS, 1), [c])
         left, size = c.amiss.numpy(), c.force.numpy()
     return np.abs(left).max(axis=(0, 2)) / np.abs(size).max(axis=(0, 2))
@@ -88,11 +79,11 @@ def test_skins_on_the_same_joints_are_corrected_together():
 
 def test_a_skin_that_does_not_act_lacks_nothing():
     with wp.ScopedDevice("cpu"):
-        c = integrator.corrections(3, 2, 1)
+        c, still = integrator.corrections(3, 2, 1), wp.zeros((2, 1), dtype=float)
         c.going.fill_(1)
-        for array in (c.force, c.amiss):
-            array.fill_(1.0)
-        wp.launch(integrator.leave_out, 2, [1, 1], [c])
+        c.acts.assign([1, 0, 1])
+        c.force.fill_(1.0)
+        wp.launch(integrator.find_amiss, 2, [still, still, c, wp.zeros(1, dtype=int)])
     for array in (c.force, c.amiss):
         assert np.all(array.numpy()[1] == 0.0) and np.all(array.numpy()[[0, 2]] == 1.0)
 

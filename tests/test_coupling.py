@@ -416,7 +416,7 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
         )
         for one, other in wanted:
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-15)
-        assert self.off == pytest.approx(coupled.size(displacement(*target, *self.asked)), abs=1e-15)
+        assert self.off == pytest.approx(coupled.size(displacement(*target, a.pos0, a.mat0)), abs=1e-15)
         seen.append(np.abs(a.wrench).max())
         conclude(self, *how)
 
@@ -492,6 +492,44 @@ def test_bodies_give_way_as_all_else_lets_them(jacobian, monkeypatch):
     data.qfrc_applied[:2] = 1.0
     mujoco.mj_step(model, data, 30)
     assert len(seen) > 40 and min(seen[-10:]) > 0.1  # against 0.03 kg
+
+
+@pytest.mark.parametrize("jacobian", ["DENSE", "SPARSE"])
+def test_bodies_give_way_as_a_sliding_contact_lets_them(jacobian, monkeypatch):
+    """Two balls over a pad that rub on each other in MuJoCo's elliptic cone: by differences of its answer."""
+    seen, find = [], group.SkinGroup.find_compliance
+
+    def watch(self, skins, inertia):
+        find(self, skins, inertia)
+        (skin,) = skins
+        if len(skin.touching):  # its own rows hold them, too
+            return
+        J, passive = skin.jacobian.reshape(-1, model.nv), data.qfrc_passive.copy()
+        scale = np.tile([1, 1, 1, 0.01, 0.01, 0.01], 2)  # compares turning with going
+        answers = [skin.data.acceleration(again=True)]
+        for force in 1e-6 * scale[:, None] * J:
+            data.qfrc_passive[:] = passive + force
+            answers.append(skin.data.acceleration(again=True))
+        sliding = skin.data.row_states() == mujoco.mjtConstraintState.mjCNSTRSTATE_CONE
+        data.qfrc_passive[:] = passive
+        skin.data.acceleration(again=True)
+        wanted = 1e6 * skin.square[0] * (scale[:, None] * J) @ (np.array(answers[1:]) - answers[0]).T
+        found = skin.compliance.transpose(0, 2, 1, 3).reshape(12, 12) * np.outer(scale, scale)
+        np.testing.assert_allclose(found, wanted, atol=1e-4 * np.abs(wanted).max())
+        seen.append(sliding.sum())
+
+    balls = "".join(
+        f'<body pos="{x} 0 .0182"><freejoint/><geom size=".01" mass="{mass}" friction=".1"/></body>'
+        for x, mass in ((-0.0099, 0.01), (0.0099, 0.02))
+    )
+    model, data, _ = scene(balls, integrator="Euler", friction=0.1)
+    model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+    model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
+    data = mujoco.MjData(model)
+    monkeypatch.setattr(group.SkinGroup, "find_compliance", watch)
+    data.qvel[:] = 0.5, 0.3, -0.3, 0, 0, 5, -0.5, -0.3, -0.3, 0, 20, 0
+    mujoco.mj_step(model, data)
+    assert seen and seen[0] == 3
 
 
 @pytest.mark.parametrize("timestep", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])

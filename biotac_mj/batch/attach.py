@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_two_way
+from ..coupling.config import Config, refuse_two_way
 from ..coupling.handle import SENSORS
 from ..coupling.implicit import energy, poses, rounds, rows
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
@@ -129,8 +129,7 @@ def attach(
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
-    limit = config.options.get("rounds", ROUNDS_IN_BATCH)
-    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, limit, config.loss)
+    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, config.rounds, config.loss)
     hook = Hook.of(m)
     hook.add(batch, d)
     if d.qpos.device.is_cuda:

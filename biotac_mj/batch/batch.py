@@ -11,6 +11,7 @@ import warp as wp
 from ..coupling.implicit import energy, rounds
 from ..coupling.implicit.compliance import Response, add_stiffness
 from ..coupling.implicit.marks import Marks
+from ..coupling.implicit.rounds import Model
 from ..coupling.implicit.rows import write_rows
 from ..coupling.implicit.rules import LOSS_FREQUENCY
 from ..coupling.loads import core_geom
@@ -151,37 +152,25 @@ class Batch(Skins):
         """Number of slots of six rows."""
         return len(self._slot)
 
-    def take_part(
-        self, m: "mjw.Model", correction: integrator.Correction, first: int, rows: wp.array, first_row: int
-    ) -> None:
-        """Has its own groups in a correction of all skins, from number `first` on, and its own of the rows of
-        all."""
+    def share(self, correction: integrator.Correction, first: int) -> None:
+        """Keeps what is corrected in the arrays of all skins, its own bodies from number `first` on."""
+        own, r, model = slice(first, first + self.groups[0]), self._of_step, self.model
+        for name in Model.vars:
+            array = getattr(correction.model, name)[own]
+            wp.copy(array, getattr(model, name))
+            setattr(model, name, array)
+        self._jacobian, r.square = correction.jacobian[own], correction.square[own]
+        self._correction_force, r.amiss = correction.force[own], correction.amiss[own]
+        self._acts = correction.acts[own]
+
+    def take_part(self, m: "mjw.Model", rows: wp.array, first_row: int) -> None:
+        """Has its own of the rows of all skins."""
         self._row = rows[first_row : first_row + self.nslot]
         self._response, self._factor = Response(self._jacobian, self.model), Factor(m, self.nworld)
-        own = slice(first, first + self.groups[0])
-        self._correction, self._first_group = correction, first
-        self._correction_force, self._of_step.amiss = correction.force[own], correction.amiss[own]
 
-    def find_amiss(self, d: "mjw.Data", qacc: wp.array) -> None:
-        """Finds what the correction lacks for accelerations qacc (nworld, nv) of the integrator; what does
-        not act lacks nothing."""
-        if self.active:
-            found = [self._first_group, self._of_step.square, self._jacobian, d.qacc, qacc, self.model]
-            self._launch(integrator.find_amiss, self.nworld, found, [self._correction])
-        else:
-            own = [self._first_group, self.groups[0]]
-            self._launch(integrator.leave_out, self.nworld, own, [self._correction])
-
-    def respond(self, factors: list[wp.array]) -> None:
-        """Finds accelerations by unit wrenches on the bodies; factors: see `integrator.respond`."""
-        known = [self._first_group, self._jacobian, *factors]
-        self._launch(integrator.respond, (self.nworld, 6 * self.groups[0]), known, [self._correction])
-
-    def write_slope(self, columns: int) -> None:
-        """Writes this skin's rows of the correction's slope."""
-        known = [self._first_group, self._of_step.square, self._jacobian, self.model, int(self.active)]
-        dim = self.nworld, self.groups[0], columns
-        self._launch(integrator.write_slope, dim, known, [self._correction])
+    def say_whether_it_acts(self) -> None:
+        """Tells the correction of all skins. Launches only."""
+        self._acts.fill_(int(self.active))
 
     def evaluate(self, qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""

@@ -64,13 +64,18 @@ class Hook:
         if any(there._core == batch._core for there in self.batches):
             raise ValueError("this BioTac is attached to the mujoco_warp Model already: attach it once")
         self.batches.append(batch)
+        moving = [one for one in self.batches if one.moving]
         for one in self.batches:
-            one.meet([other for other in self.batches if other.moving])
+            one.meet(moving)
         if self._contact_force is None or len(self._contact_force) < d.naconmax:
             self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)
             self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
         with wp.ScopedDevice(d.qpos.device):
             self._taking_part, self._going, self._next = (Marks(d.nworld) for _ in range(3))
+            first = np.cumsum([0, *(one.groups[0] for one in moving)]).tolist()
+            self._correction = integrator.corrections(first[-1], d.nworld, d.qvel.shape[1])
+        for one, number in zip(moving, first):
+            one.share(self._correction, number)
 
     def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
         """Kernels of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
@@ -127,7 +132,6 @@ class Hook:
                 "the memory for the loops in it"
             )
         self._corrected = [batch for batch in self.batches if batch.moving]
-        groups = [batch.groups[0] for batch in self._corrected]
         slots = np.cumsum([0, *(batch.nslot for batch in self._corrected)])
         with wp.ScopedDevice(device):
             self._outside = wp.empty_like(d.qfrc_passive)
@@ -136,10 +140,10 @@ class Hook:
             self._rows = rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
             self._integrator, self._ends = Integrator(m, d), Ends(d)
             self._loads = Loads(m, d, self._corrected)
-            self._slope = integrator.Slope(m, sum(groups), d.nworld)
+            self._slope = integrator.Slope(m, d.nworld)
         self._scratch, self._free = Scratch(device), Factor(m, d.nworld)
-        for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):
-            batch.take_part(m, self._slope.correction, int(first), rows, int(row))
+        for batch, row in zip(self._corrected, slots):
+            batch.take_part(m, rows, int(row))
 
     def _look_ahead(self, m, d, moving):
         """Predicts the bodies' poses with the linear models of the last step and, in worlds whose skins act
@@ -149,6 +153,8 @@ class Hook:
         _begin_dynamics(m, d)
         if self._integrator.differs:
             self._integrator.take_matrices(m, d)
+            for batch in self._corrected:
+                batch.say_whether_it_acts()
         self._accelerate(m, d, moving, first=True)
         taking_part.clear()
         self._fork.run(*(functools.partial(batch.look_ahead, m, taking_part) for batch in moving))
@@ -256,19 +262,18 @@ class Hook:
 
     def _accelerate(self, m, d, moving, first=False):
         """Computes the bodies' poses with the present models, in the worlds that continue."""
-        going, correction, device = self._going.world, self._slope.correction, d.qacc.device
+        going, correction, device = self._going.world, self._correction, d.qacc.device
         self._find_accelerations(m, d, moving, going, first)
         if self._integrator.differs:
 
             def compare():
                 self._integrator.integrate(m, d, correction.going)
                 self._amiss.zero_()
-                for batch in self._corrected:
-                    batch.find_amiss(d, self._integrator.qacc)
-                wp.launch(integrator.judge, d.nworld, [correction], [self._amiss], device=device)
+                known = [d.qacc, self._integrator.qacc, correction]
+                wp.launch(integrator.find_amiss, d.nworld, known, [self._amiss], device=device)
 
             def go_on():
-                self._slope.find(m, d, self._integrator.inertia, self._corrected)
+                self._slope.find(m, d, self._integrator.inertia, correction)
                 self._find_accelerations(m, d, moving, correction.going)
                 compare()
 

@@ -27,8 +27,6 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 
-
-
 @wp.kernel
 def core_pose(
     # In:

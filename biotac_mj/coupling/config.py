@@ -17,7 +17,6 @@ __all__ = [
     "TIERS",
     "ON_ERROR",
     "ROUNDS",
-    "ROUNDS_IN_BATCH",
     "OWN",
     "SOLID",
     "TO_COME",
@@ -34,8 +33,7 @@ COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
 _OPTIONS = ("skin", "modulus", "film", "readings", "rounds", "threads", "loss")
-# of a skin in two-way coupling, in a step; all worlds of a batch wait for the one that takes most
-ROUNDS, ROUNDS_IN_BATCH = 32, 16
+ROUNDS = 16  # of a skin in two-way coupling, in a step
 
 
 def collides(geom: mujoco.MjsGeom, mask: int = SOLID) -> bool:
@@ -78,10 +76,9 @@ class Config:
       device: Warp device of the skin.
       options: what the keyword `options` says by part: "skin", "modulus" (a list, or a .npy file), "film",
         "readings" with the sensor in it, "loss", "rounds" and "threads". In two-way coupling a skin is
-        solved 32 times in a step at most where nothing is said, 16 in batches. Fewer bound what a step costs;
-        where they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
-        `mj_step`, which are solved together, the largest number counts. So it does of threads, 1 where
-        nothing is said.
+        solved 16 times in a step at most where nothing is said. Fewer bound what a step costs; where they do
+        not lead to a balance of bodies and skin, the last model acts. Of several skins in `mj_step`, which
+        are solved together, the largest number counts. So it does of threads, 1 where nothing is said.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """

@@ -270,7 +270,7 @@ class Instance:
             if len(self._solved) > 8:
                 self._solved.clear()
             self._solved[key] = result
-        self.keep(result)
+        self._result, self._reading, self._pose = result, None, result.pose
         return result
 
     @property
@@ -285,10 +285,6 @@ class Instance:
             return head[CONVERGED] == -1.0
         skins = self.touching.skins
         return bool(skins) and head[CONVERGED] <= 0.0 and bool(models[skins, :6].any())
-
-    def keep(self, result: SkinResult) -> None:
-        """Makes an earlier result of this step the one that counts."""
-        self._result, self._reading, self._pose = result, None, result.pose
 
     def _came_to(self, state):
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies for which a skin's state holds."""

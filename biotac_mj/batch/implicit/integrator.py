@@ -12,7 +12,7 @@ import mujoco
 import warp as wp
 
 from ...coupling.implicit.compliance import substitute
-from ...coupling.implicit.rounds import Model
+from ...coupling.implicit.rounds import Model, make_model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
 from ...skin.block import sync
@@ -32,7 +32,6 @@ __all__ = [
     "begin_correction",
     "corrections",
     "find_amiss",
-    "judge",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -60,14 +59,15 @@ class Correction:
     amiss: wp.array2d(dtype=vec6)
     rounds: wp.array(dtype=int)
     going: wp.array(dtype=int)  # whether another is to be found
-    # largest entries [N] of what is amiss, of what is to be corrected, of the skins' wrenches
-    wrong: wp.array(dtype=real)
-    most: wp.array(dtype=real)
-    largest: wp.array(dtype=real)
     # [world, unit wrench, dof] accelerations of the constraint solver, of the integrator
     found: wp.array3d(dtype=real)
     moved: wp.array3d(dtype=real)
     matrix: wp.array2d(dtype=float)  # the slope of each world, what is amiss being the last entry of a row
+    # of the skins: whether each acts [group], `Rounds.square`, Jacobians [group, world, dof], models
+    acts: wp.array(dtype=int)
+    square: wp.array2d(dtype=real)
+    jacobian: wp.array3d(dtype=vec6)
+    model: Model
 
 
 def corrections(groups: int, nworld: int, nv: int) -> Correction:
@@ -76,9 +76,11 @@ def corrections(groups: int, nworld: int, nv: int) -> Correction:
     out, n = Correction(), 6 * groups
     out.force, out.amiss = (wp.zeros((groups, nworld), dtype=vec6) for _ in range(2))
     out.rounds, out.going = (wp.zeros(nworld, dtype=int) for _ in range(2))
-    out.wrong, out.most, out.largest = (wp.zeros(nworld, dtype=real) for _ in range(3))
     out.found, out.moved = (wp.zeros((nworld, n, nv), dtype=real) for _ in range(2))
     out.matrix = wp.zeros((nworld, n * (n + 1)), dtype=float)
+    out.acts, out.square = wp.ones(groups, dtype=int), wp.zeros((groups, nworld), dtype=real)
+    out.jacobian = wp.zeros((groups, nworld, nv), dtype=vec6)
+    out.model = make_model(groups, nworld)
     return out
 
 
@@ -102,76 +104,50 @@ def begin_correction(going: wp.array(dtype=int), c: Correction):
     w = wp.tid()
     c.rounds[w] = 0
     c.going[w] = going[w]
-    c.wrong[w] = real(0.0)
-    c.most[w] = real(0.0)
-    c.largest[w] = real(0.0)
 
 
 @wp.kernel
 def find_amiss(
     # In:
-    first: int,
-    square: wp.array2d(dtype=real),
-    jacobian: wp.array3d(dtype=vec6),
     found: wp.array2d(dtype=float),
     moved: wp.array2d(dtype=float),
-    model: Model,
     # In and out:
     c: Correction,
+    # Out:
+    again_out: wp.array(dtype=int),
 ):
-    """After mujoco_warp's answer a, a' [world, dof]: what the correction of one skin lacks, whose bodies
-    begin at `first`."""
+    """After mujoco_warp's answer a, a' [world, dof]: what the correction lacks, and which worlds need another
+    one; sets again[0] where one does. Skins that do not act lack nothing."""
     w = wp.tid()
-    if c.going[w] == 0:
-        return
-    for g in range(jacobian.shape[0]):
-        k = first + g
-        motion = vec6()
-        for i in range(jacobian.shape[2]):
-            motion += square[g, w] * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
-        excess = model.tangent0[g, w] * motion
-        lacks = excess - c.force[k, w]
-        c.amiss[k, w] = -lacks
-        c.wrong[w] = wp.max(c.wrong[w], _largest(lacks))
-        c.most[w] = wp.max(c.most[w], _largest(excess))
-        c.largest[w] = wp.max(c.largest[w], _largest(model.wrench0[g, w]))
-
-
-@wp.kernel
-def leave_out(first: int, count: int, c: Correction):
-    """A skin that takes no part, in the place of `find_amiss`."""
-    w = wp.tid()
-    if c.going[w] == 0:
-        return
-    for k in range(first, first + count):
-        c.force[k, w] = vec6()
-        c.amiss[k, w] = vec6()
-
-
-@wp.kernel
-def judge(c: Correction, again: wp.array(dtype=int)):
-    """After `find_amiss` of all skins: which worlds need another correction; sets again[0] where one does."""
-    w = wp.tid()
-    wrong = c.wrong[w]
-    most = c.most[w]
-    largest = c.largest[w]
-    c.wrong[w] = real(0.0)
-    c.most[w] = real(0.0)
-    c.largest[w] = real(0.0)
     if c.going[w] == 0:
         return
     c.going[w] = 0
+    wrong = real(0.0)
+    most = real(0.0)
+    largest = real(0.0)
+    for k in range(c.jacobian.shape[0]):
+        excess = vec6()
+        if c.acts[k] == 1:
+            motion = vec6()
+            for i in range(c.jacobian.shape[2]):
+                motion += c.square[k, w] * real(found[w, i] - moved[w, i]) * c.jacobian[k, w, i]
+            excess = c.model.tangent0[k, w] * motion
+            largest = wp.max(largest, _largest(c.model.wrench0[k, w]))
+        else:
+            c.force[k, w] = vec6()
+        lacks = excess - c.force[k, w]
+        c.amiss[k, w] = -lacks
+        wrong = wp.max(wrong, _largest(lacks))
+        most = wp.max(most, _largest(excess))
     if c.rounds[w] < _MAX_CORRECTIONS and _poorly_corrected(wrong, most, largest, _CORRECTED):
         c.rounds[w] = c.rounds[w] + 1
         c.going[w] = 1
-        again[0] = 1
+        again_out[0] = 1
 
 
 @wp.kernel
 def respond(
     # In:
-    first: int,
-    jacobian: wp.array3d(dtype=vec6),
     held: wp.array3d(dtype=real),
     damped: wp.array3d(dtype=real),
     inertia: wp.array2d(dtype=float),
@@ -181,52 +157,42 @@ def respond(
     # In and out:
     c: Correction,
 ):
-    """Accelerations by a unit wrench on a body of one skin. held, damped: factors of M with all rows, of the
+    """Accelerations by a unit wrench on a body. held, damped: factors of M with all rows, of the
     integrator's matrix."""
     w, column = wp.tid()
     if c.going[w] == 0:
         return
-    at = 6 * first + column
-    n = jacobian.shape[2]
+    n = c.jacobian.shape[2]
     for i in range(n):
-        c.found[w, at, i] = jacobian[column / 6, w, i][column % 6]
-        c.moved[w, at, i] = real(0.0)
-    substitute(held, w, at, c.found)
+        c.found[w, column, i] = c.jacobian[column / 6, w, i][column % 6]
+        c.moved[w, column, i] = real(0.0)
+    substitute(held, w, column, c.found)
     for i in range(n):
         for k in range(rownnz[i]):
             j = colind[rowadr[i] + k]
             m = real(inertia[w, rowadr[i] + k])
-            c.moved[w, at, i] = c.moved[w, at, i] + m * c.found[w, at, j]
+            c.moved[w, column, i] = c.moved[w, column, i] + m * c.found[w, column, j]
             if i != j:
-                c.moved[w, at, j] = c.moved[w, at, j] + m * c.found[w, at, i]
-    substitute(damped, w, at, c.moved)
+                c.moved[w, column, j] = c.moved[w, column, j] + m * c.found[w, column, i]
+    substitute(damped, w, column, c.moved)
 
 
 @wp.kernel
-def write_slope(
-    # In:
-    first: int,
-    square: wp.array2d(dtype=real),
-    jacobian: wp.array3d(dtype=vec6),
-    model: Model,
-    acts: int,
-    # In and out:
-    c: Correction,
-):
-    """Writes the rows of the slope that belong to one skin; a skin that does not act is not corrected."""
-    w, g, column = wp.tid()
+def write_slope(c: Correction):
+    """Writes the slope; a skin that does not act is not corrected."""
+    w, k, column = wp.tid()
     if c.going[w] == 0:
         return
     n = c.found.shape[1]
     motion = vec6()
     lacks = vec6()
-    if acts == 1:
-        for i in range(jacobian.shape[2]):
-            motion += square[g, w] * (c.found[w, column, i] - c.moved[w, column, i]) * jacobian[g, w, i]
-        motion = model.tangent0[g, w] * motion
-        lacks = -c.amiss[first + g, w]
+    if c.acts[k] == 1:
+        for i in range(c.jacobian.shape[2]):
+            motion += c.square[k, w] * (c.found[w, column, i] - c.moved[w, column, i]) * c.jacobian[k, w, i]
+        motion = c.model.tangent0[k, w] * motion
+        lacks = -c.amiss[k, w]
     for b in range(6):
-        row = 6 * (first + g) + b
+        row = 6 * k + b
         value = wp.where(row == column, real(1.0), real(0.0))
         value -= motion[b] * _scale(column) / _scale(row)
         c.matrix[w, row * (n + 1) + column] = float(value)
@@ -256,28 +222,22 @@ class Slope:
     """Steps of Newton's method to the corrections of all worlds.
 
     Args:
-      m: mujoco_warp Model. groups: number of bodies of all skins. nworld: number of worlds.
-
-    Attributes:
-      correction: Correction.
+      m: mujoco_warp Model. nworld: number of worlds.
     """
 
-    def __init__(self, m: "mjw.Model", groups: int, nworld: int):
-        self.correction = corrections(groups, nworld, m.nv)
+    def __init__(self, m: "mjw.Model", nworld: int):
         self._held, self._damped = Factor(m, nworld), Factor(m, nworld)
 
-    def find(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, batches: typing.Sequence) -> None:
-        """Corrects the forces of `batches` (a Batch each), after mujoco_warp's constraint solver and
-        `judge`; inertia: see `Integrator`. Launches only."""
-        c, device = self.correction, d.qpos.device
+    def find(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, c: Correction) -> None:
+        """Corrects the forces, after mujoco_warp's constraint solver and `find_amiss`; inertia: see
+        `Integrator`. Launches only."""
+        device = d.qpos.device
         self._held.find(m, d, c.going, d.M)
         self._damped.find(m, d, c.going, inertia, springs=False)
         factors = [self._held.L, self._damped.L, d.M, m.M_rownnz, m.M_rowadr, m.M_colind]
         worlds, columns = c.found.shape[:2]
-        for batch in batches:
-            batch.respond(factors)
-        for batch in batches:
-            batch.write_slope(columns)
+        wp.launch(respond, (worlds, columns), [*factors, c], device=device)
+        wp.launch(write_slope, (worlds, columns // 6, columns), [c], device=device)
         launcher = Launcher(device)
         if device.is_cuda:
             launcher.launch_blocks(step, [worlds], [c], block_dim=_BLOCK)

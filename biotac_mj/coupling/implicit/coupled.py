@@ -6,13 +6,11 @@ import numpy as np
 from ...geometry.rigid_warp import LEVER
 from ...skin.bodies import BodyMotion
 from ..instance import STAGES, Instance
-from ..stepper import SkinResult
 from ..structs import DataView
 
 __all__ = ["Coupled", "size"]
 
-# of what the solves of a step may cost together: what is left is not worth another one, and the closest model
-# must do
+# of what the solves of a step may cost together: what is left is not worth another one
 _MOST = 0.9
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
@@ -45,7 +43,7 @@ class Coupled:
             self.idle = instance.is_out_of_reach(*self.pose)
         if self.idle:
             return
-        self.asked = self.result = self.forced = None
+        self.result = self.forced = None
         self.written, self.settled = False, True
         self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.passed = self.jacobian = instance.kinematics.jacobians()
@@ -78,7 +76,7 @@ class Coupled:
         arrays.evaluate()
         if self.forced is not None:
             arrays.acting[:] = self.forced
-        self.off = np.inf if self.asked is None else float(arrays.off[0])
+        self.off = np.inf if self.result is None else float(arrays.off[0])
 
     @property
     def target(self) -> tuple:
@@ -101,27 +99,10 @@ class Coupled:
         self._solve(self.target)
 
     def _solve(self, pose, bodies=None):
+        arrays = self.arrays
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
-        self.may_act = result.converged and self._cost < _MOST
-        self.use(pose if bodies is None else result.pose, result)
-
-    @property
-    def balanced(self) -> bool:
-        """Whether its model is that of a balance found in this step."""
-        return self.result is not None and self.result.converged
-
-    def model(self) -> tuple:
-        """Arguments with which `use` restores the present model."""
-        return self.asked, self.result
-
-    def use(self, asked: tuple | None, result: SkinResult) -> None:
-        """Takes the model of a solve at `asked`."""
-        if asked is None:
-            return
-        arrays, self.asked, self.result = self.arrays, asked, result
-        self.instance.keep(result)
-        arrays.asked_pos[:], arrays.asked_mat[:] = asked
+        self.result, self.may_act = result, result.converged and self._cost < _MOST
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
         arrays.pos0[:], arrays.mat0[:] = result.pose
         self.written = False

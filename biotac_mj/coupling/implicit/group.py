@@ -41,12 +41,11 @@ class SkinGroup:
         held = square[:, None, None] * tangent @ jacobian
         return jacobian.reshape(-1, self._rows.shape[1]), held.reshape(-1, self._rows.shape[1])
 
-    def evaluate(self, acceleration: np.ndarray) -> float:
-        """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skins
-        were solved at most [m]."""
+    def evaluate(self, acceleration: np.ndarray) -> None:
+        """Finds where the bodies go with accelerations (nv,), and how far that is from where the skins were
+        solved."""
         for skin in self._skins:
             skin.evaluate(acceleration)
-        return max(skin.off for skin in self._skins)
 
     def find_compliance(self, skins: Sequence[Coupled], inertia: np.ndarray | None) -> None:
         """Finds how the bodies of some skins give way to its wrenches: held by their inertia, with the

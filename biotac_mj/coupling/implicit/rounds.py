@@ -21,6 +21,7 @@ __all__ = [
     "ask",
     "begin_rounds",
     "choose_gamma",
+    "distance_off",
     "follow",
     "force_of",
     "judge",
@@ -320,7 +321,7 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 
 
 @wp.func
-def _distance_off(model: Model, r: Rounds, w: int):
+def distance_off(model: Model, r: Rounds, w: int):
     """Largest distance of the bodies from the poses of the skin's model [m]."""
     off = real(0.0)
     for g in range(r.pos.shape[0]):
@@ -345,7 +346,7 @@ def look(
         return
     r.rounds[w] = 1
     r.settled[w] = 0
-    if _distance_off(model, r, w) < _TOLERANCE:
+    if distance_off(model, r, w) < _TOLERANCE:
         r.settled[w] = 1
     else:
         mark(going, w)
@@ -368,7 +369,7 @@ def judge(
     wanted[w] = 0
     if going[w] == 0 or r.settled[w] == 1:
         return
-    if _distance_off(model, r, w) < _TOLERANCE:
+    if distance_off(model, r, w) < _TOLERANCE:
         r.settled[w] = 1
     elif reason[w] == CONVERGED and r.rounds[w] < r.limit:
         r.rounds[w] = r.rounds[w] + 1

@@ -1,18 +1,24 @@
 """Stiffness of bodies in one mjData other than that of the skin that pushes them: their inertia, and MuJoCo's
-constraints as its solver left them."""
+constraints as its solver left them. A contact that slides holds by the Hessian of its elliptic cone."""
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 import warp as wp
 
 from ...skin.types import real
+from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
 from .compliance import factor
 from .kinematics import row
 
 __all__ = ["Springs"]
 
+_NEWTON = int(mujoco.mjtSolver.mjSOL_NEWTON)
+_QUADRATIC, _CONE = (
+    int(getattr(mujoco.mjtConstraintState, f"mjCNSTRSTATE_{name}")) for name in ("QUADRATIC", "CONE")
+)
 _ENTRIES = "J", "J_colind"  # of the constraints' Jacobian; the others are of its rows
 
 
@@ -56,21 +62,42 @@ class Springs:
     def take(self, inertia: np.ndarray | None) -> None:
         """Takes the rows as they are, and an inertia (nM,) laid out as MuJoCo's M; None: that."""
         rows, here = self._data.rows(), self._here
+        state, weight = self._data.row_states().copy(), rows.efc_D.copy()
+        cones = self._cones(state)
         if self._model.is_sparse:
-            value, column, count, first = rows.efc_J, rows.efc_J_colind, rows.efc_J_rownnz, rows.efc_J_rowadr
+            column, count, first = rows.efc_J_colind, rows.efc_J_rownnz, rows.efc_J_rowadr
+            value = rows.efc_J.copy()
+            for begin, root in cones:  # rows of a contact have their entries in the same columns
+                mine = value[first[begin] : first[begin] + len(root) * count[begin]]
+                mine[:] = (root.T @ mine.reshape(len(root), -1)).ravel()
         else:
-            whole = rows.efc_J.reshape(-1, self._model.nv)
+            whole = rows.efc_J.reshape(-1, self._model.nv).copy()
+            for begin, root in cones:
+                whole[begin : begin + len(root)] = root.T @ whole[begin : begin + len(root)]
             number, column = whole.nonzero()
             value, count = whole[number, column], np.bincount(number, minlength=len(whole))
             first = np.cumsum(count) - count
+        for begin, root in cones:
+            state[begin : begin + len(root)], weight[begin : begin + len(root)] = _QUADRATIC, 1.0
         needed = len(count), len(value)
         if needed[0] > self._room[0] or needed[1] > self._room[1]:
             self._make_room(*(2 * n for n in needed))
         here["inertia"][0] = self._data.M if inertia is None else inertia
         here["rows"][0] = needed[0]
-        given = self._data.row_states(), value, rows.efc_D, count, first, column
+        given = state, value, weight, count, first, column
         for copy, array in zip(self._copies.values(), given):
             copy[: array.size] = array
+
+    def _cones(self, state):
+        """[(first row, root (n, n) of the Hessian)] of contacts that slide on their elliptic friction cones.
+        MuJoCo's Newton solver leaves the Hessians."""
+        out, sliding = [], (state == _CONE).any() and self._model.opt.solver == _NEWTON
+        for contact in contacts_of(self._data) if sliding else ():
+            begin, size = int(contact["efc_address"]), int(contact["dim"])
+            if begin >= 0 and state[begin] == _CONE:
+                value, vector = np.linalg.eigh(contact["H"].ravel()[: size * size].reshape(size, size))
+                out.append((begin, vector * np.sqrt(np.maximum(value, 0.0))))
+        return out
 
     def factor(self, skin: int | None) -> None:
         """Finds L of what was taken, without the rows of one skin, or of all (None)."""

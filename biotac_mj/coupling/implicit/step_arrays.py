@@ -6,7 +6,6 @@ import math
 import numpy as np
 import warp as wp
 
-from ...geometry.rigid_warp import motion, size_of
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from ...skin.types import mat66, real, vec6
 from ..setup import Setup
@@ -27,17 +26,14 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def find_off(
     # In:
+    model: Model,
     r: Rounds,
     # Out:
     off_out: wp.array(dtype=real),
 ):
     """Largest distance of the bodies from where the skin was solved [m]."""
     w = wp.tid()
-    off = real(0.0)
-    for g in range(r.pos.shape[0]):
-        way = motion(r.pos[g, w], r.mat[g, w], r.asked_pos[g, w], r.asked_mat[g, w])
-        off = wp.max(off, size_of(way))
-    off_out[w] = off
+    off_out[w] = rounds.distance_off(model, r, w)
 
 
 class StepArrays:
@@ -124,7 +120,7 @@ class StepArrays:
         self.find_wrenches = row(forces)
         self.evaluate = row(
             k.bodies.accelerate(step, k.jacobian, self._qacc, r),
-            (find_off, 1, [r, self._off]),
+            (find_off, 1, [self._model, r, self._off]),
             forces,
         )
         marks = self._marks.struct

@@ -9,8 +9,8 @@ the skins are solved there while these give way as their inertia, and what else 
 One round is enough, at impacts too, unless what else holds a body changes within it: a joint's friction
 begins to slip, another skin lets go.
 
-Where the rounds never arrive, the models that came closest act. Whatever acts, no skin gives back more
-energy than was put into it (`_damp`, `_restrain`)."""
+Where the rounds never arrive, the last models act. Whatever acts, no skin gives back more energy than was put
+into it (`_damp`, `_restrain`)."""
 
 import functools
 
@@ -278,22 +278,14 @@ class World:
 
         Their forces are left in place.
         """
-        most, best = max(skin.instance.setup.config.rounds for skin in skins), None
+        most = max(skin.instance.setup.config.rounds for skin in skins)
         for rounds in range(most + 1):
-            off = self._predict(skins, outside)
-            if off < self.tolerance:
-                return rounds
-            rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
-            if best is None or not rank >= best[0]:
-                best = rank, [skin.model() for skin in skins]
+            self._predict(skins, outside)
             going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_act]
             if rounds == most or not going:
                 break
             self._group.find_compliance(going, self._inertia)
             self._solve_all({skin: skin.solve for skin in going})
-        for skin, model in zip(skins, best[1]):
-            skin.use(*model)
-        self._predict(skins, outside)
         for skin in skins:
             skin.settled = skin.off < self.tolerance
         return rounds
@@ -310,21 +302,17 @@ class World:
         run_in_threads([functools.partial(run_in_threads, mine, 1) for mine in shared.values()], threads)
 
     def _predict(self, skins, outside):
-        """Finds where the bodies go under the skins' models; returns how far that is from where the skins
-        were solved at most [m].
+        """Finds where the bodies go under the skins' models, and how far that is from where the skins were
+        solved.
 
         What PGS makes of rows that it leaves open may be anywhere, also where nothing touches.
         """
         for skin in skins:
             skin.act_by_rows()
         acceleration = self._accelerations(skins, outside)
-        off = self._group.evaluate(acceleration)
+        self._group.evaluate(acceleration)
         if self._rows_are_open(skins):
             self._solve_group(skins, outside)
-            off = max(skin.off for skin in skins)
-            for skin in skins:
-                skin.settled = True  # unless it turns out otherwise
-        return off
 
     def _rows_are_open(self, skins):
         return self.model.opt.solver == PGS and not all(map(self._rows_hold, skins))
