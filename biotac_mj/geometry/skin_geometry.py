@@ -173,7 +173,8 @@ class SkinGeometry:
                 wrong = "encloses no volume: import the mesh again"
             if wrong is not None:
                 raise ValueError(f"the {part} of skin {name} {wrong}")
-        if (TetMesh(self.vert, self.elem[:, :4]).volumes <= 0).any():
+        # a skin of one's own stepper may be a surface alone
+        if self.nelem and (TetMesh(self.vert, self.elem[:, :4]).volumes <= 0).any():
             return  # inside and outside have no meaning; `SkinModel` names the tetrahedra
         for surface, sign, where in (("outer", 1, "out of the finger"), ("inner", -1, "towards the core")):
             face = close_rim(getattr(self, f"{surface}_face"))
