@@ -29,3 +29,14 @@ def h5(change):
             change(file)
 
     return do
+
+
+def replaced(old, new):
+    """Replaces a text in a file that has it."""
+
+    def do(path):
+        before = path.read_text()
+        assert old in before
+        path.write_text(before.replace(old, new, 1))
+
+    return do

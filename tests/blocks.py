@@ -10,8 +10,6 @@ from biotac_mj.geometry import TetMesh, load_skin
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
-__all__ = ["boundary", "box", "faces_on", "four_nodes", "half_space", "nodal_areas", "place", "shell", "skin"]
-
 
 def box(axes, jitter=0.0, seed=0):
     """A box of tetrahedra, six to a cell.
@@ -68,6 +66,33 @@ def shell(outer, inner, subdivisions=2, layers=3):
     flipped = np.linalg.det(vert[elem[:, 1:]] - vert[elem[:, :1]]) < 0
     elem[flipped] = elem[flipped][:, [0, 1, 3, 2]]
     return vert, elem.astype(np.int32), (ball.faces[:, ::-1] + layers * n).astype(np.int32)
+
+
+def finger(subdivisions, fixed, tip, radius):
+    """A closed shell of a finger's size, one layer thick. Nodes with x > fixed are fixed; 19 electrodes lie
+    on a helix of this radius from x = tip on [m]."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    n, center = len(ball.vertices), np.array([-8e-3, 0, 0])
+    outer, inner, core = (
+        ball.vertices * size + center
+        for size in ([13e-3, 7e-3, 7e-3], [11.5e-3, 5.5e-3, 5.5e-3], [10e-3, 4.5e-3, 4.5e-3])
+    )
+    f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
+    elem = np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
+                           np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
+                           np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1)])  # fmt: skip
+    vert = np.concatenate([outer, inner])
+    inverted = np.linalg.det(vert[elem[:, 1:]] - vert[elem[:, :1]]) < 0
+    elem[inverted] = elem[inverted][:, [0, 1, 3, 2]]
+    angle = np.linspace(-1.0, 1.0, 19)
+    normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
+    electrode = np.stack([np.linspace(tip, -2e-3, 19), 0 * angle, 0 * angle], 1) + radius * normal
+    empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
+    inside, nail, clamp = ball.faces[:, ::-1] + n, (empty, no_face), (empty, no_face)
+    end = np.flatnonzero(vert[:, 0] > fixed)
+    return SkinGeometry(
+        "synthetic", vert, elem, ball.faces, inside, end, core, ball.faces, *nail, *clamp, electrode, normal
+    )
 
 
 def boundary(elem):

@@ -7,11 +7,11 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"): 
 import gc
 import pathlib
 import sys
+import time
+import types
 
 import numpy as np
 import pytest
-
-from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 REPO = pathlib.Path(__file__).resolve().parents[1]
 sys.path.append(str(REPO / "scripts"))  # which has no biotac_mj in it
@@ -58,40 +58,31 @@ def shared():
 def shell():
     """A small closed shell of a finger's size with 19 electrodes along a helix: for what needs a skin's
     topology, not its physics."""
-    import trimesh
+    from blocks import finger
 
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    n, center = len(ball.vertices), np.array([-8e-3, 0, 0])
-    outer = ball.vertices * [13e-3, 7e-3, 7e-3] + center
-    inner = ball.vertices * [11.5e-3, 5.5e-3, 5.5e-3] + center
-    f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
-    elem = np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
-                           np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
-                           np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1)])  # fmt: skip
-    vert = np.concatenate([outer, inner])
-    edge = vert[elem[:, 1:]] - vert[elem[:, :1]]
-    elem[np.linalg.det(edge) < 0] = elem[np.linalg.det(edge) < 0][:, [0, 1, 3, 2]]
-    core = ball.vertices * [10e-3, 4.5e-3, 4.5e-3] + center
-    angle = np.linspace(-1.0, 1.0, 19)
-    normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
-    electrode = np.stack([np.linspace(-16e-3, -2e-3, 19), 5e-3 * normal[:, 1], 5e-3 * normal[:, 2]], 1)
-    empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
-    return SkinGeometry(
-        "synthetic",
-        vert,
-        elem,
-        ball.faces,
-        ball.faces[:, ::-1] + n,
-        np.flatnonzero(vert[:, 0] > 3e-3),
-        core,
-        ball.faces,
-        empty,
-        no_face,
-        empty,
-        no_face,
-        electrode,
-        normal,
-    )
+    return finger(3, fixed=3e-3, tip=-16e-3, radius=5e-3)
+
+
+@pytest.fixture
+def serial_port(monkeypatch):
+    """A stand-in for pyserial: each read sends a line of 19 counts, the last of which counts the lines."""
+
+    class Port:
+        def __init__(self, *given, **named):
+            self.sent = 0
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = lambda self, *error: None  # noqa: E731
+
+        def readline(self):
+            time.sleep(0.002)
+            self.sent += 1
+            return b"3000 " * 18 + b"%d\n" % (3000 + self.sent % 900)
+
+    stand_in = types.ModuleType("serial")
+    stand_in.Serial, stand_in.SerialException = Port, OSError
+    stand_in.__spec__ = types.SimpleNamespace()
+    monkeypatch.setitem(sys.modules, "serial", stand_in)
 
 
 @pytest.fixture(scope="session")

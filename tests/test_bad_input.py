@@ -12,7 +12,7 @@ import shutil
 import mujoco
 import numpy as np
 import pytest
-from bad_rows import Row, h5
+from bad_rows import Row, h5, replaced
 from good_input import ROWS as NROW
 from good_input import make_files
 
@@ -105,15 +105,6 @@ def entry(**changes):
     def do(path):
         found = json.loads(path.read_text()) | changes
         path.write_text(json.dumps({name: value for name, value in found.items() if value is not None}))
-
-    return do
-
-
-def replaced(old, new):
-    def do(path):
-        before = path.read_text()
-        assert old in before
-        path.write_text(before.replace(old, new, 1))
 
     return do
 

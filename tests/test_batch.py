@@ -6,7 +6,7 @@ import functools
 import mujoco
 import numpy as np
 import pytest
-import trimesh
+from blocks import finger
 
 mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
 
@@ -16,7 +16,7 @@ import warp as wp
 import biotac_mj
 from biotac_mj import batch as batches
 from biotac_mj.coupling.implicit.rules import EULER
-from biotac_mj.geometry import SkinGeometry, load_skin
+from biotac_mj.geometry import load_skin
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.readings import PhysicsReadings
 from biotac_mj.skin import SkinOptions
@@ -38,39 +38,7 @@ def where_batches_run(default_device):
 def shell():
     """A closed shell of a finger's size of 324 nodes, one layer, with 19 electrodes: every path of the code,
     but no real sensor."""
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    n, center = len(ball.vertices), np.array([-8e-3, 0, 0])
-    outer, inner, core = (
-        ball.vertices * size + center
-        for size in ([13e-3, 7e-3, 7e-3], [11.5e-3, 5.5e-3, 5.5e-3], [10e-3, 4.5e-3, 4.5e-3])
-    )
-    f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
-    elem = np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
-                           np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
-                           np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1)])  # fmt: skip
-    vert = np.concatenate([outer, inner])
-    turned = np.linalg.det(vert[elem[:, 1:]] - vert[elem[:, :1]]) < 0
-    elem[turned] = elem[turned][:, [0, 1, 3, 2]]
-    angle = np.linspace(-1.0, 1.0, 19)
-    normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
-    electrode = np.stack([np.linspace(-14e-3, -2e-3, 19), 0 * angle, 0 * angle], 1) + 4.5e-3 * normal
-    empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
-    return SkinGeometry(
-        "synthetic",
-        vert,
-        elem,
-        ball.faces,
-        ball.faces[:, ::-1] + n,
-        np.flatnonzero(vert[:, 0] > 2e-3),
-        core,
-        ball.faces,
-        empty,
-        no_face,
-        empty,
-        no_face,
-        electrode,
-        normal,
-    )
+    return finger(2, fixed=2e-3, tip=-14e-3, radius=4.5e-3)
 
 
 def press_spec():

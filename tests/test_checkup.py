@@ -1,8 +1,5 @@
 """The checkup: its protocol, recording while it is said, and what its segments tell. Data are synthetic."""
 
-import sys
-import types
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -108,27 +105,7 @@ def test_rows_of_a_protocol_are_by_the_clock():
     assert [rows.tolist() for rows in protocol.rows(time, "rest")] == [[0, 1]]
 
 
-def test_recording_says_the_steps_and_keeps_their_times(tmp_path, monkeypatch, capsys):
-    """A stand-in for pyserial that sends a line each time it is asked."""
-
-    class Port:
-        def __init__(self, *given, **named):
-            self.sent = 0
-
-        __enter__ = lambda self: self  # noqa: E731
-        __exit__ = lambda self, *error: None  # noqa: E731
-
-        def readline(self):
-            import time
-
-            time.sleep(0.002)
-            self.sent += 1
-            return b"3000 " * 18 + b"%d\n" % (3000 + self.sent % 90)
-
-    stand_in = types.ModuleType("serial")
-    stand_in.Serial, stand_in.SerialException = Port, OSError
-    stand_in.__spec__ = types.SimpleNamespace()
-    monkeypatch.setitem(sys.modules, "serial", stand_in)
+def test_recording_says_the_steps_and_keeps_their_times(tmp_path, serial_port, capsys):
     plan, out = tmp_path / "protocol.yaml", tmp_path / "r.h5"
     write_protocol(plan, Protocol((Segment("rest", 0.1, 0.3, "air"), Segment("taps", 0.4, 0.6, "pen"))))
     command = ["recording", "record", "--serial", "/dev/x", "--protocol", str(plan), "--out", str(out)]

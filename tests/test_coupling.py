@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import spring_skin
 from grids import covering, first
+from mechanics import momentum
 from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
@@ -265,22 +266,6 @@ def test_only_dampers_take_momentum(integrator):
     assert touched >= 2
 
 
-def _momentum(model, data):
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_comVel(model, data)
-    linear, angular = np.zeros(3), np.zeros(3)
-    for b in range(1, model.nbody):
-        velocity = np.zeros(6)
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
-        axes = data.ximat[b].reshape(3, 3)
-        linear += model.body_mass[b] * velocity[3:]
-        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (
-            model.body_inertia[b] * (axes.T @ velocity[:3])
-        )
-    return linear, angular
-
-
 @pytest.mark.parametrize(
     "masses, integrator, timestep",
     covering(
@@ -303,12 +288,12 @@ def test_momentum_of_free_finger_and_object_is_conserved(masses, integrator, tim
     model.body_inertia[core] = model.body_inertia[core].mean()
     mujoco.mj_setConst(model, data)
     data.qvel[6:] = [0.1, 0.05, -0.3, 3, 4, 2]
-    linear, angular = _momentum(model, data)
+    linear, angular = momentum(model, data)
     touched = 0
     for _ in range(int(0.05 / timestep)):
         mujoco.mj_step(model, data)
         touched += handle.read(data, "contact_force").any()
-    after = _momentum(model, data)
+    after = momentum(model, data)
     assert touched >= 2
     assert np.linalg.norm(after[0] - linear) < 1e-12 * np.linalg.norm(linear)
     assert np.linalg.norm(after[1] - angular) < 1e-12 * np.linalg.norm(angular)

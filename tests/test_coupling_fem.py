@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse.linalg
 from blocks import four_nodes
 from grids import covering
+from mechanics import momentum
 from scipy.spatial.transform import Rotation
 
 import biotac_mj
@@ -182,22 +183,6 @@ def test_a_ball_sticks_and_slips_at_mu(timestep):
         ratio.append(np.hypot(force[0], force[2]) / force[1])
     assert data.qvel[1] < -0.01
     assert np.mean(ratio) == pytest.approx(mu, rel=0.05)  # what the pad's slope leaves: tan(1 degree) / mu
-
-
-def momentum(model, data):
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_comVel(model, data)
-    linear, angular = np.zeros(3), np.zeros(3)
-    for b in range(1, model.nbody):
-        velocity = np.zeros(6)
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
-        axes = data.ximat[b].reshape(3, 3)
-        linear += model.body_mass[b] * velocity[3:]
-        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (
-            model.body_inertia[b] * (axes.T @ velocity[:3])
-        )
-    return linear, angular
 
 
 @pytest.mark.parametrize("masses, timestep", covering([(0.02, 0.005), (0.05, 0.05)], [0.0005, 0.002]))

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from mechanics import check_repeats
 
 from biotac_mj import attach
 
@@ -58,15 +59,7 @@ def test_a_warm_body_warms(steel):
 
 def test_a_step_repeated_from_its_state_is_equal_to_the_bit():
     model, data, _ = pressed({"plate": "steel"}, 0.3)
-    saved = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
-    mujoco.mj_getState(model, data, saved, mujoco.mjtState.mjSTATE_INTEGRATION)
-    rows = []
-    for _ in range(2):
-        mujoco.mj_setState(model, data, saved, mujoco.mjtState.mjSTATE_INTEGRATION)
-        for _ in range(5):
-            mujoco.mj_step(model, data)
-        rows.append((data.sensordata.copy(), data.plugin_state.copy()))
-    assert (rows[0][0] == rows[1][0]).all() and (rows[0][1] == rows[1][1]).all()
+    check_repeats(model, data)
 
 
 def test_a_cold_sensor_warms_up():

@@ -415,45 +415,10 @@ def test_lines_of_a_serial_port():
         streams_of_lines("p", lines, times, ["pdc", "tdc"])
 
 
-def test_recording_from_a_port(tmp_path, monkeypatch, capsys):
-    """A stand-in for pyserial: it sends a line each time it is asked."""
-
-    class Port:
-        def __init__(self, *given, **named):
-            self.sent = 0
-
-        __enter__ = lambda self: self  # noqa: E731
-        __exit__ = lambda self, *error: None  # noqa: E731
-
-        def readline(self):
-            import time
-
-            time.sleep(0.002)
-            self.sent += 1
-            return b"3000 " * 18 + b"%d\n" % (3000 + self.sent)
-
-    stand_in = types.ModuleType("serial")
-    stand_in.Serial, stand_in.SerialException = Port, OSError
-    stand_in.__spec__ = types.SimpleNamespace()
-    monkeypatch.setitem(sys.modules, "serial", stand_in)
+def test_recording_from_a_port(tmp_path, serial_port, capsys):
     out = tmp_path / "r.h5"
-    assert (
-        cli.main(
-            [
-                "recording",
-                "record",
-                "--serial",
-                "/dev/x",
-                "--seconds",
-                "0.2",
-                "--object",
-                "air",
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
+    command = "recording record --serial /dev/x --seconds 0.2 --object air --out".split()
+    assert cli.main([*command, str(out)]) == 0
     (one,) = read(out)
     assert (
         (np.diff(one.electrodes[:, 18]) == 1).all() and one.electrodes[0, 18] == 3002 and one.object == "air"

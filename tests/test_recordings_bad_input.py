@@ -11,7 +11,7 @@ import shutil
 import numpy as np
 import pytest
 import scipy.io
-from bad_rows import Row, h5
+from bad_rows import Row, h5, replaced
 from recorded import synthetic, write_btd, write_csv, write_mat
 
 from biotac_mj import cli
@@ -42,15 +42,6 @@ def attribute(name, value, group="/"):
 
 def text(value):
     return lambda path: path.write_text(value)
-
-
-def replaced(old, new):
-    def do(path):
-        before = path.read_text()
-        assert old in before
-        path.write_text(before.replace(old, new, 1))
-
-    return do
 
 
 def lines(change):

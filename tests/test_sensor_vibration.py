@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from mechanics import check_repeats
 
 import biotac_mj
 from biotac_mj.coupling.config import Config
@@ -163,16 +164,7 @@ def test_a_ridged_plate_sings_in_mj_step():
     peak = np.fft.rfftfreq(2**15, 2 / SLOT_RATE)[power.argmax()]
     assert peak == pytest.approx(50.0, rel=0.02)
     assert loud.std() > 5 * smooth.std()
-
-    saved = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
-    mujoco.mj_getState(model, data, saved, mujoco.mjtState.mjSTATE_INTEGRATION)
-    rows = []
-    for _ in range(2):
-        mujoco.mj_setState(model, data, saved, mujoco.mjtState.mjSTATE_INTEGRATION)
-        for _ in range(5):
-            mujoco.mj_step(model, data)
-        rows.append((data.sensordata.copy(), data.plugin_state.copy()))
-    assert (rows[0][0] == rows[1][0]).all() and (rows[0][1] == rows[1][1]).all()
+    check_repeats(model, data)
 
 
 def test_textures_are_checked():
