@@ -226,6 +226,14 @@ def files_of_skins():
     for name in ("outer_face", "inner_face"):
         inside_out = arrays(**{name: lambda v: v[:, ::-1]})
         yield Row(SKIN, f"{name} of skin skin.npz is inside out: flip", "skin.npz", inside_out)
+        for said, change in (
+            ("0 triangles too many, 1 missing", lambda v: v[1:]),
+            ("1 triangles too many, 0 missing", lambda v: np.concatenate([v, v[:1]])),
+            ("1 triangles too many, 0 missing", lambda v: np.concatenate([v, v[:1, [0, 0, 1]]])),
+        ):
+            yield Row(SKIN, f"the surface of its tetrahedra: {said}", "skin.npz", arrays(**{name: change}))
+    twice = arrays(elem=lambda v: np.concatenate([v, v[:1]]))
+    yield Row(SKIN, "belong to more than two tetrahedra", "skin.npz", twice)
     for name in ("nail", "clamp"):
         said = f"the {name} of skin skin.npz encloses no volume"
         yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))

@@ -9,8 +9,8 @@ from ..files import write_npz
 from ..reading import Array, read_npz
 from ..short_repr import short_repr
 from .design import BIOTAC, Design, read_design
-from .solid import close_rim, no_solid
-from .tet_mesh import TetMesh, check_closed, enclosed_volume, indices
+from .solid import no_solid
+from .tet_mesh import TetMesh, check_closed, enclosed_volume, indices, triangle_numbers
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
@@ -173,16 +173,33 @@ class SkinGeometry:
                 wrong = "encloses no volume: import the mesh again"
             if wrong is not None:
                 raise ValueError(f"the {part} of skin {name} {wrong}")
-        # a skin of one's own stepper may be a surface alone
-        if self.nelem and (TetMesh(self.vert, self.elem[:, :4]).volumes <= 0).any():
-            return  # inside and outside have no meaning; `SkinModel` names the tetrahedra
-        for surface, sign, where in (("outer", 1, "out of the finger"), ("inner", -1, "towards the core")):
-            face = close_rim(getattr(self, f"{surface}_face"))
-            if sign * enclosed_volume(self.vert, face) < -_SOLID:
+        if self.nelem:  # a skin of one's own stepper may be a surface alone
+            self._check_surfaces(name)
+
+    def _check_surfaces(self, name):
+        """Raises ValueError unless the outer and the inner surface are the free surface of the tetrahedra."""
+        mesh = TetMesh(self.vert, self.tets)
+        if (mesh.volumes <= 0).any():
+            return  # such faces have no side; `SkinModel` names the tetrahedra
+        surface = _directed(mesh.boundary)
+        for which in ("outer_face", "inner_face"):
+            face = getattr(self, which)
+            if len(face) and np.isin(_directed(face[:, ::-1]), surface).all():
                 raise ValueError(
-                    f"{surface}_face of skin {name} is inside out: flip its faces, so that all normals point "
-                    f"{where}"
+                    f"{which} of skin {name} is inside out: flip its faces, so that normals point out of the "
+                    "rubber"
                 )
+        given, count = np.unique(
+            _directed(np.concatenate([self.outer_face, self.inner_face])), return_counts=True
+        )
+        free = ~np.isin(mesh.boundary, self.fixed).all(axis=1)
+        more = count.sum() - np.isin(given, surface).sum()
+        missing = np.count_nonzero(~np.isin(surface[free], given))
+        if more or missing or not len(self.outer_face):
+            raise ValueError(
+                f"outer_face and inner_face of skin {name} are not the surface of its tetrahedra: "
+                f"{more} triangles too many, {missing} missing; import the mesh again"
+            )
 
     def save(self, path: pathlib.Path | str) -> pathlib.Path:
         """Writes an .npz file with positions in float64, so that a reload is equal to the bit."""
@@ -207,3 +224,9 @@ class SkinGeometry:
             raise ValueError(f"{path}: {error}") from None
         skin.check(path)
         return skin
+
+
+def _directed(face):
+    """A number (n,) for each triangle (n, 3), the same for cyclic permutations."""
+    turn = (face.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    return triangle_numbers(np.take_along_axis(face, turn, axis=1))

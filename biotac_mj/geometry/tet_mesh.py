@@ -76,7 +76,8 @@ class TetMesh:
     def boundary(self) -> np.ndarray:
         """(nface, 3) int32 faces that belong to one tetrahedron only, normals outwards."""
         face = self.elem[:, _FACES].reshape(-1, 3)
-        _, first, count = np.unique(np.sort(face, axis=1), axis=0, return_index=True, return_counts=True)
+        number = triangle_numbers(np.sort(face, axis=1))
+        _, first, count = np.unique(number, return_index=True, return_counts=True)
         if count.max() > 2:
             raise ValueError(
                 f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first: "
@@ -144,6 +145,11 @@ class TetMesh:
                 "remove them and renumber"
             )
         return self
+
+
+def triangle_numbers(face: np.ndarray) -> np.ndarray:
+    """(n,) int64 numbers of triangles (n, 3) of indices, in the order of rows; they sort faster."""
+    return face.astype(np.int64) @ [1 << 42, 1 << 21, 1]
 
 
 def connected_cells(cell: np.ndarray) -> list[np.ndarray]:
