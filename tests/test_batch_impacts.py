@@ -168,11 +168,12 @@ def test_a_rolling_ball_settles_where_the_plugins_ball_does():
 @pytest.mark.slow  # quick: this ball and a thrown box in the plugin
 def test_a_light_ball_that_rolls_gains_nothing():
     xml, qpos, qvel, settings = rolling(2.335e-3, 2.0, 0.005)
-    qvel[0] += 1e-4  # without, 6 or 20 steps are lost by the last digit of where a step ends; so it is 9
+    qvel[0] += 1e-4  # without, 6 or 20 steps were lost by the last digit of where a step ends
     settings["skin"] = "coarse"  # on four nodes it gains nothing either where nothing is withheld
     (seen,), store = in_batch(xml, [qpos], [qvel], 22, {"site": "tip"}, **settings)
-    assert seen.touched > 12 and seen.growth < 0.05 and store.max() < 1.05 * seen.kinetic
-    assert seen.lost <= 14  # of 22 steps; which ones is chance, as small as the rest of a balance
+    fallen = 2.335e-3 * 9.81 * (qpos[2] - seen.qpos[2])  # [J]
+    assert seen.touched > 12 and seen.growth < 0.05 and store.max() < 1.05 * (seen.kinetic + fallen)
+    assert seen.lost <= 6  # of 22 steps; which ones is chance, as small as the rest of a balance
 
 
 def test_bodies_that_start_inside_are_pushed_out():
