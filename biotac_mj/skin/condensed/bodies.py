@@ -7,7 +7,7 @@ changes the wrench, the nodes are moved relative to them instead."""
 
 import warp as wp
 
-from ..block import block_sum, sync
+from ..block import block_sum, sum_of_lanes, sync
 from ..bodies import Bodies, follow_wrench
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
@@ -118,24 +118,32 @@ def _set_motions(w: int, t: int, threads: int, b: Bodies):
     for h in range(t, b.motion.shape[0], threads):
         m = vec6()
         for g in range(b.motion.shape[0]):
-            m += b.compliance[h, g, w] * b.wrench[g, w]
+            load = b.wrench[g, w]
+            if not wp.dot(load, load) == real(0.0):  # most bodies are not touched
+                m += b.compliance[h, g, w] * load
         b.motion[h, w] = m
     sync()
 
 
 @wp.func
-def _sum_load(w: int, t: int, threads: int, p: int, h: int, nnode: int, s: Scratch):
-    """Wrench on the nodes of a group that vector[p] of the candidates is."""
-    force = vec3()
-    torque = vec3()
-    for k in range(t, nnode, threads):
-        if s.group[w, k] == h:
-            f = vec3(s.vector[w, p, 3 * k], s.vector[w, p, 3 * k + 1], s.vector[w, p, 3 * k + 2])
-            force += f
-            torque += wp.cross(s.arm[w, k], f)
-    force = block_sum(force)
-    torque = block_sum(torque)
-    return vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
+def _list_loads(w: int, t: int, threads: int, p: int, nnode: int, s: Scratch):
+    """Makes the wrench of each body that on the nodes of its group that vector[p] of the candidates is: by a
+    warp for each, on the CPU by the one thread."""
+    b = s.bodies
+    lanes = wp.min(threads, 32)
+    for h in range(t / lanes, b.wrench.shape[0], threads / lanes):
+        force = vec3()
+        torque = vec3()
+        for k in range(t % lanes, nnode, lanes):
+            if s.group[w, k] == h:
+                f = vec3(s.vector[w, p, 3 * k], s.vector[w, p, 3 * k + 1], s.vector[w, p, 3 * k + 2])
+                force += f
+                torque += wp.cross(s.arm[w, k], f)
+        force = sum_of_lanes(force, lanes)
+        torque = sum_of_lanes(torque, lanes)
+        if t % lanes == 0:
+            b.wrench[h, w] = vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
+    sync()
 
 
 @wp.func
@@ -143,13 +151,10 @@ def move_nodes(w: int, t: int, threads: int, nnode: int, p: int, out: int, shift
     """Adds to vector[out] how the nodes move relative to their bodies by forces vector[p]; with `shifted`
     from where the geoms are."""
     b = s.bodies
-    for h in range(b.compliance.shape[0]):
-        load = _sum_load(w, t, threads, p, h, nnode, s)
-        if shifted == 1:
-            load += b.posed[h, w]
-        if t == 0:
-            b.wrench[h, w] = load
     if b.compliance.shape[0] > 0:
+        _list_loads(w, t, threads, p, nnode, s)
+        for h in range(t, wp.where(shifted == 1, b.wrench.shape[0], 0), threads):
+            b.wrench[h, w] = b.wrench[h, w] + b.posed[h, w]
         _set_motions(w, t, threads, b)
         for k in range(t, nnode, threads):
             m = b.motion[s.group[w, k], w]
@@ -203,11 +208,11 @@ def pose_by_load(
     for k in range(t, nnode, threads):
         s.arm[w, k] = x[c.node[s.node[w, k]], w]
     sync()
-    for h in range(groups):
-        load = _sum_load(w, t, threads, F, h, nnode, s)
-        if t == 0:
-            b.wrench[h, w] = -load - b.posed[h, w]
-            b.posed[h, w] = -load
+    _list_loads(w, t, threads, F, nnode, s)
+    for h in range(t, groups, threads):
+        load = b.wrench[h, w]
+        b.wrench[h, w] = -load - b.posed[h, w]
+        b.posed[h, w] = -load
     _set_motions(w, t, threads, b)
     far = real(0.0)
     for h in range(groups):
