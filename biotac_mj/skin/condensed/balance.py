@@ -15,11 +15,11 @@ from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
 from .broadphase import ROOT3
-from .states import BALANCED, EVALUATE, NEWTON, Linear, Newton
+from .states import BALANCED, Increment, Linear, Newton
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system
 
-__all__ = ["CUT", "TOLERANCE", "evaluation", "newton_from", "take_step"]
+__all__ = ["CUT", "TOLERANCE", "newton_from", "newton_method"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -82,146 +82,6 @@ def _find_motion(
     for j in range(3 * nnode + t, 3 * nnode + nin, threads):
         s.vector[w, TRY, j] = s.vector[w, TRY, j] - s.vector[w, U, j]
     sync()
-
-
-@functools.cache
-def evaluation(shapes: str) -> wp.Function:
-    """The phase EVALUATE. shapes: see `contact.touch`."""
-    touch_faces = contact_kernels(False, False, shapes).touch_faces
-
-    @wp.func
-    def evaluate(
-        w: int,
-        t: int,
-        threads: int,
-        nface: int,
-        ncore: int,
-        nnode: int,
-        nin: int,
-        at: int,
-        coupled: int,
-        anew: int,
-        travel: real,
-        geoms: Geoms,
-        x: wp.array2d(dtype=vec3),
-        touch: Contact,
-        c: Constants,
-        s: Scratch,
-    ):
-        """Forces vector[G] of the contact law at displacements vector[at] of the candidates, and flags of
-        those that touch; returns `Newton.travel`. Unless all are to be evaluated `anew`, since geoms have
-        moved, faces are left out that nothing can have reached."""
-        sync()
-        most = real(0.0)
-        for k in range(t, nnode, threads):
-            i = c.node[s.node[w, k]]
-            u = vec3(s.vector[w, at, 3 * k], s.vector[w, at, 3 * k + 1], s.vector[w, at, 3 * k + 2])
-            most = wp.max(most, wp.length_sq(c.rest[i, 0] + u - x[i, w]))
-            x[i, w] = c.rest[i, 0] + u
-        travel = wp.where(anew == 1, real(0.0), travel + ROOT3 * wp.sqrt(block_max(most)))
-        count = int(0)
-        for begin in range(0, nface, threads):
-            f = int(0)
-            left = int(0)
-            if begin + t < nface:
-                f = s.face[w, begin + t]
-                left = wp.where(anew == 1 or s.free[w, f] <= travel, 1, 0)
-            rank = block_rank(left)
-            if left == 1:
-                s.look[w, count + rank[0]] = f
-            count += rank[1]
-        sync()
-        several = s.bodies.compliance.shape[0] > 1
-        touch_faces(w, t, threads, count, s.look, s.close_to, geoms, x, touch, coupled, travel, s.free)
-        sync()
-        for k in range(t, nnode, threads):
-            i = c.node[s.node[w, k]]
-            total = vec3()
-            on = int(0)
-            for m in range(c.start[i], c.start[i + 1]):
-                f = c.slot[m] / 3
-                if touch.touching[f, w] == 1:
-                    total += touch.corner[c.slot[m], w]
-                    if on == 0 and several:
-                        s.group[w, k] = touching_group(f, w, geoms, touch, c.sample.shape[0], s.group[w, k])
-                    on = 1
-            s.on[w, k] = on
-            for a in range(3):
-                s.vector[w, G, 3 * k + a] = total[a]
-        nsample = c.sample.shape[0]
-        for k in range(t, ncore * nsample, threads):
-            place = k / nsample
-            face = c.inner_face[s.core_face[w, place]]
-            moved = vec3()
-            for a in range(3):
-                q = c.inner_number[face[a]]
-                if q >= 0:
-                    j = 3 * nnode + s.core_place[w, q]
-                    moved[a] = s.vector[w, at, j] - s.vector[w, BACK, j]
-            n = k % nsample
-            s.now[w, place, n] = s.gap[w, place, n] + wp.dot(c.sample[n], moved)
-        sync()
-        for k in range(t, nin, threads):
-            push = real(0.0)
-            stiff = real(0.0)
-            v = c.inner[s.core_node[w, k]]
-            for m in range(c.inner_start[v], c.inner_start[v + 1]):
-                f = c.inner_slot[m] / 3
-                place = s.near_core[w, f] - 1
-                if place >= 0:
-                    weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
-                    for n in range(nsample):
-                        gap = s.now[w, place, n]
-                        if gap < real(0.0):
-                            b = c.sample[n][c.inner_slot[m] % 3]
-                            push -= weight * gap * b
-                            stiff += weight * b
-            s.vector[w, G, 3 * nnode + k] = push
-            s.stiff[w, k] = stiff
-            s.on[w, nnode + k] = wp.where(stiff > real(0.0), 1, 0)
-        sync()
-        return travel
-
-    @wp.func
-    def evaluate_contact(
-        w: int,
-        t: int,
-        threads: int,
-        geoms: Geoms,
-        x: wp.array2d(dtype=vec3),
-        touch: Contact,
-        c: Constants,
-        s: Scratch,
-    ):
-        """Finds the displacements that the forces bring about, where they are not known, and evaluates
-        contact there: in the end with a symmetric tangent, and where a step is foretold with the geoms where
-        they are held."""
-        d = s.solve.newton[w]
-        o = s.solve.increment[w]
-        anew = wp.where(d.fresh >= 0, 1, 0)
-        if anew == 1:
-            skin = d.linear
-            if d.foretold == 1:
-                skin = d.before
-            multiply(w, t, threads, o.nnode, 3 * o.nnode + o.nin, F, d.fresh, 1, skin, c, s)
-        if d.foretold == 1:
-            _swap_poses(w, t, threads, geoms, s)
-        d.travel = evaluate(
-            w, t, threads, o.nface, o.ncore, o.nnode, o.nin, d.at, 1 - d.ends, anew, d.travel, geoms, x,
-            touch, c, s,
-        )  # fmt: skip
-        if d.foretold == 1:
-            _swap_poses(w, t, threads, geoms, s)
-        if t == 0:
-            d.fresh = -1
-            d.spent += real(1.0)
-            if d.foretold == 1:
-                d.foretold = 2
-                d.fresh = TRY
-            s.solve.newton[w] = d
-            s.solve.phase[w] = wp.where(d.ends == 1, BALANCED, NEWTON)
-
-    return evaluate_contact
 
 
 @wp.func
@@ -296,21 +156,20 @@ def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
 
 
 @wp.func
-def take_step(
+def _take_step(
     w: int,
     t: int,
     threads: int,
+    d: Newton,
+    o: Increment,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
 ):
-    """The phase NEWTON: after an evaluation of contact, tests a step, computes the next one, or ends."""
-    d = s.solve.newton[w]
-    o = s.solve.increment[w]
+    """After an evaluation of contact, tests a step, computes the next one, or ends."""
     n = 3 * o.nnode + o.nin
-    sync()
     if d.foretold == 2:
         multiply(w, t, threads, o.nnode, n, F, d.fresh, 1, d.linear, c, s)
         d.fresh = -1
@@ -385,6 +244,143 @@ def take_step(
         d.at = TRY
         for j in range(t, n, threads):
             s.vector[w, TRY, j] = s.vector[w, U, j] + d.alpha * s.vector[w, DU, j]
-    if t == 0:
-        s.solve.newton[w] = d
-        s.solve.phase[w] = EVALUATE
+    return d
+
+
+@functools.cache
+def newton_method(shapes: str) -> wp.Function:
+    """The phase NEWTON. shapes: see `contact.touch`."""
+    touch_faces = contact_kernels(False, False, shapes).touch_faces
+
+    @wp.func
+    def evaluate_contact(
+        w: int,
+        t: int,
+        threads: int,
+        d: Newton,
+        o: Increment,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+    ):
+        """Finds the displacements that the forces bring about, where they are not known, and there the forces
+        vector[G] of the contact law, and flags of the candidates that touch: in the end with a symmetric
+        tangent, and where a step is foretold with the geoms where they are held. Unless geoms have moved,
+        faces are left out that nothing can have reached."""
+        nnode = o.nnode
+        anew = wp.where(d.fresh >= 0, 1, 0)
+        if anew == 1:
+            skin = d.linear
+            if d.foretold == 1:
+                skin = d.before
+            multiply(w, t, threads, nnode, 3 * nnode + o.nin, F, d.fresh, 1, skin, c, s)
+        if d.foretold == 1:
+            _swap_poses(w, t, threads, geoms, s)
+        sync()
+        most = real(0.0)
+        for k in range(t, nnode, threads):
+            i = c.node[s.node[w, k]]
+            u = vec3(s.vector[w, d.at, 3 * k], s.vector[w, d.at, 3 * k + 1], s.vector[w, d.at, 3 * k + 2])
+            most = wp.max(most, wp.length_sq(c.rest[i, 0] + u - x[i, w]))
+            x[i, w] = c.rest[i, 0] + u
+        d.travel = wp.where(anew == 1, real(0.0), d.travel + ROOT3 * wp.sqrt(block_max(most)))
+        count = int(0)
+        for begin in range(0, o.nface, threads):
+            f = int(0)
+            left = int(0)
+            if begin + t < o.nface:
+                f = s.face[w, begin + t]
+                left = wp.where(anew == 1 or s.free[w, f] <= d.travel, 1, 0)
+            rank = block_rank(left)
+            if left == 1:
+                s.look[w, count + rank[0]] = f
+            count += rank[1]
+        sync()
+        several = s.bodies.compliance.shape[0] > 1
+        touch_faces(w, t, threads, count, s.look, s.close_to, geoms, x, touch, 1 - d.ends, d.travel, s.free)
+        sync()
+        for k in range(t, nnode, threads):
+            i = c.node[s.node[w, k]]
+            total = vec3()
+            on = int(0)
+            for m in range(c.start[i], c.start[i + 1]):
+                f = c.slot[m] / 3
+                if touch.touching[f, w] == 1:
+                    total += touch.corner[c.slot[m], w]
+                    if on == 0 and several:
+                        s.group[w, k] = touching_group(f, w, geoms, touch, c.sample.shape[0], s.group[w, k])
+                    on = 1
+            s.on[w, k] = on
+            for a in range(3):
+                s.vector[w, G, 3 * k + a] = total[a]
+        nsample = c.sample.shape[0]
+        for k in range(t, o.ncore * nsample, threads):
+            place = k / nsample
+            face = c.inner_face[s.core_face[w, place]]
+            moved = vec3()
+            for a in range(3):
+                q = c.inner_number[face[a]]
+                if q >= 0:
+                    j = 3 * nnode + s.core_place[w, q]
+                    moved[a] = s.vector[w, d.at, j] - s.vector[w, BACK, j]
+            n = k % nsample
+            s.now[w, place, n] = s.gap[w, place, n] + wp.dot(c.sample[n], moved)
+        sync()
+        for k in range(t, o.nin, threads):
+            push = real(0.0)
+            stiff = real(0.0)
+            v = c.inner[s.core_node[w, k]]
+            for m in range(c.inner_start[v], c.inner_start[v + 1]):
+                f = c.inner_slot[m] / 3
+                place = s.near_core[w, f] - 1
+                if place >= 0:
+                    weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    for n in range(nsample):
+                        gap = s.now[w, place, n]
+                        if gap < real(0.0):
+                            b = c.sample[n][c.inner_slot[m] % 3]
+                            push -= weight * gap * b
+                            stiff += weight * b
+            s.vector[w, G, 3 * nnode + k] = push
+            s.stiff[w, k] = stiff
+            s.on[w, nnode + k] = wp.where(stiff > real(0.0), 1, 0)
+        sync()
+        d.fresh = -1
+        d.spent += real(1.0)
+        if d.foretold == 1:
+            _swap_poses(w, t, threads, geoms, s)
+            d.foretold = 2
+            d.fresh = TRY
+        return d
+
+    @wp.func
+    def balance(
+        w: int,
+        t: int,
+        threads: int,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+    ):
+        """Newton's method from `newton_from` to its end."""
+        d = s.solve.newton[w]
+        o = s.solve.increment[w]
+        evaluated = wp.where(d.foretold == 2, 1, 0)
+        going = int(1)
+        while going == 1:
+            sync()
+            if evaluated == 1:
+                d = _take_step(w, t, threads, d, o, geoms, x, touch, c, s)
+            sync()
+            going = 1 - d.ends
+            d = evaluate_contact(w, t, threads, d, o, geoms, x, touch, c, s)
+            evaluated = 1
+        if t == 0:
+            s.solve.newton[w] = d
+            s.solve.phase[w] = BALANCED
+
+    return balance

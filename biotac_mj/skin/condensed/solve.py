@@ -7,13 +7,12 @@ import types
 
 import warp as wp
 
-from ..block import sync
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds
 from ..types import real, vec3
-from .balance import evaluation, take_step
-from .states import BALANCED, DONE, EVALUATE, NEWTON, SEARCH
+from .balance import newton_method
+from .states import BALANCED, DONE, NEWTON, SEARCH
 from .stepping import begin_step, conclude_balance, search
 from .structs import Constants, Remembered, Scratch
 
@@ -24,19 +23,10 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 256  # threads of a world, equal to `touch.BLOCK`
 
 
-@wp.func
-def phase_of(w: int, s: Scratch):
-    """The next phase of a world, for all threads of its block; none of them changes it before all know it."""
-    sync()
-    phase = s.solve.phase[w]
-    sync()
-    return phase
-
-
 @functools.cache
 def whole_step(shapes: str) -> wp.Kernel:
     """Kernel with all phases, for the CPU. shapes: see `contact.touch`."""
-    evaluate = evaluation(shapes)
+    balance = newton_method(shapes)
 
     @wp.kernel(module=f"{__name__}.{shapes}", enable_backward=False)
     def step(
@@ -60,10 +50,8 @@ def whole_step(shapes: str) -> wp.Kernel:
         while s.solve.phase[w] != DONE:
             if s.solve.phase[w] == SEARCH:
                 search(w, 0, 1, geoms, x, touch, c, s, r, st)
-            if s.solve.phase[w] == EVALUATE:
-                evaluate(w, 0, 1, geoms, x, touch, c, s)
             if s.solve.phase[w] == NEWTON:
-                take_step(w, 0, 1, geoms, x, touch, c, s)
+                balance(w, 0, 1, geoms, x, touch, c, s)
             if s.solve.phase[w] == BALANCED:
                 conclude_balance(
                     w, 0, 1, geoms, rest_pressure, x, touch, c, s, r, st, node_force_out, tier_out
@@ -102,13 +90,13 @@ def _search(
     s: Scratch,
 ):
     w, t = wp.tid()
-    while phase_of(w, s) == SEARCH:  # again where there was no room
+    if s.solve.phase[w] == SEARCH:
         search(w, t, wp.block_dim(), geoms, x, touch, c, s, r, st)
 
 
 @functools.cache
 def _balance(shapes):
-    evaluate = evaluation(shapes)
+    balance = newton_method(shapes)
 
     @wp.kernel(module=f"{__name__}.balance.{shapes}", enable_backward=False, launch_bounds=(BLOCK, 2))
     def _balance(
@@ -120,15 +108,9 @@ def _balance(shapes):
         # Out:
         s: Scratch,
     ):
-        """Newton's method."""
         w, t = wp.tid()
-        phase = phase_of(w, s)
-        while phase == EVALUATE or phase == NEWTON:
-            if phase == EVALUATE:
-                evaluate(w, t, wp.block_dim(), geoms, x, touch, c, s)
-            else:
-                take_step(w, t, wp.block_dim(), geoms, x, touch, c, s)
-            phase = phase_of(w, s)
+        if s.solve.phase[w] == NEWTON:
+            balance(w, t, wp.block_dim(), geoms, x, touch, c, s)
 
     return _balance
 

@@ -8,7 +8,6 @@ from ..types import real
 __all__ = [
     "BALANCED",
     "DONE",
-    "EVALUATE",
     "Increment",
     "Linear",
     "LoadStepping",
@@ -20,9 +19,8 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-# next phase: none; broad phase of an increment; evaluation of contact; step of Newton's method; decision
-# about increment and step
-DONE, SEARCH, EVALUATE, NEWTON, BALANCED = (wp.constant(i) for i in range(5))
+# next phase: none; broad phase of an increment; Newton's method; decision about increment and step
+DONE, SEARCH, NEWTON, BALANCED = (wp.constant(i) for i in range(4))
 
 
 @wp.struct

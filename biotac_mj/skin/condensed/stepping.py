@@ -24,7 +24,7 @@ from .broadphase import (
 )
 from .correction import is_measured
 from .results import correct, place_nodes
-from .states import BALANCED, DONE, EVALUATE, NEWTON, SEARCH, Increment, Linear, LoadStepping
+from .states import BALANCED, DONE, NEWTON, SEARCH, Increment, Linear, LoadStepping
 from .structs import Constants, F, G, Remembered, Scratch
 from .system import count_contacts, gather_load
 
@@ -314,7 +314,7 @@ def search(
     o.solving = looking
     if t == 0:
         s.solve.increment[w] = o
-        s.solve.phase[w] = wp.where(looking == 1, EVALUATE, BALANCED)
+        s.solve.phase[w] = wp.where(looking == 1, NEWTON, BALANCED)
 
 
 @wp.func
