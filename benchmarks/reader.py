@@ -24,7 +24,7 @@ from biotac_mj.data.generation.clearance import Placed, first_touch, surface_sam
 from biotac_mj.data.generation.generate import GenerateOptions, generate
 from biotac_mj.data.generation.plan import Motion
 from biotac_mj.data.generation.readings import read_motion
-from biotac_mj.data.generation.simulate import simulate, simulate_condensed
+from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.splits import assign
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import rotation
@@ -85,8 +85,11 @@ def two_contacts(
             for k in range(count)
         ]
         time = np.arange(STEPS) / RATE
-        walk = simulate if tier == "full" else simulate_condensed
-        fields, film, ones = walk(model, name, motions, time=time), FilmConduction(model.geometry), []
+        fields, film, ones = (
+            simulate(model, name, motions, time=time, tier=tier),
+            FilmConduction(model.geometry),
+            [],
+        )
         for k, motion in enumerate(motions):
             vert = fields.vert_xpos(model.geometry.vert, k)
             read = read_motion(film, vert, time, fields.pressure[k], k)

@@ -16,7 +16,7 @@ from biotac_mj.data.generation.generate import GenerateOptions
 from biotac_mj.data.generation.making import Maker
 from biotac_mj.data.generation.plan import Motion
 from biotac_mj.data.generation.readings import read_motion
-from biotac_mj.data.generation.simulate import simulate, simulate_condensed
+from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.generation.vary import draw_sense
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.channels import CHANNELS, NELECTRODE
@@ -134,9 +134,8 @@ def walked(file, tier, shaken):
     )
     maker = Maker(chosen, {})
     motion = Motion("walk", {}, WAY, np.tile(np.eye(3), (N, 1, 1)))
-    walk = simulate if tier == "full" else simulate_condensed
     tool = f"geom:sphere:{RADIUS}"
-    return maker, walk(maker.model, tool, [motion], None, maker.time, modes=maker.modes)
+    return maker, simulate(maker.model, tool, [motion], None, maker.time, modes=maker.modes, tier=tier)
 
 
 def by_generate(settings, file, tier="full"):

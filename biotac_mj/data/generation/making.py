@@ -221,7 +221,6 @@ class Maker:
         noise = [
             int(np.random.SeedSequence([o.seed, i, 1]).generate_state(1, np.uint64)[0]) for i in batch.members
         ]
-        walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
         skins = None, {}
         if self.vary:
             *skins, drawn = draw_worlds(
@@ -234,8 +233,8 @@ class Maker:
             sense, drawn = draw_sense(o, [o.seed, i, 3], self.few, self.geometry.design)
             senses.append(sense)
             motion.parameters.update(drawn)
-        fields = running.fields = walk(
-            self.model, batch.names, motions, say, self.time, *skins, modes=self.modes
+        fields = running.fields = simulate.simulate(
+            self.model, batch.names, motions, say, self.time, *skins, self.modes, o.tier
         )
         clock = self._count("skin", clock)
         running.reads = [

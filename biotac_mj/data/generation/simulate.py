@@ -19,7 +19,7 @@ from ..schema import DISPLACEMENT_SCALE, nodes_of
 from .clearance import Placed
 from .readings import Readings, Touch
 
-__all__ = ["Fields", "Scene", "clock", "describe", "simulate", "simulate_condensed"]
+__all__ = ["Fields", "Scene", "clock", "describe", "simulate"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -105,6 +105,7 @@ def simulate(
     materials: list | None = None,
     worlds: dict | None = None,
     modes: SkinModes | None = None,
+    tier: str = "full",
 ) -> Fields:
     """Simulates all motions: on a GPU in parallel, on a CPU one after another, where a batch would only cost
     more. A step that does not converge keeps the last converged state and is marked.
@@ -120,11 +121,23 @@ def simulate(
       materials: one for each motion, or None for the model's.
       worlds: name -> (k,) further properties per motion, see `skin.per_world.make_worlds`.
       modes: of the skin, for slip, drive and gain; requires time.
+      tier: "condensed" has no rate effects, and one skin for all motions.
 
     Raises:
-      ValueError: an object deep inside the rigid core (plans avoid it), or missing times.
+      ValueError: an object deep inside the rigid core (plans avoid it), missing times, or a feature that the
+        condensed tier lacks.
     """
     names = [names] * len(motions) if isinstance(names, str) else list(names)
+    if tier == "condensed":
+        if materials is not None or worlds:
+            raise ValueError(
+                "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
+            )
+        if modes is not None:
+            raise ValueError(
+                "sets of the condensed tier know no vibration: leave texture out, or tier='full'"
+            )
+        return _simulate_condensed(model, names, motions, progress)
     k = len(motions)
     times = [None] * k if time is None else list(time) if np.ndim(time[0]) else [time] * k
     worlds = {name: np.asarray(value) for name, value in (worlds or {}).items()}
@@ -207,30 +220,10 @@ def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, 
     return dt, time[0] + np.cumsum(dt) - dt[0]
 
 
-def simulate_condensed(
-    model: SkinModel,
-    names: list | tuple,
-    motions: list,
-    progress: Callable | None = None,
-    time: np.ndarray | list | None = None,
-    materials: list | None = None,
-    worlds: dict | None = None,
-    modes: SkinModes | None = None,
-) -> Fields:
-    """`simulate` for the condensed skin, one interaction after another on one core, without rate effects.
-
-    Raises:
-      ValueError: a feature that the condensed tier lacks, different materials or worlds, or modes.
-    """
+def _simulate_condensed(model, names, motions, progress):
+    """Interactions of the condensed skin one after another on one core, without rate effects."""
     from ...skin.condensed import CondensedSkin, Memory
 
-    if materials is not None or worlds:
-        raise ValueError(
-            "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
-        )
-    if modes is not None:
-        raise ValueError("sets of the condensed tier know no vibration: leave texture out, or tier='full'")
-    names = [names] * len(motions) if isinstance(names, str) else list(names)
     nstep = len(motions[0].pos)
     outer = nodes_of(model.geometry)
     fields = _empty(len(motions), nstep, model.nvert, len(outer), 0)

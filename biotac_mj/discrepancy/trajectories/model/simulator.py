@@ -208,16 +208,15 @@ class Simulator:
         """Solves trajectories (index, tool, pos, mat, time, entry of the cache), each one world, and files
         what they gave."""
         from ....data.generation.plan import Motion
-        from ....data.generation.simulate import simulate, simulate_condensed
+        from ....data.generation.simulate import simulate
 
         model, film = self.skin_and_film(log_friction, bubble)  # kept: made once
-        walk = simulate_condensed if self.tier == "condensed" else simulate
         longest = max(len(pos) for _, _, pos, _, _, _ in todo)
         # who has arrived waits there
         rows = [np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _, _ in todo]
         motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _, _) in zip(rows, todo)]
         times = [_waiting(time, longest) for *_, time, _ in todo]
-        fields = walk(model, [tool for _, tool, *_ in todo], motions, time=times)
+        fields = simulate(model, [tool for _, tool, *_ in todo], motions, time=times, tier=self.tier)
         for w, (i, _, pos, _, _, entry) in enumerate(todo):
             n = len(pos)
             impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, w)[:n])
