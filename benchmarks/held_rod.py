@@ -52,7 +52,7 @@ def record(hand: pathlib.Path, decisions: int, seed: int) -> tuple[dict, tuple]:
         step()
         for name, batch in env.batches.items():
             pos, mat, force = seen[name]
-            # where its body has given way to; zeros until it has come near
+            # where its body has given way to; at the origin until it has come near
             pos.append(batch.model.pos0.numpy()[0, 0].copy())
             mat.append(batch.model.mat0.numpy()[0, 0].copy())
             force.append(batch.skin.wrench.numpy()[0, 0, :3].copy())
@@ -74,7 +74,7 @@ def replay(
     pos: np.ndarray, mat: np.ndarray, friction: float, size: tuple, tier: str, skin: str = "coarse"
 ) -> tuple:
     """Forces (n, 3) [N] and {channel: counts (n, k)} of a BioTac on which a capsule goes along; while its
-    rotation is zero it is a metre away."""
+    place is the origin it is a metre away."""
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep=".004" gravity="0 0 0"/><worldbody><body name="finger"/>'
         '<body name="rod" mocap="true" pos="0 0 1">'
@@ -91,7 +91,7 @@ def replay(
     frame, origin = core.xmat.reshape(3, 3).copy(), core.xpos.copy()
     force, counts = [], {name: [] for name in ("electrodes", "pdc", "pac")}
     for p, R in zip(pos, mat):
-        if R.any():
+        if p.any():
             data.mocap_pos[0] = origin + frame @ p
             mujoco.mju_mat2Quat(data.mocap_quat[0], (frame @ R).ravel())
         mujoco.mj_step(model, data)
