@@ -168,8 +168,8 @@ class Batch(Skins):
         self._row = rows[first_row : first_row + self.nslot]
         self._response, self._factor = Response(self._jacobian, self.model), Factor(m, self.nworld)
 
-    def say_whether_it_acts(self) -> None:
-        """Tells the correction of all skins. Launches only."""
+    def update_active(self) -> None:
+        """Writes whether the skin acts into the correction of all skins. Launches only."""
         self._acts.fill_(int(self.active))
 
     def evaluate(self, qacc: wp.array) -> None:

@@ -154,7 +154,7 @@ class Hook:
         if self._integrator.differs:
             self._integrator.take_matrices(m, d)
             for batch in self._corrected:
-                batch.say_whether_it_acts()
+                batch.update_active()
         self._accelerate(m, d, moving, first=True)
         taking_part.clear()
         self._fork.run(*(functools.partial(batch.look_ahead, m, taking_part) for batch in moving))
