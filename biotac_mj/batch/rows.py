@@ -1,5 +1,5 @@
-"""All that batches carry from step to step, as one row of words for each world: for who keeps states of
-worlds outside of them, as JAX does."""
+"""The state that batches carry from step to step, as one row of words for each world: for callers that keep
+the states themselves, as JAX does."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -159,8 +159,8 @@ def come_from_outside(
     # In and out:
     geoms: Geoms,
 ):
-    """Geoms of which nothing is known come from where they have just left the skin at rest, along the mean
-    normal of what they touch of it: as `ProximityQuery.outside` says for one world. A block a geom."""
+    """Geoms without a known earlier pose start where they just leave the undeformed skin along the mean
+    normal of the touched faces, as in `ProximityQuery.outside` for one world. One block per geom."""
     g, w, t = wp.tid()
     last = geoms.pos_last[g, w]
     if wanted[w] == 0 or wp.isfinite(last[0] + last[1] + last[2]):

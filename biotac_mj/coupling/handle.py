@@ -199,7 +199,7 @@ class Handle:
 
 
 def _bare(one):
-    """MuJoCo's own of what dm_control wraps under the same name."""
+    """MuJoCo's own object behind dm_control's wrapper of the same name."""
     return getattr(one, "ptr", one)
 
 

@@ -252,7 +252,7 @@ class DataView(_View):
         LIBRARY.mj_projectConstraint(self.model.address, self.address)
 
     def reference_constraints(self) -> None:
-        """Makes the rows' reference accelerations of what defines them now."""
+        """Computes the rows' reference accelerations from their present values."""
         LIBRARY.mj_referenceConstraint(self.model.address, self.address)
 
     def moved_by(self, force: np.ndarray) -> np.ndarray:
@@ -266,7 +266,7 @@ class DataView(_View):
         LIBRARY.mj_kinematics(self.model.address, self.address)
 
     def moved_from(self, qpos: np.ndarray) -> np.ndarray:
-        """(nv,) way of the degrees of freedom from positions (nq,) to those of now."""
+        """Displacement (nv,) of the degrees of freedom from positions (nq,) to the present ones."""
         out = np.empty(self.model.nv)
         LIBRARY.mj_differentiatePos(
             self.model.address, out.ctypes.data, 1.0, qpos.ctypes.data, self.qpos.ctypes.data
@@ -316,9 +316,9 @@ class DataView(_View):
         return max(self.struct.solver_niter) >= self.model.opt.iterations
 
     def unsolved(self, acceleration: np.ndarray, dofs: np.ndarray) -> float:
-        """Of what `acceleration` found: forces that balance its (nv,) on some dofs and that no constraint
-        gives, as a share of constraints' and passive ones there; 0 where MuJoCo's solver ended before its
-        last iteration, as near as the model's `tolerance` asks."""
+        """Residual of `acceleration`: forces that would balance its (nv,) on some dofs and that no constraint
+        gives, as a fraction of the constraint and passive forces there; 0 if MuJoCo's solver ended before its
+        last iteration, within the model's `tolerance`."""
         if not self._stopped():
             return 0.0
         balance = np.empty(self.model.nv)

@@ -137,7 +137,7 @@ def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
 
 
 def _with_liquid(options, whole, geometry):
-    """SkinOptions with the air in the liquid and without what of it is lost."""
+    """SkinOptions with the air in the liquid and without the lost part of it."""
     liquid, changes = _liquid(geometry), {}
     if whole.air:  # liquid and air in series: V / K + V0 / p0
         changes["bulk_modulus"] = 1 / (1 / options.bulk_modulus + whole.air / (_AIR * liquid))

@@ -95,7 +95,7 @@ class Variable:
         return self.place.partition(".")[2]
 
     def is_there(self, options: Iterable[str]) -> bool:
-        """Whether these options add it."""
+        """Whether a state with these options has the variable."""
         return not self.needs or not set(self.needs).isdisjoint(options)
 
     def is_saved(self, tier: str) -> bool:

@@ -268,7 +268,7 @@ class BioTacObservables(composer.Observables):
     [m]."""
 
     def readings(self) -> list[Reading]:
-        """All of them, as a list of `Reading`s."""
+        """All observables, as a list of `Reading`s."""
         return [self.get_observable(name) for name in _ALL]
 
     def enable(self, names: Iterable[str]) -> None:

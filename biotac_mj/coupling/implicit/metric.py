@@ -171,8 +171,8 @@ class Metric:
         self._filled, self._held = True, held
 
     def excess(self, acceleration: np.ndarray) -> np.ndarray:
-        """(ngroup, 6) what the rows push more than their stiffness does under accelerations (nv,) that
-        MuJoCo's solver has just found: nothing but rounding, where it converged."""
+        """Forces (ngroup, 6) of the rows beyond those of their stiffness under accelerations (nv,) that
+        MuJoCo's solver has just found: rounding errors, if it converged."""
         out = np.zeros((len(self.body), 6))
         if self._held:  # bodies that are welded together move as one
             push = self._rows.efc_force[self._all] + self._D * (self._J @ acceleration)

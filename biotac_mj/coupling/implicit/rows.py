@@ -18,7 +18,8 @@ _PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is
 
 @wp.func
 def _pivot(S: mat66, whole: vec6, k: int):
-    """Pivot k of what is left of a matrix with diagonal `whole`, 0 where it is none, and its column of L."""
+    """Pivot k of the remaining matrix, 0 if it is negligible against the diagonal `whole`, and its column of
+    L."""
     column = vec6()
     if S[k, k] <= _PIVOT * wp.abs(whole[k]):
         return wp.float64(0.0), column

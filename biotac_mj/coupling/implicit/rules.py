@@ -57,8 +57,8 @@ def beta_of(gamma: Any) -> Any:
 
 
 def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:
-    """Energy that a skin can give a body, of what the last step left, at most what it can hold: who has moved
-    the body since put in what the forces then, or those now, did against that; all [J]."""
+    """Energy that a skin can give a body, from the last step's, at most what the skin can hold: the mover of
+    the body has put in the work against the forces before, or those now [J]."""
     return min(store - min(before, now), most)
 
 

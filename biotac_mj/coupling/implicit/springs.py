@@ -100,7 +100,7 @@ class Springs:
         return out
 
     def factor(self, skin: int | None) -> None:
-        """Finds L of what was taken, without the rows of one skin, or of all (None)."""
+        """Computes the factor L without the rows of one skin, or of all (None)."""
         if skin not in self._factors:
             own = self._own if skin is None else self._parts[skin]
             known = [self._one, self._inertia, *self._pattern, own, self._rows, *self._arrays, self.L]

@@ -156,6 +156,6 @@ class StepArrays:
 
 
 def _seen(array):
-    """A view of what is of the one world in an array [item, world] or [world]."""
+    """A view of the only world of an array [item, world] or [world]."""
     view = array.numpy()
     return view[:, 0] if array.ndim == 2 else view

@@ -53,7 +53,7 @@ class SensorReadings:
         self.nstate = place_of(geometry.design).nstate
 
     def feel_heat(self, geoms: list[Geom]) -> None:
-        """A body is made of what the first of its geoms that `config.thermal` names is made of."""
+        """Adds heat. A body has the material of the first of its geoms that `config.thermal` names."""
         self._bodies = materials_of(geoms, self._config.thermal, self._config.seed)
         self._geoms = geoms
         self.nstate += state_size(len(self._bodies))

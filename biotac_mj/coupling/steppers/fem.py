@@ -130,7 +130,7 @@ class FemStepper:
         return [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type in ("mesh", "skin")]
 
     def used(self, state: np.ndarray) -> SavedState:
-        """Copy of what a state holds, without what it has room for."""
+        """Copy of the part of a state that is in use."""
         return self._layout.read(state).copy()
 
     def begun_at(
@@ -167,7 +167,7 @@ class FemStepper:
         return self._model
 
     def contact_rows(self, state: np.ndarray) -> np.ndarray:
-        """(k, 5) sample of the outer surface, geom and anchor in its frame [m] of what touches in a state."""
+        """Contacts (k, 5) in a state: sample of the outer surface, geom, and anchor in its frame [m]."""
         return self._layout.rows(state, "contacts")
 
     @functools.cached_property
@@ -188,13 +188,13 @@ class FemStepper:
         return np.bincount(group[geom], area, minlength=1 + max(group, default=-1))
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
-        """(nvert, 3) of what touches on the nodes in a state [N]."""
+        """Contact forces (nvert, 3) on the nodes in a state [N]."""
         self._unpack(state)
         prepare_step(self._model, self._data, self._geom_set).evaluate_forces()
         return self._data.contact_force[0]
 
     def contact_push(self, state: np.ndarray) -> np.ndarray:
-        """(nface,) normal push of what touches on the geometry's outer faces in a state [N]."""
+        """Normal contact forces (nface,) on the geometry's outer faces in a state [N]."""
         return self._push(state).reshape(len(self._geometry.outer_face), -1).sum(axis=1)
 
     def touched_faces(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

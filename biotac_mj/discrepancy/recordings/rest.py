@@ -81,8 +81,8 @@ def rest(session: Session) -> Rest:
 
 
 def _kind(session, low):
-    """Key of USUAL. Without a load, or where it is not told from a drift, something else is usual; what a few
-    electrodes do is no load."""
+    """Key of USUAL. Other features are usual without a load, or if the load is not distinguished from a
+    drift; a change of a few electrodes is no load."""
     m = session.model()
     if session.loaded:
         return "loaded"

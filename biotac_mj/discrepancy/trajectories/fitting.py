@@ -183,7 +183,7 @@ class _Model:
         return _Point(effects, nuisance, offsets, residual, away / self.spread, pose, y)
 
     def _columns(self, point):
-        """(parameters, n, width) by how much less of the residual one standard deviation of each makes it."""
+        """Decrease of the residual by one standard deviation of each parameter (parameters, n, width)."""
         out = []
         for (k, name, spread, step), away in zip(self.parameters, point.away):
             for by in (step, -step):

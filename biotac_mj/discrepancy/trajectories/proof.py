@@ -122,8 +122,8 @@ def _compared(comparison, fit, rows):
 
 
 def _worse(comparison, before, after, aside) -> bool:
-    """Whether a group of channels is further off than before, by more than chance makes of what the
-    comparison resolves."""
+    """Whether the error of a group of channels has grown, by more than chance within the comparison's
+    resolution."""
     rows = [len(comparison.trajectories[i].time) for i in aside]
     independent = [_independent(comparison, i) for i in aside]
     for part in comparison.groups.values():

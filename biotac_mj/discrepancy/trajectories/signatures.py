@@ -36,7 +36,7 @@ class Signatures:
         return self.likelihood.turned(self.likelihood.stacked(raw))
 
     def columns(self, effect: "Effect", shape: dict) -> np.ndarray:
-        """(free, rows) what a realistic size of each free parameter does, by secants."""
+        """Changes (free, rows) by a realistic size of each free parameter, by secants."""
         out = []
         for name, size in sizes(effect):
             theta = {**effect.default(), **shape}
@@ -45,8 +45,8 @@ class Signatures:
         return np.array(out).reshape(len(out), -1) / self.sd
 
     def own(self, columns: np.ndarray) -> np.ndarray:
-        """Columns (m, rows) less what of them can be mimicked: products of any columns with these are those
-        that remain."""
+        """Columns (m, rows) without the part that can be mimicked: its products with any columns equal those
+        of the remaining parts."""
         return columns - (columns @ self._weights.T) @ self._weights
 
 

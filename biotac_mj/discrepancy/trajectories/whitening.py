@@ -89,8 +89,8 @@ class Comparison:
         return electrode_names(range(self.nelectrode)) + more
 
     def _floor(self, measured):
-        """(width,) what the base model may be off by in a trajectory (n, width): of electrodes by the largest
-        of all, since how they share a touch is no better known where it is light."""
+        """Expected error (width,) of the base model in a trajectory (n, width): for electrodes by the largest
+        of all, since their relative sizes are not better known where a touch is light."""
         own = np.abs(measured).max(0)
         every = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
         largest = np.where(np.arange(self.width) < self.nelectrode, every, own)
@@ -130,7 +130,7 @@ class Comparison:
         return along, r - u @ along
 
     def unposed(self, i: int, residual: np.ndarray) -> np.ndarray:
-        """(n, width) less what the most probable error of the trial's pose explains."""
+        """Residual (n, width) without the part that the most probable error of the trial's pose explains."""
         (along, apart), (u, s, _) = self._split(i, residual), self._basis[i]
         return (apart + u @ (along / (1 + s**2))).reshape(residual.shape) * self.sigmas[i]
 

@@ -221,7 +221,7 @@ def _wrong(comparison, fit) -> bool:
 
 
 def _named(comparison, null, search):
-    """Fit and Candidates of what has a name, and notes that say why others have none."""
+    """Fit and Candidates of the named effects, and notes on why others have no name."""
     current, found = search.fit, search.found
     explained = 1 - current.missed / max(null.missed, current.missed, 1e-9)
     if not found:
@@ -282,7 +282,7 @@ def _refuted(found):
 
 
 def _settle(given, comparison, null, search, chosen, aside, notes, usable):
-    """Diagnosis by a Search: what of it has a name, what the base model is off by, the proof."""
+    """Diagnosis by a Search: named effects, errors of the base model, the proof."""
     current, found, explained, why = _named(comparison, null, search)
     names = {e.id: e.name for e in usable}
     _tie_aliases(current, found, names)

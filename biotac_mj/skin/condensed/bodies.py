@@ -113,7 +113,7 @@ def rigid_column(b: int, arm: vec3):
 
 @wp.func
 def _set_motions(w: int, t: int, threads: int, b: Bodies):
-    """Motions of all bodies by the listed wrenches."""
+    """Computes the motions of all bodies by the listed wrenches."""
     sync()
     for h in range(t, b.motion.shape[0], threads):
         m = vec6()

@@ -124,8 +124,8 @@ def find_wrenches(
     touched_by: wp.array2d(dtype=int),
     wrench: wp.array3d(dtype=real),
 ):
-    """Wrenches of the skin ON each group of geoms: of the samples, and of what Newton's last step changed to
-    first order, by their shares of each node."""
+    """Wrenches of the skin ON each group of geoms: those of the samples and, to first order, the change by
+    Newton's last step, by their fractions of each node."""
     for g in range(t, geoms.count, threads):
         touched_by[g, w] = 0
     sync()
@@ -288,7 +288,7 @@ def conclude(
     wrench_out: wp.array3d(dtype=real),
     tangent_out: wp.array2d(dtype=mat66),
 ):
-    """Wrenches and tangents of what the solve of a world came to."""
+    """Wrenches and tangents at the end of a world's solve."""
     w, t = wp.tid()
     if wanted[w] == 0:
         return

@@ -104,7 +104,7 @@ class HeldTask(BatchTask):
         return self._qpos[:, self._at + 3 : self._at + 7]
 
     def _closing(self):
-        """(num_envs, 1) how far the fingers have closed, 0 to 1."""
+        """Closed fraction of the fingers (num_envs, 1), 0 to 1."""
         s = self.cfg
         return (self._age * s.substeps * s.timestep / s.close).clamp(0, 1)[:, None]
 

@@ -17,7 +17,7 @@ HELD_OUT = 54321  # seed of beginnings that no policy learns from
 
 
 def seen_by(env: BatchTask, observe: str, worlds: slice = slice(None)) -> torch.Tensor:
-    """(n, k) of what a policy sees: body and touch."""
+    """Inputs (n, k) of a policy: body and touch."""
     seen = env.observe(observe)
     return torch.cat([seen["body"], seen["touch"]], dim=1)[worlds]
 

@@ -48,7 +48,7 @@ class Network(torch.nn.Module):
 
 
 class Policy(Network):
-    """Actions (n, nout) of what is seen; `explore` is the deviation in learning."""
+    """Actions (n, nout) from inputs; `explore` is the deviation in learning."""
 
     def __init__(self, nseen: int, nout: int, hidden: tuple[int, ...] = _HIDDEN, explore: float = 0.5):
         super().__init__(nseen, nout, hidden)

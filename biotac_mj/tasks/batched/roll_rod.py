@@ -129,7 +129,7 @@ class RollRod(HeldTask):
 
     @property
     def place(self) -> torch.Tensor:
-        """(num_envs,) how far the rod's middle is from the middle of the fingers' pads, toward their tips
+        """Distance (num_envs,) of the rod's middle from the middle of the fingers' pads, toward their tips
         [m], when the last step began."""
         fingers = self._cores[:2]  # of the thumb it is another
         off = self.pos[:, None] - self._xpos[:, fingers]
@@ -137,7 +137,7 @@ class RollRod(HeldTask):
 
     @property
     def error(self) -> torch.Tensor:
-        """(num_envs,) how far the rod is from its target [m]."""
+        """Distance (num_envs,) of the rod from its target [m]."""
         return (self.place - self._target).abs()
 
     def script(self) -> torch.Tensor:

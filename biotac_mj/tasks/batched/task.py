@@ -172,7 +172,7 @@ class BatchTask(abc.ABC):
         touch."""
 
     def _find_start(self, mjm):
-        """(nq,) where all begin."""
+        """Initial positions (nq,) of all worlds."""
         return mjm.qpos0
 
     def _vary(self):

@@ -25,7 +25,7 @@ _SIGMA = 50.0  # PDC beyond so many deviations of its noise is a touch, as drive
 
 
 def check_observe(value: object) -> str:
-    """One of OBSERVE.
+    """Returns the value if it is one of OBSERVE.
 
     Raises:
       ValueError: it is none.

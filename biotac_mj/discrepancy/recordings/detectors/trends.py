@@ -162,8 +162,8 @@ def _solve(A, y):
 
 @functools.lru_cache(maxsize=64)
 def _left_out(w, k):
-    """(w, w) that makes of w levels the residuals of each block by the others' least squares on k hats over
-    even cells, and (k, w) that makes the weights of all."""
+    """Matrix (w, w) from w levels to the residuals of each block, by least squares of the other blocks on k
+    hats over even cells; and matrix (k, w) from levels to the weights of a fit to all."""
     cells = np.linspace(0, 1, w)
     basis = hats(cells, np.linspace(0, 1, k)) if k > 1 else np.ones((w, 1))
     block = np.arange(w) * min(BLOCKS, w // 2) // w

@@ -88,8 +88,8 @@ class Fields:
         return [slope + h * press for h, slope in zip(heading, slopes)]
 
     def bent(self, moving: list) -> list:
-        """(of what was solved, how much of it) of effects [(Effect, theta)]: of the most of them that were
-        solved together first, of each effect one."""
+        """Curves of effects [(Effect, theta)], as (solved change, its amount): the largest set of effects
+        that was solved together comes first, and each effect occurs once."""
         left, now, out = {e.id for e, _ in moving}, sizes(moving), []
         for ids in sorted(self.curves, key=len, reverse=True):
             if ids <= left:
