@@ -123,3 +123,35 @@ def test_a_curve_has_no_turns_that_what_was_solved_lacks():
     assert hinge.at(0, -1.0).max() == 0 and hinge.slope(0, -0.5).max() == 0  # what does not touch yet
     rows = straight.at(0, np.arange(5.0))
     np.testing.assert_allclose(rows, np.tile(2 * np.arange(5.0)[:, None], (1, 2)))
+
+
+def test_what_a_law_lacks_goes_with_what_its_effect_does(plain):
+    """One process for all channels, of nearly the law's error everywhere."""
+    comparison = plain[0]
+    likelihood = of(comparison, np.arange(2))
+    change = np.random.default_rng(0).normal(size=likelihood.stacked(comparison.raw([])).shape)
+    rows = likelihood._vectors @ likelihood.laws([change], np.array([0.2]))
+    process = rows / change
+    np.testing.assert_allclose(process, np.broadcast_to(process[:, :, :1], process.shape), atol=1e-6)
+    size = np.sqrt((process[:, :, 0] ** 2).sum(0))
+    assert 0.15 < size.min() and size.max() < 0.2 + 1e-6
+    assert len(likelihood.laws([], np.zeros(0))) == 0
+
+
+def test_data_say_how_far_a_law_is_off():
+    """Synthetic: relaxation as the law has it, and 40 % more of it when deep, less when not."""
+    relax = by_id("relax")
+    hidden = [(relax, {**relax.default(), "g": 0.3, "tau": 0.5})]
+    without, true = measured([], n=8), measured(hidden, n=8)
+    other = []
+    for a, b in zip(without, true):
+        more = 0.4 * np.sign(b.depth - 0.6 * b.depth.max())[:, None]
+        change = {k: getattr(b, k) - getattr(a, k) for k in ("electrodes", "force")}
+        changed = {k: getattr(b, k) + more * v for k, v in change.items()}
+        changed["pdc"] = b.pdc + more[:, 0] * (b.pdc - a.pdc)
+        other.append(dataclasses.replace(b, **changed))
+    errors = []
+    for data in (true, other):
+        comparison = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
+        errors += fit_effects(comparison, hidden, np.arange(len(data))).law_errors.tolist()
+    assert errors[0] < SETTINGS.law < errors[1], errors

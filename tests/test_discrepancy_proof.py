@@ -11,6 +11,7 @@ from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
 from biotac_mj.discrepancy.trajectories.proof import _closed, _Off, borne_out, proved
+from biotac_mj.discrepancy.trajectories.settings import SETTINGS
 from biotac_mj.discrepancy.trajectories.workflow import about_rests
 from biotac_mj.effects.catalogue import by_id
 
@@ -28,7 +29,8 @@ def late():
 
 
 def amended(null, *effects):
-    return Fit(list(effects), null.nuisance, [], np.zeros((0, 0)), 0.0)
+    errors = np.full(len(effects), SETTINGS.law)
+    return Fit(list(effects), null.nuisance, [], np.zeros((0, 0)), 0.0, law_errors=errors)
 
 
 def test_an_effect_that_helps_is_accepted_by_its_residuals(late):
@@ -47,7 +49,8 @@ def test_another_law_is_borne_out_and_a_wrong_effect_is_not(late):
     law, other = by_id("lowpass"), by_id("pdc_gain")
     near = fit_effects(comparison, [(law, {"tau": 0.05})], np.arange(8), null)
     assert borne_out(comparison, null, near, ASIDE)
-    wrong = dataclasses.replace(null, effects=[(other, {**other.default(), "gain": 0.05})])
+    pressure = (other, {**other.default(), "gain": 0.05})
+    wrong = dataclasses.replace(null, effects=[pressure], law_errors=np.array([SETTINGS.law]))
     assert not borne_out(comparison, null, wrong, ASIDE)
     assert not borne_out(comparison, near, null, ASIDE)
 

@@ -614,23 +614,20 @@ def test_the_skin_is_solved_until_a_fit_has_found_its_end(gain, more, times, mon
 
 
 @pytest.mark.parametrize(
-    "late, gain, alone, left",
-    [("gain", 39.0, 50.0, True), ("gain", 41.0, 50.0, False), ("gain", 39.0, 30.0, False)]
-    + [("creep", 150.0, alone, alone > 150) for alone in (140.0, 390.0)],
+    "late, gain, alone, another",
+    [("creep", 150.0, 390.0, True), ("creep", 150.0, 140.0, False), ("creep", 150.0, None, True)]
+    + [("gain", 10.0, 50.0, False)],
 )
-def test_what_the_laws_of_others_lack_is_no_effect(monkeypatch, late, gain, alone, left):
-    """Less than a tenth of what relaxation explains, and than alone; another law of it: less than alone."""
-    from biotac_mj.discrepancy.trajectories import search
+def test_another_law_of_what_was_found_is_no_second_effect(late, gain, alone, another):
+    """Unless it explains as much beside it as alone."""
+    from biotac_mj.discrepancy.trajectories.search import Candidate, Search, _another_law
 
-    def fit(score, *ids):
-        effects = [(by_id(i), by_id(i).default()) for i in ids]
-        return types.SimpleNamespace(score=score, effects=effects)
+    def candidate(name, gain):
+        return Candidate(by_id(name), None, gain, 0.0, [])
 
-    monkeypatch.setattr(search, "fit_effects", lambda *args: fit(alone))
-    null, first = fit(0.0), search.Candidate(by_id("relax"), fit(400.0, "relax"), 400.0, 0.0, [])
-    tried = search.Search(first.fit, [first], [], {frozenset(): null})
-    one = search.Candidate(by_id(late), fit(400.0 + gain, "relax", late), gain, 0.0, [])
-    assert search._left_by_laws(None, one, tried, None) is left
+    first = candidate("relax", 400.0)
+    tried = [first] + ([candidate(late, alone)] if alone else [])
+    assert _another_law(candidate(late, gain), Search(None, [first], [tried], {})) is another
 
 
 def test_signed_roots_have_the_rate_of_chance():

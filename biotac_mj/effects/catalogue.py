@@ -75,7 +75,7 @@ _SENSOR = (
 )
 
 
-# not searched: found beforehand, or drawn
+# not searched: measured beforehand, or drawn
 _NOT_SEARCHED = (Noise(), DeadTaxels(), Modulus())
 
 

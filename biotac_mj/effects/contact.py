@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .effect import LAW, Effect, Param, Run, Whole
+from .effect import Effect, Param, Run, Whole
 from .in_skin import Inside
 
 __all__ = [
@@ -99,7 +99,6 @@ class Adhesion(Effect):
     id, name, stage = "adhesion", "adhesion (JKR)", "K"
     physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more during retraction"
     params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 approaching, up to ten times that retracting", 0.05)}
-    law = LAW
     confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
 
     def given(self, names: Sequence[str]) -> "Adhesion":

@@ -29,7 +29,7 @@ if typing.TYPE_CHECKING:
     from ..sensor.presets import Sensor
     from .in_skin import Inside
 
-__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "Whole", "shifted", "memory", "stop"]
+__all__ = ["STAGES", "Effect", "Param", "Run", "Whole", "shifted", "memory", "stop"]
 
 # In the order in which they act. B and S change the object's position or size, so the skin is solved again.
 STAGES = {
@@ -40,10 +40,6 @@ STAGES = {
     "T": "transduction",
     "A": "acquisition",
 }
-
-# error of reduced laws, from practice data with other forms of the same effects
-# (docs/lab/discrepancy.md)
-LAW = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,8 +183,6 @@ class Effect(abc.ABC):
         the electrodes.
       grid: values of the shape parameters that are tried.
       rare: further parameters, added only if the data require them (`given`).
-      law: distance of the true law from this one: standard deviation as a fraction of a parameter, included
-        in its interval.
       confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
         appearance, separated only by much evidence. refit_with: ids of effects that are fitted with it.
       per_channel: whether each free parameter belongs to one electrode.
@@ -216,7 +210,6 @@ class Effect(abc.ABC):
     design: Design = BIOTAC
     grid: tuple = ({},)
     rare: dict = {}
-    law = 0.0
     confusable: dict = {}
     equivalents: tuple = ()
     refit_with: tuple = ()
@@ -313,10 +306,6 @@ class Effect(abc.ABC):
         Returns:
           lists of (n, nelectrode) per trajectory, one list per candidate form.
         """
-        return []
-
-    def unsearched(self, theta: dict) -> list[int]:
-        """Electrodes (from 0) whose baseline is no evidence if the effect has these parameters."""
         return []
 
     def undoes(self, theta: dict, log_modulus: float) -> bool:

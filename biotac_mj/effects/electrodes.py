@@ -7,7 +7,7 @@ import numpy as np
 from ..geometry.design import BIOTAC
 from ..sensor.channels import FULL_SCALE
 from ..sensor.presets import Sensor
-from .effect import LAW, Effect, Param, Run
+from .effect import Effect, Param, Run
 
 __all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
 
@@ -41,7 +41,7 @@ class ElectrodeDrift(Effect):
         "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
     }
     grid = ({"q": 0.4}, {"q": 1.0})
-    law, equivalents, per_channel = LAW, ("warmup",), True
+    equivalents, per_channel = ("warmup",), True
     confusable = {
         "warmup": "free segments over the session: one electrode or all",
         "gain": "the same probe at the beginning and the end of the session",
@@ -61,11 +61,6 @@ class ElectrodeDrift(Effect):
             out.append([np.tile(((c - begin) / scale)[:, None], self.design.nelectrode) for c in trend])
         return out
 
-    def unsearched(self, theta: dict) -> list[int]:
-        """Electrodes that drift, unless all do: the remainder of a drift of another form is no offset."""
-        drifting = [k for k, e in enumerate(self.design.electrodes) if e in theta]
-        return drifting if len(drifting) < self.design.nelectrode else []
-
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
         # a straight line to the value at SESSION
         rates = np.array([theta.get(e, 0.0) for e in self.design.electrodes]) / SESSION
@@ -77,7 +72,7 @@ class ElectrodeDrift(Effect):
 
 
 class Noise(Effect):
-    """Not in the catalogue, as it changes no prediction; `diagnose` finds it in rows at rest."""
+    """Not in the catalogue, as it changes no prediction; `diagnose` measures it in rows at rest."""
 
     id, name, stage = "noise", "noise of single electrodes", "A"
     physics = "an electrode is noisier than the others: a bad contact, a leaking lead"

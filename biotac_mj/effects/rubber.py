@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import erf
 
 from ..sensor.presets import Sensor
-from .effect import LAW, Effect, Param, Run, Whole, memory, stop
+from .effect import Effect, Param, Run, Whole, memory, stop
 from .in_skin import Inside, friction_branch, stiffening
 
 __all__ = [
@@ -58,7 +58,7 @@ class Relaxation(Effect):
     }
     rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1), "more": _MORE}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
-    law, equivalents, remembers = LAW, ("creep",), True
+    equivalents, remembers = ("creep",), True
     confusable = {
         "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
         "creep": "a hold of 100 s",
@@ -90,7 +90,7 @@ class PowerCreep(Effect):
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
     rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04), "more": _MORE}
-    law, equivalents, remembers = LAW, ("relax",), True
+    equivalents, remembers = ("relax",), True
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def rejection_reason(self, theta: dict) -> str | None:
@@ -133,7 +133,7 @@ class Hysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
-    law, equivalents, remembers = LAW, ("hyster_load",), True
+    equivalents, remembers = ("hyster_load",), True
     confusable = {
         "relax": "the same depth at ten times the speed",
         "mullins": "a third cycle to the same depth",
@@ -169,7 +169,7 @@ class LoadHysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1}, {"width": 0.3})
-    law, equivalents, remembers = LAW, ("hyster",), True
+    equivalents, remembers = ("hyster",), True
     confusable = {
         "hyster": "a small cycle on a large load",
         "relax": "the same depth at ten times the speed",
@@ -248,7 +248,7 @@ class Mullins(Effect):
         for w in (0.3, 1.0)
         for r, s in ((1.5e-3, 0.01), (4e-3, 0.01), (4e-3, 0.4))
     )
-    law, equivalents, remembers = LAW, ("damage",), True
+    equivalents, remembers = ("damage",), True
     confusable = {
         "hyster": "a third cycle to the same depth",
         "adhesion": "talc on the skin",
@@ -281,7 +281,7 @@ class Damage(Effect):
         "work": Param("J", 1e-4, 0.1, "a press takes about 1 mJ: CHOSEN", 2e-3, 2e-3, True),
     }
     grid = ({"work": 5e-4}, {"work": 2e-3}, {"work": 8e-3})
-    law, equivalents = LAW, ("mullins",)
+    equivalents = ("mullins",)
     confusable = {
         "mullins": "a deeper press than any before: is it softer than the first ones?",
         "relax": "the same press again after minutes: relaxation recovers",
@@ -313,7 +313,7 @@ class Stiffening(Effect):
     # With the skin's own solution: rubber that stiffens everywhere, not only where it is strained most, keeps
     # its shape, and electrodes hardly change.
     rare = {"through": Param("1", -0.5, 2.0, "of the load at a mean strain of 1: CHOSEN", 0.3)}
-    law, answers = LAW, ("stiffen",)
+    answers = ("stiffen",)
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:

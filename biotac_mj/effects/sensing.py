@@ -9,7 +9,7 @@ from ..geometry.design import BIOTAC
 from ..geometry.electrodes import electrode_positions
 from ..sensor.channels import PDC_REST
 from ..sensor.presets import MOST_LATENCY, Sensor
-from .effect import LAW, Effect, Param, Run, Whole, memory, shifted
+from .effect import Effect, Param, Run, Whole, memory, shifted
 from .in_skin import Inside
 
 __all__ = [
@@ -78,7 +78,7 @@ class FluidLoss(Effect):
         "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
     rare = {"sink": Param("m/h", 0.0, 20e-3, "of the skin; 0.1 mm in a minute empties a fifth: CHOSEN", 1e-3)}
-    law, equivalents, answers = LAW, ("warmup",), ("fill", "sink")
+    equivalents, answers = ("warmup",), ("fill", "sink")
     confusable = {
         "warmup": "log TDC; wait an hour",
         "gain": "the same probe at the beginning and the end of the session",
@@ -144,7 +144,7 @@ class WarmUp(Effect):
         "tau": Param("s", 5, 5000, "minutes", 100, 100, True),
     }
     grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
-    law, equivalents = LAW, ("fluidloss",)
+    equivalents = ("fluidloss",)
     confusable = {
         "thermal": "log TDC",
         "fluidloss": "wait an hour",
@@ -262,7 +262,7 @@ class CrossTalk(Linear):
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
-    law, equivalents, of_pairs = LAW, ("asper",), True
+    equivalents, of_pairs = ("asper",), True
     confusable = {
         "gain": "drive one electrode alone",
         "rocking": "another place",
@@ -297,7 +297,6 @@ class Saturation(Effect):
         "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True),
     }
     grid = ({"knee": 120.0}, {"knee": 400.0}, {"knee": 900.0})
-    law = LAW
     confusable = {"gain": "depth ladder at one place"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -313,7 +312,7 @@ class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
     physics = "electrodes follow their input with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
-    law, equivalents, alike = LAW, ("latency",), True
+    equivalents, alike = ("latency",), True
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -355,7 +354,6 @@ class Drift(Effect):
     id, name, stage = "drift", "drift of offsets within a trajectory", "A"
     physics = "counts + v t from the trajectory's beginning, the same for all electrodes"
     params = {"rate": Param("counts/s", -60, 60, "0-20 counts in 10 s", 2.0)}
-    law = LAW
     confusable = {"warmup": "free segments over the session", "relax": "free segments"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:

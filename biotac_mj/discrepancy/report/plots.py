@@ -13,11 +13,9 @@ __all__ = [
     "Panel",
     "channels",
     "curves",
-    "isolability",
     "matrix",
     "plates",
     "overview",
-    "ranking",
 ]
 
 _UNAMENDED, _AMENDED = "0.6", "tab:blue"
@@ -155,30 +153,6 @@ def matrix(
     ax.set_xticks(np.arange(len(names)), names, fontsize=7)
     ax.set_yticks(np.arange(len(rows)), rows, fontsize=7)
     figure.colorbar(image, label=label)
-    return figure
-
-
-def ranking(names: Sequence[str], evidence: Sequence[float], named: Sequence[bool], asked: float) -> object:
-    """Evidence [nats] of each cause alone, those that were named in colour; asked: what a name needs."""
-    figure, axes = _figure(6, 0.6 + 0.3 * max(len(names), 1))
-    ax, y = axes[0, 0], np.arange(len(names))[::-1]
-    ax.barh(y, evidence, color=[_AMENDED if one else "0.7" for one in named])
-    ax.set_yticks(y, names, fontsize=8)
-    ax.axvline(asked, color="k", lw=0.7, ls=":")
-    ax.set_xlabel("evidence of each cause alone [nats]; dotted: threshold", fontsize=8)
-    return figure
-
-
-def isolability(ids: Sequence[str], share: np.ndarray, evidence: Sequence[float]) -> object:
-    """Share (n, n) of the row's signature that the column cannot mimic; evidence: (n,) of a realistic size
-    [nats]."""
-    figure, axes = _figure(8, 7)
-    ax = axes[0, 0]
-    image = ax.imshow(share, vmin=0, vmax=1, cmap="viridis")
-    ax.set_xticks(np.arange(len(ids)), ids, rotation=90, fontsize=7)
-    ax.set_yticks(np.arange(len(ids)), [f"{i} ({n:.2g} nats)" for i, n in zip(ids, evidence)], fontsize=7)
-    ax.set_title("fraction of the row's signature that the column cannot mimic", fontsize=9)
-    figure.colorbar(image)
     return figure
 
 

@@ -15,7 +15,7 @@ if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
     from .whitening import Comparison
 
-__all__ = ["Fit", "fit_effects", "parameters", "sizes"]
+__all__ = ["Fit", "changes", "fit_effects", "parameters", "sizes"]
 
 _NUISANCE = [f.name for f in dataclasses.fields(Nuisance)]
 _MOVES = np.array([0.05, 0.05, 0.02, 0.2, 0.2, 0.2, 0.2, 0.3])  # of the nuisance, for differences
@@ -47,6 +47,7 @@ class Fit:
     score: float = 0.0
     amplitude: np.ndarray | None = None
     size: np.ndarray | None = None
+    law_errors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     modulus_error: float = float("nan")
     missed: float = 0.0
     y: np.ndarray | None = None
@@ -69,10 +70,11 @@ class Fit:
         return comparison.raw(self.effects, self.nuisance, exact)
 
     def interval(self, k: int) -> tuple[float, float]:
-        """95 % interval of free parameter k, from its posterior and what the effect says of its law."""
+        """95 % interval of free parameter k, from its posterior and the error of its effect's law."""
         effect, name = self.names[k]
-        value = next(th for e, th in self.effects if e.id == effect)[name]
-        law = next(e.law for e, _ in self.effects if e.id == effect) * value
+        number = next(n for n, (e, _) in enumerate(self.effects) if e.id == effect)
+        value = self.effects[number][1][name]
+        law = 0.0 if self.effects[number][0].wiring else self.law_errors[number] * value
         half = 1.96 * float(np.sqrt(max(self.covariance[k, k], 0) + law**2))
         return value - half, value + half
 
@@ -80,15 +82,15 @@ class Fit:
 @dataclasses.dataclass
 class _Point:
     """Parameters and offsets (trajectories, 3) of poses, the residual (n, width) there, in eigenvectors, and
-    each parameter's distance from its prior's mean in standard deviations; pose: what errors of poses do
-    there; y: the residual as it would be with poses as they are said to be."""
+    each parameter's distance from its prior's mean in standard deviations; errors: what errors of poses do
+    there, and then those of laws; y: the residual as it would be with poses as they are said to be."""
 
     effects: list
     nuisance: Nuisance
     offsets: np.ndarray
     residual: np.ndarray
     away: np.ndarray
-    pose: np.ndarray
+    errors: np.ndarray
     y: np.ndarray
 
 
@@ -134,6 +136,19 @@ def fit_effects(
     return model.fitted([(e, dict(th)) for e, th in effects], nuisance, amplitude, offsets)
 
 
+def changes(
+    comparison: "Comparison", own: likelihood.Likelihood, effects: list, nuisance: Nuisance
+) -> list[np.ndarray]:
+    """(n, width) what each of effects [(Effect, theta)] does by itself; nothing where it has no other law."""
+    if not effects:
+        return []
+    bare = own.stacked(comparison.raw([], nuisance))
+    return [
+        bare * 0.0 if one[0].wiring else bare - own.stacked(comparison.raw([one], nuisance))
+        for one in effects
+    ]
+
+
 class _Model:
     """Effects and nuisance as one list of `parameters`."""
 
@@ -175,12 +190,14 @@ class _Model:
         raw = self.comparison.raw(effects, nuisance, offsets=offsets)
         return likelihood.turned(likelihood.stacked(raw))
 
-    def _point(self, effects, nuisance, offsets):
+    def _point(self, effects, nuisance, offsets, laws):
+        """laws: (m, n, width) what errors of laws do."""
         away = np.array([self._value(effects, nuisance, k, n) for k, n, *_ in self.parameters])
         residual, pose = self._residual(effects, nuisance, offsets), self.likelihood.poses(offsets)
         off = offsets[self.likelihood.chosen].ravel() / self.comparison.repeatability
         y = residual + np.tensordot(off, pose, 1)
-        return _Point(effects, nuisance, offsets, residual, away / self.spread, pose, y)
+        errors = np.concatenate([pose, laws])
+        return _Point(effects, nuisance, offsets, residual, away / self.spread, errors, y)
 
     def _columns(self, point):
         """Decrease of the residual by one standard deviation of each parameter (parameters, n, width)."""
@@ -197,52 +214,61 @@ class _Model:
             out.append((point.residual - self._residual(*moved, point.offsets)) * (spread / made))
         return np.array(out).reshape(len(out), *point.residual.shape)
 
-    def _size(self, effects, nuisance):
-        """(width,) by how much a model with these effects is expected to be off."""
-        likelihood, size = self.likelihood, self.likelihood.size
-        bare = self.comparison.raw([], nuisance) if effects else None
-        for one in effects:
-            law = 0.0 if one[0].wiring else max(one[0].law, SETTINGS.law)
-            change = likelihood.stacked([a - b for a, b in zip(self.comparison.raw([one], nuisance), bare)])
-            size = np.hypot(size, law * np.quantile(np.abs(change), 0.98, axis=0))
+    def _size(self, done, law_errors):
+        """(width,) by how much a model with effects that do `done` is expected to be off."""
+        size = self.likelihood.size
+        for change, error in zip(done, law_errors):
+            size = np.hypot(size, error * np.quantile(np.abs(change), 0.98, axis=0))
         return size
 
     def _log(self, point, variance):
-        """log density of data and parameters at a point, errors of poses marginalised."""
-        log, _, factor = self.likelihood.evidence(point.y, point.pose, variance)
+        """log density of data and parameters at a point, errors of poses and laws marginalised."""
+        log, _, factor = self.likelihood.evidence(point.y, point.errors, variance)
         return log - 0.5 * point.away @ point.away, factor
 
     def fitted(self, effects, nuisance, amplitude, offsets) -> Fit:
-        """The Fit, by Gauss-Newton's steps of the parameters and steps of the amplitudes in turn."""
+        """The Fit, by Gauss-Newton's steps of the parameters and steps of the amplitudes and of errors of
+        laws in turn."""
         likelihood = self.likelihood
-        point = self._point(effects, nuisance, offsets)
-        size = self._size(effects, nuisance)
-        if amplitude is None:
-            # from above: what parameters explain is taken from what is missed, and not the other way round
-            amplitude = likelihood.amplitude_of(point.y**2, size)
+        law_errors = np.full(len(effects), SETTINGS.law)
         for _ in range(_STEPS):
+            done = changes(self.comparison, likelihood, effects, nuisance)
+            point = self._point(effects, nuisance, offsets, likelihood.laws(done, law_errors))
+            size = self._size(done, law_errors)
+            if amplitude is None:
+                # from above: what parameters explain is taken from what is missed, and not the other way
+                amplitude = likelihood.amplitude_of(point.y**2, size)
             columns = self._columns(point)
             y = point.y + np.tensordot(point.away, columns, 1)  # as from the prior's mean
-            whole = np.concatenate([point.pose, columns])
+            whole = np.concatenate([point.errors, columns])
             amplitude = likelihood.amplitudes(y, whole, amplitude, size)
             variance = likelihood.variance(amplitude, size)
-            _, weights, _ = likelihood.evidence(y, whole, variance)
-            step, off = weights[len(point.pose) :] - point.away, self._offsets(weights) - point.offsets
+            _, weights, factor = likelihood.evidence(y, whole, variance)
+            step, off = weights[len(point.errors) :] - point.away, self._offsets(weights) - offsets
             far = max(np.abs(step).max(initial=0), np.abs(off).max() / self.comparison.repeatability)
             step, off = (by * min(1.0, _FARTHEST / max(far, 1e-9)) for by in (step, off))
             before, better = self._log(point, variance)[0], None
             for share in _SHORTER:
-                trial = self._moved(point, share * step, point.offsets + share * off)
+                trial = self._moved(point, share * step, offsets + share * off)
                 gain = self._log(trial, variance)[0] - before
                 if gain > 0:
                     better = trial
                     break
             if better is None:
                 break
-            point = better
+            effects, nuisance, offsets = better.effects, better.nuisance, better.offsets
+            law_errors = self._law_errors(law_errors, weights, factor)
             if gain < _DONE:
                 break
-        return self._finished(point, amplitude)
+        return self._finished(effects, nuisance, offsets, amplitude, law_errors)
+
+    def _law_errors(self, law_errors, weights, factor):
+        """(effects,) most probable errors of laws by coefficients of what they do, and their precision."""
+        begin = 3 * len(self.likelihood.chosen)
+        rows = slice(begin, begin + len(law_errors) * likelihood.COURSES)
+        expected = weights[rows] ** 2 + (np.linalg.inv(factor)[:, rows] ** 2).sum(0)
+        square = expected.reshape(len(law_errors), likelihood.COURSES)
+        return self.likelihood.law_errors(law_errors[:, None] ** 2 * square)
 
     def _offsets(self, weights):
         """(trajectories, 3) of poses by their coefficients."""
@@ -255,23 +281,25 @@ class _Model:
         effects, nuisance = point.effects, point.nuisance
         for (k, name, spread, _), away, by in zip(self.parameters, point.away, step):
             effects, nuisance = self._with(effects, nuisance, k, name, (away + by) * spread)
-        return self._point(effects, nuisance, offsets)
+        return self._point(effects, nuisance, offsets, point.errors[3 * len(self.likelihood.chosen) :])
 
-    def _finished(self, point, amplitude):
+    def _finished(self, effects, nuisance, offsets, amplitude, law_errors):
         likelihood = self.likelihood
-        columns, size = self._columns(point), self._size(point.effects, point.nuisance)
-        whole, poses = np.concatenate([point.pose, columns]), len(point.pose)
+        done = changes(self.comparison, likelihood, effects, nuisance)
+        point = self._point(effects, nuisance, offsets, likelihood.laws(done, law_errors))
+        columns, size = self._columns(point), self._size(done, law_errors)
+        whole, errors = np.concatenate([point.errors, columns]), len(point.errors)
         y = point.y + np.tensordot(point.away, columns, 1)
         # by what is left at the point itself: where a bound holds, the linear model would leave less
         for _ in range(2):
             variance = likelihood.variance(amplitude, size)
-            amplitude = likelihood.amplitudes(point.y, point.pose, amplitude, size, 1)
+            amplitude = likelihood.amplitudes(point.y, point.errors, amplitude, size, 1)
         variance = likelihood.variance(amplitude, size)
         log, alone = self._log(point, variance)
         _, _, factor = likelihood.evidence(y, whole, variance)
-        score = log + likelihood.prior(amplitude)
+        score = log + likelihood.prior(amplitude, law_errors)
         score += np.log(np.diag(alone)).sum() - np.log(np.diag(factor)).sum()
-        covariance = np.linalg.inv(factor @ factor.T)[poses:, poses:] * np.outer(self.spread, self.spread)
+        covariance = np.linalg.inv(factor @ factor.T)[errors:, errors:] * np.outer(self.spread, self.spread)
         own = [i for i, p in enumerate(self.parameters) if p[0] is not None]
         scale = np.ones(len(own))
         for j, i in enumerate(own):
@@ -287,6 +315,7 @@ class _Model:
             float(score),
             amplitude,
             size,
+            law_errors,
             float("nan") if modulus is None else float(np.sqrt(covariance[modulus, modulus])),
             likelihood.missed(amplitude, size),
             y,

@@ -1,9 +1,14 @@
 """Likelihood of data under a model that is nearly right.
 
-Measured less predicted is noise, the error of every trial's pose, and what the model misses: a Gaussian
-process per channel over where and how deep an object presses, for how long it has touched, and the session's
-clock (Kennedy and O'Hagan 2001). In the eigenvectors of its kernel noise and process are diagonal, whatever
-the process's amplitude, which is a parameter with a prior as all others are.
+Measured less predicted is noise, the error of every trial's pose, what the laws of effects lack, and what the
+model misses: a Gaussian process per channel over where and how deep an object presses, for how long it has
+touched, and the session's clock (Kennedy and O'Hagan 2001). In the eigenvectors of its kernel noise and
+process are diagonal, whatever the process's amplitude, which is a parameter with a prior as all others are.
+
+The true law of an effect is another one than the catalogue's: what it does in truth is what the catalogue's
+does, times one and a Gaussian process over depth, time since touch and the session's clock, the same for all
+channels. The standard deviation of this process is the effect's law error, one number with a prior whose
+median is `SETTINGS.law`; data say the rest.
 """
 
 import typing
@@ -16,7 +21,7 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["Likelihood", "kernel", "of"]
+__all__ = ["COURSES", "Likelihood", "courses", "kernel", "of"]
 
 _ROWS = 1500  # of all trajectories, that eigenvectors are computed of; of more, some are left out
 # Lengths over which what a model misses changes: across the skin (a contact's radius), in depth, in heading,
@@ -31,24 +36,21 @@ _TOUCH = 20e-6  # [m]
 # Amplitudes that are tried, in what is expected: data of one sensor at some places do not show that the model
 # is much better than it was found to be elsewhere.
 _FACTORS = np.exp(np.arange(-0.4, 4.01, 0.4))
+_LAW_FACTORS = np.exp(np.arange(-1.2, 1.61, 0.2))  # of law errors, in their prior's median
+COURSES = 12  # along which the law of an effect may be another
 
 
 def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     """(n, n) covariance of what a model misses, 1 under the deepest press; rows: of each trajectory."""
 
     def gathered(of):
-        return np.concatenate([np.asarray(of(t))[r] for t, r in zip(data, rows)])
-
-    def apart(x, length):
-        x = x.reshape(len(x), -1) / length
-        square = (x**2).sum(1)
-        return np.maximum(square[:, None] + square - 2 * x @ x.T, 0.0)
+        return _gathered(data, rows, of)
 
     depth = gathered(lambda t: t.depth)
-    place = apart(gathered(lambda t: t.pos), _PLACE) + apart(depth, _DEPTH)
-    heading = apart(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
-    since = apart(gathered(_since_touch), _SINCE)
-    clock = apart(gathered(lambda t: t.clock + t.time), _CLOCK)
+    place = _apart(gathered(lambda t: t.pos), _PLACE) + _apart(depth, _DEPTH)
+    heading = _apart(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
+    since = _apart(gathered(_since_touch), _SINCE)
+    clock = _apart(gathered(lambda t: t.clock + t.time), _CLOCK)
     tool = gathered(lambda t: np.full(len(t.time), t.tool))
     static = np.exp(-0.5 * (place + heading)) * np.where(tool[:, None] == tool, 1.0, _OTHER_TOOL)
     passing = np.exp(-0.5 * (place + since + clock))
@@ -56,6 +58,27 @@ def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     rough = _ROUGH * np.eye(len(load))
     touched = (_STATIC * static + _PASSING * passing + rough) * load[:, None] * load
     return touched + _DRIFTING * np.exp(-0.5 * clock)
+
+
+def courses(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
+    """(k, n) functions of depth, time since touch and the session's clock whose sum with coefficients of unit
+    variance is the process of a law's error."""
+    away = _apart(_gathered(data, rows, lambda t: t.depth), _DEPTH)
+    away += _apart(_gathered(data, rows, _since_touch), _SINCE)
+    away += _apart(_gathered(data, rows, lambda t: t.clock + t.time), _CLOCK)
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * away))
+    return (np.sqrt(np.maximum(values, 0.0)) * vectors).T[: -COURSES - 1 : -1]
+
+
+def _gathered(data, rows, of):
+    return np.concatenate([np.asarray(of(t))[r] for t, r in zip(data, rows)])
+
+
+def _apart(x, length):
+    """(n, n) squared distances of x (n, ...) over a length."""
+    x = x.reshape(len(x), -1) / length
+    square = (x**2).sum(1)
+    return np.maximum(square[:, None] + square - 2 * x @ x.T, 0.0)
 
 
 def _since_touch(t):
@@ -78,6 +101,7 @@ class Likelihood:
         values, vectors = np.linalg.eigh(kernel(data, self._rows))
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
         self.expected = np.sqrt(vectors**2 @ self._scale)
+        self._courses = courses(data, self._rows)
         self.noise = comparison.noises
         largest = np.abs(self.stacked(comparison.measured)).max(0)
         self.size = np.concatenate(
@@ -105,6 +129,23 @@ class Likelihood:
             out += [own @ column[rows] for column in self.comparison.moved(i, offsets[i])]
         return self.comparison.repeatability * np.array(out)
 
+    def laws(self, changes: list[np.ndarray], errors: np.ndarray) -> np.ndarray:
+        """(m, n, width) what errors of laws do, of one standard deviation each, in the eigenvectors; changes:
+        (n, width) what each effect does, errors (effects,): of its law."""
+        out = [
+            self.turned(error * change * course[:, None])
+            for change, error in zip(changes, errors)
+            for course in self._courses
+        ]
+        return np.array(out).reshape(len(out), len(self._courses[0]), len(self.size))
+
+    def law_errors(self, square: np.ndarray) -> np.ndarray:
+        """(effects,) most probable errors of laws whose coefficients (effects, k) have these expected
+        squares."""
+        log = np.log(SETTINGS.law * _LAW_FACTORS)
+        fits = -square.shape[1] * log - 0.5 * square.sum(1)[:, None] * np.exp(-2 * log)
+        return np.exp(log[(fits + _law_prior(log)).argmax(1)])
+
     def variance(self, amplitude: np.ndarray, size: np.ndarray) -> np.ndarray:
         """(n, width) of noise and of what is missed."""
         return self.noise**2 + (amplitude * size) ** 2 * self._scale[:, None]
@@ -122,9 +163,10 @@ class Likelihood:
         log = -0.5 * square - np.log(np.diag(factor)).sum() - 0.5 * np.log(variance).sum()
         return float(log), np.linalg.solve(factor.T, pull), factor
 
-    def prior(self, amplitude: np.ndarray) -> float:
-        """log density of amplitudes (width,): those of a group have something in common."""
-        out = 0.0
+    def prior(self, amplitude: np.ndarray, law_errors: np.ndarray) -> float:
+        """log density of amplitudes (width,), of which those of a group have something in common, and of
+        errors of laws (effects,)."""
+        out = _law_prior(np.log(law_errors)).sum()
         for group in self.groups:
             log = np.log(amplitude[group])
             covariance = SETTINGS.own**2 * np.eye(len(log)) + SETTINGS.spread**2
@@ -174,6 +216,11 @@ def of(comparison: "Comparison", chosen: np.ndarray) -> Likelihood:
     if key not in comparison.likelihoods:
         comparison.likelihoods[key] = Likelihood(comparison, chosen)
     return comparison.likelihoods[key]
+
+
+def _law_prior(log):
+    """log density of logarithms of law errors."""
+    return -0.5 * ((log - np.log(SETTINGS.law)) / SETTINGS.own) ** 2
 
 
 def _upper(x):

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from ..evidence import ODDS
 from ..report import plots
 from ..report.verdict import Picture, Verdict
 from .fitting import fit_effects
@@ -14,13 +13,11 @@ _SHOWN = 4  # trajectories, of each of two channels
 
 
 def pictures_of(diagnosis: Verdict) -> list[Picture]:
-    """Curves and channels on held-out trajectories, where the model is off, evidence, what can be told."""
+    """Curves and channels on held-out trajectories, and where the model is off."""
     drawn = {
         "curves": ("curves", _curves),
         "channels": ("gap", _channels),
         "where": ("where", _where),
-        "evidence": ("tried", _evidence),
-        "isolability": ("unknown", _isolability),
     }
     return [Picture(name, section, draw(diagnosis)) for name, (section, draw) in drawn.items()]
 
@@ -63,18 +60,3 @@ def _where(diagnosis):
         for one in diagnosis.where
     ]
     return plots.matrix(cells.overall, asked, c.channels, dots, "mean residual, or trend [sigma]")
-
-
-def _evidence(diagnosis):
-    tried, named = diagnosis.tried, {one.id for one in diagnosis.effects}
-    return plots.ranking(
-        [one["name"] for one in tried],
-        [one["evidence_nats"] for one in tried],
-        [one["id"] in named for one in tried],
-        float(np.log(ODDS)),
-    )
-
-
-def _isolability(diagnosis):
-    table = diagnosis.details["isolability"]
-    return plots.isolability(table["ids"], table["matrix"], table["nats"])

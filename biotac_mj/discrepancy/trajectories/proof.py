@@ -9,16 +9,14 @@ import numpy as np
 from ..evidence import ODDS
 from . import likelihood
 from .base.nuisance import Nuisance
+from .fitting import changes
+from .settings import SETTINGS
 
 if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
 __all__ = ["Proof", "borne_out", "proved"]
-
-# of what effects change, that their laws lack: with it the fraction that is closed is most often within ten
-# points of the true one, in 48 practice laboratories
-_LAW = 0.15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,19 +40,22 @@ class Proof:
 
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
     """Whether held-out trajectories are likelier by `ODDS` with one Fit than with another that has fewer
-    effects, the skin solved again, parameters as they were fitted: by the one likelihood, so that what the
-    law of an effect lacks counts as what a model misses, and does not contradict the effect."""
+    effects, and by as much again for every further effect, as in the search; the skin solved again,
+    parameters as they were fitted. By the one likelihood: what the law of an effect lacks does not contradict
+    it."""
     first, last = (_density(comparison, fit, aside) for fit in (smaller, larger))
-    return bool(last - first > np.log(ODDS))
+    return bool(last - first > max(len(larger.effects), 1) * np.log(ODDS))
 
 
 def _density(comparison, fit, aside):
     """Logarithm of the likelihood of held-out trajectories, by as much as the model misses of them."""
     own = likelihood.of(comparison, aside)
     y = own.turned(own.stacked(fit.raw(comparison, exact=list(aside))))
-    pose = own.poses(np.zeros((len(comparison.trajectories), 3)))
-    amplitude = own.amplitudes(y, pose, fit.amplitude, fit.size)
-    return own.evidence(y, pose, own.variance(amplitude, fit.size))[0] + own.prior(amplitude)
+    laws = own.laws(changes(comparison, own, fit.effects, fit.nuisance), fit.law_errors)
+    errors = np.concatenate([own.poses(np.zeros((len(comparison.trajectories), 3))), laws])
+    amplitude = own.amplitudes(y, errors, fit.amplitude, fit.size)
+    log = own.evidence(y, errors, own.variance(amplitude, fit.size))[0]
+    return log + own.prior(amplitude, fit.law_errors)
 
 
 def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndarray) -> Proof:
@@ -82,7 +83,9 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
         if current.effects
         else [ends[id(start)], end]
     )
-    return Proof(current, before, after, (first, last), _closed(comparison, *sides, _LAW, aside))
+    errors = current.law_errors if current.effects else np.array([SETTINGS.law])
+    law = float(np.sqrt(np.mean(errors**2)))
+    return Proof(current, before, after, (first, last), _closed(comparison, *sides, law, aside))
 
 
 def _measured(comparison, fit, rows):

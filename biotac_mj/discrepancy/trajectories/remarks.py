@@ -6,12 +6,10 @@ import typing
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE
-from .base.channels import jumping
 from .base.nuisance import OTHER_MESH
 from .levels import astray
 from .signatures import SEEN
 from .where import phases
-from .whitening import REPEATABILITY
 
 if typing.TYPE_CHECKING:
     from ..report.verdict import Finding
@@ -19,7 +17,7 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["jumps", "next_experiment", "of_base", "of_data", "scattered", "strays"]
+__all__ = ["next_experiment", "of_base", "of_data", "strays"]
 
 
 def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, step: list) -> str:
@@ -41,13 +39,6 @@ def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.
     best = min(left, default=(np.inf, ""))
     hint = f"; {best[1]} would explain it" if best[0] < 0.5 * square[off].mean() else ""
     return f"{what}: too few of them were fitted to tell by what{hint}; measure more like them"
-
-
-def jumps(comparison: "Comparison", null: "Fit") -> str:
-    """Remark on electrodes with large errors in single rows while all others agree."""
-    which = jumping(comparison, null)
-    many = "s" if len(which) == 1 else ""
-    return f"{', '.join(which)} jump{many} from row to row: look for a loose lead" if which else ""
 
 
 def _size(comparison, i, residual) -> str:
@@ -74,7 +65,6 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
             f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
             "effect found takes up: check the set-up, or the base model"
         )
-    notes += [line] if (line := scattered(comparison)) else []
     if abs(nuisance.log_film) > 0.2:
         notes.append(
             f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data"
@@ -90,17 +80,6 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
             f"{comparison.sim.skin!r}: use that one"
         )
     return notes
-
-
-def scattered(comparison: "Comparison") -> str:
-    """Remark on poses that scatter far more than is stated; "" if they do not."""
-    if comparison.repeatability <= 2 * max(comparison.stated, REPEATABILITY):
-        return ""
-    return (
-        f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial where "
-        f"{1e3 * comparison.stated:.2f} are stated: that much is taken for granted, and an effect of the "
-        "set-up, as a mount that gives way, may hide in it"
-    )
 
 
 def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:

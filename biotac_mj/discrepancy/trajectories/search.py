@@ -30,9 +30,6 @@ _KINS, _SOME = (
     0.15,
 )  # effects whose rubber is solved for; share of the best one's evidence that is worth it
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
-# Fraction of the evidence of what was found that its laws leave to another effect. They are off by a third,
-# since they close 73 % of the gaps of 50 practice laboratories in the median; evidence goes by the square.
-_LEFT = 0.1
 
 
 @dataclasses.dataclass
@@ -100,11 +97,10 @@ def found(
     while len(out.found) < SETTINGS.most:
         step = _round(comparison, out, usable, chosen, seed, bar)
         out.rounds.append(step)
-        able = [c for c in step if not c.refused]
+        able = [c for c in step if not c.refused and not _another_law(c, out)]
         # others are not what their names say
         little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance"}]
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
-        able = [c for c in able if not _left_by_laws(comparison, c, out, chosen)]
         if not able:
             break
         best = able[0] = _other_shapes(comparison, able[0], out.fit, chosen)
@@ -112,7 +108,6 @@ def found(
         best.ties = [c.effect.id for c in able[1:] if _tied(best, c)]
         out.found.append(best)
         out.fit = best.fit
-    _without_needless(comparison, out, usable, chosen)
     return out
 
 
@@ -129,38 +124,19 @@ def _other_shapes(comparison, one, current, chosen) -> Candidate:
 
 
 def _tied(best, other) -> bool:
-    """Whether another Candidate is nearly as likely: within the odds that decide, or within what the laws of
-    both may be off by, which evidence has twice."""
-    laws = np.hypot(*(max(c.effect.law, SETTINGS.law) for c in (best, other)))
-    return bool(best.gain - other.gain < max(np.log(ODDS), 2 * laws * best.gain))
+    """Whether another Candidate is nearly as likely: within the odds that decide, or within what the law of
+    the best one is off by, which evidence has twice."""
+    return bool(best.gain - other.gain < max(np.log(ODDS), 2 * best.fit.law_errors[-1] * best.gain))
 
 
-def _left_by_laws(comparison, one, search, chosen) -> bool:
-    """Whether what an effect explains beside those found may be what their laws lack: less than is expected
-    of all laws, and less than it explains alone; beside another law of the same thing, less than that."""
-    if not search.found:
+def _another_law(one, search) -> bool:
+    """Whether an effect is another law of what was found: less of it shows beside that than alone."""
+    names = {c.effect.id for c in search.found}
+    same = names.union(*(c.effect.equivalents for c in search.found))
+    if one.effect.id not in same and not names & {*one.effect.equivalents}:
         return False
-    null = search.fits[frozenset()]
-    same = {i for c in search.found for i in (c.effect.id, *c.effect.equivalents)}
-    another = one.effect.id not in same and not same & {*one.effect.equivalents}
-    if another and one.gain >= _LEFT * (search.fit.score - null.score):
-        return False
-    item = next(pair for pair in one.fit.effects if pair[0].id == one.effect.id)
-    alone = fit_effects(comparison, [item], chosen, null)
-    return bool(one.gain < alone.score - null.score)
-
-
-def _without_needless(comparison, search, usable, chosen):
-    """Takes out effects without which data are as likely, once others are there, and these are what their
-    names say."""
-    for one in list(search.found[:-1]):
-        rest = [pair for pair in search.fit.effects if pair[0].id != one.effect.id]
-        reduced = fit_effects(comparison, rest, chosen, search.fit)
-        same = not any(effect.rejection_reason(theta) for effect, theta in reduced.effects)
-        if same and search.fit.score - reduced.score < asked(len(usable)):
-            search.found.remove(one)
-            search.fit = reduced
-            search.fits[frozenset(e.id for e, _ in rest)] = reduced
+    alone = [c.gain for c in search.rounds[0] if c.effect.id == one.effect.id]
+    return not alone or one.gain < alone[0]
 
 
 def _round(comparison, search, usable, chosen, seed, bar):
@@ -236,7 +212,7 @@ def _little(comparison, effect, theta) -> bool:
     if not effect.pose_offset:
         return False
     lever = np.array([_LEVER if effect.params[n].unit == "rad" else 1.0 for n in effect.free])
-    limit = 2 * comparison.stated / np.sqrt(len(comparison.trajectories))
+    limit = 2 * comparison.repeatability / np.sqrt(len(comparison.trajectories))
     return bool((np.abs(size) * lever < limit).all())
 
 

@@ -16,8 +16,8 @@ class Settings:
     resolution: of the largest changes of a group of channels, by which the base model is expected to be off
       (mesh, tier, film: docs/lab/condensed.md).
     spread, own: standard deviations of the logarithm of how far a group, and a channel of it, is off.
-    law: share of what an effect does, by which its true law is expected to be another; `Effect.law` where
-      that is more.
+    law: share of what an effect does, by which its true law is another: median of the prior; the standard
+      deviation of its logarithm is `own`.
     wide: standard deviation of a parameter, in units of `Param.scale`.
     rate: of false discoveries. explained: share of what the base model misses, below which an effect has no
       name. beyond: times as much as is expected of a model, from which on it misses something.
@@ -27,7 +27,7 @@ class Settings:
     resolution: float = 0.01
     spread: float = 1.5
     own: float = 0.5
-    law: float = 0.05
+    law: float = 0.1
     wide: float = 2.5
     rate: float = RATE
     explained: float = 0.2

@@ -13,8 +13,6 @@ __all__ = [
     "Trajectory",
     "measurement_noise",
     "read_trajectories",
-    "settled",
-    "still_differences",
     "write_trajectories",
 ]
 
@@ -220,23 +218,6 @@ def measurement_noise(trajectories: list[Trajectory]) -> dict:
     if any(t.force is not None for t in trajectories):
         out["force"] = _noise([t.force for t in trajectories], trajectories, 0.005)
     return out
-
-
-def still_differences(x: np.ndarray, t: Trajectory, lag: int, only: np.ndarray | None = None) -> np.ndarray:
-    """(pairs, ...) x (n, ...) less itself `lag` rows before, where the object stands still in between; only:
-    (n,) bool of rows to use."""
-    moved = np.concatenate([[0], np.cumsum(~_still(t))])
-    pairs = moved[lag:] == moved[:-lag]
-    return (x[lag:] - x[:-lag])[pairs if only is None else pairs & only[lag:] & only[:-lag]]
-
-
-def settled(t: Trajectory) -> np.ndarray:
-    """(n,) bool: the later half of each time that the object stands still, without its last row, in which it
-    may have begun to move; the first half, too, where the trajectory begins so."""
-    moved = np.concatenate([[0], np.cumsum(~_still(t))])
-    begin, end = (np.searchsorted(moved, moved, side) for side in ("left", "right"))
-    row = np.arange(len(moved))
-    return ((row >= (begin + end) // 2) | (moved == 0)) & ((row < end - 1) | (end == len(row)))
 
 
 def _still(t):

@@ -28,12 +28,8 @@ class Comparison:
     rest: the mean over all trajectories of row 0.
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
-    noisy: what `channels.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
-    rest_apart: (nelectrode,) by which its electrodes rest apart from those of the simulator that was given
-      [counts].
     noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories
     and of each.
-    stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
     likelihoods: what `likelihood.of` has made of some of its trajectories.
     """
 
@@ -43,12 +39,8 @@ class Comparison:
     noise: dict
     repeatability: float = REPEATABILITY
     modulus: float = 1.0
-    noisy: tuple | None = None
-    stated: float | None = None
-    rest_apart: np.ndarray | float = 0.0
 
     def __post_init__(self):
-        self.stated = self.repeatability if self.stated is None else self.stated
         free = np.array([t.electrodes[0] for t in self.trajectories])
         self.rest = free.mean(0)
         self.has_pdc = all(t.pdc is not None for t in self.trajectories)
@@ -74,8 +66,6 @@ class Comparison:
                 *([self.noise["force"]] if self.has_force else []),
             ]
         )
-        if self.noisy is not None:
-            sigma[:n] = np.hypot(sigma[:n], [self.noisy[1][f"e{k + 1}"] for k in range(n)])
         self.noises, self.likelihoods = sigma, {}
         # One deep press decides nothing of what the light ones can show.
         self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
@@ -141,12 +131,6 @@ class Comparison:
     def calibrated(self, nuisance: Nuisance) -> "Comparison":
         """The same about a base model whose modulus was fitted."""
         return dataclasses.replace(self, modulus=nuisance.modulus)
-
-    def scatter(self, effects: list, nuisance: Nuisance, chosen: np.ndarray) -> float:
-        """[m] by which the chosen poses scatter beside these effects, at least what is stated."""
-        poses = self.poses(effects, nuisance)[chosen]
-        scatter = 1.4826 * np.median(np.abs(poses - np.median(poses, axis=0)), axis=0).max()
-        return max(float(scatter), self.stated)
 
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""

@@ -12,8 +12,7 @@ from ...effects.catalogue import CATALOGUE
 from ...effects.sensor_file import SensorFile
 from ...geometry.design import check_nelectrode
 from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, of_electrodes
-from .base.channels import noisy_electrodes
-from .base.findings import BaseCandidate, base_findings
+from .base.findings import other_modulus
 from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .beliefs import Beliefs, believed
@@ -22,7 +21,7 @@ from .levels import few_off
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import Proof, borne_out, proved
-from .remarks import jumps, next_experiment, of_base, of_data, scattered, strays
+from .remarks import next_experiment, of_base, of_data, strays
 from .search import found
 from .settings import SETTINGS
 from .signatures import isolability
@@ -34,7 +33,6 @@ if typing.TYPE_CHECKING:
     from .model.fields import Fields
     from .trajectory import Trajectory
 
-_LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 _GROUPS = {"electrodes": "the electrodes", "pdc": "the liquid's pressure (PDC)", "force": "the force"}
 _SURE = 1 - SETTINGS.rate  # the most that is stated: so many of all names are false
 # [nats] of evidence over which names become sure, by greatest likelihood from 48 names in 60 practice
@@ -50,14 +48,13 @@ class TrajectoryDiagnosis(Verdict):
 
     Attributes:
       given: the simulator that was compared. fit: Fit, with the effects that are named and added.
-      beside: BaseCandidates, which `effects` names too. proof: on held-out trajectories, the skin solved
-        again. comparison, selection, locked: what it was made of. beliefs: how likely which explanation is.
+      proof: on held-out trajectories, the skin solved again. comparison, selection, locked: what it was
+        made of. beliefs: how likely which explanation is.
       trace: numbers that thresholds are set on, as a file can hold them.
     """
 
     given: Simulator
     fit: Fit
-    beside: list[BaseCandidate]
     proof: Proof
     comparison: Comparison
     selection: np.ndarray
@@ -78,12 +75,7 @@ class TrajectoryDiagnosis(Verdict):
         where the skin was solved with them for that, they act inside it."""
         own = self.comparison.sim.log_rest * (1 - self.fit.nuisance.stands_off)
         sim = sim.rested(own)
-        more = [pair for one in self.beside for pair in one.pairs]
-        new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
-        for one in self.beside:
-            if one.pairs:
-                found = one.finding.parameters.items()
-                new.intervals[one.finding.id] = {name: (p.low, p.high) for name, p in found}
+        new = sim.with_effects(self.fit.effects, sim.modulus * self.fit.nuisance.modulus)
         for k, (effect, name) in enumerate(self.fit.names):
             new.intervals.setdefault(effect, {})[name] = self.fit.interval(k)
         solved = self.comparison.fields.remembered
@@ -145,9 +137,10 @@ def diagnose(
         if exchange is not None:
             comparison = about_rests(sim, data, fields, repeatability, exchange.reads)
             first = fit_effects(comparison, [], chosen, first)
-        stated = comparison.calibrated(first.nuisance)
+        comparison = comparison.calibrated(first.nuisance)
         bar.update()
-        comparison, null, search = _explained(stated, usable, chosen, seed, bar)
+        null = fit_effects(comparison, [], chosen)
+        search = found(comparison, null, usable, chosen, seed, bar)
         search.hidden = hidden
         bar.update()
         report = _settle(sim, comparison, null, search, chosen, aside, notes, usable)
@@ -163,10 +156,9 @@ def about_rests(
     Args:
       given: Simulator. fields: what it solved for the data. repeatability: of poses [m].
       reads: (electrode, the one whose counts, and whose rest, it shows)."""
-    sim, own, apart = rested(given, fields, data, reads)
-    noisy = noisy_electrodes(data, [one["force"] for one in own.base])
+    sim, own = rested(given, fields, data, reads)
     noise = measurement_noise(data)
-    return Comparison(sim, data, own, noise, repeatability, noisy=noisy, rest_apart=apart)
+    return Comparison(sim, data, own, noise, repeatability)
 
 
 def _wired(usable, comparison, fit, chosen):
@@ -180,30 +172,6 @@ def _wired(usable, comparison, fit, chosen):
             effect = hearing(comparison, fit, chosen) or effect
         out += [effect] if effect is not None and not effect.of_rest else []
     return out
-
-
-def _explained(stated, usable, chosen, seed, bar):
-    """Comparison with the scatter of poses that data are likeliest with, Fit without effects and Search.
-
-    What is missing in the model looks like scatter, and scatter hides it. So effects are looked for beside
-    the scatter that is stated, and, where none explains as much as more scatter would, beside that."""
-
-    def begun(comparison):
-        null = fit_effects(comparison, [], chosen)
-        return comparison, null, found(comparison, null, usable, chosen, seed, bar)
-
-    first = begun(stated)
-    scatter = stated.scatter([], first[1].nuisance, chosen)
-    if scatter <= _LESS * stated.repeatability:
-        return first
-    # its skin is solved where its own fits end
-    wider = dataclasses.replace(
-        stated, repeatability=scatter, fields=dataclasses.replace(stated.fields, curves={})
-    )
-    if fit_effects(wider, [], chosen, first[1]).score <= first[2].fit.score:
-        return first
-    second = begun(wider)
-    return second if second[2].fit.score > first[2].fit.score else first
 
 
 def _off(comparison, fit) -> tuple[float, float]:
@@ -248,8 +216,7 @@ def _in_words(comparison, current, effects, named, chosen, refuted):
     ]
     if effects and named:
         return ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts), ""
-    remainder = refuted or ("" if effects else jumps(comparison, current))
-    remainder = remainder or left_over(comparison, current, chosen)
+    remainder = refuted or left_over(comparison, current, chosen)
     if not effects:
         return f"unknown ({remainder})", remainder
     return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder
@@ -289,14 +256,13 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     fitted = current
     current, found, refuted = _upheld(comparison, null, current, found, search, chosen, aside)
     named = not _wrong(comparison, current)
-    # What the base is off by has a name where it is all that is left: else it may be a part of what is not
-    # known.
-    beside = base_findings(comparison, current, chosen) if named else []
-    for one in beside:
-        null = one.bare if one.bare is not None and not found else null
-    seen = found or beside or _wrong(comparison, null)
+    # Another modulus has a name where it is all that is left: else it may be a part of what is not known.
+    modulus, without = other_modulus(comparison, current, chosen) if named else (None, None)
+    if modulus and not found:
+        null = without
+    seen = found or modulus or _wrong(comparison, null)
     # what has no name is not written either
-    proof = proved(comparison, null, current if found or beside else null, aside)
+    proof = proved(comparison, null, current if found or modulus else null, aside)
     alike = [names[name] for one in found for name in one.ties if name in names]
     doubts = [f"{', '.join(alike)} may be as good"] if alike else []
     if not named:
@@ -304,8 +270,10 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     if refuted:
         doubts.append(_refuted(refuted))
     beliefs = believed(comparison, search, doubts, chosen)
+    gaps = _gaps(comparison, proof)
     effects = [_described(item, current, _sure(beliefs, item), names) for item in found]
-    effects += [dataclasses.replace(one.finding, confidence=_SURE) for one in beside]
+    effects = [_proved(one, proof, gaps) for one in effects]
+    effects += [dataclasses.replace(modulus, confidence=_SURE)] if modulus else []
     stray = ""
     if seen:
         verdict, remainder = _in_words(comparison, current, effects, named, chosen, _refuted(refuted))
@@ -314,7 +282,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         verdict, remainder = (f"unknown ({stray})", stray) if stray else (verdict, remainder)
     else:
         stray = strays(comparison, null, chosen, aside, search.rounds[0])
-        stray = stray or jumps(comparison, null) or _refuted(refuted) or beliefs.against_none
+        stray = stray or _refuted(refuted) or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     table = isolability(comparison, current, usable, chosen)
@@ -329,18 +297,17 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         "closed": proof.closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
-    cells, gaps = where(comparison, null, chosen), _gaps(comparison, proof)
-    added = [effect.name for effect, _ in proof.fit.effects] + [one.finding.name for one in beside]
+    cells = where(comparison, null, chosen)
+    added = [effect.name for effect, _ in proof.fit.effects] + ([modulus.name] if modulus else [])
     return TrajectoryDiagnosis(
         kind="trajectories",
         name="trajectories",
         data=f"{len(chosen)} fitted, {len(aside)} held out",
         verdict=verdict,
         significant=bool(seen or stray),
-        effects=[_proved(one, proof, beside, gaps) for one in effects],
+        effects=effects,
         not_named=[_described(item, fitted, _sure(beliefs, item), names, False) for item in refuted],
         gap=gaps,
-        warnings=[line] if (line := scattered(comparison)) else [],
         aside=f"{len(aside)} trajectories that took no part in the search, errors of their poses taken out",
         closed=proof.closed,
         where=cells,
@@ -378,7 +345,6 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         },
         given=given,
         fit=proof.fit,
-        beside=beside,
         proof=proof,
         comparison=comparison,
         selection=chosen,
@@ -415,11 +381,9 @@ def _gaps(comparison, proof):
     return out
 
 
-def _proved(finding, proof, beside, gaps):
+def _proved(finding, proof, gaps):
     """A Finding, confirmed by held-out trajectories, with the gap that it closes most of where it alone
     was added."""
-    if any(finding.id == one.finding.id for one in beside):
-        return finding  # of the base model, which both sides have
     added = [e.id for e, _ in proof.fit.effects]
     closed = [gap for gap in gaps.values() if np.isfinite(gap.closed)] if added == [finding.id] else []
     gap = max(closed, key=lambda one: one.closed, default=None)

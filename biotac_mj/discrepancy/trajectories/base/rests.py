@@ -27,10 +27,9 @@ def rested(
     fields: "Fields",
     data: "list[Trajectory]",
     reads: Sequence[tuple[int, int]] = (),
-) -> tuple["Simulator", "Fields", np.ndarray]:
-    """The simulator and its fields of the data with electrodes that rest at their mean counts before touch,
-    and by how much that is apart (nelectrode,) [counts]; one that stands off (`channels.offsets`), which is
-    no matter of its impedance, or reads nothing, stays.
+) -> tuple["Simulator", "Fields"]:
+    """The simulator and its fields of the data with electrodes that rest at their mean counts before touch;
+    one that stands off (`channels.standing`), which is no matter of its impedance, or reads nothing, stays.
 
     Args:
       fields: as the simulator solved them. reads: (electrode, the one it shows), whose rest that is."""
@@ -49,4 +48,4 @@ def rested(
     new = copy.copy(sim)
     new.log_rest = shift
     base, quick = ([one | {"log_z": one["log_z"] + shift} for one in f] for f in (fields.base, fields.quick))
-    return new, dataclasses.replace(fields, base=base, quick=quick), np.where(off, 0.0, apart)
+    return new, dataclasses.replace(fields, base=base, quick=quick)
