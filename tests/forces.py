@@ -9,9 +9,9 @@ from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.rubber.element_points import Kind, material_functions
 from biotac_mj.skin.rubber.law import COMPRESSED, barrier, energy_density
 from biotac_mj.skin.rubber.points import Mesh, Rubber, deformation_of
-from biotac_mj.skin.types import DOUBLE, mat33, real, vec3
+from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real, vec3
 
-__all__ = ["Elements", "begin", "commit", "energy_of", "gradients"]
+__all__ = ["Elements", "begin", "check_tangent", "commit", "energy_of", "gradients"]
 
 
 class Elements:
@@ -72,6 +72,30 @@ class Elements:
         out = np.zeros((self.nvert, self.nworld, 3))
         np.add.at(out, np.repeat(np.arange(self.nvert), np.diff(start)), corner.numpy()[slot])
         return out
+
+
+def check_tangent(data, elastic, x, directions, h, bound):
+    """The tangent that rubber with memory adds to that of `elastic`, both SkinData, is the derivative of the
+    forces at x (nvert, 3) along the first of two directions, by differences of step h; it is symmetric, and
+    the same in single precision. Returns the added force as a function of the step along that direction."""
+    whole, law = Elements(data), Elements(elastic)
+    p, q = directions
+
+    def force(shift):
+        return whole.force(x + shift * p) - law.force(x + shift * p)
+
+    def product(direction):
+        return whole.product(direction) - law.product(direction)
+
+    expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
+    force(0.0)
+    found = product(p)
+    np.testing.assert_allclose(found, expected, atol=bound * abs(expected).max())
+    np.testing.assert_allclose(np.vdot(q, found), np.vdot(p, product(q)), rtol=1e-9)
+    single, double = Elements(data, SINGLE), whole.product(p)
+    single.force(x)
+    np.testing.assert_allclose(single.product(p), double, rtol=0, atol=1e-5 * abs(double).max())
+    return force
 
 
 @wp.func

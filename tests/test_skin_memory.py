@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from bars import AREA, LENGTH, NOTHING, NOW, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import nodal_areas, place, shell, skin
-from forces import Elements, begin, commit
+from forces import begin, check_tangent, commit
 from grids import covering
 from scipy.special import erf
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.state_arrays import StateArrays
-from biotac_mj.skin.types import SINGLE
 
 G, TAU = 0.4, 0.7
 SERIES = ((G, TAU),)
@@ -126,25 +125,9 @@ def test_the_tangent_is_the_forces_derivative(law, element, beside):
     commit(data)  # a past, and a largest energy to be below of
     x = rest @ (np.eye(3) + 0.1 * rng.standard_normal((3, 3))).T + 2e-4 * rng.standard_normal(rest.shape)
     begin(data, 0.2)
-    p = 1e-4 * rng.standard_normal(rest.shape)
-    all_of_it, law_alone = Elements(data), Elements(SkinData(cube(law, element)))
-
-    def force(shift):
-        return all_of_it.force(x + shift * p) - law_alone.force(x + shift * p)
-
-    def product(p):
-        return all_of_it.product(p) - law_alone.product(p)
-
-    h = 1e-3
-    expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
-    soft, got = force(0.0), product(p)
-    np.testing.assert_allclose(got, expected, atol=2e-7 * abs(expected).max())
-    q = rng.standard_normal(p.shape)
-    assert np.vdot(q, got) == pytest.approx(np.vdot(p, product(q)), rel=1e-9)
-    single = Elements(data, SINGLE)
-    single.force(x)
-    whole = all_of_it.product(p)
-    np.testing.assert_allclose(single.product(p), whole, rtol=0, atol=1e-5 * abs(whole).max())
+    directions = 1e-4 * rng.standard_normal(rest.shape), rng.standard_normal(rest.shape)
+    force = check_tangent(data, SkinData(cube(law, element)), x, directions, 1e-3, 2e-7)
+    soft = force(0.0)
     data.rubber.worst.zero_()
     assert abs(force(0.0) - soft).max() > 1e-3 * abs(soft).max()  # it was softened
 
