@@ -192,10 +192,6 @@ class BatchSkin:
         blocks = dict(dim=self.pos.shape, block_dim=BLOCK, device=self.model.device)
         wp.launch_tiled(kernels.come_from_outside, inputs=surface, outputs=[self.geoms.struct], **blocks)
 
-    def go_on(self, going: wp.array) -> None:
-        """See `CondensedStep.go_on`."""
-        self._condensed.go_on(going)
-
     def end_solve(self) -> None:
         """The last part of a solve: wrenches, tangents, pressures. Without loops or branches in the condensed
         tier."""
@@ -273,7 +269,7 @@ def solve_group(skins: Sequence[BatchSkin], fork: Fork) -> None:
 
     def go_on():
         going.zero_()
-        fork.run(*(functools.partial(skin.go_on, going) for skin in condensed))
+        fork.run(*(functools.partial(skin._condensed.go_on, going) for skin in condensed))
 
     going.fill_(1)
     wp.capture_while(going, go_on)
