@@ -1,17 +1,6 @@
 """Base class of effects: id, stage, and parameters with units, bounds and source.
 
-A custom effect in ten lines:
-
-    class HalfBoard(Effect):
-        id, name, stage = "half_board", "one half of the multiplexer creeps", "A"
-        physics = "the reference of every other electrode creeps while the session lasts"
-        params = {"rate": Param("counts/s", -5, 5, "my own board", scale=0.1)}
-        confusable = {"warmup": "one half of the electrodes or all"}
-
-        def apply(self, run, theta):
-            run.counts[:, ::2] += theta["rate"] * run.clock[:, None]
-
-    diagnose(sim, data, effects=[*CATALOGUE, HalfBoard()])
+`docs/howto/effects.md` and `docs/howto/extend.md` have examples of custom effects.
 """
 
 import abc
