@@ -9,7 +9,7 @@ from ..bodies import make_bodies
 from ..contact import penetration
 from ..data import SkinData
 from ..geoms import GeomSet
-from ..model import SkinModel
+from ..model import SkinModel, SkinOptions
 from ..program import Launcher
 from ..state import CONDENSED, allocate
 from ..types import mat33, real, vec3
@@ -17,7 +17,7 @@ from . import results
 from .linear import LinearSkin
 from .refusals import refuse
 from .results import conclude, recall
-from .solve import BLOCK, phases, whole_step
+from .solve import block_of, phases, whole_step
 from .states import Increment, LoadStepping, Newton
 from .structs import NVECTOR, Remembered, Scratch
 
@@ -30,7 +30,8 @@ def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, in
     """Modules of a step's kernels on CUDA that take long to compile, with their block sizes, for
     `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
     kernels = [kernel.module for kernel in vars(phases(shapes)).values()]
-    return [(module, BLOCK) for module in [*kernels, results]] + [(penetration, 256)]
+    block = block_of(SkinOptions.samples)  # another number compiles when it is launched
+    return [(module, block) for module in [*kernels, results]] + [(penetration, 256)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +101,7 @@ class CondensedStep:
         self.most.fill_(float(model.options.max_work))
         self._going = wp.zeros(1, dtype=int, device=model.device)
         self._phases = phases(geoms.shapes) if model.device.is_cuda else None
+        self._block = block_of(model.options.samples)
         law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
         no_bound = wp.zeros((0, 0), dtype=real, device=model.device)
         self.touch = data.outer.contact(*law, data.x_last, no_bound)
@@ -127,7 +129,7 @@ class CondensedStep:
         launcher.launch(penetration.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
         if self._phases:
             known = [m.law, geoms.struct, c, d.x, self.touch, self.remembered, d.worlds]
-            launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=BLOCK)
+            launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=self._block)
             return
         launcher.launch(  # a thread for each, and no tiles: several skins may be solved at a time
             whole_step(geoms.shapes),
@@ -149,7 +151,7 @@ class CondensedStep:
             (k.balance, known, [self._scratch]),
             (k.conclude, [known[0], d.rest_pressure, *known[1:]], out),
         ):
-            launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=BLOCK)
+            launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=self._block)
 
     def end(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
         """Last part: wrenches and tangents of the solves."""
@@ -159,7 +161,7 @@ class CondensedStep:
         launcher = launcher or Launcher(m.device)
         launch, dim, how = launcher.launch, [d.nworld, 1], {}
         if m.device.is_cuda:
-            launch, dim, how = launcher.launch_blocks, [d.nworld], {"block_dim": BLOCK}
+            launch, dim, how = launcher.launch_blocks, [d.nworld], {"block_dim": self._block}
         known = [geoms.struct, self._constants, d.worlds.wanted, d.x, self.touch, self._scratch]
         launch(conclude, dim, known, [touched_by, wrench, tangent], **how)
 
