@@ -735,6 +735,8 @@ def test_errors_say_what_to_do():
     ):
         attach(spec.compile())
     batches.add(spec, body="world", skin=shell())
+    with pytest.raises(ValueError, match="no BioTac 'left_': give prefix= one of 'biotac_'"):
+        attach(spec.copy().compile(), prefix="left_")
     with pytest.raises(ValueError, match="prefix 'biotac_' is taken"):
         batches.add(spec, body="world", skin=shell())
     mjm = spec.compile()

@@ -263,6 +263,23 @@ def test_same_seed_same_file_and_an_interrupted_run_goes_on(small, tmp_path):
         generate(tmp_path, dataclasses.replace(SMALL, steps=9), workers=0, progress=False)
 
 
+def test_a_set_whose_mesh_changed_is_not_completed(tmp_path):
+    """Or two shapes would stand in it under one name."""
+    import trimesh
+
+    mesh, out = tmp_path / "own.stl", tmp_path / "set"
+    trimesh.creation.icosphere(2, 4e-3).export(mesh)
+    own = dataclasses.replace(
+        SMALL, count=2, labelled=0, steps=8, kinds=("press",), objects=(f"mesh:{mesh}",), batch=1
+    )
+    generate(out, own, workers=0, progress=False)
+    (out / "shard-00001.h5").unlink()
+    assert generate(out, own, workers=0, progress=False).made == 1
+    trimesh.creation.box((4e-3, 4e-3, 8e-3)).export(mesh)
+    with pytest.raises(ValueError, match="other options .files .*own.stl.* there, .*own.stl.* now"):
+        generate(out, own, workers=0, progress=False)
+
+
 @pytest.mark.slow
 def test_worker_processes_give_the_same_whole_set(small, tmp_path):
     out, _ = small

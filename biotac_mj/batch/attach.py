@@ -219,10 +219,13 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     config = one.config(prefix, mesh, geometry)
     core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
     if core < 0:
-        names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
+        names = [mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name]
+        others = [name.removesuffix("core") for name in names if name.endswith("_core")]
         raise ValueError(
-            f"no BioTac {short_repr(prefix)}: add it to the spec with biotac_mj.batch.add; "
-            f"the model's bodies are {names}"
+            f"no BioTac {short_repr(prefix)}: give prefix= one of {', '.join(map(repr, others))}"
+            if others
+            else f"no BioTac {short_repr(prefix)}: add it to the spec with biotac_mj.batch.add; "
+            f"the model's bodies are {', '.join(names)}"
         )
     drawn = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
     if drawn >= 0 and mjm.skin_vertnum[drawn] != len(np.unique(geometry.outer_face)):

@@ -2,6 +2,7 @@
 of worlds."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import pathlib
@@ -252,6 +253,7 @@ def generate(
         "device": options.device.split(":")[0]
     }
     settings = json.loads(json.dumps(settings))
+    settings |= _digests(settings)
     todo = [batch for batch in batches(options) if not made_already(out / batch.path, settings)]
     begin = time.perf_counter()
     if workers is None and ray is not None:
@@ -274,6 +276,19 @@ def generate(
     if todo:
         write_json(out / "generate.json", {**dataclasses.asdict(report), "settings": settings})
     return report
+
+
+def _digests(settings: dict) -> dict:
+    """{"files": {path: first digits of its SHA-256}} of the files that settings name, if there are any: a set
+    whose mesh or material changes between two runs would have two of them under one name."""
+    found, left = {}, list(settings.values())
+    while left:
+        value = left.pop()
+        if isinstance(value, (dict, list)):
+            left += value.values() if isinstance(value, dict) else value
+        elif isinstance(value, str) and (path := pathlib.Path(value.removeprefix("mesh:"))).is_file():
+            found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return {"files": found} if found else {}
 
 
 def made_already(path: pathlib.Path, settings: dict) -> bool:
