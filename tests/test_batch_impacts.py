@@ -67,7 +67,7 @@ class Seen:
 
 
 def in_batch(xml, qpos, qvel, steps, where, readings=False, skin=SKIN, **settings):
-    """A `Seen` of each world, and energies [J] that the skins could give (nstep, nworld)."""
+    """A `Seen` of each world, and energies [J] that the skins could give (nstep, nbody, nworld)."""
     spec = mujoco.MjSpec.from_string(xml)
     batches.add(spec, **where, skin=skin)
     model = spec.compile()
@@ -343,7 +343,7 @@ def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
     qpos = [0, -0.00052, 0.00379, 0.0158, -0.5278, -0.23733, -0.761286, -0.292482]
     qvel = [0, 0, 0, -0.9284, -8.6607, -0.4185, -5.8161]
     (seen,), store = in_batch(scene(thrown, 0.004, 'gravity="0 0 0"', finger), [qpos], [qvel], 8, TIP)
-    has = seen.energy + np.concatenate([[0], store[:, 0]])
+    has = seen.energy + np.concatenate([[0], store[..., 0].sum(1)])
     assert seen.touched > 1 and np.abs(seen.speed[:, 0]).max() * 0.004 > 0.3
     assert np.diff(has).max() < 0.02 * seen.kinetic and seen.growth < 0.05
 

@@ -284,7 +284,7 @@ def test_a_rod_between_three_fingers_stays_there():
     env = RollRod(HAND, num_envs=3, device="cpu")
     draw = torch.Generator().manual_seed(3)
     for _ in range(9):
-        _, _, terminated, _, _ = env.step(0.5 * torch.randn(3, 11, generator=draw))
+        _, _, terminated, _, _ = env.step(0.5 * torch.randn(3, env.num_actions, generator=draw))
         assert not terminated.any()
     speed = env.qvel.abs()
     assert torch.isfinite(speed).all() and speed.max() < 20.0

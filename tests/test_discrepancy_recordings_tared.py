@@ -74,17 +74,6 @@ def test_values_are_put_where_all_of_them_fit():
 
 
 @pytest.mark.slow
-def test_a_sign_is_not_told_where_there_is_none(tmp_path):
-    """An electrode whose answers turn at half of the record is reversed in a tared log, and none in one
-    without a sign."""
-    e, _, rng = pressed(8, 40)
-    x = noisy(e, rng) - e.mean(0).round()
-    x[1330:, 6] *= -1
-    signed, unsigned = diagnose_recording(log(tmp_path, x)), diagnose_recording(log(tmp_path, np.abs(x)))
-    assert ("flip", (6,)) in [(f.id, f.channels) for f in signed.findings]
-    assert "flip" not in [f.id for f in (*unsigned.findings, *unsigned.rejected)]
-
-
 def test_states_are_not_fitted_to_a_rest_that_is_assumed(tmp_path):
     e, _, rng = pressed(8, 40)
     x = noisy(e, rng)
