@@ -244,6 +244,33 @@ def test_the_skin_is_solved_at_the_integrators_poses(integrator, disabled):
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
+@pytest.mark.parametrize("damping", [0, 1e-2])
+def test_bodies_are_where_an_unfinished_solver_sends_them(integrator, damping, monkeypatch):
+    """2 g under 200 g, after one iteration of CG: where the integrator goes by forces, it does not go by the
+    accelerations that the solver has."""
+    joint = f'<joint type="free" damping="{damping}"/>'
+    heavy = ball(0.2, joint, ".002 0 .0375").replace("ball", "heavy")
+    bodies = ball(0.002, joint) + heavy
+    model, data, _ = scene(bodies, 0.004, integrator=integrator)
+    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_CG, 1
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    data.qvel[8] = -0.1
+    seen = []
+
+    def finish(world, after=coupled_world.World._finish):
+        seen.extend(skin.acceleration for skin in world._acting)
+        after(world)
+
+    monkeypatch.setattr(coupled_world.World, "_finish", finish)
+    before = data.qvel.copy()
+    mujoco.mj_step(model, data)
+    real = (data.qvel - before) / model.opt.timestep
+    np.testing.assert_allclose(seen.pop(), real, rtol=1e-8, atol=1e-8 * abs(real).max())
+    if damping or integrator != "Euler":
+        assert abs(data.qacc - real).max() > 0.1 * abs(real).max()  # there was something to get right
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
 def test_only_dampers_take_momentum(integrator):
     """A damped finger hit by a free ball: what both lose is what the joint's dampers take, at the end of each
     step."""

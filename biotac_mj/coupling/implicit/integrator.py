@@ -4,7 +4,10 @@ bodies.
 Euler, implicitfast and implicit treat velocity-dependent forces implicitly, after the solver. They advance
 with a' = (M - h D)^-1 M a, where D is the derivative with respect to the velocities: of joint damping
 (Euler), or of all smooth forces (the other two). Where h D is much larger than M, as with a light object
-on a damped joint, a' is a small part of a."""
+on a damped joint, a' is a small part of a.
+
+They go by the forces that M a should balance, not by a. The two differ where MuJoCo's solver has not
+finished, as with a light body between the skin and a heavy one."""
 
 import ctypes
 
@@ -35,6 +38,7 @@ class Integrator:
     Left out: what Euler takes from the damping of actuators.
 
     Attributes:
+      by_forces: whether bodies are moved by the forces, since the last `take_matrices`.
       inertia: (nM,) M - h D as far as that is symmetric, laid out as MuJoCo's M.
     """
 
@@ -63,13 +67,15 @@ class Integrator:
         """Takes M and D at this step's state, after MuJoCo's actuation stage; returns whether a' differs from
         a."""
         size, h = len(self.dofs), self.model.opt.timestep
-        derivative = np.zeros((size, size))
-        if self.model.opt.integrator in (_FAST, _IMPLICIT):
+        derivative, self._step = np.zeros((size, size)), None
+        self.by_forces = self.model.opt.integrator in (_FAST, _IMPLICIT)
+        if self.by_forces:
             fast = self.model.opt.integrator == _FAST
             derivative = self._derived(data, not fast, fast)
         elif self.model.opt.integrator == _EULER and not self.model.opt.disableflags & (
             _NO_DAMPER | _NO_EULERDAMP
         ):
+            self.by_forces = self.model.dof_damping.any() or self.model.dof_dampingpoly.any()
             speed, high = np.abs(data.qvel[self.dofs]), self.model.dof_dampingpoly[self.dofs]
             damping = self.model.dof_damping[self.dofs] + 2 * high[:, 0] * speed + 3 * high[:, 1] * speed**2
             derivative[np.diag_indices(size)] = -damping
@@ -101,8 +107,15 @@ class Integrator:
     def integrated(self, acceleration: np.ndarray) -> np.ndarray:
         """(..., nv) a' of a (..., nv)."""
         out = acceleration.copy()
-        out[..., self.dofs] = acceleration[..., self.dofs] @ self._step.T
+        if self._step is not None:
+            out[..., self.dofs] = acceleration[..., self.dofs] @ self._step.T
         return out
+
+    def accelerations(self, data: DataView, found: np.ndarray) -> np.ndarray:
+        """(nv,) a', with which MuJoCo will move the bodies; found: a (nv,) of its constraint solver."""
+        if self.by_forces:
+            found = data.moved_by((data.qfrc_smooth + data.qfrc_constraint)[None])[0]
+        return self.integrated(found)
 
     def answer(
         self, acceleration: np.ndarray, springs: Springs, stiffness: np.ndarray, correction: np.ndarray

@@ -367,9 +367,7 @@ class World:
         wrench, tangent = zip(*(skin.equations() for skin in skins))
         self._force(skins, outside, [np.zeros_like(skin.correction) for skin in skins], 0.0)
         jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
-        response = self.data.moved_by(jacobian)
-        if self._damped:
-            response = self.integrator.integrated(response)
+        response = self.integrator.integrated(self.data.moved_by(jacobian))
         squares = np.repeat(np.concatenate([skin.square for skin in skins]), 6)
         compliance = squares[:, None] * (response @ jacobian.T)
         moved = np.concatenate([skin.moved for skin in skins])
@@ -403,22 +401,22 @@ class World:
         if self._damped is None:  # known only after the actuation stage
             self._damped = self.integrator.take_matrices(self.data)
             self._inertia = self.integrator.inertia if self._damped else None
-        if not self._damped:
+        if not self._damped and not self.integrator.by_forces:
             return found, found
         group, touching = self._group, self._group.touching
         group.amiss[:] = 0.0
         if not len(touching):
-            return found, self.integrator.integrated(found)
+            return found, self.integrator.accelerations(self.data, found)
         jacobian, held = group.held(touching)
         correction = group.correction[touching].ravel()
         largest = max(np.abs(_SCALE * s.arrays.wrench0).max(initial=0.0) for s in skins)
         for last in range(MAX_CORRECTIONS, -1, -1):
-            moved = self.integrator.integrated(found)
-            excess = held @ (found - moved)
+            excess = held @ (found - self.integrator.integrated(found))
             wrong = excess - correction
             sizes = (np.abs(_SCALE * w.reshape(-1, 6)).max() for w in (wrong, excess))
             if not (poorly_corrected(*sizes, largest, CORRECTED) and last):
-                group.amiss[touching] = -wrong.reshape(-1, 6)
+                moved = self.integrator.accelerations(self.data, found)
+                group.amiss[touching] = (correction - held @ (found - moved)).reshape(-1, 6)
                 return found, moved
             # what the constraint solver would find if the rows answered to the integrator
             known = self._springs, jacobian.T @ held, correction @ jacobian
