@@ -8,6 +8,7 @@ import pytest
 from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose
+from biotac_mj.discrepancy.trajectories import proof
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
 from biotac_mj.discrepancy.trajectories.proof import _closed, _Off, borne_out, proved
@@ -97,3 +98,15 @@ def test_what_is_left_beyond_resolution_is_not_of_the_base():
     residuals = np.full((5, 2), 10.0), np.full((5, 2), 6.0)
     sides = [(None, [r], _Off(float(((r**2).mean(1) - 1).sum()), 0.0)) for r in residuals]
     assert _closed(comparison, *sides, 0.05, [0]) == pytest.approx(1 - np.sqrt((35 - 3) / (99 - 3)))
+
+
+def test_what_the_amended_sensor_leaves_out_has_no_name(monkeypatch):
+    """Late electrodes of which held-out trajectories are likelier, where a channel group would be further
+    off with them: no finding, no confidence, no decision and no plan to tell them from others."""
+    monkeypatch.setattr(proof, "_worse", lambda comparison, *_: True)
+    data = measured([LATE], n=12)
+    report = diagnose(Springs(), data, effects=[LATE[0], by_id("lowpass")], progress=False)
+    assert not report.effects and not report.apply(Springs()).effects
+    assert report.verdict.startswith("unknown (") and report.significant
+    assert {(e.id, e.confirmed, e.confidence) for e in report.not_named} == {("latency", False, None)}
+    assert not report.beliefs.told_apart and [e.ids for e in report.beliefs.explanations] == [[]]

@@ -40,11 +40,14 @@ class Proof:
 
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
     """Whether held-out trajectories are likelier by `ODDS` with one Fit than with another that has fewer
-    effects, and by as much again for every further effect, as in the search; the skin solved again,
-    parameters as they were fitted. By the one likelihood: what the law of an effect lacks does not contradict
-    it."""
+    effects, and by as much again for every further effect, as in the search; and whether the sensor that is
+    written with it is nearer to them. The skin solved again, parameters as they were fitted. By the one
+    likelihood: what the law of an effect lacks does not contradict it."""
     first, last = (_density(comparison, fit, aside) for fit in (smaller, larger))
-    return bool(last - first > max(len(larger.effects), 1) * np.log(ODDS))
+    if last - first <= max(len(larger.effects), 1) * np.log(ODDS):
+        return False
+    _, begin = _begun(comparison, smaller, aside)
+    return _nearer(comparison, begin, _measured(comparison, larger, aside), aside)
 
 
 def _density(comparison, fit, aside):
@@ -65,27 +68,34 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     Args:
       null, current: Fits without what was found and with it. aside: indices of the trajectories.
     """
-    given = dataclasses.replace(null, effects=[], names=[], nuisance=Nuisance())
-    ends = {id(fit): _measured(comparison, fit, aside) for fit in (given, null)}
-    start = null if not _worse(comparison, ends[id(given)], ends[id(null)], aside) else given
-    before, first, _ = ends[id(start)]
+    start, begin = _begun(comparison, null, aside)
+    before, first, _ = begin
     if current is null:
         return Proof(start, before, before, (first, first), float("nan"))
     after, last, _ = end = _measured(comparison, current, aside)
-    begun, left = ends[id(start)][-1], end[-1]
-    improved = begun.off > 0 and left.off < begun.off
-    if not improved or _worse(comparison, ends[id(start)], end, aside):
+    if not _nearer(comparison, begin, end, aside):
         return Proof(start, before, before, (first, first), 0.0)
     # what effects close by themselves: with all that the base model is found to be off by on both sides
     bare = dataclasses.replace(current, effects=[], names=[])
     sides = (
-        [_compared(comparison, fit, aside) for fit in (bare, current)]
-        if current.effects
-        else [ends[id(start)], end]
+        [_compared(comparison, fit, aside) for fit in (bare, current)] if current.effects else [begin, end]
     )
     errors = current.law_errors if current.effects else np.array([SETTINGS.law])
     law = float(np.sqrt(np.mean(errors**2)))
     return Proof(current, before, after, (first, last), _closed(comparison, *sides, law, aside))
+
+
+def _begun(comparison, fit, aside):
+    """The Fit, or the model as it was given where the Fit is worse, and what `_measured` says of it."""
+    given = dataclasses.replace(fit, effects=[], names=[], nuisance=Nuisance())
+    ends = [_measured(comparison, one, aside) for one in (given, fit)]
+    return (given, ends[0]) if _worse(comparison, *ends, aside) else (fit, ends[1])
+
+
+def _nearer(comparison, before, after, aside) -> bool:
+    """Whether a model is nearer to held-out trajectories, and in no group of channels further off."""
+    begun, left = before[-1].off, after[-1].off
+    return begun > 0 and left < begun and not _worse(comparison, before, after, aside)
 
 
 def _measured(comparison, fit, rows):

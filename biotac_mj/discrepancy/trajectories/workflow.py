@@ -255,14 +255,19 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     _tie_aliases(current, found, names)
     fitted = current
     current, found, refuted = _upheld(comparison, null, current, found, search, chosen, aside)
+    if refuted:  # what held-out trajectories refute explains nothing that another experiment could tell
+        gone = {one.effect.id for one in refuted}
+        some = {ids: fit for ids, fit in search.fits.items() if not ids & gone}
+        search.fits = {k: fit for k, fit in some.items() if not k or borne_out(comparison, null, fit, aside)}
     named = not _wrong(comparison, current)
     # Another modulus has a name where it is all that is left: else it may be a part of what is not known.
     modulus, without = other_modulus(comparison, current, chosen) if named else (None, None)
     if modulus and not found:
         null = without
-    seen = found or modulus or _wrong(comparison, null)
-    # what has no name is not written either
+    # what has no name is not written, and what is not written has no name
     proof = proved(comparison, null, current if found or modulus else null, aside)
+    modulus = modulus if proof.fit is current else None
+    seen = found or modulus or _wrong(comparison, null)
     alike = [names[name] for one in found for name in one.ties if name in names]
     doubts = [f"{', '.join(alike)} may be as good"] if alike else []
     if not named:
@@ -306,7 +311,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         verdict=verdict,
         significant=bool(seen or stray),
         effects=effects,
-        not_named=[_described(item, fitted, _sure(beliefs, item), names, False) for item in refuted],
+        not_named=[_described(item, fitted, None, names, False) for item in refuted],
         gap=gaps,
         aside=f"{len(aside)} trajectories that took no part in the search, errors of their poses taken out",
         closed=proof.closed,
@@ -327,7 +332,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         notes=notes,
         next_experiment=f"{beliefs.text}; {next_experiment(effects, table, more, comparison.sim.tier)}",
         next_command="" if beliefs.decided else "biotac next REPORT --budget 20 --out plan.csv",
-        amended=_amended(added, [one.effect.name for one in found]),
+        amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
             "isolability": table,
             "mean_square": {
@@ -352,16 +357,6 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         beliefs=beliefs,
         trace=trace,
     )
-
-
-def _amended(added, named):
-    """Lines on what sensor_amended.yaml has of effects that are named."""
-    left = [name for name in named if name not in added]
-    out = [f"sensor_amended.yaml has {', '.join(added)}"] if added else []
-    if left:
-        why = "with it some channels would be further off"
-        out.append(f"sensor_amended.yaml is without {', '.join(left)}: {why}")
-    return out
 
 
 def _gaps(comparison, proof):

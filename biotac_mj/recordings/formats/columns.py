@@ -235,6 +235,11 @@ def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
     table = read_table(path, f"{len(names)} columns of numbers, {range_}")
     header = [name.lower() for name in table.names or ()]
     missing = [name for name in names if name.lower() not in header]
+    if not missing and table.width != len(header):
+        raise ValueError(
+            f"{path}, line {table.lines[0]}: {table.width} columns, and the header names {len(header)}: "
+            "give each row a number for every name"
+        )
     if not missing:
         return table.numbers([header.index(name.lower()) for name in names], list(names))
     if header and len(missing) < len(names):
