@@ -82,7 +82,7 @@ def test_bad_tables_are_named(tmp_path, text, message):
         read_columns(path, NAMES)
 
 
-def test_rows_shorter_than_a_header_of_the_asked_names_are_refused(tmp_path):
+def test_rows_shorter_than_their_header_are_refused(tmp_path):
     path = tmp_path / "electrodes.csv"
     path.write_text("x,y,z\n1,2\n")
     with pytest.raises(ValueError, match="line 2: 2 columns, and the header names 3: give each row"):
