@@ -10,6 +10,7 @@ import biotac_mj
 BODY = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><site name="mount" quat="1 -1 0 0"/>
 <body name="body"><freejoint/><geom name="body" type="{shape}" mass=".02"/></body></worldbody></mujoco>"""
 BALL, BOX = 'sphere" size=".005', 'box" size=".004 .004 .005'
+CYLINDER = 'cylinder" size=".005 .005'
 INTO = (-0.009, 0.0, 0.0126), (0.0, 0.0, 0.0)  # a position [m] in the skin, at rest
 OVER = (-0.009, 0.0, 0.0137), (0.3, 0.0, -0.3)  # a position just above it, and a velocity [m/s]
 # from the side, from above, from a few millimetres away, from half a metre away, and from a place where it
@@ -131,3 +132,42 @@ def test_in_a_batch_who_is_put_somewhere_did_not_slide_there(tier):
             fresh, jumped = forces
             assert np.linalg.norm(fresh[0, :3]) > 0.05
             np.testing.assert_allclose(jumped, fresh, atol=2e-3 * np.abs(fresh).max())
+
+
+@pytest.mark.parametrize(
+    "tier, depth, bound",
+    [
+        ("condensed", 0.001, 1e-4),
+        ("condensed", 0.002, 1e-4),
+        pytest.param("full", 0.001, 1e-3, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize(
+    "shape, x, y, quat",
+    [(BOX, -0.01, 0.0, (1.0, 0.0, 0.0, 0.0)), (CYLINDER, -0.007, 0.003, (1.0, 0.2, 0.3, 0.0))],
+)
+def test_in_a_batch_who_begins_in_the_skin_begins_as_in_one(shape, x, y, quat, tier, depth, bound):
+    """bound: of the condensed tier far below what another start changes, 3 to 10 %; in the full tier it is
+    what the two solves' tolerance leaves."""
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    settings = dict(tier=tier, readings=False)
+    pose = [x, y, 0.0135 - depth, *quat]
+    model, handle = scene(shape, biotac_mj.attach, **settings)
+    data = mujoco.MjData(model)
+    data.qpos[:] = pose
+    mjm, _ = scene(shape, batch.add)
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=1)
+        hand = batch.attach(mjm, m, d, skin="coarse", **settings)
+        d.qpos.assign(np.array([pose], np.float32))
+        forces = []
+        for _ in range(2):
+            mujoco.mj_step(model, data)
+            mjw.step(m, d)
+            assert handle.read(data, "status")[0] == 1
+            forces.append((-handle.read(data, "contact_force"), hand.wrench[0, 0]))
+    one, many = np.swapaxes(forces, 0, 1)
+    assert np.abs(one).max() > 0.5
+    np.testing.assert_allclose(many[:, :3], one[:, :3], atol=bound * np.abs(one).max())

@@ -30,9 +30,10 @@ from ..sensor.vibration import read_texture
 from ..short_repr import short_repr
 from ..skin import liquid, transfer
 from ..skin.condensed import step as condensed_step
-from ..skin.contact import meshes
+from ..skin.contact import meshes, outside
 from ..skin.contact.penetration import rest_gap
 from ..skin.geoms import shapes_of
+from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_room
 from ..skin.program import compile_ahead, finish_compiling
 from ..skin.rubber.material import Material
@@ -239,7 +240,7 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     touching.warn()  # not once a model: another may have been where this one is
     of_tier = condensed_step.kernels_for_cuda if config.tier == "condensed" else kernels_for_cuda
     first = of_tier(shapes_of([geom.type for geom in touching.geoms]))
-    compile_ahead(device, [*first, *of_engine, *((module, 256) for module in _KERNELS)])
+    compile_ahead(device, [*first, *of_engine, (outside, BLOCK), *((module, 256) for module in _KERNELS)])
     rubber, skin_options, modulus = skin_settings(config)
     differ = worlds or {}
     room = make_room(skin_options, modulus, differ, len(geometry.elem))

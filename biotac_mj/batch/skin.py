@@ -12,6 +12,7 @@ from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel
 from ..skin.condensed import CondensedStep, LinearSkin
+from ..skin.contact.outside import leave_skin
 from ..skin.contact.touch import SKINS
 from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_worlds
@@ -188,9 +189,10 @@ class BatchSkin:
         self._come_from_outside(where)
 
     def _come_from_outside(self, where):
-        surface = [where, self.model.outer.face, self.model.sample, self.data.rest_vert]
+        geoms = self.geoms.struct
+        known = [where, self.model.outer.face, self.model.sample, self.data.rest_vert, geoms]
         blocks = dict(dim=self.pos.shape, block_dim=BLOCK, device=self.model.device)
-        wp.launch_tiled(kernels.come_from_outside, inputs=surface, outputs=[self.geoms.struct], **blocks)
+        wp.launch_tiled(leave_skin, inputs=known, outputs=[geoms.pos_last, geoms.mat_last], **blocks)
 
     def end_solve(self) -> None:
         """The last part of a solve: wrenches, tangents, pressures. Without loops or branches in the condensed

@@ -71,8 +71,7 @@ class CondensedStepper(FemStepper):
             released = geom_pos, geom_mat
             if bodies is not None:  # where the bodies go without the skin
                 released = bodies.without(np.array([g.group for g in self._geoms], int), *released)
-            if self._overlaps(*released):  # as those of the full tier do
-                memory = self._skin.outside(*released)
+            memory = self._skin.outside(*released)  # as those of the full tier do
         out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies)
         new = np.zeros_like(state)
         self._layout.write(out.memory, new)

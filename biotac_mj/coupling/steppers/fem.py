@@ -148,8 +148,8 @@ class FemStepper:
         if self.inertial and not self._part(state, "started")[0]:
             return state  # the skin begins with the core's motion, geoms where they go
         saved, (pos, mat) = self._layout.read(state), (a.copy() for a in self.came_to(state))
-        if not self._model.device.is_cuda and self._overlaps(geom_pos, geom_mat):
-            geom_pos = self._proximity.outside(geom_pos, geom_mat, self._reach)
+        if not self._model.device.is_cuda:
+            geom_pos = self._proximity.outside(geom_pos, geom_mat)
         pos[placed], mat[placed] = geom_pos[placed], geom_mat[placed]
         stays = ~placed[saved.contacts[:, 1].astype(int)]
         out = state.copy()
@@ -358,11 +358,7 @@ class FemStepper:
             if _travel(*last, geom_pos, geom_mat) < _SHORT:
                 return last
             return self._proximity.last_clear(*last, geom_pos, geom_mat, self._reach)
-        return self._proximity.outside(geom_pos, geom_mat, self._reach), geom_mat
-
-    def _overlaps(self, geom_pos, geom_mat):
-        near = not self._proximity.clear(geom_pos, geom_mat, self._reach)
-        return near and self._proximity.overlaps(geom_pos, geom_mat)
+        return self._proximity.outside(geom_pos, geom_mat), geom_mat
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:

@@ -14,9 +14,10 @@ import warp as wp
 from ...geometry.rigid import displace, displacement
 from ...launches import recorded
 from ..geoms import GeomSet
-from ..types import real, vec3
+from ..types import mat33, real, vec3
 from .broadphase import ALL, geoms_within, sample_clearance
 from .meshes import TRILINEAR
+from .outside import leave_skin
 from .penetration import core_clearance
 from .posed import Geoms
 from .touch import SOLIDS
@@ -166,6 +167,11 @@ class ProximityQuery:
         if model.has_core and geoms.count:
             inputs = [model.core_vert, model.core(1).struct, geoms.struct]
             self._measure_core = recorded(_measure_core, geoms.count, inputs, [core])
+        if geoms.count:
+            left, turned = zeros((ngeom, 1), vec3)[0], zeros((ngeom, 1), mat33)[0]
+            self._left = left.numpy()[:, 0]
+            known = [wp.ones(1, dtype=int, device="cpu"), model.outer.face, model.sample, x, geoms.struct]
+            self._launch_leave_skin = recorded(leave_skin, (ngeom, 1), known, [left, turned], tiled=True)
         self._regions = _Regions(geoms.count, center, radius)
         # of a mesh it is the distance here and a lower bound there
         spacing = geoms.struct.grids.spacing.numpy() if geoms.shapes != SOLIDS else np.zeros(1)
@@ -191,17 +197,6 @@ class ProximityQuery:
                 return True
         return not len(self.faces(margin, pos, mat)) and not self.deep(pos, mat)
 
-    def overlaps(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether geoms at these poses, which are not `clear`, contain a sample of the undeformed skin or are
-        `deep`. Evaluated without the windows around edges, which the bounds of distances include."""
-        self.pose(pos, mat)
-        self._region(0.0, pos, mat)
-        window = self._geoms.struct.window.numpy()
-        saved, window[:] = window.copy(), 0.0
-        inside = len(self.faces(0.0, pos, mat)) > 0
-        window[:] = saved
-        return inside or self.deep(pos, mat)
-
     def last_clear(
         self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray, margin: float
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -215,36 +210,43 @@ class ProximityQuery:
             low, high = (middle, high) if clear else (low, middle)
         return displace(pos0, mat0, low * path)
 
-    def outside(self, pos: np.ndarray, mat: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def outside(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Positions (ngeom, 3) [m] of the geoms after each is moved out of the undeformed skin, along the
-        mean normal of the faces that it touches."""
-        return self._out(pos, mat, lambda at: self.clear(at, mat, margin), _NARROW, margin)
+        mean normal of the faces that it touches (`outside.leave_skin`); of one in the core that touches none,
+        after it is made `shallow`."""
+        if self.clear(pos, mat, 0.0):
+            return pos
+        out = self._leave_skin(pos, mat)
+        self.pose(out, mat)
+        return self._leave_skin(self.shallow(out, mat), mat) if self.deep(out, mat) else out
+
+    def _leave_skin(self, pos, mat):
+        self.pose(pos, mat)
+        self._left[...] = np.nan
+        self._launch_leave_skin()
+        return self._left.copy()
 
     def shallow(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Positions (ngeom, 3) [m] of the geoms. Each one that is too `deep` in the core is moved out, along
-        the mean normal of the undeformed faces that it touches, until a skin fits between."""
-        return self._out(pos, mat, lambda at: not self.deep(at, mat), _CORE)
-
-    def _out(self, pos, mat, free, narrow, margin=0.0):
-        """Positions (ngeom, 3) to which each geom is moved until it is free, the others far away; accurate to
-        `narrow` [m]."""
+        the mean normal of the undeformed faces that it touches, until a skin fits between; accurate to 1
+        um."""
         out = pos.copy()
         for g in range(len(pos)):
-            single = np.full_like(pos, 2 * _FAR)
+            single = np.full_like(pos, 2 * _FAR)  # the others far away
 
             def is_free(distance, g=g, single=single, normal=0.0):
                 single[g] = pos[g] + distance * normal
                 self.pose(single, mat)
-                return free(single)
+                return not self.deep(single, mat)
 
             if is_free(0.0):
                 continue
-            normal = self._outward(pos[g], self.faces(margin, single, mat))
-            high = narrow
+            normal = self._outward(pos[g], self.faces(0.0, single, mat))
+            high = _CORE
             while high < _FAR and not is_free(high, normal=normal):
                 high *= 2
             low = high / 2
-            while high - low > narrow:
+            while high - low > _CORE:
                 middle = (low + high) / 2
                 low, high = (low, middle) if is_free(middle, normal=normal) else (middle, high)
             out[g] = pos[g] + high * normal
