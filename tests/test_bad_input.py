@@ -878,6 +878,7 @@ def numbers():
     yield Row("view press.h5", "nothing takes press.h5")
     yield Row("generate", "no verb generate: it is `biotac data generate`")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
+    yield Row("play roll_rod --render out.png", "out.png does not end in .gif")
     yield Row("diagnose", "nothing to diagnose")
     for data in ("set", "shard.h5"):
         yield Row(f"diagnose {data} --object abc", f"{data} says itself what touched: leave --object out")

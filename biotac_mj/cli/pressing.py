@@ -246,7 +246,9 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--episodes", type=whole(1, 100000), help="of a task: score so many, show nothing")
     verb.add_argument("--json", action="store_true", help="with --episodes: scores as JSON, with the card")
-    verb.add_argument("--render", type=output_file(), metavar="GIF", help="of a task: draw one episode")
+    verb.add_argument(
+        "--render", type=output_file(".gif"), metavar="FILE.gif", help="of a task: draw one episode"
+    )
     verb.add_argument("--window", action="store_true", help="of a task: MuJoCo's viewer in place of the page")
 
 
