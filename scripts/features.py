@@ -366,7 +366,7 @@ _NEIGHBOURS = (
     ("MJX, Brax, MuJoCo Playground (JAX)", "`mjx.put_model`, `make_data`, `step`, `forward` and `readings`: "
      "the batch inside `mujoco_warp.step`, two-way, as one call of JAX's; jit, scan and vmap; gradients are "
      "refused by name; settings are the same in all worlds, but for the seed",
-     "JAX 0.9 and 0.10, Brax 0.14 on a CPU; on a GPU not at all"),
+     "JAX 0.9 and 0.10, Brax 0.14 on a CPU; on an H200 in part"),
     ("Isaac Lab", "`neighbours.isaaclab.BioTacSensor` with the methods of its `SensorBase`, no subclass: "
      "`batch.make` beside its physics, told poses, forces handed back explicitly, one step late; put into "
      "`scene.sensors`", "a double of its calls on the CPU, not in Isaac Lab"),
