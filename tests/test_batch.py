@@ -735,8 +735,11 @@ def test_errors_say_what_to_do():
     ):
         attach(spec.compile())
     batches.add(spec, body="world", skin=shell())
-    with pytest.raises(ValueError, match="no BioTac 'left_': give prefix= one of 'biotac_'"):
-        attach(spec.copy().compile(), prefix="left_")
+    two = ball_spec()
+    for prefix in ("thumb", "index_"):
+        batches.add(two, body="world", skin=shell(), prefix=prefix)
+    with pytest.raises(ValueError, match="no BioTac 'left_': give prefix= one of 'thumb', 'index_'"):
+        attach(two.compile(), prefix="left_")
     with pytest.raises(ValueError, match="prefix 'biotac_' is taken"):
         batches.add(spec, body="world", skin=shell())
     mjm = spec.compile()

@@ -221,7 +221,7 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
     if core < 0:
         names = [mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name]
-        others = [name.removesuffix("core") for name in names if name.endswith("_core")]
+        others = [name.removesuffix("core") for name in names if name.endswith("core")]
         raise ValueError(
             f"no BioTac {short_repr(prefix)}: give prefix= one of {', '.join(map(repr, others))}"
             if others
