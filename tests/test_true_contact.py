@@ -277,12 +277,13 @@ def test_in_a_batch_contact_sensors_feel_the_skin(cone):
         check_contacts(read.get, external[-1])  # the plate's
 
 
-def on_a_static_link():
-    """MJCF of a ball that rests on a BioTac whose link, and the stand below it, do not move."""
-    link = '<body name="stand"><body name="link"><site name="mount" quat="1 -1 0 0"/>'
+def on_a_static_link(turn=-1, height=0.0134):
+    """MJCF of a ball that comes to rest on a BioTac whose link, and the stand below it, do not move: on its
+    pad, or with turn 1 on its nail."""
+    link = f'<body name="stand"><body name="link"><site name="mount" quat="1 {turn} 0 0"/>'
     link += '<site name="around" size=".04"/></body><site name="below" size=".04"/></body>'
     beside = '<body name="beside"><site name="beside" size=".04"/></body>'
-    ball = '<body pos="-.009 0 .0134"><joint type="slide" axis="0 0 1" damping="4"/>'
+    ball = f'<body pos="-.009 0 {height}"><joint type="slide" axis="0 0 1" damping="4"/>'
     ball += '<geom size=".005" mass=".1"/>'
     touch = "".join(f'<touch name="{name}" site="{name}"/>' for name in ("around", "below", "beside"))
     return (
@@ -291,8 +292,12 @@ def on_a_static_link():
     )
 
 
-def test_touch_at_a_static_link_feels_the_skin():
-    spec = mujoco.MjSpec.from_string(on_a_static_link())
+ON_A_LINK = pytest.mark.parametrize("place", [(-1, 0.0134), (1, 0.025)], ids=["pad", "nail"])
+
+
+@ON_A_LINK
+def test_touch_at_a_static_link_feels_its_biotac(place):
+    spec = mujoco.MjSpec.from_string(on_a_static_link(*place))
     biotac_mj.attach(spec, site="mount", tier="condensed", skin="coarse", readings=False)
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -301,8 +306,9 @@ def test_touch_at_a_static_link_feels_the_skin():
         assert data.sensor(name).data[0] == pytest.approx(expected, rel=1e-2)
 
 
-def test_in_a_batch_touch_at_a_static_link_feels_the_skin():
-    d, _ = batch_of(on_a_static_link(), 200)
+@ON_A_LINK
+def test_in_a_batch_touch_at_a_static_link_feels_its_biotac(place):
+    d, _ = batch_of(on_a_static_link(*place), 200)
     read = d.sensordata.numpy()[:, :3]  # before those of the BioTac
     np.testing.assert_allclose(read, np.tile([WEIGHT, WEIGHT, 0.0], (2, 1)), rtol=1e-2)
 

@@ -338,17 +338,6 @@ class Batch(Skins):
         samples += [outer.sample_force, skin.x, self._acting]
         self._launch(loads.find_touches, self.groups, samples, [*self._touches])
 
-    def add_touch(self, m: "mjw.Model", d: "mjw.Data", sensor: wp.array, is_core: wp.array) -> None:
-        """Adds its touches to the touch sensors of these numbers; is_core: (nbody,) 1 of BioTacs' bodies."""
-        from . import loads
-
-        sensors = [sensor, m.sensor_objid, m.sensor_adr, m.sensor_cutoff]
-        sensors += [m.body_weldid, m.body_rootid, m.geom_bodyid, m.site_bodyid]
-        sites = [m.site_type, m.site_size, d.site_xpos, d.site_xmat, d.xpos, d.xmat]
-        pos, normal, _, wrench = self._touches
-        known = [self._core, is_core, self._geom, *sensors, *sites, pos, normal, wrench]
-        self._launch(loads.add_touch, (len(sensor), self.nworld), known, [d.sensordata])
-
     def list_touches(self, m: "mjw.Model", d: "mjw.Data", row: int, listed: list) -> None:
         """Adds its touches to the contacts, with rows from `row` on, and clears its own rows."""
         from mujoco_warp import ConeType

@@ -8,10 +8,9 @@ import typing
 import mujoco
 import numpy as np
 import warp as wp
-from mujoco_warp._src.ray import ray_geom
 from mujoco_warp._src.types import ContactType, vec5
 
-from ..coupling.loads import PYRAMID
+from ..coupling.loads import PYRAMID, passes
 from ..skin.types import double, real, vec3, vec6, widen
 
 if typing.TYPE_CHECKING:
@@ -114,67 +113,11 @@ def find_touches(
                 wrench_out[k, w][i + 3] = share * turn[i]
 
 
-@wp.func
-def feels(
-    body: int,
-    other: int,
-    is_core: wp.array(dtype=int),
-    body_weldid: wp.array(dtype=int),
-    body_rootid: wp.array(dtype=int),
-):
-    """Whether a site on `body` feels a touch of `other`: itself, or a BioTac's core that is welded to it."""
-    welded = body_weldid[body] == body_weldid[other] and body_rootid[body] == body_rootid[other]
-    return body == other or (is_core[other] == 1 and welded)
-
-
 @wp.kernel
-def add_touch(
-    # In:
-    core: int,
-    is_core: wp.array(dtype=int),
-    geom: wp.array(dtype=int),
-    sensor: wp.array(dtype=int),
-    sensor_objid: wp.array(dtype=int),
-    sensor_adr: wp.array(dtype=int),
-    sensor_cutoff: wp.array(dtype=float),
-    body_weldid: wp.array(dtype=int),
-    body_rootid: wp.array(dtype=int),
-    geom_bodyid: wp.array(dtype=int),
-    site_bodyid: wp.array(dtype=int),
-    site_type: wp.array(dtype=int),
-    site_size: wp.array(dtype=wp.vec3),
-    site_xpos: wp.array2d(dtype=wp.vec3),
-    site_xmat: wp.array2d(dtype=wp.mat33),
-    xpos: wp.array2d(dtype=wp.vec3),
-    xmat: wp.array2d(dtype=wp.mat33),
-    pos: wp.array2d(dtype=vec3),
-    normal: wp.array2d(dtype=vec3),
-    wrench: wp.array2d(dtype=vec6),
-    # In and out:
-    sensordata: wp.array2d(dtype=float),
-):
-    """Adds the touches whose ray out of the sensor's body meets its site."""
-    i, w = wp.tid()
-    s = sensor[i]
-    site = sensor_objid[s]
-    b = site_bodyid[site]
-    turn = widen(xmat[w, core])
-    for k in range(geom.shape[0]):
-        sign = real(0.0)
-        if feels(b, geom_bodyid[geom[k]], is_core, body_weldid, body_rootid):
-            sign = real(-1.0)
-        elif feels(b, core, is_core, body_weldid, body_rootid):
-            sign = real(1.0)
-        push = wp.dot(wp.spatial_top(wrench[k, w]), normal[k, w])
-        if sign != real(0.0) and push > real(0.0):
-            at = wp.vec3(turn * pos[k, w] + double(xpos[w, core]))
-            ray = wp.vec3(sign * (turn * normal[k, w]))
-            frame = site_xmat[w, site]
-            away, _normal = ray_geom(site_xpos[w, site], frame, site_size[site], at, ray, site_type[site])
-            if away >= 0.0:
-                sensordata[w, sensor_adr[s]] = sensordata[w, sensor_adr[s]] + float(push)
-    if sensor_cutoff[s] > 0.0:
-        sensordata[w, sensor_adr[s]] = wp.min(sensordata[w, sensor_adr[s]], sensor_cutoff[s])
+def clear_sums(address: wp.array(dtype=int), sensordata_out: wp.array2d(dtype=float)):
+    """Clears the touch sensors, to which mujoco_warp adds."""
+    w, i = wp.tid()
+    sensordata_out[w, address[i]] = 0.0
 
 
 @wp.struct
@@ -284,23 +227,14 @@ class Loads:
     delay lack the skins."""
 
     def __init__(self, m: "mjw.Model", d: "mjw.Data", batches: list):
-        kind, late = m.sensor_type.numpy(), m.sensor_delay.numpy().max(axis=0, initial=0.0) > 0.0
-
-        def those(*kinds):
-            return wp.array(np.flatnonzero(np.isin(kind, kinds) & ~late).astype(np.int32), dtype=int)
-
+        kind, adr = m.sensor_type.numpy(), m.sensor_adr.numpy()
+        found = passes(m, [batch._core for batch in batches])
+        sums = [adr[i] for sensors, _ in found for i in sensors if kind[i] == _TOUCH]
+        self._forces = bool(m.opt.run_rne_postconstraint or m.sensor_rne_postconstraint)
+        self._lists = self._forces or bool(found)
         with wp.ScopedDevice(d.qpos.device):
-            self._touch, none = those(_TOUCH), those()
-            cores = np.zeros(m.nbody, np.int32)
-            cores[[batch._core for batch in batches]] = 1
-            self._is_core = wp.array(cores, dtype=int)
-            self._again = again = copy.copy(m)  # with those sensors alone which feel what is listed
-            again.callback = type(m.callback)()
-            again.sensor_acc_adr, again.sensor_contact_acc_adr = those(_FORCE, _TORQUE), those(_CONTACT)
-            again.sensor_touch_adr = again.sensor_tendonactfrc_adr = again.sensor_limitfrc_adr = none
-            again.sensor_stage_acc_adr = none
-            self._forces = bool(m.opt.run_rne_postconstraint or m.sensor_rne_postconstraint)
-            self._lists = self._forces or bool(len(again.sensor_contact_acc_adr))
+            self._sums = wp.array(np.array(sums, np.int32), dtype=int)
+            self._again = [_with_sensors(m, *one) for one in found]
             if self._lists:
                 self._prepare_contacts(d, batches)
 
@@ -324,29 +258,46 @@ class Loads:
         self._data.naconmax, self._data.njmax = room, rows
 
     def write(self, m: "mjw.Model", d: "mjw.Data", batches: list) -> None:
-        """Writes them, when each `Batch` has found what acts; of those that move bodies. Launches only."""
-        if len(self._touch) or self._lists:
-            for batch in batches:
-                batch.find_touches()
-        if len(self._touch):
-            for batch in batches:
-                batch.add_touch(m, d, self._touch, self._is_core)
-        if self._lists:
-            self._write_again(m, d, batches)
-
-    def _write_again(self, m, d, batches):
-        """Runs mujoco_warp's own functions on its contacts and those of the skins."""
-        from mujoco_warp._src.sensor import sensor_acc
+        """Writes them, when each `Batch` has found what acts; of those that move bodies: by mujoco_warp's own
+        functions on its contacts and those of the skins. Launches only."""
+        from mujoco_warp._src import sensor
         from mujoco_warp._src.smooth import rne_postconstraint
 
+        if not self._lists:
+            return
         listed, device = [self._listed, self._data.nacon], d.qpos.device
         wp.launch(copy_contacts, d.naconmax, [self._mujocos, d.nacon], listed, device=device)
         for name in ("force", "type", "id"):
             wp.copy(getattr(self._data.efc, name)[:, : d.njmax], getattr(d.efc, name))
         row = d.njmax
         for batch in batches:
+            batch.find_touches()
             batch.list_touches(m, d, row, [*listed, self._data.efc.force])
             row += _PYRAMID * batch.ngeom
         if self._forces:
             rne_postconstraint(m, self._data)
-        sensor_acc(self._again, self._data, skip_rne_postconstraint=True)
+        sums = d.nworld, len(self._sums)
+        wp.launch(clear_sums, sums, [self._sums], [d.sensordata], device=device)
+        for again in self._again:
+            sensor.sensor_acc(again, self._data, skip_rne_postconstraint=True)
+            wp.launch(  # mujoco_warp cuts tendons' sums alone
+                sensor._tendon_actuator_force_cutoff,
+                (d.nworld, again.sensor_touch_adr.size),
+                [m.sensor_type, m.sensor_datatype, m.sensor_adr, m.sensor_cutoff, again.sensor_touch_adr],
+                [d.sensordata, d.sensordata],
+                device=device,
+            )
+
+
+def _with_sensors(m, chosen, body):
+    """The Model with these sensors of force alone, and with geoms on these bodies."""
+    again, kind = copy.copy(m), m.sensor_type.numpy()[chosen]
+
+    def those(*kinds):
+        return wp.array(chosen[np.isin(kind, kinds)].astype(np.int32), dtype=int)
+
+    again.callback, again.geom_bodyid = type(m.callback)(), wp.array(body.astype(np.int32), dtype=int)
+    again.sensor_acc_adr, again.sensor_contact_acc_adr = those(_FORCE, _TORQUE), those(_CONTACT)
+    again.sensor_touch_adr, none = those(_TOUCH), those()
+    again.sensor_tendonactfrc_adr = again.sensor_limitfrc_adr = again.sensor_stage_acc_adr = none
+    return again

@@ -10,7 +10,8 @@ The rows of a skin lie where MuJoCo expects those of welds: what they push is le
 here."""
 
 import ctypes
-from typing import NamedTuple
+from collections.abc import Collection
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,12 +19,11 @@ import numpy as np
 from .solid_contacts import CONTACT, contact_frame
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
-__all__ = ["PYRAMID", "Loads", "core_geom"]
+__all__ = ["PYRAMID", "Loads", "core_geom", "passes"]
 
 LIBRARY.mj_rnePostConstraint.argtypes = LIBRARY.mj_sensorAcc.argtypes = (ctypes.c_void_p,) * 2
-_FORCE, _TORQUE, _TOUCH, _CONTACT = (
-    int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH", "CONTACT")
-)
+_SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "CONTACT", "TOUCH")]
+_CONTACT, _TOUCH = _SENSORS[2:]
 _ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
 _PYRAMIDAL = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
 PYRAMID = 10  # edges of a contact's friction pyramid with six components
@@ -47,24 +47,24 @@ class Loads:
 
     def __init__(self, model: ModelView, data: DataView, coupled: list):
         self.model, self.data, self.coupled = model, data, coupled
-        kind, now = model.sensor_type, ~(model.sensor_delay > 0.0)
-        self._again, self._arrays = _with_sensors(
-            model, np.flatnonzero(now & np.isin(kind, (_FORCE, _TORQUE, _CONTACT)))
-        )
-        self._touch_sensors = np.flatnonzero(now & (kind == _TOUCH)).tolist()
+        self._core_geom = {t.touching.core: core_geom(model, t.touching.core) for t in coupled}
+        found = passes(model, list(self._core_geom))
+        self._again = [_with_sensors(model, *one) for one in found]
         # others feel what a body gets, whatever the places are at which it gets it
-        self._by_place = bool((now & np.isin(kind, (_TOUCH, _CONTACT))).any())
+        kinds = {kind for sensors, _ in found for kind in model.sensor_type[sensors].tolist()}
+        self._by_place = not kinds.isdisjoint((_TOUCH, _CONTACT))
+        # sites that feel MuJoCo's contacts with a BioTac, whether its skin is touched or not
+        self._welded = any((body != model.geom_bodyid).any() for _, body in found)
         self._touch = np.zeros((), CONTACT)  # what all touches have in common
         self._touch["friction"], self._touch["dim"] = 1.0, 6
         for name in ("flex", "elem", "vert"):
             self._touch[name] = -1
-        self._core_geom = {t.touching.core: core_geom(model, t.touching.core) for t in coupled}
 
     def write(self, acting: dict) -> None:
         """Writes cfrc_ext, cfrc_int and the sensors. acting: {instance: wrenches (ngroup, 6) that its bodies
         get}, in the BioTac's frame."""
         touches = [t for instance, wrench in acting.items() for t in self._touches(instance, wrench)]
-        if not touches:
+        if not touches and not self._welded:
             return
         data = self.data.struct
         kept = data.contact, data.ncon, data.efc_force
@@ -73,13 +73,11 @@ class Loads:
         data.efc_force = force.ctypes.data
         try:
             LIBRARY.mj_rnePostConstraint(self.model.address, self.data.address)
-            if self._again.nsensor:
-                self._again.opt = self.model.struct.opt
-                LIBRARY.mj_sensorAcc(ctypes.addressof(self._again), self.data.address)
+            for again, _ in self._again:
+                again.opt = self.model.struct.opt
+                LIBRARY.mj_sensorAcc(ctypes.addressof(again), self.data.address)
         finally:
             data.contact, data.ncon, data.efc_force = kept
-        for i in self._touch_sensors:
-            self._add_touch(i, touches)
 
     def _touches(self, instance, wrench):
         core = instance.touching.core
@@ -111,30 +109,6 @@ class Loads:
             force[row : row + len(value)] = value
         return contact, force
 
-    def _add_touch(self, sensor, touches):
-        """Adds the touches whose ray out of the sensor's body meets the site, as MuJoCo does with its own.
-        What a BioTac is welded to is one with it, but for the world."""
-        model, data, site = self.model, self.data, int(self.model.sensor_objid[sensor])
-        body, weld, root = int(model.site_bodyid[site]), model.body_weldid, model.body_rootid
-        adr, cutoff = int(model.sensor_adr[sensor]), model.sensor_cutoff[sensor]
-
-        def feels(other):
-            one = other in self._core_geom and weld[body] == weld[other] and root[body] == root[other]
-            return body == other or one
-
-        for t in touches:
-            if feels(int(model.geom_bodyid[t.geom])):
-                ray = -t.normal
-            elif feels(t.core):
-                ray = t.normal
-            else:
-                continue
-            zone = data.site_xpos[site], data.site_xmat[site], model.site_size[site]
-            if mujoco.mju_rayGeom(*zone, t.pos, ray, int(model.site_type[site]), None) >= 0.0:
-                data.sensordata[adr] += max(float(t.force @ t.normal), 0.0)
-        if cutoff > 0.0:
-            data.sensordata[adr] = min(data.sensordata[adr], cutoff)
-
 
 def core_geom(model: ModelView, core: int) -> int:
     """Number of the geom that stands for the skin of BioTac `core`: the one that has the body's name."""
@@ -142,11 +116,39 @@ def core_geom(model: ModelView, core: int) -> int:
     return next((g for g in mine if model.name("geom", g) == name), mine[0])
 
 
-def _with_sensors(model, chosen):
-    """The model as it is, but with these sensors alone, which MuJoCo computes at its last stage."""
+def passes(model: Any, cores: Collection[int]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Passes in which MuJoCo's functions compute its sensors of force, those with a delay left out: the
+    numbers of the sensors, and the body (ngeom,) of each geom. A touch sensor feels a BioTac that is welded
+    to its site's body as a part of this body, but not what else is fixed to the world.
+
+    Args:
+      model: mjModel, or that of mujoco_warp. cores: ids of the BioTacs' bodies.
+    """
+
+    def read(name):
+        array = getattr(model, name)
+        return array.numpy() if hasattr(array, "numpy") else array
+
+    kind, delay = read("sensor_type"), np.atleast_2d(read("sensor_delay")).max(axis=0, initial=0.0)
+    wanted = np.flatnonzero(np.isin(kind, _SENSORS) & ~(delay > 0.0))
+    body, weld, root = (read(name) for name in ("geom_bodyid", "body_weldid", "body_rootid"))
+    site = [int(read("site_bodyid")[read("sensor_objid")[i]]) if kind[i] == _TOUCH else -1 for i in wanted]
+    alike, out = {}, []
+    for i, b in zip(wanted.tolist(), site):
+        welded = [c for c in cores if b not in (-1, c) and weld[c] == weld[b] and root[c] == root[b]]
+        alike.setdefault((b if welded else -1, *welded), []).append(i)
+    for (b, *welded), sensors in alike.items():
+        out.append((np.array(sensors), np.where(np.isin(body, welded), b, body)))
+    return out
+
+
+def _with_sensors(model, chosen, body):
+    """The model as it is, but with these sensors alone, which MuJoCo computes at its last stage, and with
+    geoms on these bodies."""
     struct = c_structs("mjModel").from_buffer_copy(model.struct)
     struct.nsensor, struct.nplugin = len(chosen), 0
-    arrays = {}  # which keep the memory
+    arrays = {"geom_bodyid": np.ascontiguousarray(body, np.int32)}  # which keep the memory
+    struct.geom_bodyid = arrays["geom_bodyid"].ctypes.data
     for name in (name for name, *_ in struct._fields_ if name.startswith("sensor_")):
         arrays[name] = np.ascontiguousarray(getattr(model, name)[chosen])
         setattr(struct, name, arrays[name].ctypes.data)
