@@ -304,6 +304,9 @@ class SkinModel:
             faces = self._core_faces() if core_faces is None else geometry.inner_face[core_faces]
             self.core_surface = Surface.create(vert, faces, self.device)
             self.core_vert = wp.array(geometry.core_vert, dtype=vec3, device=self.device)
+            center = geometry.core_vert.mean(0)
+            self.core_center = vec3(*center)
+            self.core_radius = float(np.linalg.norm(geometry.core_vert - center, axis=1).max())
         if self.inner is not None:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()

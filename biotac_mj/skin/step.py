@@ -386,7 +386,8 @@ class SkinStep:
             chunk = points if not m.device.is_cuda else 2 if w < 32 else 64
             dim = (g.count, -(-points // chunk), w)
             core = m.core(w).struct
-            constants = [chunk, m.options.max_core_depth, m.core_vert, core, g.struct]
+            ball = [m.core_center, m.core_radius]
+            constants = [chunk, m.options.max_core_depth, m.core_vert, *ball, core, g.struct]
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(penetration.mark_deep_geoms, dim, constants, outputs)
         self._forces.evaluate(self._launcher, self.st.active, keep_pressure=1)

@@ -5,7 +5,7 @@ import warp as wp
 
 from ..types import mat33, real, vec3
 from .meshes import TRILINEAR, grid_value
-from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from
+from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
 
 __all__ = [
@@ -90,6 +90,8 @@ def mark_deep_geoms(
     chunk: int,
     limit: real,
     core_vert: wp.array(dtype=vec3),
+    center: vec3,
+    radius: real,
     core: Geoms,
     geoms: Geoms,
     # In and out:
@@ -99,9 +101,11 @@ def mark_deep_geoms(
     deep_out: wp.array(dtype=int),
 ):
     """Marks a world as failed and deep if geom g is deeper in the rigid core than `limit` [m], since no skin
-    fits between them."""
+    fits between them. center, radius: of a ball around the core."""
     g, c, w = wp.tid()
     if active[w] == 0:
+        return
+    if bound_to(geoms, g, center, place_on(geoms, g, w, center)) > radius:
         return
     for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0] + 1)):
         if core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], core, core_vert) < -limit:

@@ -55,7 +55,7 @@ class BodyContact:
     displacement: wp.array2d(dtype=wp.spatial_vectord)  # motion of the bodies by dy
     pending: wp.array2d(dtype=wp.spatial_vectord)  # motion from the start of the step, where it is a load
     inverse: wp.array3d(dtype=real)  # of 1 + S A [world, 6 group, 6 group]
-    pivot: wp.array2d(dtype=int)  # [world, 6 group]
+    pivot: wp.array2d(dtype=int)  # of each row of it; -1: that of a body that does not touch [world, 6 group]
     has_pending: wp.array(dtype=int)  # 1: the motion in this step is the first iteration's load [world]
     wrench_known: wp.array(dtype=int)  # 1: the wrenches at the start of the step were evaluated [world]
 
@@ -188,8 +188,10 @@ def measure_stiffness(
 @wp.func
 def _invert(w: int, t: int, n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=int)):
     """Inverts M[w] in place by Gauss-Jordan elimination with row pivots, together with the other threads of a
-    block; t is this one."""
+    block; t is this one. Rows whose pivot is -1 are those of the unit matrix, of bodies that do not touch."""
     for k in range(n):
+        if pivot[w, k] < 0:
+            continue
         p = int(k)
         for i in range(k + 1, n):
             if wp.abs(M[w, i, k]) > wp.abs(M[w, p, k]):
@@ -216,7 +218,11 @@ def _invert(w: int, t: int, n: int, M: wp.array3d(dtype=real), pivot: wp.array2d
     for back in range(n):
         k = n - 1 - back
         p = pivot[w, k]
-        if p != k:
+        if p < 0:
+            for i in range(t, n, wp.block_dim()):
+                if i != k:
+                    M[w, i, k] = -M[w, i, k]
+        elif p != k:
             for i in range(t, n, wp.block_dim()):
                 value = M[w, i, k]
                 M[w, i, k] = M[w, i, p]
@@ -278,10 +284,14 @@ def begin_iteration(
         for c in range(t, partial.shape[1], wp.block_dim()):
             own += partial[g, c, w]
         S = wp.spatial_matrixd()
-        for i in range(6):
-            row = block_sum(vec6(own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]))
-            for j in range(6):
-                S[i, j] = row[j]
+        touching = block_sum(wp.ddot(own, own)) > real(0.0)
+        if touching:
+            for i in range(6):
+                row = block_sum(vec6(own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]))
+                for j in range(6):
+                    S[i, j] = row[j]
+        for i in range(t, 6, wp.block_dim()):
+            d.pivot[w, 6 * g + i] = wp.where(touching, 0, -1)
         for h in range(t, groups, wp.block_dim()):
             M = S * b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])
             for i in range(6):
