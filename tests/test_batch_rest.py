@@ -8,9 +8,11 @@ mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install 
 
 # ruff: noqa: E402
 import warp as wp
-from test_batch import ball_spec, make, move, places, press, press_spec, read, shell
+from test_batch import RADIUS, ball_spec, make, move, places, press, press_spec, read, shell
 
+from biotac_mj.batch.release import Clearance
 from biotac_mj.batch.rest import Rest
+from biotac_mj.coupling.steppers.fem import CLEAR
 from biotac_mj.skin import newton
 
 CHANNELS = ("contact_force", "electrodes", "pdc", "status")
@@ -81,6 +83,29 @@ def test_a_step_in_which_all_rest_solves_nothing(monkeypatch):
         mjw.step(m, d)
     assert not calls and not batch.rest.any.numpy()[0]
     assert (read(mjm, d, "status")[:, 0] == 1).all() and not read(mjm, d, "contact_force").any()
+
+
+def test_clearances_equal_distances_of_points_from_spheres():
+    """Of spheres that touch the skin, are near it, and are far from it, in one world after the other."""
+    batch = make(press_spec(), 6, readings=False)[-1]
+    skin, clearance = batch.skin, Clearance(batch.skin.model, 6)
+    corner = skin.model.rest.vert[skin.model.outer.face.numpy()]
+    point = np.einsum("sk,fki->fsi", skin.model.sample.numpy(), corner).reshape(-1, 3)
+    away = 1e-3 * np.array([-1, -0.5, 0.2, 0.5, 3, 9])
+    centre = places(6) - away[:, None] * [0, 1, 0]
+    for turn in range(6):
+        at = np.roll(centre, turn, axis=0)
+        skin.pos.assign(at[None])
+        clearance.close.fill_(1)
+        clearance.measure(skin.geoms.struct, skin.data.laws.struct, skin.data.rest_vert)
+        found = clearance.found.numpy()[:, 0]
+        distance = np.linalg.norm(point[None] - at[:, None], axis=2).min(1) - RADIUS
+        touched, near = distance < 0, (0 <= distance) & (distance < CLEAR)
+        assert touched.sum() == 2 and near.sum() == 2
+        np.testing.assert_array_equal(found < 0, touched)
+        np.testing.assert_allclose(found[near], distance[near], rtol=0, atol=1e-9)
+        assert (found[distance >= CLEAR] >= CLEAR).all()
+        assert (found[~touched] <= distance[~touched] + 1e-9).all()
 
 
 def bounce():

@@ -63,7 +63,7 @@ def corrected(steps):
             found = first + np.linalg.solve(held, force[:, :, None])[:, :, 0]
             moved = np.linalg.solve(damped, mass @ found[:, :, None])[:, :, 0]
             both = [wp.array(x, dtype=float) for x in (found, moved)]
-            wp.launch(integrator.find_amiss, WORLDS, [*both, c, again])
+            wp.launch(integrator.find_amiss, (WORLDS, 1), [*both, c, again])
             if left == 0:
                 break
             wp.launch(integrator.respond, (WORLDS, 6 * SKINS), [*factors, c])
@@ -83,7 +83,7 @@ def test_a_skin_that_does_not_act_lacks_nothing():
         c.going.fill_(1)
         c.acts.assign([1, 0, 1])
         c.force.fill_(1.0)
-        wp.launch(integrator.find_amiss, 2, [still, still, c, wp.zeros(1, dtype=int)])
+        wp.launch(integrator.find_amiss, (2, 1), [still, still, c, wp.zeros(1, dtype=int)])
     for array in (c.force, c.amiss):
         assert np.all(array.numpy()[1] == 0.0) and np.all(array.numpy()[[0, 2]] == 1.0)
 

@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from ..coupling.implicit.marks import Marks
-from ..skin.program import Fork
+from ..skin.program import Fork, Launcher
 from .ahead import kernels_of_step
 from .batch import Batch
 from .implicit import integrator
@@ -269,8 +269,9 @@ class Hook:
             def compare():
                 self._integrator.integrate(m, d, correction.going)
                 self._amiss.zero_()
-                known = [d.qacc, self._integrator.qacc, correction]
-                wp.launch(integrator.find_amiss, d.nworld, known, [self._amiss], device=device)
+                known, again = [d.qacc, self._integrator.qacc, correction], [self._amiss]
+                worlds, threads = [d.nworld], integrator.BLOCK
+                Launcher(device).launch_blocks(integrator.find_amiss, worlds, known, again, threads)
 
             def go_on():
                 self._slope.find(m, d, self._integrator.inertia, correction)

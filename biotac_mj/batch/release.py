@@ -7,6 +7,7 @@ import warp as wp
 from ..coupling.implicit.rules import PATIENCE, stayed
 from ..coupling.steppers.fem import CLEAR
 from ..geometry.rigid_warp import is_finite
+from ..skin.block import block_max
 from ..skin.contact.broadphase import ALL, contact_range, face_clearance, sample_clearance
 from ..skin.contact.faces import Laws
 from ..skin.contact.penetration import core_clearance
@@ -15,6 +16,7 @@ from ..skin.data import SkinData
 from ..skin.geoms import GeomSet
 from ..skin.model import SkinModel
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
+from ..skin.program import Launcher
 from ..skin.state import allocate
 from ..skin.types import mat66, real, vec3, vec4, vec6
 
@@ -105,35 +107,53 @@ def measure_clearance(
     x: wp.array2d(dtype=vec3),
     close: wp.array(dtype=int),
     # In and out:
-    clearance: wp.array(dtype=wp.vec2d),
+    touched: wp.array(dtype=int),
+    # Out:
+    clearance_out: wp.array(dtype=wp.vec2d),
 ):
     """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core: as
-    `ProximityQuery` of one world. A thread for each face, then for each point of the core."""
-    f, w = wp.tid()
-    if close[w] == 0 or clearance[w][0] < contact_range(laws, w):  # one that touches is not to be measured
+    `ProximityQuery` of one world. One block per world: each time its threads have measured a face each, they
+    end if one is touched. They begin with those among which the last touched face was."""
+    w, t = wp.tid()
+    if close[w] == 0:
         return
-    if f < face.shape[0]:
-        own = w % x.shape[1]
-        t = face[f]
-        margin = margin_of(laws, w)
-        least = sample_clearance(
-            x[t[0], own], x[t[1], own], x[t[2], own], sample, w, geoms, ALL, margin, contact_range(laws, w)
-        )
-        if least >= margin:
-            ball, _beyond, _count, _within = face_clearance(
-                x[t[0], own], x[t[1], own], x[t[2], own], w, geoms, ALL, margin
+    threads = wp.block_dim()
+    own = w % x.shape[1]
+    margin = margin_of(laws, w)
+    reach = contact_range(laws, w)
+    parts = (face.shape[0] + threads - 1) / threads
+    part = touched[w]
+    skin = real(wp.inf)
+    seen = int(0)
+    while seen < parts:
+        f = part * threads + t
+        if f < face.shape[0]:
+            i = face[f]
+            least = sample_clearance(
+                x[i[0], own], x[i[1], own], x[i[2], own], sample, w, geoms, ALL, margin, reach
             )
-            least = wp.max(least, ball)
-        if least < clearance[w][0]:
-            wp.atomic_min(clearance, w, wp.vec2d(least, real(wp.inf)))
-    else:
-        least = clearance[w][1]
+            if least >= margin:
+                ball, _beyond, _count, _within = face_clearance(
+                    x[i[0], own], x[i[1], own], x[i[2], own], w, geoms, ALL, margin
+                )
+                least = wp.max(least, ball)
+            skin = wp.min(skin, least)
+        skin = -block_max(-skin)
+        seen += 1
+        if skin < reach:
+            seen = parts
+        else:
+            part = (part + 1) % parts
+    inside = real(wp.inf)
+    points = wp.where(core_vert.shape[0] > 0 and skin >= reach, core_vert.shape[0] + 1, 0)
+    for i in range(t, points, threads):
         for g in range(geoms.count):
-            pos = geoms.pos[g, w]
-            mat = geoms.mat[g, w]
-            least = wp.min(least, core_clearance(f - face.shape[0], geoms, g, pos, mat, core, core_vert))
-        if least < clearance[w][1]:
-            wp.atomic_min(clearance, w, wp.vec2d(real(wp.inf), least))
+            at = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], core, core_vert)
+            inside = wp.min(inside, at)
+    inside = -block_max(-inside)
+    if t == 0:
+        touched[w] = part
+        clearance_out[w] = wp.vec2d(skin, inside)
 
 
 @wp.kernel
@@ -269,16 +289,16 @@ class Clearance:
         with wp.ScopedDevice(model.device):
             self.close = wp.zeros(nworld, dtype=int)
             self.found = wp.zeros(nworld, dtype=wp.vec2d)
+            self._touched = wp.zeros(nworld, dtype=int)
             core = [wp.zeros(0, dtype=vec3), Geoms()]
             if model.has_core:
                 core = [model.core_vert, model.core(nworld).struct]
-        self._skin, points = [model.outer.face, model.sample, *core], len(core[0]) + model.has_core
-        self._dim = len(model.outer.face) + points, nworld
+        self._skin = [model.outer.face, model.sample, *core]
 
     def measure(self, geoms: Geoms, laws: Laws, x: wp.array) -> None:
         """Finds the clearance of the close geoms, with nodes at (nvert, nworld or 1). Launches only."""
-        inputs = [*self._skin, geoms, laws, x, self.close]
-        wp.launch(measure_clearance, self._dim, inputs, [self.found], device=self._model.device)
+        known, found = [*self._skin, geoms, laws, x, self.close], [self._touched, self.found]
+        Launcher(self._model.device).launch_blocks(measure_clearance, [len(self.close)], known, found)
 
 
 class Release:

@@ -53,8 +53,4 @@ class Factor:
         held = [no_slot if own is None else own, d.nefc if springs else none]
         held += [efc.state, efc.J, efc.D, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
         known = [going, inertia, *self._inertia_rows, *held]
-        launcher, n = Launcher(self.L.device), len(self.L)
-        if self.L.device.is_cuda:
-            launcher.launch_blocks(factor, [n], known, [self.L], block_dim=_BLOCK)
-        else:
-            launcher.launch(factor, [n, 1], known, [self.L])
+        Launcher(self.L.device).launch_blocks(factor, [len(self.L)], known, [self.L], block_dim=_BLOCK)

@@ -15,7 +15,7 @@ from ...coupling.implicit.compliance import substitute
 from ...coupling.implicit.rounds import Model, make_model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
-from ...skin.block import sync
+from ...skin.block import block_max, sync
 from ...skin.condensed.lanes import eliminate
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
@@ -25,6 +25,7 @@ if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 __all__ = [
+    "BLOCK",
     "Correction",
     "Integrator",
     "Slope",
@@ -37,7 +38,7 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 
-_BLOCK = 64  # threads that solve for the corrections of a world
+BLOCK = 64  # threads that correct the forces of a world
 _MAX_CORRECTIONS = wp.constant(MAX_CORRECTIONS)
 _CORRECTED = wp.constant(wp.float64(1e-4))  # of the skins' wrenches: accelerations are of single precision
 _poorly_corrected = wp.func(poorly_corrected)
@@ -117,15 +118,14 @@ def find_amiss(
     again_out: wp.array(dtype=int),
 ):
     """After mujoco_warp's answer a, a' [world, dof]: what the correction lacks, and which worlds need another
-    one; sets again[0] where one does. Skins that do not act lack nothing."""
-    w = wp.tid()
+    one; sets again[0] where one does. Skins that do not act lack nothing. One block per world."""
+    w, t = wp.tid()
     if c.going[w] == 0:
         return
-    c.going[w] = 0
     wrong = real(0.0)
     most = real(0.0)
     largest = real(0.0)
-    for k in range(c.jacobian.shape[0]):
+    for k in range(t, c.jacobian.shape[0], wp.block_dim()):
         excess = vec6()
         if c.acts[k] == 1:
             motion = vec6()
@@ -139,10 +139,13 @@ def find_amiss(
         c.amiss[k, w] = -lacks
         wrong = wp.max(wrong, _largest(lacks))
         most = wp.max(most, _largest(excess))
-    if c.rounds[w] < _MAX_CORRECTIONS and _poorly_corrected(wrong, most, largest, _CORRECTED):
-        c.rounds[w] = c.rounds[w] + 1
-        c.going[w] = 1
-        again_out[0] = 1
+    wrong, most, largest = block_max(wrong), block_max(most), block_max(largest)
+    if t == 0:
+        c.going[w] = 0
+        if c.rounds[w] < _MAX_CORRECTIONS and _poorly_corrected(wrong, most, largest, _CORRECTED):
+            c.rounds[w] = c.rounds[w] + 1
+            c.going[w] = 1
+            again_out[0] = 1
 
 
 @wp.kernel
@@ -238,11 +241,7 @@ class Slope:
         worlds, columns = c.found.shape[:2]
         wp.launch(respond, (worlds, columns), [*factors, c], device=device)
         wp.launch(write_slope, (worlds, columns // 6, columns), [c], device=device)
-        launcher = Launcher(device)
-        if device.is_cuda:
-            launcher.launch_blocks(step, [worlds], [c], block_dim=_BLOCK)
-        else:
-            launcher.launch(step, [worlds, 1], [c])
+        Launcher(device).launch_blocks(step, [worlds], [c], block_dim=BLOCK)
 
 
 def _damping_inputs() -> list[str]:

@@ -159,11 +159,9 @@ class CondensedStep:
         _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
         launcher = launcher or Launcher(m.device)
-        launch, dim, how = launcher.launch, [d.nworld, 1], {}
-        if m.device.is_cuda:
-            launch, dim, how = launcher.launch_blocks, [d.nworld], {"block_dim": self._block}
         known = [geoms.struct, self._constants, d.worlds.wanted, d.x, self.touch, self._scratch]
-        launch(conclude, dim, known, [touched_by, wrench, tangent], **how)
+        found = [touched_by, wrench, tangent]
+        launcher.launch_blocks(conclude, [d.nworld], known, found, block_dim=self._block)
 
     def recall(self, launcher: Launcher) -> None:
         """Computes positions of the nodes from `remembered`. Launches only, on the CPU."""
