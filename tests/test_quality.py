@@ -616,7 +616,7 @@ def test_a_clock_that_cannot_be_right_misses_no_row(tmp_path):
     clocks = {
         "leaps by 3600 s": even + 3600.0 * (np.arange(n) >= 1000),
         "starts anew in row 800": even - 8.0 * (np.arange(n) >= 800),
-        "": np.repeat(even[: n // 2] * 2, 2),
+        "does not increase were left out": np.repeat(even[: n // 2] * 2, 2),
     }
     header = ",".join(["time", *(f"e{k + 1}" for k in range(19))])
     for said, time in clocks.items():
@@ -624,7 +624,7 @@ def test_a_clock_that_cannot_be_right_misses_no_row(tmp_path):
         np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header=header, comments="")
         read = read_recording(tmp_path / "log.csv")
         assert read.missing is None or not read.missing.any()
-        assert len(read.warnings) == bool(said) and said in "".join(read.warnings)
+        assert len(read.warnings) == 1 and said in read.warnings[0]
 
 
 def slow(seed, rate, size=1.2):

@@ -129,10 +129,20 @@ def test_numpy(tmp_path, names):
         np.savez(tmp_path / "r.npz", electrodes=E, force=F, time=T, other=np.array("x"))
         one = read(tmp_path / "r.npz")
         np.testing.assert_allclose(one.force, F)
+        said(one, "left out other")
     else:
         np.save(tmp_path / "r.npy", np.column_stack([T, E]))
         one = read(tmp_path / "r.npy")
     same(one)
+
+
+@pytest.mark.parametrize("form", ["datetime64", "timedelta64", "words"])
+def test_numpy_clock_of_dates(tmp_path, form):
+    since = np.rint(1e9 * T).astype("m8[ns]")
+    date = np.datetime64("2026-01-31T12:34:56") + since
+    clock = {"datetime64": date, "timedelta64": since, "words": date.astype(str)}[form]
+    np.savez(tmp_path / "r.npz", electrodes=E, time=clock)
+    same(read(tmp_path / "r.npz"))
 
 
 @pytest.mark.parametrize(

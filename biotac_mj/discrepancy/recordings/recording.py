@@ -198,7 +198,8 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
     if tdc is not None and found.unit("tdc") != "counts":  # of no temperature
         tdc = None
     missing, faults = check_clock(found, counts)
-    said = (*doubts(found), *lacks, *(fault.message for fault in faults))
+    left = (note for note in found.notes if "left out" in note)
+    said = (*doubts(found), *lacks, *(fault.message for fault in faults), *left)
     source = found.rate_source
     since = found.time - begin
     out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit, since)

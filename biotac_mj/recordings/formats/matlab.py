@@ -62,7 +62,11 @@ def read_hdf5(path: pathlib.Path) -> list[Stream]:
     with reading(path, _WHAT, _REMEDY), h5py.File(path) as file:
 
         def take(name, item):
-            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
+            if not isinstance(item, h5py.Dataset) or name.startswith("#"):
+                return
+            if item.dtype.kind not in "fiu":
+                said.append(f"{path.name}: left out {name}, which has no numbers")
+            else:
                 value, note = _in_our_unit(
                     name, item[()], item.attrs.get("unit", item.attrs.get("units", ""))
                 )
