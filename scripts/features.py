@@ -334,9 +334,6 @@ _COUPLING = (
     ("A try that comes no nearer has 40 iterations before it is given up. Where friction makes the tangent "
      "unsymmetric, the preconditioner's answer is taken as the step",
      "the full tier on all its paths; condensed solves such contact directly"),
-    ("On CUDA a world that did not converge is solved again on the CPU (`skin.step(second_solve=)`)",
-     "generate, calibrate, diagnose, `differentiable.press(together=)`, skins of your own; not with inertia, "
-     "and not `mj_step` and batches, which must not wait: the next step goes on there"),
     ("A skin that could not move for three steps begins anew from rest", "attach, condensed, batch"),
     ("Bodies move with the accelerations of MuJoCo's integrator (velocity products, joint damping), found "
      "for all skins of a world together", "attach, condensed, batch"),

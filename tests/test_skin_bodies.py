@@ -60,7 +60,7 @@ def solved(pad, preconditioner, bodies=None, at=None, nworld=1):
             b.predicted.assign(np.repeat(predicted[:, None], nworld, 1))
             b.origin.assign(np.repeat((POS + DOWN)[:, None], nworld, 1))
             b.arm.assign(np.repeat((POS + 0.4 * DOWN)[:, None], nworld, 1))
-        step(pad, data, geoms, second_solve=False)
+        step(pad, data, geoms)
         assert data.converged.all()
     return data, geoms
 

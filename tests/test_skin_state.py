@@ -91,7 +91,7 @@ class Full:
         self.geoms.set_pose(np.array(center)[:, None], np.tile(turned(angle), (self.nworld, 1, 1, 1)))
         frame = [2e-4 * aside, 0, 0], turned(0.02 * aside)
         frame = [np.tile(a, (self.nworld, *[1] * np.ndim(a))) for a in frame]
-        step(self.model, self.data, self.geoms, 5e-3, *frame, second_solve=False)
+        step(self.model, self.data, self.geoms, 5e-3, *frame)
         assert self.data.converged.all()
 
 

@@ -1,7 +1,7 @@
 """The skin: finite elements in Warp."""
 
 from ..quiet import quiet_warp
-from . import fill, second_solve  # noqa: F401  they register themselves in `model` and `step`
+from . import fill  # noqa: F401  it registers itself in `model`
 from .contact.law import ContactLaw
 from .contact.meshes import bake_distance_grid
 from .data import SkinData

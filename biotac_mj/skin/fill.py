@@ -166,7 +166,7 @@ def _inflate(bare, data, nothing, what, fill, size=0.25):
         tolerance = _FINAL if done + size == 1 else _INTERMEDIATE
         bare.options = dataclasses.replace(options, tolerance=tolerance)
         fill(done + size)
-        step(bare, data, nothing, second_solve=False)
+        step(bare, data, nothing)
         converged = data.converged.all()
         if converged and (data.volume <= _most_liquid(bare)).all():
             done += size

@@ -97,7 +97,7 @@ class GeomSet:
         number = np.cumsum(gridded) - 1 if count else np.zeros(0)
         self.types, self.count, self.nworld, self.device = list(types), count, nworld, wp.get_device(device)
         self.ngroup = int(groups.max()) + 1 if count else 0
-        self.groups, self._grids, self._own, self._rounding = groups, list(grids), own, rounding
+        self.groups, self._grids, self._rounding = groups, list(grids), rounding
         struct = Geoms()
         struct.count = count
         with wp.ScopedDevice(self.device):
@@ -127,12 +127,6 @@ class GeomSet:
         if len(self.types) == 1 and len(self._grids) == 1 and self._grids[0].coefficient is not None:
             return CORE
         return shapes_of(self.types)
-
-    def single_world(self) -> "GeomSet":
-        """The same geoms for one world on the CPU, without poses and frictions."""
-        size, rounding = self.struct.size.numpy(), self.struct.rounding.numpy()
-        made = [self.types, size, None, self.groups, rounding, self._grids, self._own]
-        return GeomSet(*made) if self.count else GeomSet([], [])
 
     def resolve(self, spacing: float, samples: int) -> None:
         """Sets the windows around edges whose radius is below the spacing [m] of a skin's samples^2 contact

@@ -248,7 +248,7 @@ class SkinModel:
         self.device = wp.get_device(device)
         announce_compilation(self.device)
         self._cores, self._rest = {}, None
-        self._elimination, self._on_cpu = None, None
+        self._elimination = None
         self.law = LAWS[self.material.law]
         vert = geometry.vert
         if not np.isfinite(vert).all():
@@ -259,7 +259,6 @@ class SkinModel:
         if fixed is not None:
             geometry = dataclasses.replace(geometry, fixed=fixed)
         given = geometry
-        self._given = {"geometry": given, "core_faces": core_faces, "modulus": modulus}
         geometry, self.element = solved_geometry(given, self.material, self.options)
         if core_faces is not None and geometry is not given:
             core_faces = (4 * np.asarray(core_faces)[:, None] + np.arange(4)).ravel()
@@ -310,16 +309,6 @@ class SkinModel:
         if self.inner is not None:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
-
-    def on_cpu(self) -> "SkinModel":
-        """The same model on the CPU, made at the first call."""
-        if not self.device.is_cuda:
-            return self
-        if self._on_cpu is None:
-            given, made = dict(self._given), {"material_choice": self.material, "options": self.options}
-            self._on_cpu = SkinModel(given.pop("geometry"), **made, **given)
-            self._on_cpu.rest = self.rest
-        return self._on_cpu
 
     @property
     def rubber_options(self) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ from .newton import convergence, krylov, line_search, load_path, nodes, worlds
 from .precondition import Residual, batched_inverse
 from .program import Launcher, Program, compile_ahead, compile_kernels
 from .rubber.element_forces import module_for_cuda
-from .types import SINGLE, mat33, vec3
+from .types import mat33, vec3
 
 __all__ = ["SkinStep", "kernels_for_cuda", "launch_step", "prepare_step", "step"]
 
@@ -53,8 +53,6 @@ _FREE = (
     "stiffness_damping",
     "max_core_depth",
 )
-# (SkinModel, SkinData, GeomSet) -> SecondSolve; set by the module `second_solve`, which imports this one
-make_second_solve = None
 
 _LEAST_INCREMENT = 1 / 32  # of the load factor
 _PASSING = 1e-2  # tolerance of increments that a step goes through, where bodies give way
@@ -67,16 +65,11 @@ def step(
     dt: float | np.ndarray | None = None,
     core_pos: np.ndarray | None = None,
     core_mat: np.ndarray | None = None,
-    second_solve: bool = True,
 ) -> None:
     """Advances every world to equilibrium at the present poses of the geoms.
 
     A world that does not converge stops at the last equilibrium on its load path, see `data.load_factor`; it
     is counted in `data.nonconverged` and flagged in `data.converged`. The next step starts from there.
-
-    With the dense preconditioner (CUDA, many worlds) such a world is first solved again on the CPU
-    (`second_solve.SecondSolve`). That takes as long as a difficult step of a single skin, and the other
-    worlds wait.
 
     Args:
       model, data: the skin.
@@ -84,7 +77,6 @@ def step(
       dt: time step [s], a number or (nworld,); needed by implicit dynamics and by a Prony series.
       core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of
         the step, for implicit dynamics; None: it does not move.
-      second_solve: whether worlds that did not converge are solved again; skins with inertia never are.
 
     Raises:
       ValueError: geoms of another number of worlds, adhesion beyond the range in which a mesh geom's distance
@@ -98,8 +90,6 @@ def step(
     else:
         with single_thread():
             ready.run()
-    if second_solve and not ready.implicit and data.precision is SINGLE:
-        ready.solve_again(data)
 
 
 def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep":
@@ -221,7 +211,7 @@ class SkinStep:
         if model.device.is_cuda:
             self._warm_up()
         self._program = Program(model.device, self._record)
-        self._evaluation = self._second_solve = self._normal_forces = None
+        self._evaluation = self._normal_forces = None
 
     def run(self) -> None:
         """Runs one step on the current stream."""
@@ -286,7 +276,7 @@ class SkinStep:
         k, st = self.k, self.st
         k.p.assign(np.ascontiguousarray(p))
         st.running.fill_(1)
-        self._once(lambda: self._forces.multiply(self._launcher))
+        self._forces.multiply(Launcher(self.m.device))
         q = k.q.numpy().astype(float)
         if self.m.has_liquid and not at_pressure:
             free = self.m.free_mask.numpy()[:, None, None]
@@ -310,29 +300,6 @@ class SkinStep:
         square of r by chunks."""
         k = self.k
         self.M.apply(program, self.st, k.partial, r, self._forces.gradient, k.z, k.partial)
-
-    def _once(self, body):
-        self.st.moving.fill_(1)
-        self._launcher = Launcher(self.m.device)
-        body()
-
-    def refresh(self) -> None:
-        """Evaluates forces and tangents at `data.x` in the worlds that are moving and active, and clears
-        these flags."""
-        self._launcher = Launcher(self.m.device)
-        wp.copy(self.k.x_start, self.d.x_last)
-        self._forces.evaluate(self._launcher, self.st.moving)
-        self._precondition()
-        self.st.active.zero_()
-        self.st.moving.zero_()
-
-    def solve_again(self, data: SkinData) -> None:
-        """Solves the worlds that did not converge in the last step again, see `second_solve`."""
-        if self._second_solve is None:
-            if data.converged.all():
-                return
-            self._second_solve = make_second_solve(self.m, data, self.geoms)
-        self._second_solve.solve(self, data, self.geoms)
 
     # --- the step ---
 

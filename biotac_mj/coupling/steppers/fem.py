@@ -259,9 +259,9 @@ class FemStepper:
         if not started and not self.resting(state):
             geoms.advance()
         if self.inertial:
-            step(model, d, geoms, dt, core_pos[1:], core_mat[1:], second_solve=False)
+            step(model, d, geoms, dt, core_pos[1:], core_mat[1:])
         else:
-            step(model, d, geoms, dt, second_solve=False)
+            step(model, d, geoms, dt)
         new = np.zeros_like(state)
         self._pack(new)
         if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *released, 0.0):
