@@ -169,7 +169,8 @@ def clear_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
         bound[i, w] = real(0.0)
 
 
-@wp.kernel
+# in a module of its own: it takes as long to compile as all others here, and few uses need it
+@wp.kernel(module=f"{__name__}.normal_forces", enable_backward=False)
 def normal_forces(
     # In:
     geoms: Geoms,

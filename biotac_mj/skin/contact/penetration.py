@@ -158,7 +158,8 @@ def start_path_outside(
             path.mat_start[g, w] = R
 
 
-@wp.kernel
+# in a module of its own: only the condensed tier needs it
+@wp.kernel(module=f"{__name__}.come_from_outside", enable_backward=False)
 def come_from_outside(
     # In:
     center: vec3,
