@@ -248,6 +248,34 @@ def test_fast_turning_bodies_gain_nothing_from_withheld_force(integrator):
     assert most_energy(model, data, 0.1) < 1.02
 
 
+@pytest.mark.parametrize(
+    "light, quat, place, heavy, speed",
+    [
+        ('type="box" size=".0022 .0038 .0031" mass=".0039"', "-.62 .15 -1.61 .24", ".0016 -.0001 .0312",
+         1.71, 0.79),
+        ('type="cylinder" size=".0028 .0022" mass=".0037"', "1.83 .03 -.52 .58", "-.0009 .0013 .0324",
+         2.06, 0.72),
+    ],
+)  # fmt: skip
+def test_a_crushed_light_body_gains_nothing_in_stages(light, quat, place, heavy, speed):
+    """Runge-Kutta's later stages held the force of the first, against what MuJoCo's contact with the heavy
+    body was there: no number was left."""
+    between = float(place.split()[2]) - 12e-3 - 8.4e-3
+    bodies = f"""<body name="light" pos="0 0 {8.4e-3 + between / 2}" quat="{quat}"><freejoint/><geom {light}/>
+      </body><body pos="{place}"><freejoint/><geom type="box" size=".012 .012 .0115" mass="{heavy}"/>
+      </body>"""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".005" gravity="0 0 0" integrator="RK4" solver="CG" cone="elliptic"/>'
+        f'<worldbody><site name="tip" quat="1 -1 0 0"/>{bodies}</worldbody></mujoco>'
+    )
+    biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", readings="none")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[8] = -speed
+    mujoco.mj_forward(model, data)
+    assert most_energy(model, data, 0.1) < 1.001
+
+
 def test_a_tool_that_jumps_into_the_condensed_skin_is_followed():
     """Nothing can give way: where a step was in vain the next one may take four times as much. Without that
     none settled in so many."""

@@ -328,6 +328,10 @@ class Instance:
         """
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
+    def acts(self, acting: np.ndarray) -> None:
+        """Keeps the wrenches (ngroup, 6) that the bodies get in one of Runge-Kutta's stages."""
+        self._outcome = *self._outcome[:-1], acting
+
     def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
         """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
         they were to go; asked only with Runge-Kutta, whose status is written when the step ends."""

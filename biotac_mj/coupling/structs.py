@@ -34,11 +34,6 @@ for _stage in (
     getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
-LIBRARY.mj_differentiatePos.argtypes = (
-    *(ctypes.c_void_p,) * 2,
-    ctypes.c_double,
-    *(ctypes.c_void_p,) * 2,
-)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
 
 _SCALARS = {
@@ -264,14 +259,6 @@ class DataView(_View):
     def find_poses(self) -> None:
         """Makes the poses of bodies, geoms and sites those of the positions of now."""
         LIBRARY.mj_kinematics(self.model.address, self.address)
-
-    def moved_from(self, qpos: np.ndarray) -> np.ndarray:
-        """Displacement (nv,) of the degrees of freedom from positions (nq,) to the present ones."""
-        out = np.empty(self.model.nv)
-        LIBRARY.mj_differentiatePos(
-            self.model.address, out.ctypes.data, 1.0, qpos.ctypes.data, self.qpos.ctypes.data
-        )
-        return out
 
     def acceleration(self, again: bool = False) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint

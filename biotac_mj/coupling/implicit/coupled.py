@@ -30,8 +30,6 @@ class Coupled:
         too.
       compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
         `SkinGroup.find_compliance`.
-      passed: (n, 6, nv) by which the bodies' motion in the step is that of the degrees of freedom: the mean
-        over Runge-Kutta's stages.
       forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_group`.
     """
 
@@ -46,10 +44,9 @@ class Coupled:
         self.result = self.forced = None
         self.written, self.settled = False, True
         self.off, self.may_act, self._cost = np.inf, True, 0.0
-        self.passed = self.jacobian = instance.kinematics.jacobians()
+        self.jacobian = instance.kinematics.jacobians()
         self.arrays = arrays = instance.begin_arrays()
         self.touching = _touching(arrays.tangent0)  # without bodies that were placed
-        self._rows = self.jacobian.reshape(6 * len(self.jacobian), self.jacobian.shape[2])
         self.square, self.tangent, self.moved = arrays.square, arrays.tangent0, arrays.moved
         self.compliance = arrays.compliance
         if arrays.inside[0] and instance.is_clear(arrays.here_pos, arrays.here_mat):
@@ -135,10 +132,9 @@ class Coupled:
         self.forced, self.arrays.push[:] = wrench, push
         self.touching, self.written, self.settled = np.zeros(0, int), False, False
 
-    def hold(self) -> None:
-        """Lets what acts go on as it is, whatever accelerations come: in all stages of Runge-Kutta's step."""
-        self.forced, self.touching, self.written = self.arrays.acting.copy(), np.zeros(0, int), False
-        self.passed = STAGES[0] * self.jacobian
+    def move_on(self) -> None:
+        """Takes the Jacobians of the bodies where one of Runge-Kutta's stages has them."""
+        self.jacobian, self.written = self.instance.kinematics.jacobians(), False
 
     def act_by_rows(self) -> None:
         """Lets model and rows act again."""
@@ -155,7 +151,7 @@ class Coupled:
         step."""
         if self.forced is not None:
             return self.forced
-        moved = self.square[:, None] * (self._rows @ acceleration).reshape(self.moved.shape)
+        moved = self.square[:, None] * (self.jacobian @ acceleration)
         rows = self.instance.metric.excess(acceleration)
         rows -= (self.tangent @ moved[:, :, None])[:, :, 0]
         return self.correction + self.arrays.wrench + rows
@@ -175,18 +171,26 @@ class Coupled:
         """Tells the instance how the step went."""
         arrays, withheld = self.arrays, 1.0 - self.arrays.push.min(initial=1.0)
         left = arrays.conclude(self.result.converged)
+        share = STAGES[0] if self.instance.by_stages else 1.0
+        self._jacobian, self._acting = share * self.jacobian, share * arrays.acting
         self.instance.concluded(rounds, self.settled, withheld, left, self.target, arrays.acting.copy())
         self.instance.step_gamma, self.instance.frequency = arrays.gamma.copy(), arrays.frequency.copy()
 
+    def act(self, acceleration: np.ndarray, share: float) -> None:
+        """Notes what acts with accelerations (nv,) in one of Runge-Kutta's stages, which has this share in
+        the step."""
+        acting = self.acting_with(acceleration)
+        self._jacobian += share * self.jacobian
+        self._acting += share * acting
+        self.instance.acts(acting)
+
     def arrived(self, moved: np.ndarray, near: float) -> None:
-        """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of
-        now. near: [m] from where they were to go."""
+        """Settles the account when MuJoCo's poses are those of now. moved: (nv,) displacement of the degrees
+        of freedom by their mean velocity in the step. near: [m] from where they were to go."""
         arrays = self.arrays
-        ends, travel = self.instance.kinematics.predict(0.0), self.passed @ moved
-        if not self.instance.by_stages:  # they went by the velocity after the step
-            travel += arrays.straight - arrays.travel
+        ends, travel = self.instance.kinematics.predict(0.0), self._jacobian @ moved
         error = size(travel - arrays.travel)
-        arrays.travel[:] = travel
+        arrays.travel[:], arrays.acting[:] = travel, self._acting
         self.instance.arrived(arrays.conclude(self.result.converged), ends, error < near)
 
 

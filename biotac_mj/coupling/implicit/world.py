@@ -95,7 +95,7 @@ class World:
                     other.refuse_foreign_state(error)
                 raise
         elif index == self.first:
-            self._go_on_holding()
+            self._go_on()
         if instance.by_stages:
             instance.end_stage(self._stage == 1)
 
@@ -220,13 +220,8 @@ class World:
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
-            if skins[0].instance.by_stages:  # found for the step's end: explicit, if each stage had its own
-                for skin in skins:
-                    skin.hold()
-                self._forces(skins, outside)
             self._group.find_frequencies()
-            self._acting, self._now = skins, self.data.qpos.copy()
-            self._began_at = self._now
+            self._acting, self._now, self._began_with = skins, self.data.qpos.copy(), self.data.qvel.copy()
         else:
             rounds = 1
             self._group.evaluate(np.zeros(self.model.nv))
@@ -238,17 +233,23 @@ class World:
         for skin in skins:
             skin.conclude(rounds)
 
-    def _go_on_holding(self):
-        """Lets what was found in the first of Runge-Kutta's stages act where the bodies are in this one."""
+    def _go_on(self):
+        """Lets the models that were found in the first of Runge-Kutta's stages answer to the accelerations of
+        this one. The models are linear, so their mean over the stages is their answer to the mean
+        acceleration, with which the step is made."""
         self._take_rows()
         for t in self.coupled:
             t.metric.release()
-        for skin in self._acting:
-            jacobian = skin.instance.kinematics.jacobians()
-            skin.passed += STAGES[self._stage - 1] * jacobian
-            self.data.qfrc_passive += np.einsum("ni,nij->j", skin.forced, jacobian)
-        self._project()
         self._now = self.data.qpos.copy()
+        if not self._acting:
+            return
+        for skin in self._acting:
+            skin.move_on()
+        self._group = SkinGroup(self._acting, self._springs)
+        self._forces(self._acting, self.data.qfrc_passive.copy())
+        found = self.data.acceleration()
+        for skin in self._acting:
+            skin.act(found, STAGES[self._stage - 1])
 
     def _finish(self):
         """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
@@ -256,7 +257,7 @@ class World:
         skins, self._acting = self._acting, ()
         if not skins:
             return
-        moved = self.data.moved_from(self._began_at)
+        moved = 0.5 * self.model.opt.timestep * (self._began_with + self.data.qvel)
         self.data.find_poses()
         for skin in skins:
             skin.arrived(moved, ASTRAY)
