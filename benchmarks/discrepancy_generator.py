@@ -259,12 +259,15 @@ class Generator:
 
 def _way(one, pos, r):
     """Centres of the sphere on the way through poses, finer than the fitter's; and whether a pose is
-    reached."""
+    reached. Poses are those of its tip, of a bare geom those of its centre."""
+    from biotac_mj.data.objects import make_object
+
+    back = r - (float(make_object(one["tool"]).size[0]) if one["tool"].startswith("geom:") else 0.0)
     before = pos[0]
     for p in pos:
         parts = max(1, int(np.ceil(np.linalg.norm(p - before) / 0.6e-4)))
         for k in range(1, parts + 1):
-            yield before + (p - before) * k / parts - r * one["heading"], k == parts
+            yield before + (p - before) * k / parts - back * one["heading"], k == parts
         before = p
 
 

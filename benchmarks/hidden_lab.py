@@ -22,10 +22,10 @@ from records import write_json
 
 __all__ = ["carried_out", "draw", "opened", "read_plan", "seal"]
 
-# of 30 one after another: half single effects, five pairs, four outside the catalogue, four with nothing
-# hidden and two of a rubber that is half as stiff, or twice
-_KINDS = 3 * ("single", "single", "pair", "single", "none", "outside", "single", "single")
-_KINDS += ("wrong-base", "single", "pair", "none", "outside", "pair")
+# of 30 laboratories; wrong-base: a rubber that is half as stiff, or twice
+_OF_30 = {"single": 15, "pair": 5, "none": 4, "outside": 4, "wrong-base": 2}
+# in an order in which the first ones have all kinds in their proportion
+_KINDS = [kind for _, kind in sorted(((k + 0.5) / n, kind) for kind, n in _OF_30.items() for k in range(n))]
 _STIFF = 1.7  # factor on the modulus of a wrong base, or one by it
 _BASE = {"modulus": 0.2, "film": 0.2}  # standard deviations of logarithms
 _FOOTPRINT = 0.03  # largest

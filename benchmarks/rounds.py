@@ -6,7 +6,7 @@
 Round 1 is random and the same for all; each further round takes as many contacts from one pool within the
 same bounds, by design or at random, each at most twice, unless one explanation is decided. A name is right
 where a hidden effect's id is among _MEANT; that of a modulus is where the laboratory's is another one. After
-the last round the gap is measured with a tool and at a place that no round has touched. Run again, it goes on
+each round the gap is measured with a tool and at a place that no round touches as well. Run again, it goes on
 where it stopped; what is not done after --minutes is counted as far as it came."""
 
 import argparse
@@ -31,12 +31,12 @@ _BIN = 15  # names whose stated confidence is set beside how many are right
 _OTHER_MODULUS = 0.15  # of its logarithm, from which on it is another one
 
 
-def _trajectories(contacts, readings, turn):
+def _trajectories(contacts, readings, name):
     from biotac_mj.discrepancy import Trajectory
 
     return [
         Trajectory(
-            f"r{turn}-{c['id']}",
+            f"{name}-{c['id']}",
             c["tool"],
             c["clock"],
             c["time"],
@@ -118,18 +118,22 @@ def run(task, args):
         file = args.cache / f"{path.stem}_{kind}_{turn}.csv"
         write_plan(plan, file)
         contacts = read_plan(file)
-        free = _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), turn)
+        name = f"{kind}{turn}"
+        free = _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), name)
         clean.update((t.id, t) for t in free)
-        return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), turn)
+        return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), name)
 
-    def judged(data):
+    def judged(data, turn):
         began = time.process_time()
         report = diagnose(sim, data, progress=False)
         record = _record(report, time.process_time() - began)
         if report.effects:
             aside = {data[i].id for i in report.locked}
             # the base is the sensor's own
-            record["true"] = gap(data, [clean[t.id] for t in data], report.apply(sim), aside)
+            amended = report.apply(sim)
+            record["true"] = gap(data, [clean[t.id] for t in data], amended, aside)
+            other = measured(_plan(unseen, _end(data)), turn, "unseen")
+            record["unseen"] = gap(other, [clean[t.id] for t in other], amended, {t.id for t in other})
         return report, record
 
     row = {"lab": path.stem, "arm": arm, "truth": sensor}
@@ -138,7 +142,7 @@ def run(task, args):
     if same is not None and same["decided"]:  # as the other arm ended
         return row | {"rounds": [same] * args.rounds}
     data = measured(_plan(begin, 0.0), 1, "first")
-    report, record = judged(data) if same is None else (None, same)
+    report, record = judged(data, 1) if same is None else (None, same)
     row["rounds"] = [record]
     for turn in range(2, args.rounds + 1):
         write_json(_part(args, path, arm), row)
@@ -154,14 +158,10 @@ def run(task, args):
         design = time.process_time() - began
         if plan.contacts:
             data = data + measured(plan, turn)
-        report, record = judged(data)
+        report, record = judged(data, turn)
         row["rounds"].append(record | {"design_seconds": design, "alike": plan.alike})
         print(path.stem, arm, turn, record["verdict"][:80], flush=True)
     write_json(_part(args, path, arm), row)
-    if report is not None and report.effects:
-        other = measured(_plan(unseen, _end(data)), args.rounds + 1, "unseen")
-        without = [clean[t.id] for t in other]
-        row["unseen"] = gap(other, without, report.apply(sim), {t.id for t in other})
     return row
 
 
@@ -177,7 +177,8 @@ def _end(data):
 
 def counted(rows):
     """Per arm and round: names right and given, singles found, both of pairs, decided rightly and wrongly,
-    false names, and unknown outside the catalogue."""
+    false names, unknown outside the catalogue, and the median gap closed on held-out contacts and by another
+    tool elsewhere."""
     table = {}
     for arm in ARMS:
         own = [r for r in rows if r["arm"] == arm]
@@ -186,10 +187,6 @@ def counted(rows):
             table[f"{arm}, round {turn + 1}"] = _counted(some)
         last = [(r["rounds"][-1], r["truth"]) for r in own]
         table[f"{arm}, as far as it came"] = _counted(last) | _stated(last)
-        unseen = [r["unseen"] for r in own if isinstance(r.get("unseen"), float)]
-        if unseen:
-            median = float(np.median(unseen))
-            table[f"{arm}, where nothing was measured"] = {"closed": median, "of": len(unseen)}
     return table
 
 
@@ -218,7 +215,6 @@ def _stated(some):
 def _counted(some):
     keys = "labs right names found singles both pairs decided wrongly false clean unknown outside contacts"
     c = dict.fromkeys(keys.split(), 0)
-    closed = []
     for record, truth in some:
         kind = truth["kind"]
         named, want, right, found = _judged(record, truth)
@@ -238,9 +234,11 @@ def _counted(some):
         c["false"] += bool(kind in ("none", "wrong-base") and named)
         c["outside"] += kind == "outside"
         c["unknown"] += kind == "outside" and "unknown" in record["verdict"]
-        closed += [record["true"]] if isinstance(record.get("true"), float) else []
     c = {k: int(v) for k, v in c.items()}
-    return c | {"closed": float(np.median(closed)) if closed else None}
+    for name, key in (("closed", "true"), ("elsewhere", "unseen")):
+        known = [record[key] for record, _ in some if record.get(key) is not None]
+        c |= {name: float(np.median(known)) if known else None, f"{name}_of": len(known)}
+    return c
 
 
 def done(tasks, args, rows):
