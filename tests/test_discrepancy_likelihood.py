@@ -84,11 +84,32 @@ def test_what_a_model_misses_is_as_much_as_was_hidden(plain):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_data_with_nothing_in_them_show_no_effect(seed):
-    """Their surrogates show less than is asked of an effect, and so do they."""
+    """Nor do data that are drawn from the model of them: a ratio of densities is one on average."""
     comparison, null, chosen = compared(seed=seed)
-    _, chance = screened(comparison, null, SOME, chosen)
-    assert np.quantile(chance, 1 - SETTINGS.rate) < asked(len(SOME))
-    assert not found(comparison, null, SOME, chosen).found
+    assert screened(comparison, null, SOME, chosen)[0][0] < asked(len(SOME))
+    search = found(comparison, null, SOME, chosen)
+    assert not search.found and all(c.p > SETTINGS.rate for c in search.rounds[0])
+    likelihood, rng, ratios = of(comparison, chosen), np.random.default_rng(seed), []
+    sd = np.sqrt(likelihood.variance(null.amplitude, null.size))
+    for _ in range(40):
+        y = np.tensordot(rng.standard_normal(len(null.columns)), null.columns, 1)
+        y = y + sd * rng.standard_normal(sd.shape)
+        drawn = dataclasses.replace(null, y=y)
+        ratios += [np.exp(gain) for gain, *_ in screened(comparison, drawn, SOME, chosen)]
+    assert np.mean(ratios) < 1.5 and np.mean(np.array(ratios) > len(SOME) / SETTINGS.rate) < SETTINGS.rate
+
+
+@pytest.mark.parametrize("name, size", [("friction", -0.9), ("latency", 0.08), ("relax", 0.4)])
+def test_a_fit_with_an_effect_more_is_hardly_less_likely(plain, name, size):
+    """Wherever straight lines lead: a fit begins from no effect, so it loses its prior's volume at most."""
+    from biotac_mj.discrepancy.trajectories.search import _fitted
+
+    comparison, null, chosen = plain
+    effect = by_id(name)
+    main = next(iter(effect.params))
+    far = {**effect.default(), main: -size if effect.params[main].low < 0 else size}
+    fit = _fitted(comparison, effect, far, 0.0, null, chosen)
+    assert fit.score > null.score - 10
 
 
 def test_a_second_law_of_the_same_is_no_second_effect():

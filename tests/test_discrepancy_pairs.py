@@ -9,8 +9,8 @@ from test_discrepancy_base_model import changed
 from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose, load_simulator
-from biotac_mj.discrepancy.trajectories.base.channels import narrowed
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+from biotac_mj.discrepancy.trajectories.search import screened
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
@@ -44,6 +44,10 @@ def test_two_gains_that_bend_are_those_of_two_electrodes(tmp_path):
 
 def test_electrodes_are_singled_out_only_where_few_stand_out():
     gain, drift = by_id("gain"), by_id("electrode_drift")
+
+    def narrowed(comparison, null, effect, chosen):
+        return screened(comparison, null, [effect], chosen)[0][1]
+
     nothing = compared(measured([]))
     assert narrowed(*nothing[:2], gain, nothing[2]) is gain
     assert narrowed(*nothing[:2], drift, nothing[2]) is drift

@@ -10,6 +10,7 @@ import typing
 
 import numpy as np
 import pytest
+import tqdm
 from scipy.integrate import solve_ivp
 from verdicts import check_verdict
 
@@ -17,8 +18,7 @@ from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajector
 from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance, widen
-from biotac_mj.discrepancy.trajectories.levels import astray
-from biotac_mj.discrepancy.trajectories.remarks import next_experiment
+from biotac_mj.discrepancy.trajectories.remarks import astray, next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import STAGES, Run, memory, shifted
@@ -613,21 +613,26 @@ def test_the_skin_is_solved_until_a_fit_has_found_its_end(gain, more, times, mon
     assert solved == ([True] + [False] * times)[:times]  # with its parameters changed first
 
 
-@pytest.mark.parametrize(
-    "late, gain, alone, another",
-    [("creep", 150.0, 390.0, True), ("creep", 150.0, 140.0, False), ("creep", 150.0, None, True)]
-    + [("gain", 10.0, 50.0, False)],
-)
-def test_another_law_of_what_was_found_is_no_second_effect(late, gain, alone, another):
-    """Unless it explains as much beside it as alone."""
-    from biotac_mj.discrepancy.trajectories.search import Candidate, Search, _another_law
+def test_a_cause_has_one_law(monkeypatch):
+    """Another law of what was found is not looked for, whichever of the two says that it is one."""
+    from biotac_mj.discrepancy.trajectories import search
 
-    def candidate(name, gain):
-        return Candidate(by_id(name), None, gain, 0.0, [])
-
-    first = candidate("relax", 400.0)
-    tried = [first] + ([candidate(late, alone)] if alone else [])
-    assert _another_law(candidate(late, gain), Search(None, [first], [tried], {})) is another
+    tried = []
+    monkeypatch.setattr(
+        search, "screened", lambda comparison, fit, effects, chosen: tried.append(effects) or []
+    )
+    first, bar = (
+        types.SimpleNamespace(effects=[(by_id("electrode_drift"), {})]),
+        tqdm.tqdm(total=0, disable=True),
+    )
+    some = [by_id(name) for name in ("electrode_drift", "warmup", "gain", "relax")]
+    search._round(None, search.Search(first, [], [], {}), some, np.arange(3), bar)
+    first.effects = [(by_id("inhomog"), {})]
+    search._round(None, search.Search(first, [], [], {}), some, np.arange(3), bar)
+    assert [[e.id for e in effects] for effects in tried] == [
+        ["gain", "relax"],
+        ["electrode_drift", "warmup", "relax"],
+    ]
 
 
 def test_signed_roots_have_the_rate_of_chance():

@@ -285,18 +285,6 @@ class Effect(abc.ABC):
         """Work of adhesion of the contact [J/m2] at which the skin must be solved, or None."""
         return None
 
-    def trends(self, change: list, clock: list) -> list:
-        """Trends that an effect of single electrodes adds, per unit parameter.
-
-        Args:
-          change: (n, nelectrode) per trajectory, expected change of each electrode from rest.
-          clock: (n,) per trajectory, the session's clock [s].
-
-        Returns:
-          lists of (n, nelectrode) per trajectory, one list per candidate form.
-        """
-        return []
-
     def undoes(self, theta: dict, log_modulus: float) -> bool:
         """Whether it compensates a modulus factor exp(log_modulus) of the base model."""
         return False

@@ -52,15 +52,6 @@ class ElectrodeDrift(Effect):
         # a common trend is a warm-up
         return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
 
-    def trends(self, change: list, clock: list) -> list:
-        out = []
-        for shape in self.grid:
-            trend = [np.maximum(t, 0.0) ** shape["q"] for t in clock]
-            begin = np.mean([c[0] for c in trend])
-            scale = max(np.concatenate(trend).std(), 1e-9)
-            out.append([np.tile(((c - begin) / scale)[:, None], self.design.nelectrode) for c in trend])
-        return out
-
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
         # a straight line to the value at SESSION
         rates = np.array([theta.get(e, 0.0) for e in self.design.electrodes]) / SESSION

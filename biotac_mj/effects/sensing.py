@@ -216,9 +216,6 @@ class Gain(Linear):
         # manufacturing scatter has zero mean
         return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
 
-    def trends(self, change: list, clock: list) -> list:
-        return [change]
-
     def apply(self, run: Run, theta: dict) -> None:
         rest, change = run.rest, run.counts - run.rest
         gain = np.array([theta.get(e, 0.0) for e in self.design.electrodes])

@@ -124,7 +124,8 @@ def fit_effects(
     """The most probable parameters of effects (list of (Effect, theta to start from)) and of the nuisance.
 
     Args:
-      keep: trajectories to use (indices), None all. start: Fit whose nuisance to start from.
+      keep: trajectories to use (indices), None all. start: Fit whose nuisance, offsets and errors of laws to
+        start from.
       known: names of the nuisance that is as the base model says.
     """
     chosen = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
@@ -133,7 +134,9 @@ def fit_effects(
     nuisance = dataclasses.replace(nuisance, **{n: 0.0 for n in _NUISANCE if n not in model.free})
     amplitude = None if start is None else start.amplitude
     offsets = np.zeros((len(comparison.trajectories), 3)) if start is None else start.offsets
-    return model.fitted([(e, dict(th)) for e, th in effects], nuisance, amplitude, offsets)
+    known_errors = {} if start is None else {e.id: v for (e, _), v in zip(start.effects, start.law_errors)}
+    law_errors = np.array([known_errors.get(e.id, SETTINGS.law) for e, _ in effects])
+    return model.fitted([(e, dict(th)) for e, th in effects], nuisance, amplitude, offsets, law_errors)
 
 
 def changes(
@@ -226,11 +229,10 @@ class _Model:
         log, _, factor = self.likelihood.evidence(point.y, point.errors, variance)
         return log - 0.5 * point.away @ point.away, factor
 
-    def fitted(self, effects, nuisance, amplitude, offsets) -> Fit:
+    def fitted(self, effects, nuisance, amplitude, offsets, law_errors) -> Fit:
         """The Fit, by Gauss-Newton's steps of the parameters and steps of the amplitudes and of errors of
         laws in turn."""
         likelihood = self.likelihood
-        law_errors = np.full(len(effects), SETTINGS.law)
         for _ in range(_STEPS):
             done = changes(self.comparison, likelihood, effects, nuisance)
             point = self._point(effects, nuisance, offsets, likelihood.laws(done, law_errors))

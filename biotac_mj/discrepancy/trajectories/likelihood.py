@@ -37,7 +37,8 @@ _TOUCH = 20e-6  # [m]
 # is much better than it was found to be elsewhere.
 _FACTORS = np.exp(np.arange(-0.4, 4.01, 0.4))
 _LAW_FACTORS = np.exp(np.arange(-1.2, 1.61, 0.2))  # of law errors, in their prior's median
-COURSES = 12  # along which the law of an effect may be another
+COURSES = 24  # along which the law of an effect may be another
+_LAW_PLACE = 10e-3  # [m] along the finger, over which a law is nearly the same
 
 
 def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
@@ -51,8 +52,7 @@ def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     heading = _apart(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
     since = _apart(gathered(_since_touch), _SINCE)
     clock = _apart(gathered(lambda t: t.clock + t.time), _CLOCK)
-    tool = gathered(lambda t: np.full(len(t.time), t.tool))
-    static = np.exp(-0.5 * (place + heading)) * np.where(tool[:, None] == tool, 1.0, _OTHER_TOOL)
+    static = np.exp(-0.5 * (place + heading)) * _same_tool(data, rows)
     passing = np.exp(-0.5 * (place + since + clock))
     load = _UNTOUCHED + np.clip(depth / max(depth.max(), 1e-9), 0.0, 1.0)
     rough = _ROUGH * np.eye(len(load))
@@ -61,13 +61,20 @@ def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
 
 
 def courses(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
-    """(k, n) functions of depth, time since touch and the session's clock whose sum with coefficients of unit
-    variance is the process of a law's error."""
+    """(k, n) functions of depth, time since touch, the session's clock, place and tool whose sum with
+    coefficients of unit variance is the process of a law's error."""
     away = _apart(_gathered(data, rows, lambda t: t.depth), _DEPTH)
     away += _apart(_gathered(data, rows, _since_touch), _SINCE)
     away += _apart(_gathered(data, rows, lambda t: t.clock + t.time), _CLOCK)
-    values, vectors = np.linalg.eigh(np.exp(-0.5 * away))
+    away += _apart(_gathered(data, rows, lambda t: t.pos), _LAW_PLACE)
+    values, vectors = np.linalg.eigh(_same_tool(data, rows) * np.exp(-0.5 * away))
     return (np.sqrt(np.maximum(values, 0.0)) * vectors).T[: -COURSES - 1 : -1]
+
+
+def _same_tool(data, rows):
+    """(n, n) correlation of rows by their tools."""
+    tool = _gathered(data, rows, lambda t: np.full(len(t.time), t.tool))
+    return np.where(tool[:, None] == tool, 1.0, _OTHER_TOOL)
 
 
 def _gathered(data, rows, of):

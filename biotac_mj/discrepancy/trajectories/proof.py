@@ -40,11 +40,11 @@ class Proof:
 
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
     """Whether held-out trajectories are likelier by `ODDS` with one Fit than with another that has fewer
-    effects, and by as much again for every further effect, as in the search; and whether the sensor that is
-    written with it is nearer to them. The skin solved again, parameters as they were fitted. By the one
-    likelihood: what the law of an effect lacks does not contradict it."""
+    effects, and whether the sensor that is written with it is nearer to them. The skin solved again,
+    parameters as they were fitted. By the one likelihood: what the law of an effect lacks does not contradict
+    it."""
     first, last = (_density(comparison, fit, aside) for fit in (smaller, larger))
-    if last - first <= max(len(larger.effects), 1) * np.log(ODDS):
+    if last - first <= np.log(ODDS):
         return False
     _, begin = _begun(comparison, smaller, aside)
     return _nearer(comparison, begin, _measured(comparison, larger, aside), aside)

@@ -1,6 +1,6 @@
 """Searches for the effects that explain the data together, one after another: each is the one under which the
-data are likeliest, if it is far likelier than none and gains more than any effect does on surrogates of the
-data without it."""
+data are likeliest, if it is far likelier than none. The prior: every effect of the catalogue is there or not,
+whatever others are, one of them on average; and a cause has one law."""
 
 import dataclasses
 import typing
@@ -9,7 +9,6 @@ import numpy as np
 import tqdm
 
 from ..evidence import ODDS, asked
-from .base.channels import narrowed
 from .fitting import Fit, fit_effects, sizes
 from .model.in_skin import FOLLOWS, remember
 from .settings import SETTINGS
@@ -21,14 +20,11 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["Candidate", "Search", "found", "screened"]
 
-_SURROGATES = 199
 _SOLVED, _FURTHER = 2, 4  # times that the skin is solved for an effect that moves the object; and again
 _WORTH, _MUCH = 5.0, 30.0  # [nats] of evidence that is worth it; that solving the rubber is worth
 _SETTLED = 1.0  # [nats] that a solution changes where a fit has found its end
-_KINS, _SOME = (
-    2,
-    0.15,
-)  # effects whose rubber is solved for; share of the best one's evidence that is worth it
+_KINS, _SOME = 2, 0.15  # effects whose rubber is solved for, and their share of the best one's evidence
+_ELECTRODES = 5  # at most; where more have it, all may
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 
 
@@ -37,8 +33,8 @@ class Candidate:
     """An effect refitted beside others.
 
     Attributes:
-      effect, fit. gain: evidence over the fit without it [nats]; p: share of surrogates without it in which
-      any effect has as much. refused: why it is not taken. ties: ids that are as likely.
+      effect, fit. gain: evidence over the fit without it [nats]; p: the largest probability with which any
+      effect has as much of data without it. refused: why it is not taken. ties: ids that are as likely.
     """
 
     effect: "Effect"
@@ -84,7 +80,6 @@ def found(
     null: Fit,
     usable: "list[Effect]",
     chosen: np.ndarray,
-    seed: int = 0,
     bar: tqdm.tqdm | None = None,
 ) -> Search:
     """The effects that the chosen trajectories are likeliest with.
@@ -95,11 +90,10 @@ def found(
     out = Search(null, [], [], {frozenset(): null})
     bar = tqdm.tqdm(total=0, disable=True) if bar is None else bar
     while len(out.found) < SETTINGS.most:
-        step = _round(comparison, out, usable, chosen, seed, bar)
+        step = _round(comparison, out, usable, chosen, bar)
         out.rounds.append(step)
-        able = [c for c in step if not c.refused and not _another_law(c, out)]
-        # others are not what their names say
-        little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance"}]
+        able = [c for c in step if not c.refused]
+        little = [c for c in step if c.refused == ["evidence"]]  # others are not what their names say
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         if not able:
             break
@@ -129,23 +123,14 @@ def _tied(best, other) -> bool:
     return bool(best.gain - other.gain < max(np.log(ODDS), 2 * best.fit.law_errors[-1] * best.gain))
 
 
-def _another_law(one, search) -> bool:
-    """Whether an effect is another law of what was found: less of it shows beside that than alone."""
-    names = {c.effect.id for c in search.found}
-    same = names.union(*(c.effect.equivalents for c in search.found))
-    if one.effect.id not in same and not names & {*one.effect.equivalents}:
-        return False
-    alone = [c.gain for c in search.rounds[0] if c.effect.id == one.effect.id]
-    return not alone or one.gain < alone[0]
-
-
-def _round(comparison, search, usable, chosen, seed, bar):
+def _round(comparison, search, usable, chosen, bar):
     """Candidates beside what was found, best first."""
     current = search.fit
     bar.set_description(" + ".join(["diagnose", *(e.name for e, _ in current.effects)]))
-    known = {e.id for e, _ in current.effects}
-    effects = [narrowed(comparison, current, e, chosen) for e in usable if e.id not in known]
-    ranked, chance = screened(comparison, current, effects, chosen, seed)
+    known = [e for e, _ in current.effects]
+    same = {one.id for one in known}.union(*(one.equivalents for one in known))
+    effects = [e for e in usable if e.id not in same and not same & {*e.equivalents}]
+    ranked = screened(comparison, current, effects, chosen)
     search.unseen = [(gain, effect) for gain, effect, _ in ranked]
     short = [r for r in ranked[: SETTINGS.refit] if r[0] > 0]
     # differences do not reach far where poses are moved
@@ -158,29 +143,27 @@ def _round(comparison, search, usable, chosen, seed, bar):
         fit = _fitted(comparison, effect, start, expected, current, chosen)
         plain = next(e for e in effects if e.id == effect.id)
         if effect is not plain and effect.rejection_reason(fit.effects[-1][1]):
-            # its rare parameters are not what its name says: without them
-            effect, start = plain, {name: start[name] for name in plain.params}
+            # its rare parameters, or so few electrodes, are not what its name says
+            effect, start = plain, {name: start.get(name, v) for name, v in plain.default().items()}
             fit = _fitted(comparison, effect, start, expected, current, chosen)
         fit = _solved(comparison, fit, effect, current, chosen)
-        out.append(_candidate(comparison, effect, fit, current, chance, usable, chosen))
+        out.append(_candidate(comparison, effect, fit, current, usable))
         bar.update()
     for k in _moving(out):
         fit = _solved(comparison, out[k].fit, out[k].effect, current, chosen, _FURTHER, True)
-        out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable, chosen)
+        out[k] = _candidate(comparison, out[k].effect, fit, current, usable)
     for k in _remembering(out):
         fit = _remembered(comparison, out[k], current, chosen)
         if fit is not None:
-            out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable, chosen)
+            out[k] = _candidate(comparison, out[k].effect, fit, current, usable)
     return sorted(out, key=lambda c: -c.gain)
 
 
 def _fitted(comparison, effect, start, expected, current, chosen):
-    """Fit of an effect beside others, from where straight lines lead; expected: evidence by these.
+    """Fit of an effect beside others; expected: evidence by straight lines, which lead to `start`.
 
-    What moves the object takes back what errors of poses have to explain without it: from no effect, step by
-    step, or from poses as they are said to be where that leads to less than is expected."""
-    if not effect.moves_object:
-        return fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
+    From no effect, step by step: what was fitted without it has put into poses and nuisance what it has to
+    take back. From `start`, with poses as they are said to be, where that leads to less than is expected."""
     none = {n: v if effect.params[n].shape else effect.params[n].start for n, v in start.items()}
     fit = fit_effects(comparison, [*current.effects, (effect, none)], chosen, current)
     if fit.score - current.score >= expected:
@@ -190,18 +173,20 @@ def _fitted(comparison, effect, start, expected, current, chosen):
     return max(fit, other, key=lambda one: one.score)
 
 
-def _candidate(comparison, effect, fit, current, chance, usable, chosen):
+def _candidate(comparison, effect, fit, current, usable):
     """Candidate of a fit with one effect more than `current`."""
-    gain, theta = fit.score - current.score, fit.effects[-1][1]
-    p = float((1 + (chance >= gain).sum()) / (1 + len(chance)))
-    # as much again of every further effect: laws of other forms leave something
-    least = len(fit.effects) * asked(len(usable))
-    refused = ["evidence"] if gain < least else []
-    refused += ["chance"] if p > SETTINGS.rate else []
+    every = next(e for e in usable if e.id == effect.id)
+    few = effect.per_channel and len(effect.free) < len(every.free)
+    # any electrode may have it
+    forms = len(effect.free) * np.log(len(every.free)) if few else 0.0
+    gain, theta = float(fit.score - current.score - forms), fit.effects[-1][1]
+    # without the effect the expected ratio of densities is one (Markov's inequality, of each that is tried)
+    p = float(np.exp(min(np.log(len(usable)) - gain, 0.0)))
+    refused = ["evidence"] if gain < asked(len(usable)) else []
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
     refused += ["little"] if _little(comparison, effect, theta) else []
-    return Candidate(effect, fit, float(gain), p, refused)
+    return Candidate(effect, fit, gain, p, refused)
 
 
 def _little(comparison, effect, theta) -> bool:
@@ -265,29 +250,50 @@ def _remembered(comparison, one, current, chosen):
 
 
 def screened(
-    comparison: "Comparison", current: Fit, effects: "list[Effect]", chosen: np.ndarray, seed: int = 0
-) -> tuple[list[tuple], np.ndarray]:
-    """By straight lines about a fit: [(evidence of the effect beside it [nats], effect, parameters where a
-    fit may start)], best first; and the most evidence (surrogates,) that any of them has of data drawn from
-    the model without it."""
+    comparison: "Comparison", current: Fit, effects: "list[Effect]", chosen: np.ndarray
+) -> list[tuple[float, "Effect", dict]]:
+    """By straight lines about a fit: evidence of each effect beside it [nats], the effect, parameters where a
+    fit may start; best first."""
     signatures = Signatures(comparison, current, chosen)
-    rng = np.random.default_rng(seed)
-    draws = rng.standard_normal((_SURROGATES, len(signatures.known))) @ signatures.known
-    draws += rng.standard_normal(draws.shape)
-    y = signatures.own(np.vstack([current.y.ravel() / signatures.sd, draws]))  # the data first
-    best, chance = {}, np.full(_SURROGATES, -np.inf)
+    y = signatures.own(current.y.reshape(1, -1) / signatures.sd)[0]
+    best = {}
     for effect, shape in [(e, s) for one in effects for e in _variants(one) for s in e.grid]:
         prior = [[SETTINGS.wide * effect.params[name].scale / size] for name, size in sizes(effect)]
         columns = signatures.columns(effect, shape) * np.array(prior)
         precision = np.eye(len(columns)) + columns @ signatures.own(columns).T
-        pull = columns @ y.T
-        weights = np.linalg.solve(precision, pull)
-        gain = 0.5 * (pull * weights).sum(0) - 0.5 * np.linalg.slogdet(precision)[1]
-        chance = np.maximum(chance, gain[1:])
-        if effect.id not in best or gain[0] > best[effect.id][0]:
-            start = _begin(effect, shape, weights[:, 0])
-            best[effect.id] = float(gain[0]), effect, start
-    return sorted(best.values(), key=lambda one: -one[0]), chance
+        pull = columns @ y
+        some = _few(precision, pull) if effect.per_channel else []
+        if some:
+            precision, pull = precision[np.ix_(some, some)], pull[some]
+            effect = effect.only([effect.free[k] for k in some])
+            shape = effect.grid[0] | shape
+        gain, weights = _gained(precision, pull), np.linalg.solve(precision, pull)
+        gain -= len(some) * np.log(len(columns))
+        if effect.id not in best or gain > best[effect.id][0]:
+            best[effect.id] = gain, effect, _begin(effect, shape, weights)
+    return sorted(best.values(), key=lambda one: -one[0])
+
+
+def _gained(precision, pull) -> float:
+    """Evidence of a linear model [nats], by the precision of its coefficients of unit variance and what pulls
+    at them."""
+    return 0.5 * float(pull @ np.linalg.solve(precision, pull) - np.linalg.slogdet(precision)[1])
+
+
+def _few(precision, pull) -> list[int]:
+    """Electrodes that are likelier to have an effect than all of them, any of them before the data; none
+    where many have it. One after another that which adds most evidence."""
+    some, best = [], 0.0
+    while len(some) <= _ELECTRODES:
+        more = [
+            _gained(precision[np.ix_(some + [k], some + [k])], pull[some + [k]]) if k not in some else -np.inf
+            for k in range(len(pull))
+        ]
+        k, gain = int(np.argmax(more)), max(more) - (len(some) + 1) * np.log(len(pull))
+        if gain < best:
+            return sorted(some) if best > _gained(precision, pull) else []
+        some, best = [*some, k], gain
+    return []
 
 
 def _variants(effect):

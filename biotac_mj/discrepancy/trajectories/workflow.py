@@ -17,11 +17,10 @@ from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .beliefs import Beliefs, believed
 from .fitting import Fit, fit_effects
-from .levels import few_off
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import Proof, borne_out, proved
-from .remarks import next_experiment, of_base, of_data, strays
+from .remarks import few_off, next_experiment, of_base, of_data, strays
 from .search import found
 from .settings import SETTINGS
 from .signatures import isolability
@@ -140,7 +139,7 @@ def diagnose(
         comparison = comparison.calibrated(first.nuisance)
         bar.update()
         null = fit_effects(comparison, [], chosen)
-        search = found(comparison, null, usable, chosen, seed, bar)
+        search = found(comparison, null, usable, chosen, bar)
         search.hidden = hidden
         bar.update()
         report = _settle(sim, comparison, null, search, chosen, aside, notes, usable)

@@ -13,7 +13,6 @@ from ....effects.sensing import CrossTalk
 from ....geometry.electrodes import electrode_positions
 from ...evidence import signed_root_t
 from ..fitting import fit_effects
-from .channels import evidence, predicted_by, supported
 
 if typing.TYPE_CHECKING:
     from ..fitting import Fit
@@ -30,6 +29,7 @@ _LEAST = 0.04  # share
 _MOST = 8  # pairs: where more electrodes follow others, it is the skin or the set-up that is another
 _ROUNDS = 3
 _NEAR = 5.0  # [mm], or sampled one after the other
+_RIDGE = 1e-3
 
 
 def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Exchange | None:
@@ -69,7 +69,7 @@ def _in_place_of(comparison, i, predicted):
     measured = comparison.measured[i][:, :n]
     measured, predicted = measured - measured[:1], predicted[:, :n] - predicted[:1, :n]
     square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[:n, None] ** 2
-    return evidence(square, len(measured))
+    return _evidence(square, len(measured))
 
 
 def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTalk | None:
@@ -102,21 +102,45 @@ def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTa
 def _heard(i, residual, change, known, design):
     """[(electrode that electrode i hears best, its share)], or []."""
     y = [r[:, i] for r in residual]
-    if np.mean([evidence((b**2).mean(), len(b)) for b in y]) > -_HEARD:  # there is no more to gain
+    if np.mean([_evidence((b**2).mean(), len(b)) for b in y]) > -_HEARD:  # there is no more to gain
         return []
-    own, _ = predicted_by(y, [c[:, [i]] for c in change])
+    own, _ = _predicted_by(y, [c[:, [i]] for c in change])
     tried = {
-        j: predicted_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i, design) if (i, j) not in known
+        j: _predicted_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i, design) if (i, j) not in known
     }
     tried = {j: (held - own, share) for j, (held, share) in tried.items() if share > _LEAST}
     if not tried:
         return []
     j = max(tried, key=lambda k: tried[k][0].mean())
     gain, share = tried[j]
-    return [(j, share)] if supported(gain, _HEARD, _HEARD_CHANCE) else []
+    return [(j, share)] if _supported(gain, _HEARD, _HEARD_CHANCE) else []
 
 
 def _beside(i, design):
     at = electrode_positions(design)
     near = np.linalg.norm(at - at[i], axis=1) < _NEAR
     return [j for j in range(len(at)) if j != i and (near[j] or abs(i - j) == 1)]
+
+
+def _evidence(square: np.ndarray, rows: int) -> np.ndarray:
+    """-(rows / 2) log of mean squares, of what lies beyond noise [nats]."""
+    return -0.5 * rows * np.log(np.maximum(square, 1.0))
+
+
+def _supported(gain: np.ndarray, nats: float, p: float) -> bool:
+    """Whether gains of evidence (trajectories,) are large enough on average, and no chance."""
+    return bool(gain.mean() > nats and signed_root_t(gain) < p)
+
+
+def _predicted_by(y: list[np.ndarray], x: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    """Evidence (trajectories,) of y [(n,)] by x [(n, q)], each by weights from the others [nats]; the last
+    weight of all together."""
+    squares = np.array([a.T @ a for a in x])
+    products = np.array([a.T @ b for a, b in zip(x, y)])
+    ridge = (_RIDGE * squares.sum(0).trace() + 1e-12) * np.eye(squares.shape[1])
+    left = [
+        b - a @ np.linalg.solve(squares.sum(0) - s + ridge, products.sum(0) - p)
+        for a, b, s, p in zip(x, y, squares, products)
+    ]
+    whole = np.linalg.solve(squares.sum(0) + ridge, products.sum(0))
+    return np.array([_evidence((b**2).mean(), len(b)) for b in left]), float(whole[-1])

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ....sensor.channels import DIVIDER, counts_from_log_impedance, log_impedance
-from .channels import standing
 
 if typing.TYPE_CHECKING:
     from ..model.fields import Fields
@@ -20,6 +19,11 @@ __all__ = ["rested"]
 
 _LOG_DIVIDER = float(np.log(DIVIDER))
 _LEAST, _MOST = 40.0, 4055.0  # [counts] beyond which an electrode is at the end of what it can read
+# Electrodes that rest elsewhere, which comparisons about the rest leave out.
+_FAR = 8.0  # robust standard deviations of the other electrodes, which differ from sensor to sensor
+_ROBUST = 1.4826  # standard deviation of a normal variable by its median absolute deviation
+_STANDING = 12.0  # [counts]
+_FEW = 4  # where more stand off, it is the base model or the sensor that is another
 
 
 def rested(
@@ -29,7 +33,7 @@ def rested(
     reads: Sequence[tuple[int, int]] = (),
 ) -> tuple["Simulator", "Fields"]:
     """The simulator and its fields of the data with electrodes that rest at their mean counts before touch;
-    one that stands off (`channels.standing`), which is no matter of its impedance, or reads nothing, stays.
+    one that stands off (`_standing`), which is no matter of its impedance, or reads nothing, stays.
 
     Args:
       fields: as the simulator solved them. reads: (electrode, the one it shows), whose rest that is."""
@@ -40,12 +44,18 @@ def rested(
         rest[shown] = rest[shows]
     apart = rest - simulated
     off = (
-        np.isin(np.arange(len(apart)), standing(apart - np.median(apart))[0])
-        | (rest < _LEAST)
-        | (rest > _MOST)
+        np.isin(np.arange(len(apart)), _standing(apart - np.median(apart))) | (rest < _LEAST) | (rest > _MOST)
     )
     shift = np.where(off, 0.0, log_impedance(rest) - own)
     new = copy.copy(sim)
     new.log_rest = shift
     base, quick = ([one | {"log_z": one["log_z"] + shift} for one in f] for f in (fields.base, fields.quick))
     return new, dataclasses.replace(fields, base=base, quick=quick)
+
+
+def _standing(other):
+    """Indices of baselines that deviate from the model's, by differences (nelectrode,) about their median
+    [counts]; none if many do."""
+    away = np.abs(other)
+    which = np.flatnonzero(away > max(_FAR * _ROBUST * np.median(away), _STANDING))
+    return which if len(which) <= _FEW else which[:0]

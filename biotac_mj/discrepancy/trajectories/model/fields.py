@@ -49,6 +49,7 @@ class Fields:
         self.quick = self.base if self.quick is None else self.quick
         first = self.trajectories[0].tdc
         self.stacked = {k: [stack(one) for one in v] for k, v in self.slopes.items()}
+        self._last = {}  # trajectory -> the offset that `shifted` had last, and what it gave
         self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
 
     def add(self, name: str, slope: list) -> None:
@@ -68,13 +69,17 @@ class Fields:
 
     def shifted(self, i: int, offset: np.ndarray) -> np.ndarray:
         """(n, 23) what an offset (n, 3) of the poses changes of trajectory i [m]."""
-        heading, change = self.trajectories[i].heading, 0.0
+        before, change = self._last.get(i, (None, 0.0))
+        if before is not None and np.array_equal(before, offset):
+            return change
+        heading, change, across = self.trajectories[i].heading, 0.0, offset
         if self.deeper is not None:
             along = offset @ heading
-            change, offset = self.deeper.at(i, along), offset - np.outer(along, heading)
-        for name, by in zip("xyz", offset.T):
+            change, across = self.deeper.at(i, along), offset - np.outer(along, heading)
+        for name, by in zip("xyz", across.T):
             if name in self.stacked and by.any():
                 change = change + self.stacked[name][i] * by[:, None]
+        self._last[i] = offset.copy(), change
         return change
 
     def shifting(self, i: int, offset: np.ndarray) -> list[np.ndarray]:
