@@ -20,7 +20,9 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.readings import PhysicsReadings
 from biotac_mj.skin import SkinOptions
+from biotac_mj.skin.newton.worlds import NOT_CONVERGED
 from biotac_mj.skin.rubber.material import material as preset
+from biotac_mj.skin.state import GUESS, MEMORY, VARIABLES
 
 DT = 2e-3
 RADIUS = 3.5e-3
@@ -121,6 +123,33 @@ def read(mjm, d, channel):
     """(nworld, dim) of a channel."""
     sensor = mjm.sensor(f"biotac_{channel}")
     return d.sensordata.numpy()[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_skins_that_are_put_back_remember_the_step_before(tier):
+    """Of worlds that touch, begin to touch, and leave in the step."""
+    _, m, d, batch = make(press_spec(), 3, tier=tier, readings=False)
+    skin, start = batch.skin, places(3)
+    inwards = -start * [0, 1, 1] / np.linalg.norm(start[:, 1:], axis=1, keepdims=True)
+    skin.prepare_keep()
+    for depth in ([8e-4, -2e-3, 8e-4], [1e-3, 8e-4, -2e-3]):
+        before = {
+            v.name: skin.state.arrays[v.name].numpy().copy()
+            for v in VARIABLES
+            if v.role in (MEMORY, GUESS) and v.name in skin.state.arrays
+        }
+        skin.keep()
+        move(d, start + np.array(depth)[:, None] * inwards)
+        mjw.step(m, d)
+    assert (before["kept"].any(0) != skin.state.arrays["kept"].numpy().any(0)).tolist() == [False, True, True]
+    skin.data.worlds.wanted.fill_(1)
+    skin.reason.fill_(NOT_CONVERGED)  # so that guesses are put back, too
+    skin.put_back()
+    held = before["anchor_geom"] >= 0
+    for name, value in before.items():
+        now = skin.state.arrays[name].numpy()
+        same = (now[held], value[held]) if name == "anchor" else (now, value)
+        np.testing.assert_array_equal(*same, err_msg=name)
 
 
 def places(nworld, seed=0, geometry=None):

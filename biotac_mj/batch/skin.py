@@ -17,7 +17,7 @@ from ..skin.contact.touch import SKINS
 from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_worlds
 from ..skin.program import Fork, Launcher
-from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, allocate
+from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, allocate, zeros
 from ..skin.state_arrays import StateArrays
 from ..skin.step import launch_step, prepare_step
 from ..skin.transfer import Transfer
@@ -118,6 +118,7 @@ class BatchSkin:
             )
             self.by_mocap = wp.array(touching.by_mocap, dtype=bool)
             self._touched, self._bare = wp.zeros(nworld, dtype=int), wp.zeros(nworld, dtype=bool)
+            self._every = wp.ones(nworld, dtype=int)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
         self.release = Release(model, self.data, self.geoms)
@@ -232,7 +233,11 @@ class BatchSkin:
 
     def prepare_keep(self) -> None:
         """Allocates the arrays of `keep`."""
+        outer = self.data.outer
+        self._contact = outer.kept, outer.anchor_geom, outer.anchor
+        self._kept_contact = [zeros(a.shape, a.dtype, self.kind) for a in self._contact]
         memory, guesses = self.state.of_role(MEMORY), self.state.of_role(GUESS)
+        memory = [a for a in memory if a not in self._contact]
         # as they lie in memory, so that whole blocks of it are copied
         lying = [a if a.is_contiguous else a.transpose() for a in [*memory, *guesses]]
         self._kept = [(a, wp.empty_like(a)) for a in lying]
@@ -247,11 +252,19 @@ class BatchSkin:
         """Keeps what the skins remember, for `put_back`. Launches only."""
         for array, kept in self._kept:
             wp.copy(kept, array)
+        self._copy_contact(self._every, self._contact, self._kept_contact)
 
     def put_back(self) -> None:
         """Gives the wanted worlds back what they remembered; where the last solve converged, the next one
         begins from it, as if the skin had gone there in the last step already. Launches only."""
-        self._put_back.launch_wanted(self.data.worlds.wanted, self.reason)
+        wanted = self.data.worlds.wanted
+        self._put_back.launch_wanted(wanted, self.reason)
+        self._copy_contact(wanted, self._kept_contact, self._contact)
+
+    def _copy_contact(self, on, source, target):
+        """Copies the anchors, most of the memory, of those faces alone that have some."""
+        dim = source[0].shape[::-1]
+        self._launch(kernels.copy_anchors, dim, [on, *source], target)
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""

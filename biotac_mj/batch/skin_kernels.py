@@ -9,6 +9,7 @@ from ..skin.types import mat33, real, vec3, vec6
 __all__ = [
     "begin_at_rest",
     "begin_frames",
+    "copy_anchors",
     "find_bare",
     "forget_contacts",
     "forget_poses",
@@ -128,6 +129,34 @@ def forget_contacts(
             anchor_geom[i, w] = -1
         elif g >= 0:
             touched_out[w] = 1
+
+
+@wp.kernel
+def copy_anchors(
+    # In:
+    on: wp.array(dtype=int),
+    kept: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # In and out:
+    kept_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+):
+    """Copies the contact of face f, see `contact.faces.commit_face`: anchors of faces that have some."""
+    w, f = wp.tid()
+    has = kept[f, w]
+    if on[w] == 0 or (has == 0 and kept_out[f, w] == 0):
+        return
+    kept_out[f, w] = has
+    nsample = geom.shape[0] / kept.shape[0]
+    for i in range(f * nsample, (f + 1) * nsample):
+        g = int(-1)
+        if has == 1:
+            g = geom[i, w]
+        geom_out[i, w] = g
+        if g >= 0:
+            anchor_out[i, w] = anchor[i, w]
 
 
 @wp.kernel
