@@ -364,20 +364,16 @@ def test_viscosity_acts_near_balance_only_without_progress(model, error, stale, 
 
 @pytest.mark.parametrize("adhesion", [0.0, 0.05])
 def test_a_skin_that_is_left_comes_to_rest_in_one_step(adhesion):
-    """From a deep press Newton's method may not find there, and in parts it took ten times as long. One that
-    is still touched goes on in parts, and so does one that sticks: what pulls may hold it."""
-    law = {"contact_law": {"adhesion": adhesion}}
-    easy, hasty = finger(**law), finger(max_newton=1, **law)
-    rest = SkinData(easy, 1).vert_xpos[0]
-    data, touching = press(easy, [0, 0], PATH[:3])
+    """From a deep press, beside a skin that is still touched; also where adhesion held it."""
+    model = finger(contact_law={"adhesion": adhesion})
+    rest = SkinData(model, 1).vert_xpos[0]
+    data, touching = press(model, [0, 0], PATH[:3])
     away = [[0, 0, 30e-3], [30e-3, 0, 0]]
     touching.set_pose([away, pose(1.4e-3)])
-    step(hasty, data, touching)
-    assert data.converged.tolist() == [adhesion == 0, False]
-    if adhesion == 0:
-        np.testing.assert_allclose(data.vert_xpos[0], rest, rtol=0, atol=1e-9)
-        assert not data.wrench[0].any() and data.load_factor.tolist() == [1, 0]
-    assert data.wrench[1].any()
+    step(model, data, touching)
+    assert data.converged.all()
+    np.testing.assert_allclose(data.vert_xpos[0], rest, rtol=0, atol=1e-9)
+    assert not data.wrench[0].any() and data.wrench[1].any()
 
 
 def test_numbers_of_worlds(model):

@@ -25,7 +25,7 @@ class CompliantBodies:
             self._wrench = wp.zeros((n, w, 6), dtype=real)
             self._stiffness = wp.zeros((n, *self._faces), dtype=wp.spatial_matrixd)
             self._load = wp.zeros((2 * n, *self._faces), dtype=vec3)
-            self._none, self._least = (wp.zeros(self._groups, dtype=wp.spatial_vectord) for _ in range(2))
+            self._least = wp.zeros(self._groups, dtype=wp.spatial_vectord)
             self._x_least = wp.zeros_like(self._data.x)
             self.needs_wrench = wp.zeros(w, dtype=int)
         # a view of `_wrench` with the type that the kernels here take
@@ -86,10 +86,6 @@ class CompliantBodies:
         d, on = self._data, self._data.worlds.cut_off
         self._set(program, self._least, on, d.bodies.posed)
         self._set(program, self._x_least, on, d.x)
-
-    def release(self, program: Launcher, on: wp.array) -> None:
-        """Sets the wrenches to zero."""
-        self._set(program, self._none, on, self._data.bodies.posed)
 
     def mark_unknown_wrenches(self, program: Launcher) -> None:
         """Marks (`needs_wrench`) worlds with a load increment whose wrenches at the start of the path have

@@ -44,7 +44,7 @@ class Vectors:
             self.partial = wp.zeros((3, self.nchunk, w), dtype=real)
             self.viscous_work = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
-            self.flags = wp.zeros(9, dtype=int)
+            self.flags = wp.zeros(8, dtype=int)
             # bound of each sample's friction at the start of the load increment [N]
             self.bound = wp.zeros((len(model.outer.face) * len(model.sample), w), dtype=real)
             self.corner_normal_force = wp.zeros((3 * len(model.outer.face) if has_law else 0, w), dtype=real)

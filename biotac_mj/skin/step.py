@@ -200,12 +200,11 @@ class SkinStep:
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
         (
             self._any_open,
-            self._any_failed,
             self._any_increment,
             self._any_short,
             self._any_lagged,
             self._any_pending,
-        ) = (flags[i : i + 1] for i in range(3, 9))
+        ) = (flags[i : i + 1] for i in range(3, 8))
         self._graph = None
         compile_kernels(model.device, self._record)
         if model.device.is_cuda:
@@ -367,11 +366,8 @@ class SkinStep:
     def _try_next(self):
         """The next try of the open worlds."""
         d, k, st, m, g = self.d, self.k, self.st, self.m, self.geoms
-        if not (self.implicit or d.memory):  # with these a skin without contact may be elsewhere
-            self._launch(worlds.mark_failed, d.nworld, [st], [self._any_failed])
-            self._launcher.branch(self._any_failed, self._restart_untouched)
-        bounds, passed = [_LEAST_INCREMENT if g.count else 1.0, m.options.max_work], k.flags[3:5]
-        self._launch(load_path.choose_increment, d.nworld, [*bounds, st, passed, self._any_increment])
+        bounds = [_LEAST_INCREMENT if g.count else 1.0, m.options.max_work]
+        self._launch(load_path.choose_increment, d.nworld, [*bounds, st, self._any_open, self._any_increment])
         # slip of new contact counts from the poses at the end of an accepted increment
         poses = [(g.struct.pos, g.struct.pos_last), (g.struct.mat, g.struct.mat_last)]
         for value, out in [*poses, (d.x, k.x_start)]:
@@ -381,18 +377,6 @@ class SkinStep:
             self._compliant.accept(self._launcher, st.accepted)
         self._launcher.branch(self._any_increment, self._start_increment)
         self._try()
-
-    def _restart_untouched(self):
-        """Starts a try from the reference configuration in worlds where nothing touches it. A skin that all
-        geoms left in one step is far from it, and would take many load increments."""
-        d, st = self.d, self.st
-        self._set(d.rest_vert, st.moving, d.x)
-        if self._compliant:
-            self._compliant.release(self._launcher, st.moving)
-            self._pose(st.trial_factor, st.moving)
-        self._forces.evaluate(self._launcher, st.moving)
-        self._launch(faces.switch_off_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
-        self._launch(worlds.begin_reference_try, d.nworld, [self.m.options.max_work, st])
 
     def _start_increment(self):
         """The next load increment of the worlds that are moving."""

@@ -24,7 +24,6 @@ __all__ = [
     "face_samples",
     "clear_bounds",
     "limit_contacts",
-    "switch_off_touched",
     "partial_wrench",
     "normal_forces",
     "sum_normal_forces",
@@ -151,14 +150,6 @@ def write_face(
 def block_index(a: int, b: int):
     """Index of the stored block of a face between corners a <= b: 00 01 02 11 12 22."""
     return a * (5 - a) // 2 + b
-
-
-@wp.kernel
-def switch_off_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
-    """Clears the flag of a world in which face f touches."""
-    f, w = wp.tid()
-    if on[w] == 1 and touching[f, w] == 1:
-        on[w] = 0
 
 
 @wp.kernel

@@ -15,8 +15,6 @@ from .worlds import (
     NO_CUTBACK,
     NOT_CONVERGED,
     NOT_FINITE,
-    TRIED,
-    TRYING,
     Worlds,
     begin_try,
     set_viscosity,
@@ -50,8 +48,12 @@ def end_try(st: Worlds, any_open: wp.array(dtype=int)):
         return
     if st.inverted[w] >= 2:
         st.failed[w] = 1
-    if _is_finished(st, w):
-        _finish(st, w)
+    if st.failed[w] == 0 and st.trial_factor[w] == real(1.0) and _bound_is_current(st, w):
+        set_viscosity(st, w, real(0.0))
+        st.friction_mode[w] = CURRENT
+        st.load_factor[w] = real(1.0)
+        st.reason[w] = CONVERGED
+        st.unfinished[w] = 0
     else:
         any_open[0] = 1
 
@@ -72,27 +74,12 @@ def _bounds_converge(st: Worlds, w: int):
     return rounds < 2 or st.start_error[w] < most
 
 
-@wp.func
-def _is_finished(st: Worlds, w: int):
-    """Whether the world is in equilibrium at the end of its load path."""
-    return st.failed[w] == 0 and st.trial_factor[w] == real(1.0) and _bound_is_current(st, w)
-
-
-@wp.func
-def _finish(st: Worlds, w: int):
-    set_viscosity(st, w, real(0.0))
-    st.friction_mode[w] = CURRENT
-    st.load_factor[w] = real(1.0)
-    st.reason[w] = CONVERGED
-    st.unfinished[w] = 0
-
-
 @wp.kernel
 def choose_increment(
     shortest: real,
     max_work: int,
     st: Worlds,
-    passed: wp.array(dtype=int),
+    any_open: wp.array(dtype=int),
     any_increment: wp.array(dtype=int),
 ):
     """Accepts or cuts back the load increment of each unfinished world and chooses the next one. Worlds that
@@ -107,24 +94,16 @@ def choose_increment(
     forces have a potential (except adhesion). The bounds are updated until they repeat. If they do not, the
     anchors are committed at each equilibrium; slip then dissipates energy, so that the iteration ends.
 
-    passed: flags of earlier kernels, which are cleared.
+    any_open: the flag of `end_try`, which is cleared.
     """
     w = wp.tid()
     if w == 0:
-        for k in range(passed.shape[0]):
-            passed[k] = 0
+        any_open[0] = 0
     st.active[w] = 0
     st.moving[w] = 0
     st.accepted[w] = 0
     st.restores[w] = 0
     if st.unfinished[w] == 0:
-        return
-    if st.reference_try[w] == TRYING:
-        st.reference_try[w] = TRIED
-        st.active[w] = 1
-        return
-    if _is_finished(st, w):
-        _finish(st, w)
         return
     set_viscosity(st, w, real(0.0))
     again = st.failed[w] == 0 and not _bound_is_current(st, w)

@@ -18,19 +18,14 @@ __all__ = [
     "NOT_CONVERGED",
     "NOT_FINITE",
     "NO_CUTBACK",
-    "TRIED",
-    "TRYING",
-    "UNTRIED",
     "VISCOUS_AFTER",
     "Worlds",
     "all_on",
     "begin_try",
     "begin_worlds",
     "end_worlds",
-    "mark_failed",
     "modulus_of",
     "set_viscosity",
-    "begin_reference_try",
     "total_of",
     "totals_of",
 ]
@@ -45,8 +40,6 @@ _LEAST_REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] lower limit of `referenc
 VISCOUS_AFTER = wp.constant(8)  # iterations of a try before artificial viscosity may start
 _LIQUID_STIFFNESS = wp.constant(wp.float64(40.0))  # bulk modulus of the liquid in a line search, over E
 
-# values of `Worlds.reference_try`
-UNTRIED, TRYING, TRIED = (wp.constant(i) for i in range(3))
 # values of `Worlds.cut_back`: no increment was cut back; the last one was; an earlier one was
 NO_CUTBACK, LAST_CUT_BACK, CUT_BACK_BEFORE = (wp.constant(i) for i in range(3))
 
@@ -110,7 +103,6 @@ class Worlds:
     restores: wp.array(dtype=int)  # the next try starts from the last increment's equilibrium
     rounds: wp.array(dtype=int)  # equilibria with lagged friction bounds in this increment
     start_error: wp.array(dtype=real)  # `error` at the start of the try
-    reference_try: wp.array(dtype=int)  # whether a try from the reference configuration was made
     least_error: wp.array(dtype=real)  # of an iterate at the end of the path; bodies give way
     improved: wp.array(dtype=int)  # `least_error` is that of the present iterate
     cut_off: wp.array(dtype=int)  # the step ends with the iterate of the least error
@@ -279,37 +271,10 @@ def begin_worlds(
     st.increment[w] = real(0.0)
     st.cut_back[w] = NO_CUTBACK
     st.rounds[w] = 0
-    st.reference_try[w] = UNTRIED
     st.offset[w] = real(0.0)
     if st.keeps_volume[w] == 1:
         st.offset[w] = st.last_pressure[w]
     st.reference[w] = wp.max(wp.abs(st.last_pressure[w]), _LEAST_REFERENCE)
-
-
-@wp.kernel
-def mark_failed(st: Worlds, any_failed: wp.array(dtype=int)):
-    """Marks worlds (as moving) whose first try failed and that may be tried from the reference configuration,
-    since the geoms may have left the skin. Not with adhesion, which may still hold it."""
-    w = wp.tid()
-    st.moving[w] = 0
-    if st.unfinished[w] == 0 or st.failed[w] == 0:
-        return
-    if st.reference_try[w] != UNTRIED or st.increment[w] > real(0.0):
-        return
-    if st.deep[w] == 0 and st.adhesive[w] == 0:
-        st.moving[w] = 1
-        any_failed[0] = 1
-
-
-@wp.kernel
-def begin_reference_try(max_work: int, st: Worlds):
-    """Starts a try from the reference configuration in the moving worlds, where nothing touches it."""
-    w = wp.tid()
-    if st.moving[w] == 1:
-        st.reference_try[w] = TRYING
-        st.failed[w] = 0
-        set_viscosity(st, w, real(0.0))
-        begin_try(st, w, VISCOUS_AFTER, max_work)
 
 
 @wp.kernel
