@@ -16,6 +16,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import face_areas
 from ..geometry.tet_mesh import enclosed_volume
 from ..quiet import announce_compilation
+from ..threads import single_thread
 from . import liquid
 from .contact.faces import face_samples
 from .contact.law import ContactLaw, contact_law
@@ -23,7 +24,7 @@ from .contact.meshes import bake_distance_grid
 from .contact.penetration import rest_gap
 from .geoms import GeomSet
 from .precondition.block_inverse import DissectedInverse
-from .precondition.sparse import SparseFactor
+from .precondition.supernodal import SupernodalFactor, elimination_of
 from .rubber.law import LAWS
 from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
@@ -401,7 +402,7 @@ class SkinModel:
         return self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
 
     @functools.cached_property
-    def factor(self) -> SparseFactor:
+    def factor(self) -> SupernodalFactor:
         """Sparse factor of `stiffness`, on the CPU."""
         return self.factor_of(self.stiffness)
 
@@ -411,7 +412,7 @@ class SkinModel:
         points, thirds = self.geometry.vert[self.free], self.material.poissons_ratio > _STIFF_IN_VOLUME
         return DissectedInverse(self.stiffness, points, self.device, thirds)
 
-    def factor_at(self, vert_xpos: np.ndarray) -> SparseFactor:
+    def factor_at(self, vert_xpos: np.ndarray) -> SupernodalFactor:
         """Sparse factor of the skin in a deformed shape, see `Tetrahedra.deformed`; always positive definite.
         On the CPU.
 
@@ -425,11 +426,12 @@ class SkinModel:
         stiffness = self.elements.deformed(vert_xpos).rest_stiffness(self.material.mu, self.material.lame)
         return self.factor_of(self._of_free(stiffness))
 
-    def factor_of(self, stiffness: sp.csc_matrix) -> SparseFactor:
+    def factor_of(self, stiffness: sp.csc_matrix) -> SupernodalFactor:
         """Sparse factor of a matrix with the pattern of `stiffness`."""
-        made = SparseFactor(stiffness, self.free, self.geometry.vert, self._elimination)
-        self._elimination = made.elimination
-        return made
+        if self._elimination is None:
+            self._elimination = elimination_of(stiffness, self.geometry.vert[self.free])
+        with single_thread():  # its fronts are small: more threads would wait for each other
+            return SupernodalFactor(stiffness, self._elimination, self.free)
 
     def _of_free(self, stiffness):
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()

@@ -16,7 +16,7 @@ class Factors:
     press have similar shapes.
 
     Attributes:
-      now: a `skin.precondition.sparse.SparseFactor`. dof: free coordinates, in the order of its rows.
+      now: a `skin.precondition.supernodal.SupernodalFactor`. dof: free coordinates, in the order of its rows.
     """
 
     def __init__(self, model: SkinModel):

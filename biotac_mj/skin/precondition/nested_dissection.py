@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-__all__ = ["clusters", "cut", "dissect"]
+__all__ = ["cut", "dissect"]
 
 _LEAF = 25  # nodes that are not divided further
 _CUTS = (0.42, 0.5, 0.58)  # fractions of the nodes on one side that are tried
@@ -95,20 +95,3 @@ def _separator(neighbours, first):
         front = front[(front >= 0) & ~row_seen[front]]
         row_seen[front] = True
     return np.concatenate([a[rows[~row_seen]], b[columns[column_seen]]])
-
-
-def clusters(points: np.ndarray, size: int) -> list[np.ndarray]:
-    """Groups of about `size` neighbouring nodes, from repeated halving of points (n, 3) along the longest
-    side."""
-    order = np.arange(len(points))
-    stack, out = [order], []
-    while stack:
-        nodes = stack.pop()
-        if len(nodes) <= size:
-            out.append(nodes)
-            continue
-        axis = np.ptp(points[nodes], axis=0).argmax()
-        nodes = nodes[np.argsort(points[nodes, axis], kind="stable")]
-        stack += [nodes[len(nodes) // 2 :], nodes[: len(nodes) // 2]]
-    order = np.concatenate(out)
-    return np.array_split(order, max(1, len(order) // size))
