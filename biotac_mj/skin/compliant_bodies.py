@@ -24,6 +24,7 @@ class CompliantBodies:
             self._touched_by = wp.zeros((forces.geoms.count, w), dtype=int)
             self._wrench = wp.zeros((n, w, 6), dtype=real)
             self._stiffness = wp.zeros((n, *self._faces), dtype=wp.spatial_matrixd)
+            self._touched = wp.zeros((n, *self._faces), dtype=int)
             self._load = wp.zeros((2 * n, *self._faces), dtype=vec3)
             self._least = wp.zeros(self._groups, dtype=wp.spatial_vectord)
             self._x_least = wp.zeros_like(self._data.x)
@@ -107,11 +108,9 @@ class CompliantBodies:
         """Computes residual and compliance of the bodies in the active worlds."""
         d, f = self._data, self._forces
         inputs = [f.wrench_chunk, f.geoms.struct, d.x, f.contact, d.worlds.active]
-        outputs = [d.body_contact, self._stiffness]
-        self._launch(program, bodies.measure_stiffness, self._faces, inputs, outputs)
-        f.decide(
-            program, bodies.begin_iteration, [self._stiffness, d.worlds.active, *self._structs, d.worlds]
-        )
+        stiffness = [self._touched, self._stiffness]
+        self._launch(program, bodies.measure_stiffness, self._faces, inputs, [d.body_contact, *stiffness])
+        f.decide(program, bodies.begin_iteration, [*stiffness, d.worlds.active, *self._structs, d.worlds])
 
     def add_residual(self, program: Launcher) -> None:
         """Adds the effect of the bodies' residual on the skin to r and its square."""

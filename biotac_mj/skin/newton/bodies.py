@@ -143,14 +143,16 @@ def measure_stiffness(
     on: wp.array(dtype=int),
     # Out:
     d: BodyContact,
+    touched_out: wp.array3d(dtype=int),
     partial_out: wp.array3d(dtype=wp.spatial_matrixd),
 ):
-    """S = R' D R of a chunk of faces [group, chunk, world]."""
+    """S = R' D R of a chunk of faces, and whether it touches the body [group, chunk, world]. S is written
+    only there: few chunks touch."""
     c, w = wp.tid()
     if on[w] == 0:
         return
-    for g in range(partial_out.shape[0]):
-        partial_out[g, c, w] = wp.spatial_matrixd()
+    for g in range(touched_out.shape[0]):
+        touched_out[g, c, w] = 0
     nsample = contact.sample.shape[0]
     for f in range(c * chunk, wp.min((c + 1) * chunk, contact.face.shape[0])):
         if contact.touching[f, w] == 1:
@@ -175,7 +177,10 @@ def measure_stiffness(
                         turn -= back
                         bend += arm * K
                         wind -= arm * back
-                total = partial_out[mine, c, w]
+                total = wp.spatial_matrixd()
+                if touched_out[mine, c, w] == 1:
+                    total = partial_out[mine, c, w]
+                touched_out[mine, c, w] = 1
                 for i in range(3):
                     for j in range(3):
                         total[i, j] = total[i, j] + move[i, j]
@@ -266,6 +271,7 @@ def _respond(w: int, t: int, b: Bodies, d: BodyContact, st: Worlds):
 @wp.kernel
 def begin_iteration(
     # In:
+    touched: wp.array3d(dtype=int),
     partial: wp.array3d(dtype=wp.spatial_matrixd),
     on: wp.array(dtype=int),
     # In and out:
@@ -281,10 +287,13 @@ def begin_iteration(
     groups = partial.shape[0]
     for g in range(groups):
         own = wp.spatial_matrixd()
+        mine = real(0.0)
         for c in range(t, partial.shape[1], wp.block_dim()):
-            own += partial[g, c, w]
+            if touched[g, c, w] == 1:
+                own += partial[g, c, w]
+                mine = real(1.0)
         S = wp.spatial_matrixd()
-        touching = block_sum(wp.ddot(own, own)) > real(0.0)
+        touching = block_sum(mine) > real(0.0)
         if touching:
             for i in range(6):
                 row = block_sum(vec6(own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]))
