@@ -3,13 +3,12 @@
 import argparse
 import difflib
 import math
-import os
 import pathlib
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
-from .files import check_output, check_output_file, refuse_inputs
+from .files import check_output, check_output_file, picture_kind, refuse_existing, refuse_inputs
 from .units import SI, UNITS, number_of, question, read_quantity
 
 __all__ = [
@@ -217,27 +216,36 @@ def _flat(value: object) -> Iterator[str]:
             yield from _flat(one)
 
 
-def output_folder(*names: str) -> Callable[[str], str]:
-    """Type of a folder to which files of these names can be written; no other argument may name them."""
+def output_folder(*names: str, new: str | None = None) -> Callable[[str], str]:
+    """Type of a folder to which files of these names can be written; no other argument may name them.
+
+    Args:
+      new: a file in it that must not exist, see `files.refuse_existing`; "" for the folder itself.
+    """
 
     def check(text):
         check_output(text, *names)
+        if new is not None:
+            refuse_existing(pathlib.Path(text, new))
         return tuple(pathlib.Path(text) / name for name in names)
 
     return _output(check)
 
 
-def output_file(suffix: str = "", new: bool = False) -> Callable[[str], str]:
+def output_file(suffix: str = "", new: bool = False, picture: bool = False) -> Callable[[str], str]:
     """Type of a file that can be written; no other argument may name it.
 
     Args:
-      suffix: of its name; "" for any. new: whether it must not exist, as what it holds cannot be made again.
+      suffix: of its name; "" for any. new: whether it must not exist, see `files.refuse_existing`.
+      picture: whether its name must be a picture's.
     """
 
     def check(text):
-        if new and os.path.lexists(text):
-            raise ValueError(f"{text} is there already: give a new name")
+        if new:
+            refuse_existing(text)
         check_output_file(text)
+        if picture:
+            picture_kind(text)
         if not text.endswith(suffix):
             raise ValueError(f"{text} does not end in {suffix}: give a name that does")
         return (pathlib.Path(text),)

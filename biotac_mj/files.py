@@ -25,6 +25,7 @@ __all__ = [
     "check_output_file",
     "hdf5",
     "picture_kind",
+    "refuse_existing",
     "refuse_inputs",
     "remove_leftovers",
     "replacing",
@@ -207,6 +208,14 @@ def picture_kind(path: pathlib.Path | str) -> str:
     if kind not in known:
         raise ValueError(f"{path} is no picture: give a name that ends in one of {', '.join(sorted(known))}")
     return kind
+
+
+def refuse_existing(*paths: pathlib.Path | str) -> None:
+    """Raises ValueError if one of these exists. Results replace earlier ones of the same name; recordings,
+    bags, sets and designs never do."""
+    for path in paths:
+        if os.path.lexists(path):
+            raise ValueError(f"{path} is there already: give a new name, or remove it")
 
 
 def refuse_inputs(

@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from . import batch
+from .batch.attach import core_of
 from .batch.rows import Rows
 from .coupling.handle import SENSORS
 from .coupling.settings import SettingKeywords, Settings
@@ -201,14 +202,13 @@ def forward(model: Model, data: Data) -> Data:
 def readings(model: Model, data: Data, prefix: str = "biotac_") -> dict[str, "jax.Array"]:
     """Readings {channel: (..., dim)} of the BioTac with a prefix, from `data.sensordata`: electrodes, pdc,
     pac, tac and tdc [counts], contact_force [N, N m] and status, see `Handle.read`."""
+    core_of(model.mjm, prefix)
     found = {}
     for name in SENSORS:
         i = mujoco.mj_name2id(model.mjm, mujoco.mjtObj.mjOBJ_SENSOR, prefix + name)
         if i >= 0:
             begin = model.mjm.sensor_adr[i]
             found[name] = data.sensordata[..., begin : begin + model.mjm.sensor_dim[i]]
-    if not found:
-        raise ValueError(f"the model has no BioTac {prefix!r}: give the prefix that batch.add was given")
     return found
 
 

@@ -88,6 +88,19 @@ def cell(row, column, value, separator=" "):
     return do
 
 
+def moved(factor, offset):
+    """Other vertices in an .obj file: scaled, then moved along x."""
+
+    def do(path):
+        lines = [line.split() for line in path.read_text().splitlines()]
+        for words in lines:
+            if words[0] == "v":
+                words[1:4] = (f"{factor * float(x) + off:.9g}" for x, off in zip(words[1:4], (offset, 0, 0)))
+        path.write_text("\n".join(" ".join(words) for words in lines) + "\n")
+
+    return do
+
+
 def latin(path):
     path.write_bytes("{'name': 'ö'}".encode("latin-1"))
 
@@ -240,7 +253,9 @@ def files_of_skins():
     yield Row("press --quiet --material material.json", "('utf-8' codec", "material.json", latin)
     yield Row(SKIN, "elem has shape", "skin.npz", arrays(elem=lambda v: v[:, :3]))
     yield Row("press --skin mesh", "no skin at mesh: pass 'coarse'")
-    yield Row(SKIN, "a finger in metres is needed", "skin.npz", arrays(vert=lambda v: 1e3 * v))
+    yield Row(SKIN, "is it in millimetres? multiply it", "skin.npz", arrays(vert=lambda v: 1e3 * v))
+    yield Row(SKIN, "was it scaled twice? multiply it", "skin.npz", arrays(vert=lambda v: 1e-3 * v))
+    yield Row(SKIN, "mm from the origin of its frame, and", "skin.npz", arrays(core_vert=lambda v: v + 0.1))
     for name in ("electrode_pos", "electrode_normal"):
         for factor in (0, 9):
             if (name, factor) != ("electrode_pos", 0):
@@ -770,6 +785,12 @@ def meshes():
     yield Row(ball, "vertices that are not finite", "ball.obj", cell(0, 1, "nan"))
     yield Row(ball, "ball.obj is", "ball.obj", replaced("f ", "# "))
     yield Row(ball, "ball.obj", "ball.obj", text(""))
+    for factor, offset, said in (
+        (1e3, 0, "is it in millimetres? multiply it"),
+        (1e-3, 0, "was it scaled twice? multiply it"),
+        (1, 0.2, "mm from the origin of its frame"),
+    ):
+        yield Row(ball, said, "ball.obj", moved(factor, offset))
     yield Row(ball, "ball.obj is no indenter mesh", "ball.obj", cell(0, 1, "x"))
     stl = ball.replace("ball.obj", "ball.stl")
     for said, content in (
@@ -870,8 +891,8 @@ def numbers():
     yield Row(words, "--reference-material belongs to our own synthetic skin: leave it out")
     yield Row("view --render out.png --hand force.txt", "force.txt is no hand (")
     yield Row("view --skin coarse --render o.xyz", "o.xyz is no picture: give a name that ends in one of")
-    yield Row("press --indenter geom:sphere:3", "has a half-size of 3 m, 0.25 m at most")
-    yield Row("press --indenter geom:box:0.003,0.003,300", "scale them from millimetres")
+    yield Row("press --indenter geom:sphere:3", "geom:sphere:3's largest dimension is 6000 mm, not")
+    yield Row("press --indenter geom:box:0.003,0.003,300", "300's largest dimension is 6e+05 mm, not")
     yield Row("press --jelly", "no option --jelly")
     yield Row("", "the following arguments are required: VERB")
     yield Row("jelly", "invalid choice: 'jelly'")
@@ -932,8 +953,6 @@ OVER_FOLDERS = {
 OVER_FILES = {
     "lab mesh skin.npz --out": "skin.npz",
     "hand mount force.txt --body a --out": "force.txt",
-    "recording show electrodes.txt --out": "electrodes.txt",
-    "view --material material.json --render": "material.json",
     "lab estimate electrodes.txt --known force.txt --out": "force.txt",
 }
 
@@ -980,10 +999,9 @@ def outputs():
         "hand mount force.txt --body=--",
     ):
         yield Row(words, f"no value in {words.split()[-1]}: give one, or leave the option out")
-    yield Row(
-        "recording import shard.h5 --out shard.h5",
-        "--out shard.h5 is one of the files that are",
-    )
+    yield Row("recording import shard.h5 --out shard.h5", "shard.h5 is there already: give a new")
+    yield Row("recording show electrodes.txt --out electrodes.txt", "electrodes.txt is no picture: give a")
+    yield Row("view --material material.json --render material.json", "material.json is no picture: give a")
     yield Row("recording import electrodes.txt --out a.csv", "a.csv does not end in .h5: give a name that")
     yield Row("recording export electrodes.txt --ros1 a.csv", "a.csv does not end in .bag: give a name that")
     yield Row("recording export electrodes.txt --ros1 force.txt", "force.txt is there already: give a new")
@@ -1000,7 +1018,7 @@ def outputs():
     yield Row("lab mesh mesh --out force.txt/a.npz", "force.txt is a file")
     yield Row(f"lab mesh mesh --out {'x' * 300}.npz", "is too long for a name")
     yield Row("data export shard.h5 --out mesh", "mesh is there already")
-    yield Row("data import electrodes.txt --out set", "holds a set already")
+    yield Row("data import electrodes.txt --out set", "set/shard-00000.h5 is there already: give a new")
 
 
 TABLES = (

@@ -1,7 +1,9 @@
 """The command line: help, errors in one line, and the files of a whole press."""
 
+import argparse
 import csv
 import dataclasses
+import pathlib
 import re
 import subprocess
 import sys
@@ -23,6 +25,66 @@ def test_names_in_the_help_are_the_real_ones():
 
     assert sorted(cli.INDENTERS) == sorted(indenter.INDENTERS)
     assert list(cli.MATERIALS) == list(PRESETS) and cli.SKINS == SKINS
+
+
+def options_of(parser, verb=""):
+    """(verb, action) of the whole command line."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, inner in action.choices.items():
+                yield from options_of(inner, f"{verb} {name}".strip())
+        else:
+            yield verb, action
+
+
+OUTPUTS = {
+    f"{verb} {(*action.option_strings, action.dest)[0]}": action.type
+    for verb, action in options_of(cli.parser())
+    if action.dest in ("out", "json", "render", "picture", "ros1", "ros2", "folder")
+    and action.nargs != 0  # a flag
+}
+# file or folder of an output -> what must be there for it to be refused
+NEVER_REPLACED = {
+    "recording import --out": "",
+    "recording record --out": "",
+    "recording export --ros1": "",
+    "recording export --ros2": "",
+    "data import --out": "shard-00000.h5",
+    "data export --out": "",
+    "design new folder": "design.json",
+}
+
+
+def output(name, place):
+    """An output in a folder, of the suffix that it must have."""
+    for suffix in ("", ".h5", ".bag", ".gif", ".npz"):
+        try:
+            return OUTPUTS[name](str(place / f"made{suffix}"))
+        except argparse.ArgumentTypeError as error:
+            assert "does not end in" in str(error)
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_an_output_is_checked_before_the_work(name, tmp_path):
+    """While arguments are read, so before a verb begins."""
+    good = output(name, tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(argparse.ArgumentTypeError, match="is a file|lies under"):
+        OUTPUTS[name](good.replace(str(tmp_path), f"{tmp_path}/file/inside"))
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_results_are_replaced_and_recordings_are_not(name, tmp_path):
+    good = output(name, tmp_path)
+    files = [pathlib.Path(good) / NEVER_REPLACED[name]] if name in NEVER_REPLACED else good.files
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        file.touch() if good.files else file.mkdir()
+    if name not in NEVER_REPLACED:
+        assert OUTPUTS[name](str(good)).files == files
+        return
+    with pytest.raises(argparse.ArgumentTypeError, match=f"{files[0]} is there already: give a new name"):
+        OUTPUTS[name](str(good))
 
 
 def test_help_shows_all_choices(capsys):
@@ -164,7 +226,6 @@ def test_help_is_light():
         (["press", "--depth", "-1mm"], "depth is -1 mm: it must be a positive number"),
         (["lab", "mesh", "nowhere"], "no mesh at nowhere"),
         (["play", "insert_peg", "--policy", "no.safetensors"], "no policy at no.safetensors: give script"),
-        (["lab", "mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
     ],
 )
 def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):

@@ -90,9 +90,5 @@ def test_measured_counts_are_exported(made, exported, capsys):
     data = mujoco.MjData(model)
     data.sensordata[:] = np.load(exported / "measured" / "001.npz")["sensordata"][2]
     np.testing.assert_allclose(data.sensor("electrodes").data, made[1].measured_counts[2, :19], rtol=1e-6)
-    for more, said in (
-        (["--measured"], "is there already: choose"),
-        (["--rate", "50"], "--rate is of --form"),
-    ):
-        assert cli.main([*words, str(exported / "measured"), *more]) == 2
-        assert said in capsys.readouterr().err
+    assert cli.main([*words, str(exported / "other"), "--rate", "50"]) == 2
+    assert "--rate is of --form" in capsys.readouterr().err

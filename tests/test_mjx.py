@@ -174,7 +174,7 @@ def test_what_cannot_be_is_refused_by_name(model):
         mjx.step(model, data.replace(qpos=jnp.zeros((3, 1))))
     with pytest.raises(ValueError, match="seed is of a world here: give it to make_data"):
         mjx.put_model(model.mjm, skin=shell(), seed=1)
-    with pytest.raises(ValueError, match="no BioTac 'thumb_'"):
+    with pytest.raises(ValueError, match="no BioTac 'thumb_': give prefix= one of"):
         mjx.readings(model, data, "thumb_")
     with pytest.raises(TypeError, match="MjModel"):
         mjx.put_model("model.xml")

@@ -196,7 +196,7 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
 def test_a_design_is_not_overwritten(tmp_path):
     flat = PadShape(block=(20.0, 20.0, 6.0), edge=6.0)
     new_design(tmp_path / "flat", flat)
-    with pytest.raises(ValueError, match="flat' holds a design already: give another folder"):
+    with pytest.raises(ValueError, match="flat/design.json is there already: give a new name"):
         new_design(tmp_path / "flat", flat)
     with pytest.raises(ValueError, match="biotac_sp' names no design of your own"):
         new_design(tmp_path / "biotac_sp", flat)

@@ -268,7 +268,7 @@ def test_indenter_meshes_are_checked(tmp_path):
     pair = trimesh.util.concatenate([upright, beside])
     assert not bounds_solid(pair.vertices, pair.faces)
     trimesh.creation.icosphere(radius=3.0).export(tmp_path / "big.obj")
-    with pytest.raises(ValueError, match="must be in metres"):
+    with pytest.raises(ValueError, match="is it in millimetres"):
         make_indenter(f"mesh:{tmp_path / 'big.obj'}")
 
 

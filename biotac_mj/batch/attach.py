@@ -54,7 +54,7 @@ if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 
-__all__ = ["attach", "make"]
+__all__ = ["attach", "core_of", "make"]
 
 # what takes long to compile, or is launched first: it begins before the skin is made
 _KERNELS = [rest_gap.module, meshes, closest, liquid, release, rest, rounds, film_kernels, core_surface]
@@ -183,6 +183,27 @@ def make(
     return made
 
 
+def core_of(mjm: mujoco.MjModel, prefix: str) -> int:
+    """Number of the body that is the core of the BioTac with a prefix.
+
+    Raises:
+      ValueError: the model has none, with the prefixes of those it has.
+    """
+    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
+    if core >= 0:
+        return core
+    names = [mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name]
+    others = [name.removesuffix("core") for name in names if name.endswith("core")]
+    if others:
+        raise ValueError(
+            f"no BioTac {short_repr(prefix)}: give prefix= one of {', '.join(map(repr, others))}"
+        )
+    raise ValueError(
+        f"no BioTac {short_repr(prefix)}: add it to the spec with biotac_mj.batch.add; "
+        f"the model's bodies are {', '.join(names)}"
+    )
+
+
 def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
     """The Settings; refuses what later lines take for granted of the types."""
     if not isinstance(mjm, mujoco.MjModel):
@@ -218,16 +239,7 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
         device=device,
     )
     config = one.config(prefix, mesh, geometry)
-    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
-    if core < 0:
-        names = [mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name]
-        others = [name.removesuffix("core") for name in names if name.endswith("core")]
-        raise ValueError(
-            f"no BioTac {short_repr(prefix)}: give prefix= one of {', '.join(map(repr, others))}"
-            if others
-            else f"no BioTac {short_repr(prefix)}: add it to the spec with biotac_mj.batch.add; "
-            f"the model's bodies are {', '.join(names)}"
-        )
+    core = core_of(mjm, prefix)
     drawn = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
     if drawn >= 0 and mjm.skin_vertnum[drawn] != len(np.unique(geometry.outer_face)):
         raise ValueError(

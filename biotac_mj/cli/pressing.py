@@ -178,7 +178,7 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
     add_skin(verb)
     verb.add_argument(
         "--render",
-        type=output_file(),
+        type=output_file(picture=True),
         metavar="FILE",
         help="write a picture of the ball lying on the pad instead of opening a window",
     )
@@ -317,7 +317,8 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         help="geoms that the BioTac replaces (default: all of the link)",
     )
     verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
-    verb.add_argument("--picture", type=output_file(), metavar="PNG", help="the link before and after")
+    picture = output_file(picture=True)
+    verb.add_argument("--picture", type=picture, metavar="PNG", help="the link before and after")
 
 
 def _mount(args):
@@ -334,6 +335,7 @@ def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--out",
+        type=output_file(".npz"),
         metavar="FILE.npz",
         help="where to store it (default: PATH's name with .npz, in the current folder)",
     )
@@ -347,8 +349,6 @@ def _import_mesh(args):
 
     source = pathlib.Path(args.path)
     out = pathlib.Path(args.out or f"{source.resolve().stem}.npz")
-    if out.suffix != ".npz":
-        raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
     check_output_file(out)
     refuse_inputs("--out", out, source)
     geometry = import_mesh(source)
@@ -369,7 +369,8 @@ def _import_mesh(args):
 def add_design(verbs: argparse._SubParsersAction) -> None:
     """Adds its jobs to the command line."""
     verb = add_verb(verbs, "new", _new_design, "Make a custom pad: a folder for attach(design=FOLDER).")
-    verb.add_argument("folder", metavar="FOLDER", help="of the design; its name is the design's")
+    made = output_folder("default.npz", new="design.json")
+    verb.add_argument("folder", type=made, metavar="FOLDER", help="of the design; its name is the design's")
     length, axes = quantity("length", 0.1, 1e-4), ("ALONG", "ACROSS", "DEPTH")
     for name, text in (
         ("dome", "shell: half an ellipsoid of these semi axes over a core, with liquid"),

@@ -117,7 +117,8 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     )
     add_load_arguments(verb)
     verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
-    verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder of the set")
+    folder = output_folder(new="shard-00000.h5")
+    verb.add_argument("--out", type=folder, required=True, metavar="DIR", help="folder of the set")
     verb = add_verb(
         verbs,
         "export",
@@ -137,7 +138,8 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         metavar="HZ",
         help="of LeRobot's frames, which hold the nearest rows (default: the set's)",
     )
-    verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
+    folder = output_folder(new="")
+    verb.add_argument("--out", type=folder, required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..files import refuse_existing
 from ..geometry.design import SINGLES
 from ..recordings import Recording, load, warnings
 from .schema import Interaction
@@ -126,8 +127,7 @@ def import_recordings(
     paths, out = [pathlib.Path(path) for path in paths], pathlib.Path(out)
     if len(set(paths)) < len(paths):
         raise ValueError("a file is given twice: give each once")
-    if list(out.glob("shard-*.h5")):
-        raise ValueError(f"{out} holds a set already: choose another folder, or delete it")
+    refuse_existing(*out.glob("shard-*.h5"))
     groups, kinds = [], set()
     for path in paths:
         found = load(path, **options)

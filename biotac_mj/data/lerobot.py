@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import tqdm
 
-from ..files import replacing
+from ..files import refuse_existing, replacing
 from ..geometry.design import SINGLES
 from .schema import SPLITS
 
@@ -82,8 +82,7 @@ def interactions_to_export(
     Raises:
       ValueError: `out` exists, or the set is unfinished or lacks counts or needed columns.
     """
-    if pathlib.Path(out).exists():
-        raise ValueError(f"{out} is there already: choose another folder, or delete it")
+    refuse_existing(out)
     if data.unfinished:
         raise ValueError(
             f"{data.path} is unfinished ({data.unfinished}): run its `biotac data generate` again, which "

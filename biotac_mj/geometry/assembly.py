@@ -7,10 +7,11 @@ from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.geometry.solid import check_size
 from biotac_mj.geometry.surface import face_areas
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_cells, enclosed_volume
 
-__all__ = ["assemble", "check_size", "fixed_nodes", "electrodes_on", "split_surfaces"]
+__all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
 
 EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # an absent rigid body
 FIXED_WITHIN = 1e-5  # nodes within this distance of a rigid body are fixed [m] (Narang et al., ICRA 2021)
@@ -106,22 +107,6 @@ def electrodes_on(
     weight = np.exp(-0.5 * (np.linalg.norm(position[:, None] - centre, axis=-1) / 2.5e-4) ** 2) + 1e-12
     normal = weight @ face_areas(core_vert, core_face)
     return position, normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
-def check_size(size: float, what: str = "skin", least: float = 5e-3) -> None:
-    """Raises ValueError unless the largest dimension [m] of a body is that of a part of a fingertip: from
-    `least` to 0.1."""
-    if least <= size <= 0.1:
-        return
-    meant = {1e-3: "is it in millimetres? ", 1e-6: "is it in micrometres? ", 1e3: "was it scaled twice? "}
-    factor = next((factor for factor in meant if least <= factor * size <= 0.1), None)
-    remedy = "make it smaller" if size > 0.1 else "scale it to metres"
-    if factor:
-        remedy = f"{meant[factor]}multiply it by {factor:g}"
-    raise ValueError(
-        f"the {what}'s largest dimension is {1e3 * size:.4g} mm, not between {1e3 * least:g} and 100 mm: "
-        f"{remedy}"
-    )
 
 
 def assemble(

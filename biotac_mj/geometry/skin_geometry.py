@@ -9,7 +9,7 @@ from ..files import write_npz
 from ..reading import Array, read_npz
 from ..short_repr import short_repr
 from .design import BIOTAC, Design, read_design
-from .solid import no_solid
+from .solid import check_place, check_size, no_solid
 from .tet_mesh import TetMesh, check_closed, enclosed_volume, indices, triangle_numbers
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
@@ -28,7 +28,6 @@ PARTS = np.array(
         [4, 9, 6, 7],
     ]
 )
-_SMALLEST, _LARGEST = 0.005, 0.1  # range of a skin's size [m]
 _SOLID = 1e-12  # least volume of core, nail and clamp [m^3], for which MuJoCo computes an inertia
 _OFF = 1e-3  # largest distance of an electrode outside the core's box [m]
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
@@ -143,16 +142,13 @@ class SkinGeometry:
 
     def check(self, name: object) -> None:
         """Raises ValueError if the model of this skin is impossible; name: of the skin in the message."""
-        size = np.ptp(self.vert, axis=0).max(initial=0) if len(self.vert) else 0.0
-        if not _SMALLEST <= size <= _LARGEST:
-            raise ValueError(
-                f"skin {name} is {size:.3g} m long: a finger in metres is needed; import it again"
-            )
+        check_size(np.ptp(self.vert, axis=0).max(initial=0) if len(self.vert) else 0.0, f"skin {name}")
         if not len(self.core_face):
             raise ValueError(
                 f"the core of skin {name} has no faces: a BioTac's skin sits on a closed rigid core; import "
                 "the mesh again"
             )
+        check_place(self.core_vert, f"core of skin {name}")
         low, high = self.core_vert.min(0) - _OFF, self.core_vert.max(0) + _OFF
         length = np.linalg.norm(self.electrode_normal, axis=1)
         if (

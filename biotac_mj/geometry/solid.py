@@ -1,4 +1,5 @@
-"""Triangle meshes as solids: tests whether a mesh bounds a solid, convex hulls, solids of height fields."""
+"""Triangle meshes as solids: tests whether a mesh bounds a solid, has the size of a part of a fingertip and
+lies at its frame's origin, convex hulls, solids of height fields."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -7,6 +8,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 __all__ = [
     "bounds_solid",
+    "check_place",
+    "check_size",
     "close_rim",
     "convex_hull",
     "face_outwards",
@@ -16,6 +19,34 @@ __all__ = [
     "spread_points",
     "winding",
 ]
+
+
+def check_size(size: float, what: str = "skin", least: float = 5e-3, most: float = 0.1) -> None:
+    """Raises ValueError unless the largest dimension [m] of a body is from `least` to `most`, by default that
+    of a part of a fingertip."""
+    if least <= size <= most:
+        return
+    meant = {1e-3: "is it in millimetres? ", 1e-6: "is it in micrometres? ", 1e3: "was it scaled twice? "}
+    factor = next((factor for factor in meant if least <= factor * size <= most), None)
+    remedy = "make it smaller" if size > most else "scale it to metres"
+    if factor:
+        remedy = f"{meant[factor]}multiply it by {factor:g}"
+    raise ValueError(
+        f"the {what}'s largest dimension is {1e3 * size:.4g} mm, not between {1e3 * least:g} and "
+        f"{1e3 * most:g} mm: {remedy}"
+    )
+
+
+def check_place(vert: np.ndarray, what: str) -> None:
+    """Raises ValueError where the box around vertices (n, 3) [m] is farther from the origin of their frame
+    than it is long."""
+    off = np.linalg.norm(np.maximum(np.maximum(vert.min(axis=0), -vert.max(axis=0)), 0.0))
+    size = np.ptp(vert, axis=0).max()
+    if off > size:
+        raise ValueError(
+            f"the {what} is {1e3 * off:.4g} mm from the origin of its frame, and {1e3 * size:.4g} mm long: "
+            "move it to the origin"
+        )
 
 
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:

@@ -11,14 +11,14 @@ import numpy as np
 
 from ..geometry.indenters import INDENTERS, indenter
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
-from ..geometry.solid import face_outwards, no_solid
+from ..geometry.solid import check_place, check_size, face_outwards, no_solid
 from ..reading import reading
 from ..triangles import trimesh
 from ..units import read_quantity
 
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
-_LARGEST = 0.5  # [m] along any axis
+_SMALLEST, _LARGEST = 1e-4, 0.5  # [m] along the longest axis
 _STL_HEADER, _STL_FACE = 84, 50  # bytes of a binary STL, with the number of faces at the header's end
 _ALONG = ("radius", "half length")
 _SIZES = {
@@ -91,11 +91,8 @@ def _from_geom(text):
         raise ValueError(
             f"'geom:{text}' is no {kind}: give its {', '.join(needed)}, above 0, as in geom:{kind}:{example}"
         )
-    if kind != "plane" and max(size) > _LARGEST / 2:
-        raise ValueError(
-            f"'geom:{text}' has a half-size of {max(size):g} m, {_LARGEST / 2:g} m at most: a "
-            "finger is 26 mm long, and sizes are in metres; scale them from millimetres"
-        )
+    if kind != "plane":
+        check_size(2 * max(size), f"indenter geom:{text}", _SMALLEST, _LARGEST)
     vert, face = _surface(kind, size)
     return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), Z_TO_Y, vert @ matrix(Z_TO_Y).T, face)
 
@@ -108,11 +105,8 @@ def _from_file(path):
     if not sound:
         wrong = "has vertices that are not finite" if len(getattr(raw, "faces", ())) else _why_no_faces(path)
         raise ValueError(f"the indenter mesh {path} {wrong}: give a closed surface in metres")
-    if mesh.extents.max() > _LARGEST:
-        raise ValueError(
-            f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; "
-            "scale it from millimetres"
-        )
+    check_size(mesh.extents.max(), f"indenter mesh {path}", _SMALLEST, _LARGEST)
+    check_place(mesh.vertices, f"indenter mesh {path}")
     mesh.update_faces(mesh.unique_faces())
     vert = np.asarray(mesh.vertices)
     face = face_outwards(vert, np.asarray(mesh.faces))  # the inside of a closed surface is no question

@@ -22,7 +22,8 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     )
     v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of its forces and poses")
     add_load_arguments(v)
-    v.add_argument("--out", type=output_file(".h5"), required=True, metavar="FILE.h5", help="the recording")
+    recording = output_file(".h5", new=True)
+    v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="the recording")
     v = verb(
         verbs,
         "export",
@@ -44,7 +45,8 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     v.add_argument("files", nargs="+", metavar="FILE", help="output or input of `biotac recording import`")
     add_which(v)
     add_load_arguments(v)
-    v.add_argument("--out", type=output_file(), default="out/show.png", metavar="PNG", help="the picture")
+    picture = output_file(picture=True)
+    v.add_argument("--out", type=picture, default="out/show.png", metavar="PNG", help="the picture")
     v = verb(
         verbs, "record", _record, "Record a running sensor: a topic of ROS, or lines from a serial port."
     )
@@ -74,8 +76,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         "write their times into it",
     )
     v.add_argument("--object", metavar="NAME", help="what touches")
-    measured = output_file(".h5", new=True)
-    v.add_argument("--out", type=measured, required=True, metavar="FILE.h5", help="the recording")
+    v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="the recording")
 
 
 def add_which(verb: argparse.ArgumentParser) -> None:

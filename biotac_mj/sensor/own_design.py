@@ -8,14 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.distance import pdist, squareform
 
-from ..files import write_json
-from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, check_size, fixed_nodes
+from ..files import refuse_existing, write_json
+from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
 from ..geometry.core_surface import CoreSurface
 from ..geometry.design import DESIGNS, Design
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.importing import read_obj, read_tet_mesh
 from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.solid import check_size
 from ..geometry.tet_mesh import TetMesh, connected_cells, enclosed_volume
 from .channels import counts_from_impedance
 from .film import FilmConduction
@@ -152,9 +153,9 @@ def new_design(
         design already, or has the name of one that is shipped.
     """
     folder = pathlib.Path(folder)
-    if folder.name in ("", "..", *DESIGNS) or (folder / "design.json").exists():
-        why = "holds a design already" if (folder / "design.json").exists() else "names no design of your own"
-        raise ValueError(f"{str(folder)!r} {why}: give another folder")
+    refuse_existing(folder / "design.json")
+    if folder.name in ("", "..", *DESIGNS):
+        raise ValueError(f"{str(folder)!r} names no design of your own: give another folder")
     n = len(electrodes_mm)
     if n and not shape.liquid:
         raise ValueError(

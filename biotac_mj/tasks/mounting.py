@@ -289,8 +289,6 @@ def _add_axes(body):
 
 def mount_verb(args: argparse.Namespace) -> None:
     """`biotac hand mount`: guesses, writes, draws and reports the mount."""
-    if args.picture:
-        picture_kind(args.picture)  # check before the work
     with reading(args.hand, "MJCF of a hand", "give its .xml, beside its meshes"):
         mujoco.MjSpec.from_file(args.hand).compile()
     given = {name: getattr(args, name) for name in ("tip", "pad", "pos", "replaces")}

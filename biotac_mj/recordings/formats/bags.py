@@ -4,6 +4,7 @@ import os
 import pathlib
 import tempfile
 
+from ...files import refuse_existing
 from ...reading import reading
 from ..recording import Recording
 from .driver import FORMS, KINDS, Messages, rows_of
@@ -114,8 +115,7 @@ def write_bag(
     path = pathlib.Path(path)
     if ros not in (1, 2) or form not in FORMS:
         raise ValueError(f"ros is {ros} and form {form!r}: choose 1 or 2, and one of {', '.join(FORMS)}")
-    if ros == 2 and path.exists():
-        raise ValueError(f"{path} is there already: a bag of ROS 2 is a new folder, choose another name")
+    refuse_existing(path)
     rows = rows_of(recording, form)
     types = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
