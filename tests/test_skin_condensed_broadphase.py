@@ -10,8 +10,9 @@ import warp as wp
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, SkinModel, SkinOptions
 from biotac_mj.skin.condensed import LinearSkin
-from biotac_mj.skin.condensed.broadphase import _may_meet_core, _meets_core
+from biotac_mj.skin.condensed.broadphase import _may_meet_core, _meets_core, may_meet_core
 from biotac_mj.skin.condensed.structs import Constants
+from biotac_mj.skin.contact.faces import Contact
 from biotac_mj.skin.contact.meshes import mesh_distance
 from biotac_mj.skin.types import real, vec3
 
@@ -40,27 +41,69 @@ def look(
             true_out[f, w] = 1
 
 
+def pushed(rest, nworld, farthest):
+    """Nodes (nvert, nworld, 3) of skins that are pushed about, as a whole and by waves [m]."""
+    draw, x = np.random.default_rng(1), np.empty((len(rest), nworld, 3))
+    for w in range(nworld):
+        wave = np.sin(rest @ draw.normal(0, 400, (3, 3)) + draw.uniform(0, 6, 3))
+        u = draw.standard_normal(3) + wave * draw.standard_normal(3)
+        x[:, w] = rest + draw.uniform(0.2e-3, farthest) * u / np.linalg.norm(u, axis=1).max()
+    return x
+
+
+def near_core(share, c, x):
+    """Which inner faces [face, world] are found to be nearer to the core than a share of their displacement,
+    and which are."""
+    shape = len(c.inner_face), x.shape[1]
+    found, true = (wp.zeros(shape, dtype=int, device="cpu") for _ in range(2))
+    known = [float(share), c, wp.array(x, dtype=vec3, device="cpu")]
+    wp.launch(look, shape, known, [found, true], device="cpu")
+    return found.numpy(), true.numpy()
+
+
 @pytest.mark.parametrize("name", ["coarse", "ring", pytest.param("biotac_sp/coarse", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_no_face_that_meets_the_core_is_passed_over(name, share):
-    """Skins that are pushed about by millimetres, as a whole and by waves."""
+    """Skins that are pushed about by millimetres."""
     skin = load_skin("coarse" if name == "ring" else name)
     if name == "ring":  # concave, and far below the skin
         ring = trimesh.creation.torus(4e-3, 1.2e-3)
         skin = dataclasses.replace(skin, core_vert=ring.vertices - [8e-3, 0, 0], core_face=ring.faces)
     model = SkinModel(skin, PRESETS["default"], SkinOptions())
     linear = LinearSkin.of(model)
-    c, rest, draw, nworld = linear.constants(model), model.rest.vert, np.random.default_rng(1), 60
-    farthest = 6e-3 if name == "ring" else 2.5e-3
-    x = np.empty((len(rest), nworld, 3))
-    for w in range(nworld):
-        wave = np.sin(rest @ draw.normal(0, 400, (3, 3)) + draw.uniform(0, 6, 3))
-        u = draw.standard_normal(3) + wave * draw.standard_normal(3)
-        x[:, w] = rest + draw.uniform(0.2e-3, farthest) * u / np.linalg.norm(u, axis=1).max()
-    x = wp.array(x, dtype=vec3, device="cpu")
-    found, true = (wp.zeros((len(linear.core_gap), nworld), dtype=int, device="cpu") for _ in range(2))
-    wp.launch(look, found.shape, [float(share), c, x], [found, true], device="cpu")
-    assert 0.01 < true.numpy().mean() < 0.7
-    np.testing.assert_array_equal(found.numpy(), true.numpy())
+    c = linear.constants(model)
+    x = pushed(model.rest.vert, 60, 6e-3 if name == "ring" else 2.5e-3)
+    found, true = near_core(share, c, x)
+    assert 0.01 < true.mean() < 0.7
+    np.testing.assert_array_equal(found, true)
     if name != "ring":  # else nothing is saved
         assert np.median(c.inner_bend.numpy()) < 0.6
+
+
+@wp.kernel(enable_backward=False)
+def ask(
+    share: real,
+    c: Constants,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    may_out: wp.array(dtype=bool),
+):
+    w = wp.tid()
+    may_out[w] = may_meet_core(w, 0, 1, share, x, touch, c)
+
+
+def test_faces_that_come_to_the_core_unsought_were_candidates():
+    """Nodes that move by a little less than the bound, and in half of the worlds by a little more."""
+    share, model = 0.3, SkinModel(load_skin("coarse"), PRESETS["default"], SkinOptions())
+    c, rest = LinearSkin.of(model).constants(model), model.rest.vert[:, None]
+    last = pushed(model.rest.vert, 60, 2.5e-3)
+    way = np.random.default_rng(2).standard_normal(last.shape)
+    way *= np.linalg.norm(last - rest, axis=2, keepdims=True) / np.linalg.norm(way, axis=2, keepdims=True)
+    x = last + share / 3**0.5 * np.where(np.arange(60) < 30, 0.999, 1.001)[:, None] * way
+    touch, may = Contact(), wp.zeros(60, dtype=bool, device="cpu")
+    nodes, touch.x_last = (wp.array(a, dtype=vec3, device="cpu") for a in (x, last))
+    wp.launch(ask, 60, [share, c, nodes, touch], [may], device="cpu")
+    np.testing.assert_array_equal(may.numpy(), np.arange(60) >= 30)
+    candidate, before, now = near_core(share, c, last)[0], near_core(0, c, last)[1], near_core(0, c, x)[1]
+    assert (now > before).sum() > 20
+    assert (candidate >= now)[:, :30].all()

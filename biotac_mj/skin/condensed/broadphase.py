@@ -31,6 +31,7 @@ __all__ = [
     "is_deep",
     "largest_displacement",
     "may_be_reached",
+    "may_meet_core",
     "measure_core",
 ]
 
@@ -344,6 +345,27 @@ def may_be_reached(
             )
             posed = wp.max(posed, moved)
     return ROOT3 * (wp.sqrt(block_max(nodes)) + posed) >= reach
+
+
+@wp.func
+def may_meet_core(
+    w: int,
+    t: int,
+    threads: int,
+    fraction: real,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+):
+    """Whether an inner face that was not nearer to the core than a fraction of its displacement when the
+    increment began may have come to it since, by how far its nodes have moved."""
+    over = real(0.0)
+    for k in range(t, c.inner.shape[0], threads):
+        i = c.inner[k]
+        moved = wp.length_sq(x[i, w] - touch.x_last[i, w])
+        before = wp.length_sq(touch.x_last[i, w] - c.rest[i, 0])
+        over = wp.max(over, ROOT3 * ROOT3 * moved - fraction * fraction * before)
+    return block_max(over) > real(0.0)
 
 
 @wp.func

@@ -72,6 +72,7 @@ class Increment:
     travel: real
     near: wp.int64
     reach: real  # faces closer than this are candidates when the increment begins [m]
+    fraction: real  # inner faces closer to the core than this times their displacement are
     spent: real
     error: real
     pressure: real

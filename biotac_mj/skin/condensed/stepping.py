@@ -20,6 +20,7 @@ from .broadphase import (
     is_deep,
     largest_displacement,
     may_be_reached,
+    may_meet_core,
     measure_core,
 )
 from .correction import is_measured
@@ -260,19 +261,21 @@ def search(
             o.deep = 1
             looking = 0
     if looking == 1:
-        largest = largest_displacement(w, t, threads, x, c)
-        fraction = real(0.0)
-        if first == 1 and p.holds == 0 and largest > real(0.0):
-            fraction = wp.min(real(1.0), real(1.5) * moved / largest)
         nface = o.nface
+        ncore = o.ncore
         new = int(0)
         if first == 1 or may_be_reached(w, t, threads, o.reach, o.near, geoms, x, touch, c, s):
+            largest = largest_displacement(w, t, threads, x, c)
+            if first == 1 and o.reach * largest > real(0.0):
+                o.fraction = wp.min(real(1.0), real(1.5) * o.reach / largest)
             reach = wp.where(first == 1, o.reach, real(0.0))
             nface, new = find_faces(
                 w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, x, c, s
             )  # fmt: skip
-        ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
-        new += inner
+        if first == 1 or may_meet_core(w, t, threads, o.fraction, x, touch, c):
+            fraction = wp.where(first == 1, o.fraction, real(0.0))
+            ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
+            new += inner
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
         else:
