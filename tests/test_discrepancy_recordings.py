@@ -13,18 +13,21 @@ from verdicts import check_verdict
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import max_t, sign_flip
+from biotac_mj.discrepancy.recordings.candidates import KINDS
 from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.detectors.latency import ForceView
 from biotac_mj.discrepancy.recordings.detectors.levels import levels
 from biotac_mj.discrepancy.recordings.detectors.order import slipped
 from biotac_mj.discrepancy.recordings.detectors.process import process
-from biotac_mj.discrepancy.recordings.detectors.trends import sharp, trends
+from biotac_mj.discrepancy.recordings.detectors.trends import Trend, sharp, trends
 from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.plots import overview
 from biotac_mj.discrepancy.report.text import summary
+from biotac_mj.effects.catalogue import entries
 from biotac_mj.effects.effect import shifted
+from biotac_mj.effects.logged import LOGGED
 from biotac_mj.recordings import Recording, load_one
 from biotac_mj.recordings.recording import CLOCKED
 from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
@@ -547,7 +550,6 @@ def test_the_report_leads_with_the_largest_gap(tmp_path):
 
 def test_parameters_are_those_of_the_simulators_effects():
     """What is found can be given to the catalogue's effect of that id."""
-    from biotac_mj.discrepancy.recordings.candidates import KINDS
     from biotac_mj.effects.catalogue import CATALOGUE
 
     for effect in CATALOGUE:
@@ -558,7 +560,37 @@ def test_parameters_are_those_of_the_simulators_effects():
 def test_summary_says_what_it_cannot_know():
     e, rng = unloaded()
     text = summary(diagnose_recording(PlainRecording(noisy(e, rng))))
-    assert "no force: how late" in text and "not loaded: saturation" in text
+    assert "no force: latency" in text and "not loaded: saturation" in text
+
+
+def test_an_effect_is_searched_or_said_to_be_untold():
+    """Of each entry of the catalogue a log tells by itself, or the report says what it would ask for."""
+    e, rng = unloaded()
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
+    untold = {name for line in d.notes for name in line.partition(": ")[2].split(", ")}
+    assert not untold & {"stuck channel", "noise of single electrodes", "liquid lost over the session"}
+    for effect in (*entries("poses"), *LOGGED):
+        effect = KINDS.get(effect.id, effect)
+        has = {"rest", "sign", "time"}  # raw counts for a minute, and nothing else
+        assert (effect.name in untold) == bool(effect.asks - has), effect.id
+
+
+def test_what_no_bound_allows_has_no_name():
+    """Two thirds of the liquid in half a minute are more than a leak loses."""
+    e, rng = unloaded(seconds=30)
+    lost = np.log(1 - 0.67 * np.linspace(0, 1, len(e)))[:, None]
+    counts = counts_from_log_impedance(log_impedance(e) - lost)
+    found = diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE)).findings
+    assert "fluidloss" not in [f.id for f in found] and all(f.possible for f in found)
+
+
+def test_a_straight_drift_is_no_long_warm_up():
+    time = np.linspace(0.0, 200.0, 50)
+    straight = Trend("smooth", np.nan, time, -0.1 * time / 200, 0.0, np.ones(16), 0.0)
+    found = KINDS["warmup"].of_trend(straight, -0.1, np.ones(19), np.ones(19))
+    (a, low, _), (tau, *_) = found["a"], found["tau"]
+    assert low <= a < -0.1 and a > -1.0 and KINDS["warmup"].possible(found)
+    assert a * (1 - np.exp(-200 / tau)) == pytest.approx(-0.1, rel=0.05)
 
 
 @pytest.mark.slow  # quick: what a summary says it cannot know

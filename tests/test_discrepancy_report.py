@@ -26,7 +26,7 @@ WARM = Finding(
     physics="the liquid warms",
     confusable={"thermal": "record TDC"},
     channels=tuple(range(19)),
-    parameters={"tau": Estimate.of(Param("s", 1, 100, "minutes", 60.0), 100.0, 90.0, 110.0)},
+    parameters={"tau": Estimate.of(Param("s", 1, 100, "minutes", 60.0), 100.0, 90.0, 99.0)},
     evidence=12.0,
     p=0.001,
     confidence=0.9,
@@ -192,7 +192,7 @@ def test_the_summary_has_effect_proof_gap_and_what_is_unknown():
     assert text.startswith(VERDICT.headline)
     for part in (
         "warm-up [transduction], all electrodes, confidence 0.90, 0.0 s to 60.0 s",
-        "tau 100 s (90 .. 110)",
+        "tau 100 s (90 .. 99)",
         "level of all electrodes: 10 -> 2 counts, noise 1 (confirmed)",
         "not told from temperature: record TDC",
         "no TDC: whether it is warmth",

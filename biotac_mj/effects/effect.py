@@ -185,9 +185,13 @@ class Effect(abc.ABC):
       instead_of: nuisance parameters of the base model that it replaces.
       sound: root mean square of its parameters that a healthy sensor may have.
       drifts: whether it is a level that changes with the session's clock. in_noise: whether measured noise
-        includes it. silent: whether an electrode has one value under any contact.
+        includes it. is_noise: whether it is noise, which a sensor's measured noise has. silent: whether an
+        electrode has one value under any contact.
       alike: whether a running sensor has it equally on all electrodes. most: {parameter: largest value that a
         running sensor can have}.
+      asks: what a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of the counts;
+        "time" in which touches are told from drift; "load"; "change", that it begins or ends there; "poses",
+        where nothing else will do; "search", where nothing searches it.
       detector: class of evidence in logs, which sets a name's confidence
         (`discrepancy.recordings.confidence`).
     """
@@ -212,8 +216,9 @@ class Effect(abc.ABC):
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0
-    drifts = in_noise = silent = alike = False
+    drifts = in_noise = is_noise = silent = alike = False
     most: dict = {}
+    asks: frozenset = frozenset({"poses"})
     detector = ""
 
     @abc.abstractmethod
@@ -292,6 +297,10 @@ class Effect(abc.ABC):
     def rejection_reason(self, theta: dict) -> str | None:
         """Reason why fitted parameters are implausible for this effect, or None."""
         return None
+
+    def possible(self, values: dict) -> bool:
+        """Whether found parameters, name -> (value, low, high), lie within their bounds."""
+        return all(self.params[n].low <= v[0] <= self.params[n].high for n, v in values.items())
 
     def alias(self, theta: dict) -> tuple:
         """Ids of other effects that are as likely with such parameters, whichever fits better."""

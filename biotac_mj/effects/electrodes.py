@@ -41,7 +41,7 @@ class ElectrodeDrift(Effect):
         "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
     }
     grid = ({"q": 0.4}, {"q": 1.0})
-    equivalents, per_channel = ("warmup",), True
+    equivalents, per_channel, asks = ("warmup",), True, frozenset()
     confusable = {
         "warmup": "free segments over the session: one electrode or all",
         "gain": "the same probe at the beginning and the end of the session",
@@ -63,12 +63,12 @@ class ElectrodeDrift(Effect):
 
 
 class Noise(Effect):
-    """Not in the catalogue, as it changes no prediction; `diagnose` measures it in rows at rest."""
+    """Not searched with poses, as it changes no prediction; `diagnose` measures it in rows at rest."""
 
     id, name, stage = "noise", "noise of single electrodes", "A"
     physics = "an electrode is noisier than the others: a bad contact, a leaking lead"
     fits = frozenset()
-    per_channel = True
+    per_channel = is_noise = True
     each = Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)
     params = dict.fromkeys(BIOTAC.electrodes, each)
     confusable = {"offset": "a long record at rest"}

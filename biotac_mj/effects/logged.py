@@ -12,6 +12,7 @@ import numpy as np
 
 from ..sensor.channels import FULL_SCALE, NELECTRODE, electrode_noise
 from .effect import Effect, Param, Run
+from .electrodes import Noise
 from .sensing import FluidLoss, Saturation, WarmUp
 
 __all__ = ["LOGGED", "SHARED", "Logged", "SharedLevel"]
@@ -31,7 +32,7 @@ class Logged(Effect):
     """
 
     stage = "A"
-    fits = _LOG
+    fits, asks = _LOG, frozenset()
 
     def __init__(
         self,
@@ -95,6 +96,7 @@ class SharedLevel(Effect):
 
 class CountOffset(Logged, SharedLevel):
     id, name, detector = "count_offset", "common offset in counts", "supply"
+    asks = frozenset({"rest", "change"})
     physics = "reference or supply: adds the same counts to every electrode"
     params = {"change": _COUNTS}
     confusable = {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}
@@ -111,6 +113,7 @@ class CountOffset(Logged, SharedLevel):
 
 class CountGain(Logged, SharedLevel):
     id, name, detector = "count_gain", "common gain in counts", "supply"
+    asks = frozenset({"rest", "change"})
     physics = "reference or supply: scales every count"
     params = {"change": Param("1", -0.9, 0.9, "supplies")}
     confusable = {"count_offset": "rest levels that differ more"}
@@ -129,7 +132,7 @@ class Level(Logged):
     """A step if it ends where it begins, else a ramp to a constant level."""
 
     id, name = "drift", "drift or jump of an electrode"
-    drifts = True
+    drifts, asks = True, frozenset({"time"})
     physics = "an offset of one channel's amplifier or contact"
     params = {"change": _COUNTS}
     confusable = {
@@ -147,6 +150,7 @@ class Level(Logged):
 
 class Flip(Logged):
     id, name = "flip", "sign of an electrode reversed"
+    asks = frozenset({"sign", "change"})
     physics = "an electrode responds to the load with the opposite sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
     confusable = {"gain": "press next to the electrode"}
@@ -159,7 +163,7 @@ class ExchangeInLog(Logged):
     """Each of its electrodes shows the next one, from the start on."""
 
     id, name = "swap", "exchanged channels"
-    wiring = True
+    wiring, asks = True, frozenset({"change"})
     physics = "electrodes carry each other's signal: cable or channel order"
     params = {"onset": _TIME}
     confusable = {"gain": "an exchange changes two channels at once"}
@@ -208,7 +212,7 @@ class LostRows(Logged):
 
 
 class SaturationInLog(Saturation, Logged):
-    fits = _LOG
+    fits, asks = _LOG, frozenset({"time", "load"})
     params = {"level": _COUNTS}
     grid = ({},)
     confusable = Saturation.confusable | {
@@ -258,10 +262,20 @@ class Hum(Logged):
         return counts + theta["amplitude"] * np.sin(2 * np.pi * theta["frequency"] * time)
 
 
+class NoiseInLog(Noise, Logged):
+    fits, asks = _LOG, frozenset()
+    params = {"size": Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)}
+    confusable = Noise.confusable | {"gain": "press next to the electrode: a gain makes touches larger, too"}
+    apply = Logged.apply
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return counts + theta["size"] * self.rng.standard_normal(counts.shape)
+
+
 class CommonNoise(Logged):
     """Not searched."""
 
-    id, name, fits = "common_noise", "noise common to all channels", frozenset()
+    id, name, fits, asks = "common_noise", "noise common to all channels", frozenset(), frozenset({"search"})
     physics = "one noise is added to every channel: reference, supply"
     params = {"correlation": Param("1", 0.05, 1, "0.001 in a real sensor")}
     confusable = {"crosstalk": "cross-talk falls off with distance"}
@@ -279,7 +293,7 @@ _LEVELS = {
 
 
 class WarmUpInLog(WarmUp, SharedLevel):
-    fits, detector, drifts = _LOG, "shared", True
+    fits, asks, detector, drifts = _LOG, frozenset(), "shared", True
     params = {
         "a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source),
         "tau": Param("s", 1, 1e5, "minutes"),
@@ -287,16 +301,17 @@ class WarmUpInLog(WarmUp, SharedLevel):
     confusable = WarmUp.confusable | _LEVELS
 
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """a, tau of the a (1 - exp(-t / tau)) closest to the trend."""
-        time = np.linspace(trend.knots[0], trend.knots[-1], 200)
+        """a, tau of the a (1 - exp(-t / tau)) closest to the trend. A straight line has no end: of all
+        that are as close it is the one with the least a."""
+        time, bounds = np.linspace(trend.knots[0], trend.knots[-1], 200), self.params["tau"]
         y = trend(time) - trend(time[:1])
         fits = []
-        for tau in np.geomspace(0.05, 20, 60) * time[-1]:
+        for tau in np.unique(np.clip(np.geomspace(0.05, 20, 60) * time[-1], bounds.low, bounds.high)):
             basis = np.column_stack([1 - np.exp(-time / tau), np.ones(len(time))])
             w, *_ = np.linalg.lstsq(basis, y, rcond=None)
             fits.append((float(((y - basis @ w) ** 2).sum()), tau, w[0]))
-        least = min(fits)
-        near = [f for f in fits if f[0] < 1.5 * least[0] + 1e-4 * (y**2).sum()]
+        near = [f for f in fits if f[0] < 1.5 * min(fits)[0] + 1e-4 * (y**2).sum()]
+        least = min(near, key=lambda f: abs(f[2]))
         return {
             name: (least[i], min(f[i] for f in near), max(f[i] for f in near))
             for name, i in (("a", 2), ("tau", 1))
@@ -304,8 +319,11 @@ class WarmUpInLog(WarmUp, SharedLevel):
 
 
 class FluidLossInLog(FluidLoss, SharedLevel):
-    fits, detector, drifts = _LOG, "loss", True
+    fits, asks, detector, drifts = _LOG, frozenset({"sign"}), "loss", True
     rises = True
+    params = FluidLoss.params | {
+        "rate": Param("1/h", 0.0, 60.0, "0-15 % a day from permeability; a leak empties it in a minute", 0.2)
+    }
     confusable = FluidLoss.confusable | _LEVELS
 
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
@@ -328,6 +346,7 @@ LOGGED = (
     Quantise(),
     Spikes(),
     Hum(),
+    NoiseInLog(),
     CommonNoise(),
 )
 SHARED = tuple(effect for effect in LOGGED if isinstance(effect, SharedLevel))

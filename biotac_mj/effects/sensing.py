@@ -115,7 +115,7 @@ class FluidLoss(Effect):
 
 class Thermal(Effect):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
-    fits, detector = frozenset({"poses", "log"}), "shared"
+    fits, asks, detector = frozenset({"poses", "log"}), frozenset({"tdc"}), "shared"
     physics = "ln Z = ... - alpha (T - T0), T from TDC"
     params = {
         "alpha": Param(
@@ -322,7 +322,7 @@ class LowPass(Effect):
 
 class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
-    fits = frozenset({"poses", "log"})
+    fits, asks = frozenset({"poses", "log"}), frozenset({"force"})
     alike, most = True, {"delay": MOST_LATENCY}
     physics = "electrodes are read with a delay: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}

@@ -9,6 +9,7 @@ from .fault import Fault
 from .lines import hum
 from .log import Log
 from .lost import dropped, jumping, unmeasured
+from .noise import noisy
 from .sample_hold import sample_and_hold
 from .spikes import off_rows, spikes
 from .stuck import dead, stuck_or_clipped
@@ -42,7 +43,7 @@ def check(log: Log, named: float = NAMED) -> Checked:
 
 def sample_faults(log: Log, named: float = NAMED) -> Checked:
     """Finds faults of samples: dead, coarse, repeated, stuck, clipped and spiked ones, words that overflow,
-    hum.
+    hum, noise.
 
     Each detector ignores the samples that the detectors before it rejected.
     """
@@ -51,7 +52,7 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
         return Checked(log, dead(log), [])
     log, faults = put_back(log)
     weak = []
-    for find in (off_rows, unmeasured, coarse, dead, sample_and_hold, hum, stuck_or_clipped, spikes):
+    for find in (off_rows, unmeasured, coarse, dead, sample_and_hold, hum, stuck_or_clipped, spikes, noisy):
         for fault in find(_less(log, faults), faults):
             fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)

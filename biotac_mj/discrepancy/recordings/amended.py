@@ -48,11 +48,11 @@ def amended_sensor(session: Session) -> SensorFile:
 
 
 def running(session: Session) -> tuple[list, list[str]]:
-    """[(Effect, theta)] of the effects found that act in a running sensor, without its baseline and trend;
-    and ids of the others: faults of the logger or of the force sensor, and single events."""
+    """[(Effect, theta)] of the effects found that act in a running sensor, without its baseline, trend and
+    noise; and ids of the others: faults of the logger or of the force sensor, and single events."""
     design, effects, left = designed(session.recording.electrodes), [], []
     for finding in session.findings:
-        if finding.kind.drifts or finding.kind.silent:
+        if finding.kind.drifts or finding.kind.silent or finding.kind.is_noise:
             continue
         theta = _theta(finding)
         if theta is None:

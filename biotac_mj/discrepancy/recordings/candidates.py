@@ -89,6 +89,11 @@ class Candidate:
         return KINDS[self.id]
 
     @property
+    def possible(self) -> bool:
+        """Whether its parameters lie within the catalogue's bounds."""
+        return self.kind.possible(self.parameters)
+
+    @property
     def of_all(self) -> bool:
         """Whether it is of the sensor rather than of some electrodes."""
         return len(self.channels) > _MOST

@@ -1,7 +1,6 @@
 """Diagnosis of a plain recording: its verdict with figures, and its sensor."""
 
 import dataclasses
-import math
 
 from ...effects.catalogue import name_of
 from ...effects.sensor_file import SensorFile
@@ -9,10 +8,10 @@ from ...recordings.protocol import Protocol
 from ...recordings.recording import REST_LIKE
 from ..report.verdict import Estimate, Finding, Picture, Verdict
 from .amended import amended_sensor, running
+from .blind import untold
 from .candidates import Candidate
-from .model import LEAST, WINDOW
 from .proof import views
-from .recording import FORCE_MOVED, PlainRecording
+from .recording import PlainRecording
 from .rest import Rest, rest
 from .session import Session
 
@@ -82,7 +81,7 @@ def concluded(
         where_note="electrodes that depart, from and to [s], RMS [counts]",
         remainder=left.text,
         unknown=left.significant,
-        notes=_notes(session),
+        notes=untold(session) + _order(r),
         next_experiment=_next(session.findings, protocol),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(session),
@@ -161,28 +160,8 @@ def _amended(session):
     return lines
 
 
-def _notes(session):
-    """Lines on effects that the data cannot show."""
-    recording, loads, out = session.recording, "saturation", []
-    if recording.force is None:
-        out.append("no force: how late the electrodes follow it")
-    if recording.tdc is None:
-        out.append("no TDC: whether a warm-up is the liquid's temperature")
-    if not session.model().parted:
-        out.append(
-            f"too short to tell touches from drift, record {math.ceil(LEAST / session.fit.mean())} s or "
-            f"more: slow changes of single electrodes, {loads}"
-        )
-    elif not session.loaded and recording.force is not None and recording.force.std(0).max() > FORCE_MOVED:
-        out.append(
-            "touches could not be told from drift, record some at several places that each change electrodes "
-            f"by tens of counts within {WINDOW[0]:g} s: {loads}"
-        )
-    elif not session.loaded:
-        out.append(f"not loaded: {loads}")
-    out += recording.not_identifiable
-    if recording.absolute and recording.rest_correlation < REST_LIKE:
-        out.append(
-            "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
-        )
-    return out
+def _order(recording):
+    """Line on an order of channels that is wrong all the time."""
+    if not recording.absolute or recording.rest_correlation >= REST_LIKE:
+        return []
+    return ["rest levels unlike those of published sensors: an order of channels that is wrong all the time"]

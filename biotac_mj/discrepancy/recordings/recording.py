@@ -114,22 +114,6 @@ class PlainRecording:
         return not self.unit.endswith("without sign")
 
     @property
-    def not_identifiable(self) -> list[str]:
-        """Lines on effects that a log with subtracted baseline does not show; empty for raw counts."""
-        if self.absolute:
-            return []
-        out = [
-            f"the electrodes are {self.unit}, their rest is assumed: the ends of the converter, words that "
-            "overflow, gain and offset of all against a warm-up, the amended sensor's rest"
-        ]
-        if not self.signed:
-            out.append(
-                "the electrodes have no sign: the sign of an electrode, lost liquid against a warm-up, a "
-                "lower limit"
-            )
-        return out
-
-    @property
     def time(self) -> np.ndarray:
         """(n,) [s] from the first row."""
         return np.arange(len(self)) / self.rate

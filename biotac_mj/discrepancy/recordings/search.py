@@ -124,7 +124,7 @@ def _beside(session, checked, named):
 def _take(session, finding, named):
     """Takes a finding out of the counts if it is likely enough beside all others."""
     alone = finding.trend is not None and finding.share is None
-    if finding.p >= _P:
+    if finding.p >= _P or not finding.possible:
         finding.confidence = _sure(session, finding)
         session.weak.append(finding)
         return False

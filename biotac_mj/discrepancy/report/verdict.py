@@ -12,6 +12,8 @@ import math
 import re
 import typing
 
+import numpy as np
+
 from ...effects.effect import STAGES
 
 if typing.TYPE_CHECKING:
@@ -55,7 +57,9 @@ class Estimate:
     @classmethod
     def of(cls, param: "Param", value: float, low: float = math.nan, high: float = math.nan) -> "Estimate":
         """Estimate of a parameter of an effect."""
-        return cls(float(value), float(low), float(high), param.unit, (param.low, param.high), param.source)
+        bounds = param.low, param.high
+        low, high = (float(np.clip(end, *bounds)) for end in (low, high))
+        return cls(float(value), low, high, param.unit, bounds, param.source)
 
     def __str__(self):
         text = f"{self.value:.4g}" + ("" if self.unit in ("", "1") else f" {self.unit}")

@@ -8,6 +8,7 @@ something moves, single electrodes are processes of the others and of time (`pro
 import numpy as np
 
 from ....effects.logged import SHARED
+from ....effects.sensing import Thermal
 from ....geometry.design import Design
 from ....geometry.electrodes import electrode_positions
 from ....recordings.recording import designed
@@ -315,15 +316,16 @@ def _name_shared(session, finding, trend, change):
     common, at = m.levels(m.shared(np.ones(len(m.used))))
     sudden = trend.kind == "step" and sharp(common, at, trend.onset) > SHARP
     order = [e for e in sorted(SHARED, key=lambda e: e.drifts == sudden) if change > 0 or not e.rises]
-    best, *ties = [e for e in order if misfit[e.id] < 2 * min(misfit.values()) + 12]
-    finding.id, ties = best.id, [e.id for e in ties]
-    finding.parameters = best.of_trend(trend, change, m.slope, middle)
+    alike = [e for e in order if misfit[e.id] < 2 * min(misfit.values()) + 12]
+    found = {e.id: e.of_trend(trend, change, m.slope, middle) for e in alike}
+    best, *ties = [e for e in alike if e.possible(found[e.id])] or alike
+    finding.id, finding.parameters, ties = best.id, found[best.id], [e.id for e in ties]
+    finding.detector = Detector(alike[0].detector)  # by which way all go, whatever is possible
     ties = _by_temperature(session, finding, trend, ties)
     if not session.recording.absolute:  # the patterns follow from the levels, the sign from the sign
         alike = [e.id for e in SHARED if not e.rises or change > 0 or not session.recording.signed]
         ties = [*ties, *(i for i in alike if i != finding.id and i not in ties)]
     finding.ties = tuple(ties)
-    finding.detector = Detector(finding.kind.detector)
 
 
 def _misfits(m, middle, trend):
@@ -366,10 +368,13 @@ def _by_temperature(session, finding, trend, ties):
         return [*ties, "thermal"] if alike else ties
     if gain.sum() <= _TOLD * finding.nats:
         return [*ties, "thermal"]
-    ties, finding.id = [finding.id, *ties], "thermal"
+    finding.detector = Detector(Thermal.detector)  # another channel tells it, whatever its cause
     slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
     spread = float(np.sqrt(np.mean(out**2)) / (np.std(warm) * np.sqrt(len(warm))))
-    finding.parameters = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}
+    alpha = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}
+    if not Thermal().possible(alpha):
+        return ties
+    ties, finding.id, finding.parameters = [finding.id, *ties], "thermal", alpha
     share = finding.share
 
     def correct(counts, at):

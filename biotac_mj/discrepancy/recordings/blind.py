@@ -1,0 +1,52 @@
+"""What a plain recording does not tell: effects of the catalogue that ask for what it lacks."""
+
+import math
+
+from ...effects.catalogue import entries
+from ...effects.logged import LOGGED
+from .model import LEAST, WINDOW
+from .recording import FORCE_MOVED
+from .session import Session
+
+__all__ = ["untold"]
+
+
+def untold(session: Session) -> list[str]:
+    """Lines, one for each thing that the recording lacks (`Effect.asks`): what would show there, or how, and
+    names of the effects that ask for it. An effect stands in the first of them."""
+    known = {e.id: e for e in (*entries("poses"), *LOGGED, *entries("log"))}
+    lacking, names = _lacking(session), {}
+    for effect in known.values():
+        first = next((need for need in lacking if need in effect.asks), None)
+        names.setdefault(first, []).append(effect.name)
+    return [f"{text}: {', '.join(names[need])}" for need, text in lacking.items() if need in names]
+
+
+def _lacking(session):
+    """Key of `Effect.asks` -> in words, of what the recording lacks."""
+    r, out = session.recording, {}
+    if r.force is None:
+        out["force"] = "no force"
+    if r.tdc is None:
+        out["tdc"] = "no TDC"
+    if not r.absolute:
+        out["rest"] = (
+            f"the electrodes are {r.unit}, their rest is assumed, as is that of the amended sensor, and the "
+            "ends of the converter are not known"
+        )
+    if not r.signed:
+        out["sign"] = "the electrodes have no sign"
+    if not session.model().parted:
+        least = math.ceil(LEAST / session.fit.mean())
+        out["time"] = f"too short to tell touches from drift, record {least} s or more"
+    elif not session.loaded and r.force is not None and r.force.std(0).max() > FORCE_MOVED:
+        out["load"] = (
+            "touches could not be told from drift, record some at several places that each change electrodes "
+            f"by tens of counts within {WINDOW[0]:g} s"
+        )
+    elif not session.loaded:
+        out["load"] = "not loaded"
+    out["change"] = "told only where it begins or ends here, not where it holds throughout or comes slowly"
+    out["poses"] = "no poses of what touched, with which `diagnose` searches these"
+    out["search"] = "not searched in any data"
+    return out
