@@ -5,6 +5,7 @@ A plugin's callbacks get bare addresses. The field layouts of the installed MuJo
 introspection tables, so that a new release that adds fields needs no change here."""
 
 import ctypes
+import functools
 import math
 import pathlib
 import types
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, enums, structs
 
-__all__ = ["LIBRARY", "PGS", "DataView", "ModelView", "c_structs"]
+__all__ = ["LIBRARY", "DataView", "ModelView", "c_structs"]
 
 LIBRARY = ctypes.CDLL(
     str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
@@ -70,10 +71,11 @@ _ROWS = (
 )
 _built = {}
 _TINY = np.finfo(float).tiny
-PGS = int(mujoco.mjtSolver.mjSOL_PGS)
+_PGS, _NEWTON = int(mujoco.mjtSolver.mjSOL_PGS), int(mujoco.mjtSolver.mjSOL_NEWTON)
 _NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 # iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
 _ENOUGH = 99
+_SEARCHES = 50  # of a line at most, MuJoCo's default
 
 
 def _c_type(node):
@@ -207,6 +209,7 @@ class DataView(_View):
         super().__init__("mjData", address)
         self.model, self._other = model, model.struct
         self._where = self._rows = None
+        self._solver = self.model.struct  # whose options the last `acceleration` had
 
     def __getattr__(self, name):
         if name not in self._field:
@@ -231,10 +234,28 @@ class DataView(_View):
     def row_states(self) -> np.ndarray:
         """(nefc,) states of the rows, mjtConstraintState, where MuJoCo's constraint solver left them. Where
         it solves island by island it leaves `efc_state` as the warm start was, and writes `iefc_state`."""
-        option, rows = self.model.opt, self.rows()
-        if not self.struct.nisland or option.solver == PGS or option.noslip_iterations:
+        rows = self.rows()
+        if not self.struct.nisland or _is_dual(self._solver.opt):
             return rows.efc_state
         return rows.iefc_state[rows.map_efc2iefc]
+
+    @property
+    def is_dual(self) -> bool:
+        """Whether the model's solver, PGS or with noslip, works on the forces of rows: in its iterations it
+        does not find those of stiff ones."""
+        return _is_dual(self.model.opt)
+
+    @functools.cached_property
+    def _primal(self):
+        return c_structs("mjModel").from_buffer_copy(self.model.struct)
+
+    def _take_primal(self):
+        """The model with Newton's method for its solver."""
+        self._primal.opt, option = self.model.struct.opt, self._primal.opt
+        option.solver, option.noslip_iterations = _NEWTON, 0
+        option.iterations = max(option.iterations, _ENOUGH + 1)
+        option.ls_iterations = max(option.ls_iterations, _SEARCHES)
+        return self._primal
 
     def make_constraints(self) -> None:
         """Makes all constraint rows again, as mj_fwdPosition does: equalities were switched since."""
@@ -260,7 +281,7 @@ class DataView(_View):
         """Makes the poses of bodies, geoms and sites those of the positions of now."""
         LIBRARY.mj_kinematics(self.model.address, self.address)
 
-    def acceleration(self, again: bool = False) -> np.ndarray:
+    def acceleration(self, again: bool = False, primal: bool = False) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
         rows as they are now.
 
@@ -272,6 +293,7 @@ class DataView(_View):
         Args:
           again: whether nothing but passive forces, Jacobians and regularisation of rows has changed since it
             was last called.
+          primal: whether Newton's method takes the place of a dual solver.
         """
         model, data = self.model.address, self.address
         qacc, warmstart = self.qacc, self.qacc_warmstart
@@ -281,26 +303,28 @@ class DataView(_View):
             LIBRARY.mj_referenceConstraint(model, data)
             LIBRARY.mj_fwdActuation(model, data)
         LIBRARY.mj_fwdAcceleration(model, data)
-        LIBRARY.mj_fwdConstraint(model, data)
+        self._solver = self._take_primal() if primal and self.is_dual else self.model.struct
+        solver = ctypes.addressof(self._solver)
+        LIBRARY.mj_fwdConstraint(solver, data)
         for _ in range(self._rounds_left()):
             if not self._stopped():
                 break
             warmstart[:] = kept[1][:] = qacc
-            LIBRARY.mj_fwdConstraint(model, data)
+            LIBRARY.mj_fwdConstraint(solver, data)
         out = qacc.copy()
         qacc[:], warmstart[:] = kept
         return out
 
     def _rounds_left(self):
         """Number of further rounds; none if each run starts anew."""
-        option = self.model.opt
+        option = self._solver.opt
         if option.disableflags & _NO_WARMSTART:
             return 0
         return _ENOUGH // max(option.iterations, 1)
 
     def _stopped(self):
         """Whether MuJoCo's constraint solver ended at its last iteration, not as near as it should."""
-        return max(self.struct.solver_niter) >= self.model.opt.iterations
+        return max(self.struct.solver_niter) >= self._solver.opt.iterations
 
     def unsolved(self, acceleration: np.ndarray, dofs: np.ndarray) -> float:
         """Residual of `acceleration`: forces that would balance its (nv,) on some dofs and that no constraint
@@ -315,3 +339,7 @@ class DataView(_View):
         inertia = np.maximum(self.model.dof_M0[dofs], _TINY)
         size, *others = (math.sqrt(float(f @ (f / inertia))) for f in (left, held, passive))
         return size / max(others) if any(others) else 0.0
+
+
+def _is_dual(option):
+    return option.solver == _PGS or bool(option.noslip_iterations)

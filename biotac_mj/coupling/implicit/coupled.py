@@ -30,7 +30,7 @@ class Coupled:
         too.
       compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
         `SkinGroup.find_compliance`.
-      forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_group`.
+      forced: wrenches (n, 6) that act in place of model and rows, or None. withdrawn: nothing acts.
     """
 
     def __init__(self, instance: Instance, data: DataView):
@@ -42,7 +42,7 @@ class Coupled:
         if self.idle:
             return
         self.result = self.forced = None
-        self.written, self.settled = False, True
+        self.withdrawn, self.written, self.settled = False, False, True
         self.off, self.may_act, self._cost = np.inf, True, 0.0
         self.jacobian = instance.kinematics.jacobians()
         self.arrays = arrays = instance.begin_arrays()
@@ -71,8 +71,8 @@ class Coupled:
         arrays.qacc[:] = acceleration
         np.add(self.amiss, self.excess, out=arrays.amiss)
         arrays.evaluate()
-        if self.forced is not None:
-            arrays.acting[:] = self.forced
+        if self.withdrawn:
+            arrays.acting[:] = 0.0
         self.off = np.inf if self.result is None else float(arrays.off[0])
 
     @property
@@ -126,25 +126,20 @@ class Coupled:
         self.arrays.find_wrenches()
         return self.correction + self.arrays.wrench
 
-    def force(self, wrench: np.ndarray, push: float) -> None:
-        """Lets wrenches (n, 6) act in place of model and rows; push: 1 where these are the skin's, 0 where
-        they are none."""
-        self.forced, self.arrays.push[:] = wrench, push
+    def withdraw(self) -> None:
+        """Lets nothing act in this step; the model stays as the next one's first."""
+        self.forced, self.withdrawn, self.arrays.push[:] = np.zeros_like(self.correction), True, 0.0
         self.touching, self.written, self.settled = np.zeros(0, int), False, False
 
     def move_on(self) -> None:
         """Takes the Jacobians of the bodies where one of Runge-Kutta's stages has them."""
         self.jacobian, self.written = self.instance.kinematics.jacobians(), False
+        if not self.withdrawn:
+            self.forced = None
 
-    def act_by_rows(self) -> None:
-        """Lets model and rows act again."""
-        if self.forced is not None:
-            self.forced, self.touching = None, _touching(self.tangent)
-
-    def equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Wrenches (n, 6) without acceleration, and how they fall as the bodies move on (n, 6, 6)."""
-        self.arrays.find_wrenches()
-        return self.arrays.wrench.copy(), self.tangent
+    def hold(self, acceleration: np.ndarray) -> None:
+        """Lets what acts with accelerations (nv,) of MuJoCo's constraint solver act in place of the rows."""
+        self.forced, self.written = self.acting_with(acceleration), False
 
     def acting_with(self, acceleration: np.ndarray) -> np.ndarray:
         """(n, 6) that acts with accelerations (nv,) that MuJoCo's constraint solver has found, in this
@@ -161,11 +156,6 @@ class Coupled:
         self.instance.metric.release()
 
     # --- the energy that the skin can give ---
-
-    @property
-    def turning(self) -> float:
-        """Largest rotation of its bodies in the step [rad]."""
-        return np.abs(self.arrays.travel[:, 3:]).max(initial=0.0)
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""

@@ -16,7 +16,6 @@ import functools
 
 import mujoco
 import numpy as np
-from scipy.linalg import block_diag
 
 from ...geometry.rigid_warp import LEVER
 from ...threads import run_in_threads
@@ -24,7 +23,7 @@ from ..instance import NO_PASSIVE, NO_SENSOR, STAGES, Instance
 from ..loads import Loads
 from ..solid import SOLVED
 from ..solid_contacts import SolidContacts
-from ..structs import PGS, DataView, ModelView
+from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .group import SkinGroup
 from .integrator import Integrator
@@ -37,7 +36,6 @@ __all__ = ["ASTRAY", "World"]
 CORRECTED = 1e-6
 # [m] from where a skin was solved: there Runge-Kutta's stages may lead its bodies, other than the first says
 ASTRAY = 1e-4
-_FAR = 1.0  # [rad] that a body turns in a step
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
 _RESETS = {
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name.upper()}")): name for name in ("qpos", "qvel", "qacc")
@@ -220,6 +218,7 @@ class World:
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
+            self._hold(skins, outside, self._found)
             self._group.find_frequencies()
             self._acting, self._now, self._began_with = skins, self.data.qpos.copy(), self.data.qvel.copy()
         else:
@@ -246,10 +245,12 @@ class World:
         for skin in self._acting:
             skin.move_on()
         self._group = SkinGroup(self._acting, self._springs)
-        self._forces(self._acting, self.data.qfrc_passive.copy())
-        found = self.data.acceleration()
+        outside = self.data.qfrc_passive.copy()
+        self._forces(self._acting, outside)
+        found = self.data.acceleration(primal=True)
         for skin in self._acting:
             skin.act(found, STAGES[self._stage - 1])
+        self._hold(self._acting, outside, found)
 
     def _finish(self):
         """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
@@ -304,19 +305,8 @@ class World:
 
     def _predict(self, skins, outside):
         """Finds where the bodies go under the skins' models, and how far that is from where the skins were
-        solved.
-
-        What PGS makes of rows that it leaves open may be anywhere, also where nothing touches.
-        """
-        for skin in skins:
-            skin.act_by_rows()
-        acceleration = self._accelerations(skins, outside)
-        self._group.evaluate(acceleration)
-        if self._rows_are_open(skins):
-            self._solve_group(skins, outside)
-
-    def _rows_are_open(self, skins):
-        return self.model.opt.solver == PGS and not all(map(self._rows_hold, skins))
+        solved."""
+        self._group.evaluate(self._accelerations(skins, outside))
 
     def _damp(self, skins, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
@@ -338,50 +328,12 @@ class World:
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself.
         """
-        by_rows = all(skin.forced is None for skin in skins)
-        while [skin for skin in skins if by_rows and skin.arrays.restrain()]:
-            self._group.evaluate(self._accelerations(skins, outside))
-        if self._rows_are_open(skins) or self._gain(skins):
-            self._act_by_force(skins, outside)
-
-    def _act_by_force(self, skins, outside):
-        """If MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too little
-        of the passive forces, or too much. So only forces act, without rows, and none if they would gain
-        energy together with others."""
-        self._solve_group(skins, outside)
-        gains = self._gain(skins)
-        if gains:
-            self._force(skins, outside, [np.zeros_like(skin.correction) for skin in skins], 0.0)
-        for skin in skins:
-            skin.settled = not gains and skin.off < self.tolerance
-
-    def _gain(self, skins):
-        """Whether bodies gain more than they have in the skins. Where one turns by a radian in a step under
-        forces, its way does not tell their work."""
-        return any(
-            skin.arrays.gains() or (skin.forced is not None and skin.turning >= _FAR) for skin in skins
-        )
-
-    def _solve_group(self, skins, outside):
-        """Solves the models and the bodies' inertia together, with what other constraints do without the
-        skins; lets what is found act as forces."""
-        wrench, tangent = zip(*(skin.equations() for skin in skins))
-        self._force(skins, outside, [np.zeros_like(skin.correction) for skin in skins], 0.0)
-        jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
-        response = self.integrator.integrated(self.data.moved_by(jacobian))
-        squares = np.repeat(np.concatenate([skin.square for skin in skins]), 6)
-        compliance = squares[:, None] * (response @ jacobian.T)
-        moved = np.concatenate([skin.moved for skin in skins])
-        stiffness = block_diag(*np.concatenate(tangent))
-        left = np.concatenate(wrench).ravel() - stiffness @ moved.ravel()
-        found = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
-        ends = np.cumsum([len(skin.correction) for skin in skins])[:-1]
-        self._force(skins, outside, np.split(found, ends), 1.0)
-
-    def _force(self, skins, outside, wrenches, push):
-        for skin, wrench in zip(skins, wrenches):
-            skin.force(wrench, push)
-        self._group.evaluate(self._accelerations(skins, outside))
+        while [skin for skin in skins if skin.arrays.restrain()]:
+            self._predict(skins, outside)
+        if any(skin.arrays.gains() for skin in skins):
+            for skin in skins:
+                skin.withdraw()
+            self._predict(skins, outside)
 
     def _accelerations(self, skins, outside):
         """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
@@ -398,7 +350,7 @@ class World:
     def _corrected(self, skins, outside):
         """Accelerations a and a'."""
         self._forces(skins, outside)
-        found = self.data.acceleration(again=self._damped is not None)
+        found = self.data.acceleration(again=self._damped is not None, primal=True)
         if self._damped is None:  # known only after the actuation stage
             self._damped = self.integrator.take_matrices(self.data)
             self._inertia = self.integrator.inertia if self._damped else None
@@ -425,7 +377,14 @@ class World:
             correction = held @ (found - self.integrator.integrated(found))
             group.correction[touching] = correction.reshape(-1, 6)
             self._forces(skins, outside)
-            found = self.data.acceleration(again=True)
+            found = self.data.acceleration(again=True, primal=True)
+
+    def _hold(self, skins, outside, found):
+        """Lets forces act in place of rows that a dual solver would leave open."""
+        if self.data.is_dual:
+            for skin in skins:
+                skin.hold(found)
+            self._forces(skins, outside)
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
@@ -433,6 +392,5 @@ class World:
         self._project()
 
     def _project(self):
-        option = self.model.opt
-        if option.solver == PGS or option.noslip_iterations:  # they work on what the rows were before
+        if self.data.is_dual:  # it works on what the rows were before
             self.data.project_constraints()
