@@ -385,7 +385,10 @@ def _conclude_pass(
     o.passes += 1
     n = 3 * o.nnode + o.nin
     if o.ok == CUT:
-        _bound(w, t, threads, o.nnode, o.nin, s)
+        if o.error < real(1.0) - p.at:
+            _bound(w, t, threads, o.nnode, o.nin, s)
+        else:  # further from a balance than where the path began
+            o.ok = 0
     if count_contacts(w, t, threads, o.nface, touch, c, s) > s.most_contacts:
         o.ok = 0
     if o.ok == 0:
