@@ -261,9 +261,9 @@ def find_faces(
         f = begin + t
         left = int(0)
         if f < c.face.shape[0]:
-            if s.near[w, f] == 0 and s.far[w, view, f] < most:
+            left = wp.where(s.near[w, f] > 0 or s.far[w, view, f] < most, 1, 0)
+            if left == 1 and s.near[w, f] == 0:
                 room = s.far[w, view, f] - free  # by which it has to move
-                left = 1
                 if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, x, c):
                     left = 0
         rank = block_rank(left)
@@ -272,16 +272,23 @@ def find_faces(
         count += rank[1]
     sync()
     close = int(0)
+    new = int(0)
     for begin in range(0, count, threads):
         f = int(0)
         left = int(0)
         within = wp.int64(0)
         if begin + t < count:
             f = s.look[w, begin + t]
+            near_by = wp.where(s.near[w, f] > 0, wp.max(reach, real(0.0)), reach)
             face = c.face[f]
             center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-            within = _seen_from(f, w, reach, view, travel, near, x, c, s)
-            left, within = geoms_within(center, radius + reach, w, geoms, within)
+            within = _seen_from(f, w, near_by, view, travel, near, x, c, s)
+            left, within = geoms_within(center, radius + near_by, w, geoms, within)
+            if s.near[w, f] > 0:
+                left = 0
+                if within & s.close_to[w, f] != within:
+                    s.close_to[w, f] = within | s.close_to[w, f]
+                    new += 1
         rank = block_rank(wp.min(left, 1))  # its barriers are between reading and writing
         if left > 0:
             s.look[w, close + rank[0]] = f
@@ -301,20 +308,10 @@ def find_faces(
             if sample_within(p, reach, face_radius(x1 - x0, x2 - x0), w, geoms, s.close_to[w, f]):
                 s.near[w, f] = 1
     sync()
-    new = int(0)
     for k in range(t, close, threads):
         new += s.near[w, s.look[w, k]]
     sync()
     nface = _list_marked(w, t, threads, 0, s.near, s.face)
-    for k in range(t, nface, threads):
-        f = s.face[w, k]
-        face = c.face[f]
-        center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-        within = _seen_from(f, w, wp.max(reach, real(0.0)), view, travel, near, x, c, s)
-        _count, within = geoms_within(center, radius + wp.max(reach, real(0.0)), w, geoms, within)
-        if within & s.close_to[w, f] != within:
-            s.close_to[w, f] = within | s.close_to[w, f]
-            new += 1
     return nface, block_rank(new)[1]
 
 
