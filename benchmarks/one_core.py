@@ -13,8 +13,9 @@
            4 ms; --self-touch: fingers touch fingers, too
 
 Each turn is a process of its own. A row is a phase of a case: median and slowest ms of processor time of
-`mj_step`, skin steps without a balance, and the mean force of each BioTac [N]. Of several turns the least of
-each time counts. --against DIR: the same of another checkout's package, in turns, and the ratio of this one's
+`mj_step`, which part of it the kernels of the skins take and which the film (the rest is Python and MuJoCo),
+skin steps without a balance, and the mean force of each BioTac [N]. Of several turns the least of each time
+counts. --against DIR: the same of another checkout's package, in turns, and the ratio of this one's
 times to that one's."""
 
 import os
@@ -23,6 +24,7 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 import argparse
+import functools
 import json
 import pathlib
 import sys
@@ -50,31 +52,60 @@ FIST = {"THJ5": 0.4, "THJ4": 1.2, "THJ3": 0.0, "THJ2": 0.6, "THJ1": 0.6, "LFJ5":
 STRAIGHT = ("WRJ1", "WRJ2", "FFJ4", "MFJ4", "RFJ4", "LFJ4")
 
 
+class _Clock:
+    """Processor time of the calls of a method [ms]."""
+
+    def __init__(self, owner: type, name: str):
+        self.spent, method = 0.0, getattr(owner, name)
+
+        def timed(*given, **named):
+            begin = time.process_time()
+            try:
+                return method(*given, **named)
+            finally:
+                self.spent += 1e3 * (time.process_time() - begin)
+
+        setattr(owner, name, timed)
+
+
+@functools.cache
+def _clocks():
+    """Clocks of the skins' kernels and of the film. They must be there before a skin is made."""
+    from biotac_mj.sensor.film.conduction import FilmConduction
+    from biotac_mj.skin.program import Program
+
+    return _Clock(Program, "run"), _Clock(FilmConduction, "impedance")
+
+
 def _follow(model, handles, until, drive: Callable[[mujoco.MjData], None] = lambda data: None, data=None):
-    """Steps until a time [s], `drive` before each: times at their ends [s], ms of processor time, skins
-    without a balance, and forces (steps, BioTacs) [N]."""
+    """Steps until a time [s], `drive` before each: times at their ends [s], ms of processor time, of it in
+    the skins' kernels and in the film, skins without a balance, and forces (steps, BioTacs) [N]."""
     data, rows = data or mujoco.MjData(model), []
     mujoco.mj_forward(model, data)
     while data.time < until:
         drive(data)
-        begin = time.process_time()
+        before, begin = [clock.spent for clock in _clocks()], time.process_time()
         mujoco.mj_step(model, data)
         spent = 1e3 * (time.process_time() - begin)
+        parts = [clock.spent - was for clock, was in zip(_clocks(), before)]
         lost = sum(handle.read(data, "status")[0] == 0 for handle in handles)
         force = [np.linalg.norm(handle.read(data, "contact_force")[:3]) for handle in handles]
-        rows.append([data.time, spent, lost, *force])
+        rows.append([data.time, spent, *parts, lost, *force])
     return np.array(rows)
 
 
 def _phase(rows, begin=0.0, end=np.inf):
     """The row of the steps that end between two times [s]."""
     some = rows[(rows[:, 0] > begin) & (rows[:, 0] <= end)]
+    whole, solves, film = some[:, 1:4].sum(0)
     return {
         "steps": len(some),
         "ms_median": float(np.median(some[:, 1])),
         "ms_most": float(some[:, 1].max()),
-        "unsettled": int(some[:, 2].sum()),
-        "force_n": some[:, 3:].mean(0).round(4).tolist(),
+        "solves": float(solves / whole),
+        "film": float(film / whole),
+        "unsettled": int(some[:, 4].sum()),
+        "force_n": some[:, 5:].mean(0).round(4).tolist(),
     }
 
 
@@ -181,7 +212,8 @@ def _least(turns: list[dict]) -> dict:
 def table(found: dict) -> str:
     """What was measured, in Markdown."""
     other = any("against" in case for case in found["cases"].values())
-    heads = ["case", "phase", "steps", "ms a step, median", "slowest", "unsettled skin steps", "N of each"]
+    heads = ["case", "phase", "steps", "ms a step, median", "slowest", "solves %", "film %"]
+    heads += ["unsettled skin steps", "N of each"]
     heads += ["median against", "slowest against", "unsettled against", "ratio of medians"] * other
     lines = [f"{found['tier']}, {found['skin']}, {found['turns']} turns\n"]
     lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
@@ -191,7 +223,11 @@ def table(found: dict) -> str:
         for phase, row in here.items():
             force = ", ".join(f"{f:.3g}" for f in row["force_n"])
             cells = [case, phase, str(row["steps"]), f"{row['ms_median']:.2f}", f"{row['ms_most']:.1f}"]
-            cells += [str(row["unsettled"]), force]
+            cells += [
+                *(f"{100 * row[part]:.0f}" for part in ("solves", "film")),
+                str(row["unsettled"]),
+                force,
+            ]
             if phase in there:
                 that = there[phase]
                 cells += [f"{that['ms_median']:.2f}", f"{that['ms_most']:.1f}", str(that["unsettled"])]
@@ -218,6 +254,7 @@ def main(arguments=None) -> int:
         print(table(json.loads(options.table.read_text(encoding="utf-8"))))
         return 0
     if options.child:
+        _clocks()
         how = {"tier": options.tier, "skin": options.skin, "self_touch": options.self_touch}
         print(json.dumps(CASES[options.child](**how)))
         return 0
