@@ -103,11 +103,11 @@ def solved(number, args):
 
 
 def run(task, args):
-    """Rounds of (a laboratory, an arm); as far as they have come they lie in the cache."""
+    """Rounds of (a laboratory, an arm); as far as they have come they lie beside the results."""
     path, arm = task
     from biotac_mj.discrepancy import diagnose
     from biotac_mj.discrepancy.trajectories.design import planned
-    from biotac_mj.discrepancy.trajectories.plan_files import write_plan
+    from biotac_mj.discrepancy.trajectories.plan_files import write_poses
 
     sensor = opened(path.read_bytes())
     lab = generator_of(sensor, "coarse", "condensed")
@@ -116,7 +116,7 @@ def run(task, args):
 
     def measured(plan, turn, kind=arm):
         file = args.cache / f"{path.stem}_{kind}_{turn}.csv"
-        write_plan(plan, file)
+        write_poses(plan, file)
         contacts = read_plan(file)
         name = f"{kind}{turn}"
         free = _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), name)
@@ -145,7 +145,7 @@ def run(task, args):
     report, record = judged(data, 1) if same is None else (None, same)
     row["rounds"] = [record]
     for turn in range(2, args.rounds + 1):
-        write_json(_part(args, path, arm), row)
+        write_json(_part(args, path, arm), row)  # a run may be cut off
         if row["rounds"][-1]["decided"]:
             row["rounds"].append(row["rounds"][-1])
             continue
@@ -167,7 +167,7 @@ def run(task, args):
 
 def _part(args, path, arm):
     """Where a laboratory's rounds lie as far as they have come."""
-    return args.cache / f"{path.stem}_{arm}.json"
+    return pathlib.Path(args.json).with_suffix("") / f"{path.stem}_{arm}.json"
 
 
 def _end(data):
@@ -298,7 +298,8 @@ def main(argv=None):
     args.add_argument("--cache", type=pathlib.Path, default=pathlib.Path("out/rounds"))
     args.add_argument("--json", default="out/rounds.json")
     args = args.parse_args(argv)
-    args.cache.mkdir(parents=True, exist_ok=True)
+    for folder in (args.cache, pathlib.Path(args.json).with_suffix("")):
+        folder.mkdir(parents=True, exist_ok=True)
     rows = read_json(args.json, [])
     i, n = map(int, args.share.split("/"))
     paths = sorted(args.labs.glob("lab_*.sealed"))[i::n]

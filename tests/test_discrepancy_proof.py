@@ -11,7 +11,7 @@ from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.trajectories import proof
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
-from biotac_mj.discrepancy.trajectories.proof import _closed, _Off, borne_out, proved
+from biotac_mj.discrepancy.trajectories.proof import _closed, borne_out, proved
 from biotac_mj.discrepancy.trajectories.settings import SETTINGS
 from biotac_mj.discrepancy.trajectories.workflow import about_rests
 from biotac_mj.effects.catalogue import by_id
@@ -96,8 +96,21 @@ def test_errors_of_poses_are_taken_out_of_residuals(late):
 def test_what_is_left_beyond_resolution_is_not_of_the_base():
     comparison = types.SimpleNamespace(noises=np.ones(2), sigmas=[np.full(2, 2.0)])
     residuals = np.full((5, 2), 10.0), np.full((5, 2), 6.0)
-    sides = [(None, [r], _Off(float(((r**2).mean(1) - 1).sum()), 0.0)) for r in residuals]
+    sides = [(None, [r], float(((r**2).mean(1) - 1).sum())) for r in residuals]
     assert _closed(comparison, *sides, 0.05, [0]) == pytest.approx(1 - np.sqrt((35 - 3) / (99 - 3)))
+
+
+def test_what_closes_little_of_its_gap_has_no_name(late, monkeypatch):
+    """Electrodes that are late by a twelfth of what they are make the data far likelier all the same."""
+    comparison, null = late
+    late, little = (
+        dataclasses.replace(null, effects=[(LATE[0], {"delay": by})], law_errors=np.array([SETTINGS.law]))
+        for by in (0.06, 0.005)
+    )
+    assert borne_out(comparison, null, late, ASIDE)
+    assert not borne_out(comparison, null, little, ASIDE)
+    monkeypatch.setattr(proof, "SETTINGS", dataclasses.replace(SETTINGS, explained=0.0))
+    assert borne_out(comparison, null, little, ASIDE)
 
 
 def test_what_the_amended_sensor_leaves_out_has_no_name(monkeypatch):

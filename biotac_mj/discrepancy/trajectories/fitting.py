@@ -34,7 +34,8 @@ class Fit:
       effects: list of (Effect, theta). nuisance: fitted with them. names: of the free parameters: (effect
       id, name); covariance: theirs.
       score: log evidence of the data for these effects [nats]. amplitude: (width,) by how many times more
-      than `size` (width,) [counts, N], which is what is expected, the model with them is off.
+      than `size` (width,) [counts, N], which is what is expected of a base model, the model with them is off;
+      off: (width,) the same beside what the laws of the effects may lack.
       modulus_error: standard error of the logarithm of the modulus. missed: see `Likelihood.missed`.
       y, columns: (n, width), (m, n, width) of the linear model about this fit, in the likelihood's
       eigenvectors. offsets: (trajectories, 3) most probable errors of poses [m].
@@ -47,6 +48,7 @@ class Fit:
     score: float = 0.0
     amplitude: np.ndarray | None = None
     size: np.ndarray | None = None
+    off: np.ndarray | None = None
     law_errors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     modulus_error: float = float("nan")
     missed: float = 0.0
@@ -82,14 +84,16 @@ class Fit:
 @dataclasses.dataclass
 class _Point:
     """Parameters and offsets (trajectories, 3) of poses, the residual (n, width) there, in eigenvectors, and
-    each parameter's distance from its prior's mean in standard deviations; errors: what errors of poses do
-    there, and then those of laws; y: the residual as it would be with poses as they are said to be."""
+    each parameter's distance from its prior's mean in standard deviations; done: what each effect does;
+    errors: what errors of poses do there, and then those of laws; y: the residual as it would be with poses
+    as they are said to be."""
 
     effects: list
     nuisance: Nuisance
     offsets: np.ndarray
     residual: np.ndarray
     away: np.ndarray
+    done: list
     errors: np.ndarray
     y: np.ndarray
 
@@ -193,14 +197,14 @@ class _Model:
         raw = self.comparison.raw(effects, nuisance, offsets=offsets)
         return likelihood.turned(likelihood.stacked(raw))
 
-    def _point(self, effects, nuisance, offsets, laws):
-        """laws: (m, n, width) what errors of laws do."""
+    def _point(self, effects, nuisance, offsets, law_errors):
         away = np.array([self._value(effects, nuisance, k, n) for k, n, *_ in self.parameters])
         residual, pose = self._residual(effects, nuisance, offsets), self.likelihood.poses(offsets)
         off = offsets[self.likelihood.chosen].ravel() / self.comparison.repeatability
         y = residual + np.tensordot(off, pose, 1)
-        errors = np.concatenate([pose, laws])
-        return _Point(effects, nuisance, offsets, residual, away / self.spread, errors, y)
+        done = changes(self.comparison, self.likelihood, effects, nuisance)
+        errors = np.concatenate([pose, self.likelihood.laws(done, law_errors)])
+        return _Point(effects, nuisance, offsets, residual, away / self.spread, done, errors, y)
 
     def _columns(self, point):
         """Decrease of the residual by one standard deviation of each parameter (parameters, n, width)."""
@@ -217,13 +221,6 @@ class _Model:
             out.append((point.residual - self._residual(*moved, point.offsets)) * (spread / made))
         return np.array(out).reshape(len(out), *point.residual.shape)
 
-    def _size(self, done, law_errors):
-        """(width,) by how much a model with effects that do `done` is expected to be off."""
-        size = self.likelihood.size
-        for change, error in zip(done, law_errors):
-            size = np.hypot(size, error * np.quantile(np.abs(change), 0.98, axis=0))
-        return size
-
     def _log(self, point, variance):
         """log density of data and parameters at a point, errors of poses and laws marginalised."""
         log, _, factor = self.likelihood.evidence(point.y, point.errors, variance)
@@ -231,38 +228,35 @@ class _Model:
 
     def fitted(self, effects, nuisance, amplitude, offsets, law_errors) -> Fit:
         """The Fit, by Gauss-Newton's steps of the parameters and steps of the amplitudes and of errors of
-        laws in turn."""
-        likelihood = self.likelihood
+        laws in turn, each of which makes the data more likely."""
+        likelihood, size = self.likelihood, self.likelihood.size
+        point, poses = self._point(effects, nuisance, offsets, law_errors), 3 * len(likelihood.chosen)
+        if amplitude is None:
+            # from above: what parameters explain is taken from what is missed, and not the other way
+            amplitude = likelihood.amplitude_of(point.y**2, size)
         for _ in range(_STEPS):
-            done = changes(self.comparison, likelihood, effects, nuisance)
-            point = self._point(effects, nuisance, offsets, likelihood.laws(done, law_errors))
-            size = self._size(done, law_errors)
-            if amplitude is None:
-                # from above: what parameters explain is taken from what is missed, and not the other way
-                amplitude = likelihood.amplitude_of(point.y**2, size)
             columns = self._columns(point)
             y = point.y + np.tensordot(point.away, columns, 1)  # as from the prior's mean
             whole = np.concatenate([point.errors, columns])
             amplitude = likelihood.amplitudes(y, whole, amplitude, size)
             variance = likelihood.variance(amplitude, size)
             _, weights, factor = likelihood.evidence(y, whole, variance)
-            step, off = weights[len(point.errors) :] - point.away, self._offsets(weights) - offsets
+            known, law_errors = law_errors, self._law_errors(law_errors, weights, factor)
+            laws = likelihood.laws(point.done, law_errors)
+            point = dataclasses.replace(point, errors=np.concatenate([point.errors[:poses], laws]))
+            step, off = weights[len(point.errors) :] - point.away, self._offsets(weights) - point.offsets
             far = max(np.abs(step).max(initial=0), np.abs(off).max() / self.comparison.repeatability)
             step, off = (by * min(1.0, _FARTHEST / max(far, 1e-9)) for by in (step, off))
-            before, better = self._log(point, variance)[0], None
+            before, gain = self._log(point, variance)[0], 0.0
             for share in _SHORTER:
-                trial = self._moved(point, share * step, offsets + share * off)
-                gain = self._log(trial, variance)[0] - before
-                if gain > 0:
-                    better = trial
+                trial = self._moved(point, share * step, point.offsets + share * off, law_errors)
+                more = self._log(trial, variance)[0] - before
+                if more > 0:
+                    point, gain = trial, more
                     break
-            if better is None:
+            if gain < _DONE and np.array_equal(known, law_errors):
                 break
-            effects, nuisance, offsets = better.effects, better.nuisance, better.offsets
-            law_errors = self._law_errors(law_errors, weights, factor)
-            if gain < _DONE:
-                break
-        return self._finished(effects, nuisance, offsets, amplitude, law_errors)
+        return self._finished(point, amplitude, law_errors)
 
     def _law_errors(self, law_errors, weights, factor):
         """(effects,) most probable errors of laws by coefficients of what they do, and their precision."""
@@ -279,17 +273,17 @@ class _Model:
         out[chosen] = self.comparison.repeatability * weights[: 3 * len(chosen)].reshape(-1, 3)
         return out
 
-    def _moved(self, point, step, offsets):
+    def _moved(self, point, step, offsets, law_errors):
         effects, nuisance = point.effects, point.nuisance
         for (k, name, spread, _), away, by in zip(self.parameters, point.away, step):
             effects, nuisance = self._with(effects, nuisance, k, name, (away + by) * spread)
-        return self._point(effects, nuisance, offsets, point.errors[3 * len(self.likelihood.chosen) :])
+        return self._point(effects, nuisance, offsets, law_errors)
 
-    def _finished(self, effects, nuisance, offsets, amplitude, law_errors):
-        likelihood = self.likelihood
-        done = changes(self.comparison, likelihood, effects, nuisance)
-        point = self._point(effects, nuisance, offsets, likelihood.laws(done, law_errors))
-        columns, size = self._columns(point), self._size(done, law_errors)
+    def _finished(self, point, amplitude, law_errors):
+        likelihood, size = self.likelihood, self.likelihood.size
+        columns, expected = self._columns(point), size
+        for change, error in zip(point.done, law_errors):
+            expected = np.hypot(expected, error * np.quantile(np.abs(change), 0.98, axis=0))
         whole, errors = np.concatenate([point.errors, columns]), len(point.errors)
         y = point.y + np.tensordot(point.away, columns, 1)
         # by what is left at the point itself: where a bound holds, the linear model would leave less
@@ -317,6 +311,7 @@ class _Model:
             float(score),
             amplitude,
             size,
+            amplitude * size / expected,
             law_errors,
             float("nan") if modulus is None else float(np.sqrt(covariance[modulus, modulus])),
             likelihood.missed(amplitude, size),

@@ -7,7 +7,7 @@ import textwrap
 from ...files import replacing
 from .design import Plan
 
-__all__ = ["COLUMNS", "write_plan"]
+__all__ = ["COLUMNS", "write_plan", "write_poses"]
 
 COLUMNS = "contact object time object_pos_x object_pos_y object_pos_z object_qw object_qx object_qy object_qz"
 _WIDTH = 170  # letters in a line of the picture
@@ -21,7 +21,7 @@ def write_plan(plan: Plan, path: pathlib.Path | str) -> list[pathlib.Path]:
     trajectory_msgs/MultiDOFJointTrajectory a contact."""
     path = pathlib.Path(path)
     files = [path, path.with_suffix(".yaml"), path.with_suffix(".png")]
-    for file, write in zip(files, (_csv, _ros, _picture)):
+    for file, write in zip(files, (write_poses, _ros, _picture)):
         with replacing(file) as temporary:
             write(plan, temporary)
     return files
@@ -34,7 +34,8 @@ def _poses(trajectory):
     return trajectory.pos, Rotation.from_matrix(trajectory.mat).as_quat(canonical=True, scalar_first=True)
 
 
-def _csv(plan, path):
+def write_poses(plan: Plan, path: pathlib.Path) -> None:
+    """Writes the poses of a plan alone, as CSV."""
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(COLUMNS.split())

@@ -40,14 +40,15 @@ class Proof:
 
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
     """Whether held-out trajectories are likelier by `ODDS` with one Fit than with another that has fewer
-    effects, and whether the sensor that is written with it is nearer to them. The skin solved again,
-    parameters as they were fitted. By the one likelihood: what the law of an effect lacks does not contradict
-    it."""
+    effects, whether the sensor that is written with it is nearer to them, and whether its further effects
+    close the share of the gap that a name is for. The skin solved again, parameters as they were fitted. By
+    the one likelihood: what the law of an effect lacks does not contradict it."""
     first, last = (_density(comparison, fit, aside) for fit in (smaller, larger))
     if last - first <= np.log(ODDS):
         return False
     _, begin = _begun(comparison, smaller, aside)
-    return _nearer(comparison, begin, _measured(comparison, larger, aside), aside)
+    nearer = _nearer(comparison, begin, _measured(comparison, larger, aside), aside)
+    return nearer and _share(comparison, smaller, larger, aside) >= SETTINGS.explained
 
 
 def _density(comparison, fit, aside):
@@ -75,14 +76,23 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     after, last, _ = end = _measured(comparison, current, aside)
     if not _nearer(comparison, begin, end, aside):
         return Proof(start, before, before, (first, first), 0.0)
-    # what effects close by themselves: with all that the base model is found to be off by on both sides
-    bare = dataclasses.replace(current, effects=[], names=[])
-    sides = (
-        [_compared(comparison, fit, aside) for fit in (bare, current)] if current.effects else [begin, end]
+    if current.effects:
+        closed = _share(comparison, null, current, aside)
+    else:
+        closed = _closed(comparison, begin, end, SETTINGS.law, aside)
+    return Proof(current, before, after, (first, last), closed)
+
+
+def _share(comparison, smaller, larger, aside):
+    """Share of the gap that the effects which one Fit has beyond another close by themselves, with all that
+    the base model is found to be off by on both sides."""
+    known = {effect.id for effect, _ in smaller.effects}
+    new = np.array([effect.id not in known for effect, _ in larger.effects])
+    bare = dataclasses.replace(
+        larger, effects=[one for one, further in zip(larger.effects, new) if not further], names=[]
     )
-    errors = current.law_errors if current.effects else np.array([SETTINGS.law])
-    law = float(np.sqrt(np.mean(errors**2)))
-    return Proof(current, before, after, (first, last), _closed(comparison, *sides, law, aside))
+    law = float(np.sqrt(np.mean(larger.law_errors[new] ** 2)))
+    return _closed(comparison, *(_compared(comparison, fit, aside) for fit in (bare, larger)), law, aside)
 
 
 def _begun(comparison, fit, aside):
@@ -94,8 +104,7 @@ def _begun(comparison, fit, aside):
 
 def _nearer(comparison, before, after, aside) -> bool:
     """Whether a model is nearer to held-out trajectories, and in no group of channels further off."""
-    begun, left = before[-1].off, after[-1].off
-    return begun > 0 and left < begun and not _worse(comparison, before, after, aside)
+    return 0 < before[-1] > after[-1] and not _worse(comparison, before, after, aside)
 
 
 def _measured(comparison, fit, rows):
@@ -109,29 +118,17 @@ def _measured(comparison, fit, rows):
     return out, residual, beyond
 
 
-class _Off(typing.NamedTuple):
-    """Error of trajectories together, as sums over rows of mean squares minus their expectation:channels:
-    beyond noise; poses: beyond their scatter.
+def _compared(comparison, fit, rows):
+    """Residuals of all trajectories, the skin solved again in `rows`; those of `rows` without errors of their
+    poses; and the error of these, as a sum over rows of mean squares beyond noise.
 
     What all poses are off by is as much a disagreement as what is left of the channels: the most probable
     error of a pose counts in units of its repeatability, and each of its three numbers as much as a row."""
-
-    channels: float
-    poses: float
-
-    @property
-    def off(self) -> float:
-        return self.channels + self.poses
-
-
-def _compared(comparison, fit, rows):
-    """Residuals of all trajectories, the skin solved again in `rows`; those of `rows` without errors of their
-    poses; and `_Off`."""
     raw = fit.raw(comparison, exact=rows)
     residual = [comparison.unposed(i, raw[i]) for i in rows]
     channels = sum((((r / comparison.noises) ** 2).mean(1) - 1).sum() for r in residual)
     poses = sum((comparison.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
-    return raw, residual, _Off(float(channels), float(poses))
+    return raw, residual, float(channels + poses)
 
 
 def _worse(comparison, before, after, aside) -> bool:
@@ -169,7 +166,7 @@ def _closed(comparison, before, after, law, aside):
     base = sum(
         len(r) * ((comparison.sigmas[i] / comparison.noises) ** 2 - 1).mean() for i, r in zip(aside, last)
     )
-    remains = max(left.channels, 0.0)
+    remains = max(left, 0.0)
     of_base = min(base, remains * base / max(law**2 * change + base, 1e-12))
-    lacking, hidden = remains - of_base, begun.channels - of_base
+    lacking, hidden = remains - of_base, begun - of_base
     return float(1 - np.sqrt(lacking / hidden)) if hidden > lacking else 0.0

@@ -19,8 +19,8 @@ class Settings:
     law: share of what an effect does, by which its true law is another: median of the prior; the standard
       deviation of its logarithm is `own`.
     wide: standard deviation of a parameter, in units of `Param.scale`.
-    rate: of false discoveries. explained: share of what the base model misses, below which an effect has no
-      name. beyond: times as much as is expected of a model, from which on it misses something.
+    rate: of false discoveries. explained: share of its gap on held-out trajectories that an effect with a
+      name closes. beyond: times as much as is expected of a model, from which on it misses something.
     most, refit: effects of an explanation; effects that are refitted after the screen.
     """
 

@@ -176,27 +176,14 @@ def _wired(usable, comparison, fit, chosen):
 def _off(comparison, fit) -> tuple[float, float]:
     """Ratio of the residual to what is expected of a model: in the worst group of channels, and in the worst
     channel."""
-    log = np.log(fit.amplitude)
-    groups = [np.exp(log[part].mean()) for part in comparison.groups.values()]
-    return float(max(groups)), float(fit.amplitude.max())
+    groups = [np.exp(np.log(fit.off[part]).mean()) for part in comparison.groups.values()]
+    return float(max(groups)), float(fit.off.max())
 
 
 def _wrong(comparison, fit) -> bool:
     """Whether the model misses more than is expected of it."""
     group, channel = _off(comparison, fit)
     return group > SETTINGS.beyond or channel > SETTINGS.beyond**2
-
-
-def _named(comparison, null, search):
-    """Fit and Candidates of the named effects, and notes on why others have no name."""
-    current, found = search.fit, search.found
-    explained = 1 - current.missed / max(null.missed, current.missed, 1e-9)
-    if not found:
-        return current, found, explained, []
-    nearest = " and ".join(one.effect.name for one in found)
-    if explained < SETTINGS.explained and _wrong(comparison, current):
-        return null, [], 0.0, [f"{nearest} would explain {explained:.0%} of it: too little for a name"]
-    return current, found, explained, []
 
 
 def _tie_aliases(current, found, names):
@@ -249,7 +236,7 @@ def _refuted(found):
 
 def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     """Diagnosis by a Search: named effects, errors of the base model, the proof."""
-    current, found, explained, why = _named(comparison, null, search)
+    current, found = search.fit, search.found
     names = {e.id: e.name for e in usable}
     _tie_aliases(current, found, names)
     fitted = current
@@ -291,12 +278,11 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     table = isolability(comparison, current, usable, chosen)
     more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
-    notes = [*notes, *why, *of_base(comparison, current, chosen), *table.pop("notes")]
+    notes = [*notes, *of_base(comparison, current, chosen), *table.pop("notes")]
     before, after = (dict(zip(("level", "peak"), _off(comparison, fit))) for fit in (null, current))
     trace = {
         "before": before,
         "after": after,
-        "explained": explained,
         "rounds": [[c.record() for c in step] for step in search.rounds],
         "closed": proof.closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],

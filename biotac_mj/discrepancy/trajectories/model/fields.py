@@ -49,7 +49,6 @@ class Fields:
         self.quick = self.base if self.quick is None else self.quick
         first = self.trajectories[0].tdc
         self.stacked = {k: [stack(one) for one in v] for k, v in self.slopes.items()}
-        self._last = {}  # trajectory -> the offset that `shifted` had last, and what it gave
         self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
 
     def add(self, name: str, slope: list) -> None:
@@ -69,17 +68,13 @@ class Fields:
 
     def shifted(self, i: int, offset: np.ndarray) -> np.ndarray:
         """(n, 23) what an offset (n, 3) of the poses changes of trajectory i [m]."""
-        before, change = self._last.get(i, (None, 0.0))
-        if before is not None and np.array_equal(before, offset):
-            return change
-        heading, change, across = self.trajectories[i].heading, 0.0, offset
+        heading, change = self.trajectories[i].heading, 0.0
         if self.deeper is not None:
             along = offset @ heading
-            change, across = self.deeper.at(i, along), offset - np.outer(along, heading)
-        for name, by in zip("xyz", across.T):
+            change, offset = self.deeper.at(i, along), offset - np.outer(along, heading)
+        for name, by in zip("xyz", offset.T):
             if name in self.stacked and by.any():
                 change = change + self.stacked[name][i] * by[:, None]
-        self._last[i] = offset.copy(), change
         return change
 
     def shifting(self, i: int, offset: np.ndarray) -> list[np.ndarray]:
@@ -126,16 +121,23 @@ class Curve:
         """at: (m,) that were solved, rising, one of them 0. changes: per trajectory (m, n, 23)."""
         self.solved, self.changes = at, changes
         self._cubics = [CubicHermiteSpline(at, one, _tangents(at, one)) for one in changes]
+        self._last = {}  # trajectory -> the values that were asked for last, and the change
 
     def part(self, which: np.ndarray) -> "Curve":
         return Curve(self.solved, [self.changes[i] for i in which])
 
     def at(self, i: int, value: np.ndarray | float) -> np.ndarray:
         """(n, 23) change of trajectory i by values (n,), or one of all rows."""
+        before, known = self._last.get(i, (np.nan, None))
+        if np.array_equal(before, value):
+            return known
         inside = np.clip(value, self.solved[0], self.solved[-1])
         (a, b, c, d), x = self._cubic(i, inside)
         change, beyond = ((a * x + b) * x + c) * x + d, np.subtract(value, inside)[..., None]
-        return change + beyond * self.slope(i, inside) if beyond.any() else change
+        if beyond.any():
+            change = change + beyond * self.slope(i, inside)
+        self._last[i] = np.copy(value), change
+        return change
 
     def slope(self, i: int, value: np.ndarray | float) -> np.ndarray:
         """(n, 23) of the change at values (n,), or one of all rows."""
