@@ -192,7 +192,7 @@ class SkinData:
         stiffness = [model.options.contact_stiffness or stiffness_of_contact(m) for m in materials]
         self.worlds.contact_stiffness.assign(stiffness)
         self.laws = WorldLaws(model, materials, np.array(stiffness))
-        self.worlds.adhesive, self.worlds.load_dependent = self.laws.adhesive, self.laws.load_dependent
+        self.worlds.load_dependent = self.laws.load_dependent
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
         remembers = model.material.remembers
         self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None

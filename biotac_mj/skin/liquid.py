@@ -181,7 +181,7 @@ def soften_face(
     block: wp.array2d(dtype=mat33),
 ):
     """Subtracts the decrease of the liquid's force with the dry fraction, p / (2 p_ref) k, from the tangent
-    of a core face."""
+    of a core face. Gradients and the tangents of bodies need it; a press takes the same work without it."""
     nsample = sample.shape[0]
     fraction = area[f] / real(nsample)
     factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * fraction

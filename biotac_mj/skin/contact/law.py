@@ -111,7 +111,7 @@ class WorldLaws:
 
     Attributes:
       struct: `faces.Laws`, empty if the model has no contact law.
-      adhesive: (nworld,) Warp array, 1 with adhesion. load_dependent: 1 if friction depends on pressure.
+      load_dependent: (nworld,) Warp array, 1 if friction depends on pressure.
       range: (nworld,) gap at which adhesion ends [m].
     """
 
@@ -126,7 +126,7 @@ class WorldLaws:
             self.struct.smoothing = wp.zeros(0, dtype=real)
             self.struct.node_area = wp.zeros(nvert, dtype=real)
             self.struct.node_normal_force = wp.zeros((nvert, nworld), dtype=real)
-            self.adhesive, self.load_dependent = (wp.zeros(nworld, dtype=int) for _ in range(2))
+            self.load_dependent = wp.zeros(nworld, dtype=int)
         if self.law is None:
             return
         self.stiffness = stiffness
@@ -199,7 +199,6 @@ class WorldLaws:
             (s.work, values["adhesion"]),
             (s.separation, separation),
             (s.reach, reach),
-            (self.adhesive, (separation > 0).astype(np.int32)),
             (self.load_dependent, (values["friction_exponent"] > 0).astype(np.int32)),
         ):
             array.assign(value)

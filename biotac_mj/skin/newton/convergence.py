@@ -6,7 +6,7 @@ import warp as wp
 from ..block import block_sum
 from ..contact.touch import LAGGED
 from ..types import real, vec6
-from .line_search import MAX_TRIES, SMALL_ERROR
+from .line_search import MAX_TRIES
 from .worlds import NEGLIGIBLE_RESIDUAL, VISCOUS_AFTER, Worlds, set_viscosity
 
 __all__ = ["check_convergence", "choose_viscosity"]
@@ -20,6 +20,8 @@ _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor
 _CORRECTED, _STIFF_LIQUID = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
 _LAGGED_TOLERANCE = wp.constant(wp.float64(0.05))  # of the error at which a round of lagged friction starts
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
+# error below which a bad iteration may be rounding: no viscosity starts
+_SMALL_ERROR = wp.constant(wp.float64(0.01))
 # the viscosity is divided by the first after a good full step, and multiplied by the second after a bad one
 _DECREASE, _INCREASE = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # a lower viscosity is set to zero; a higher one makes the skin stiffer than contact, and the try fails
@@ -180,7 +182,7 @@ def choose_viscosity(tolerance: real, st: Worlds):
         if viscosity > real(0.0) or st.error[w] < st.last_error[w]:
             good = 1
     stale = st.iterations[w] - st.since[w]
-    if good == 0 and viscosity == real(0.0) and st.error[w] < SMALL_ERROR and stale < VISCOUS_AFTER:
+    if good == 0 and viscosity == real(0.0) and st.error[w] < _SMALL_ERROR and stale < VISCOUS_AFTER:
         return
     if good == 0:
         viscosity = _INCREASE * wp.max(viscosity, real(1.0))

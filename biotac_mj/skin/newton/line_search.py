@@ -5,13 +5,11 @@ import warp as wp
 from ..types import real
 from .worlds import Worlds, totals_of
 
-__all__ = ["MAX_TRIES", "SMALL_ERROR", "begin_line_search", "choose_length"]
+__all__ = ["MAX_TRIES", "begin_line_search", "choose_length"]
 
 wp.set_module_options({"enable_backward": False})
 
 MAX_TRIES = wp.constant(12)  # evaluations of a line search
-# error below which a bad iteration may be rounding: no viscosity starts, and adhesion does not lengthen steps
-SMALL_ERROR = wp.constant(wp.float64(0.01))
 
 
 @wp.func
@@ -44,9 +42,6 @@ def choose_length(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.ar
     done = st.work[w]
     tries = st.tries[w]
     inverted = st.inverted[w]
-    adhesive = st.adhesive[w]
-    viscosity = st.viscosity[w]
-    error = st.error[w]
     highest = st.high[w]
     total = totals_of(partial, w, t)
     if t > 0:
@@ -75,17 +70,12 @@ def choose_length(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.ar
     valid = int(0)
     if wp.isfinite(now) and inverted % 2 == 0:  # most laws recover from an inverted element
         valid = 1
-    if viscosity > real(0.0) or error < SMALL_ERROR:
-        adhesive = 0
     has_high = int(0)
     if highest >= real(0.0):
         has_high = 1
     enough = int(0)
     if valid == 1 and now >= real(-0.5) * slope:
-        if adhesive == 1:
-            if now <= real(0.2) * slope:
-                enough = 1
-        elif has_high == 0 or now <= real(0.5) * slope:
+        if has_high == 0 or now <= real(0.5) * slope:
             enough = 1
     st.tries[w] = tries + 1
     if enough == 1 or tries + 1 == MAX_TRIES:
@@ -108,13 +98,6 @@ def choose_length(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.ar
         st.side[w] = -1
         st.low[w] = st.alpha[w]
         st.slope_low[w] = now
-    if adhesive == 1 and st.high[w] < real(0.0):
-        # the tangent has no adhesion that softens as the gap opens: lengthen the step
-        further = wp.clamp(slope / wp.max(slope - now, slope / real(4.0)), real(1.25), real(4.0))
-        st.alpha[w] = alpha * further
-        st.alpha_change[w] = st.alpha[w] - alpha
-        any_active[0] = 1
-        return
     low = st.low[w]
     high = st.high[w]
     guess = real(0.5) * (low + high)

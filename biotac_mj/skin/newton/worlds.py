@@ -80,7 +80,6 @@ class Worlds:
     deep: wp.array(dtype=int)  # a geom is inside the core
     touched: wp.array(dtype=int)  # a geom or the core touches
     friction_mode: wp.array(dtype=int)  # CURRENT, CONSISTENT, RECORDED or LAGGED, see `contact.touch`
-    adhesive: wp.array(dtype=int)  # has adhesion, whose softening branch has no tangent
     load_dependent: wp.array(dtype=int)  # its friction coefficient depends on pressure
     inverted: wp.array(dtype=int)  # by an element, at the last evaluation: `ElementForces.evaluate_corners`
     reason: wp.array(dtype=int)  # CONVERGED, NOT_FINITE, INSIDE_CORE or NOT_CONVERGED
