@@ -20,7 +20,7 @@ from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from . import kernels, solid
 from .implicit import dynamics, integrator
-from .implicit.factor import Factor
+from .implicit.factor import Cones, Factor
 from .release import Clearance
 from .senses import Senses
 from .skin import BatchSkin
@@ -163,10 +163,10 @@ class Batch(Skins):
         self._correction_force, r.amiss = correction.force[own], correction.amiss[own]
         self._acts = correction.acts[own]
 
-    def take_part(self, m: "mjw.Model", rows: wp.array, first_row: int) -> None:
+    def take_part(self, m: "mjw.Model", rows: wp.array, first_row: int, cones: Cones) -> None:
         """Has its own of the rows of all skins."""
         self._row = rows[first_row : first_row + self.nslot]
-        self._response, self._factor = Response(self._jacobian, self.model), Factor(m, self.nworld)
+        self._response, self._factor = Response(self._jacobian, self.model), Factor(m, self.nworld, cones)
 
     def update_active(self) -> None:
         """Writes whether the skin acts into the correction of all skins. Launches only."""

@@ -24,7 +24,7 @@ from .ahead import kernels_of_step
 from .batch import Batch
 from .implicit import integrator
 from .implicit.ends import Ends
-from .implicit.factor import Factor
+from .implicit.factor import Cones, Factor
 from .implicit.integrator import Integrator
 from .memory import Scratch
 from .skin import solve_group
@@ -140,10 +140,11 @@ class Hook:
             self._rows = rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
             self._integrator, self._ends = Integrator(m, d), Ends(d)
             self._loads = Loads(m, d, self._corrected)
-            self._slope = integrator.Slope(m, d.nworld)
-        self._scratch, self._free = Scratch(device), Factor(m, d.nworld)
+            cones = Cones(m, d)
+            self._slope = integrator.Slope(m, d.nworld, cones)
+        self._scratch, self._free = Scratch(device), Factor(m, d.nworld, cones)
         for batch, row in zip(self._corrected, slots):
-            batch.take_part(m, rows, int(row))
+            batch.take_part(m, rows, int(row), cones)
 
     def _look_ahead(self, m, d, moving):
         """Predicts the bodies' poses with the linear models of the last step and, in worlds whose skins act

@@ -2,31 +2,137 @@
 
 import typing
 
+import mujoco
 import warp as wp
 
 from ...coupling.implicit.compliance import factor
 from ...skin.program import Launcher
-from ...skin.types import real
+from ...skin.types import real, vec6
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Factor"]
+__all__ = ["Cones", "Factor"]
+
+wp.set_module_options({"enable_backward": False})
 
 _BLOCK = 64  # threads that factor a world's matrix
+
+_CONE = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE))
+_ELLIPTIC = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
+
+
+@wp.kernel
+def find_hessians(
+    # In:
+    going: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    world: wp.array(dtype=int),
+    dim: wp.array(dtype=int),
+    friction: wp.array2d(dtype=float),
+    address: wp.array2d(dtype=int),
+    stretch: wp.array(dtype=float),
+    qacc: wp.array2d(dtype=float),
+    state: wp.array2d(dtype=int),
+    J: wp.array3d(dtype=float),
+    D: wp.array2d(dtype=float),
+    aref: wp.array2d(dtype=float),
+    sparse: int,
+    J_rownnz: wp.array2d(dtype=int),
+    J_rowadr: wp.array2d(dtype=int),
+    J_colind: wp.array3d(dtype=int),
+    # Out:
+    cone_out: wp.array2d(dtype=int),
+    hessian_out: wp.array2d(dtype=vec6),
+):
+    """Hessians of the contacts that slide on their elliptic cones: as in MuJoCo, of the cost
+    D0 / (mu^2 (1 + mu^2)) (N - mu T)^2 / 2, with N and T the rows' residuals times mu and times friction.
+
+    Args:
+      stretch: 1 / sqrt(impratio).
+    """
+    c = wp.tid()
+    if c >= count[0]:
+        return
+    first = address[c, 0]
+    w = world[c]
+    if first < 0 or going[w] == 0 or state[w, first] != _CONE:
+        return
+    mu = real(friction[c, 0] * stretch[w % stretch.shape[0]])
+    scale = vec6()
+    u = vec6()
+    square = real(0.0)
+    for k in range(dim[c]):
+        r = first + k
+        left = -real(aref[w, r])
+        if sparse == 1:
+            for n in range(J_rownnz[w, r]):
+                at = J_rowadr[w, r] + n
+                left += real(J[w, 0, at]) * real(qacc[w, J_colind[w, 0, at]])
+        else:
+            for n in range(qacc.shape[1]):
+                left += real(J[w, r, n]) * real(qacc[w, n])
+        scale[k] = mu
+        if k > 0:
+            scale[k] = real(friction[c, k - 1])
+            square += scale[k] * left * scale[k] * left
+        u[k] = scale[k] * left
+    T = wp.max(wp.sqrt(square), real(1e-15))
+    slope = mu * u[0] / T
+    stiff = real(D[w, first]) / (mu * mu * (real(1.0) + mu * mu))
+    for k in range(dim[c]):
+        row = vec6()
+        for n in range(dim[c]):
+            h = slope * u[k] * u[n] / (T * T)
+            if k == 0 and n == 0:
+                h = real(1.0)
+            elif k == 0 or n == 0:
+                h = -mu * u[k + n] / T
+            elif k == n:
+                h += mu * mu - slope
+            row[n] = stiff * scale[k] * scale[n] * h
+        cone_out[w, first + k] = first
+        hessian_out[w, first + k] = row
+
+
+class Cones:
+    """Hessians of mujoco_warp's contacts that slide on elliptic cones, see `compliance.factor`: cone, hessian
+    [world, row], empty where its cones are pyramids."""
+
+    def __init__(self, m: "mjw.Model", d: "mjw.Data"):
+        self._wanted, friction = m.opt.cone == _ELLIPTIC, d.contact.friction
+        shape = (d.nworld, d.njmax) if self._wanted else (d.nworld, 0)
+        with wp.ScopedDevice(d.qpos.device):
+            self.cone, self.hessian = wp.full(shape, -1, dtype=int), wp.zeros(shape, dtype=vec6)
+        self._friction = wp.array(
+            ptr=friction.ptr, shape=(len(friction), 5), dtype=float, device=friction.device, copy=False
+        )
+
+    def find(self, m: "mjw.Model", d: "mjw.Data", going: wp.array) -> None:
+        """Finds them in worlds that are going (nworld,), after mujoco_warp's constraint solver. Launches
+        only."""
+        if not self._wanted:
+            return
+        c, efc = d.contact, d.efc
+        contacts = [d.nacon, c.worldid, c.dim, self._friction, c.efc_address, m.opt.impratio_invsqrt]
+        rows = [d.qacc, efc.state, efc.J, efc.D, efc.aref]
+        rows += [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
+        found = [self.cone, self.hessian]
+        wp.launch(find_hessians, d.naconmax, [going, *contacts, *rows], found, device=self.cone.device)
 
 
 class Factor:
     """Cholesky's factors of inertias, with the springs that MuJoCo's constraints are.
 
     Args:
-      m: mujoco_warp Model. nworld: number of worlds.
+      m: mujoco_warp Model. nworld: number of worlds. cones: of its Data, which several share.
 
     Attributes:
       L: (nworld, nv, nv), lower triangles.
     """
 
-    def __init__(self, m: "mjw.Model", nworld: int):
+    def __init__(self, m: "mjw.Model", nworld: int, cones: Cones):
+        self._cones = cones
         self._inertia_rows = [m.M_rownnz, m.M_rowadr, m.M_colind]
         with wp.ScopedDevice(m.qpos0.device):
             self.L = wp.zeros((nworld, m.nv, m.nv), dtype=real)
@@ -52,5 +158,8 @@ class Factor:
         efc, (none, no_slot) = d.efc, self._none
         held = [no_slot if own is None else own, d.nefc if springs else none]
         held += [efc.state, efc.J, efc.D, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
+        held += [self._cones.cone, self._cones.hessian]
+        if springs:
+            self._cones.find(m, d, going)
         known = [going, inertia, *self._inertia_rows, *held]
         Launcher(self.L.device).launch_blocks(factor, [len(self.L)], known, [self.L], block_dim=_BLOCK)

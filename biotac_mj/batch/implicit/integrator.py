@@ -19,7 +19,7 @@ from ...skin.block import block_max, sync
 from ...skin.condensed.lanes import eliminate
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
-from .factor import Factor
+from .factor import Cones, Factor
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -225,11 +225,11 @@ class Slope:
     """Steps of Newton's method to the corrections of all worlds.
 
     Args:
-      m: mujoco_warp Model. nworld: number of worlds.
+      m: mujoco_warp Model. nworld: number of worlds. cones: of its Data.
     """
 
-    def __init__(self, m: "mjw.Model", nworld: int):
-        self._held, self._damped = Factor(m, nworld), Factor(m, nworld)
+    def __init__(self, m: "mjw.Model", nworld: int, cones: Cones):
+        self._held, self._damped = (Factor(m, nworld, cones) for _ in range(2))
 
     def find(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, c: Correction) -> None:
         """Corrects the forces, after mujoco_warp's constraint solver and `find_amiss`; inertia: see

@@ -20,9 +20,20 @@ __all__ = ["Response", "add_stiffness", "factor", "substitute"]
 wp.set_module_options({"enable_backward": False})
 
 
-_QUADRATIC = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC))
+_QUADRATIC, _CONE = (
+    wp.constant(int(getattr(mujoco.mjtConstraintState, f"mjCNSTRSTATE_{name}")))
+    for name in ("QUADRATIC", "CONE")
+)
 _LEAST = wp.constant(wp.float64(1e-12))  # of a pivot, of the entry that it came from
 _NONE = wp.constant(wp.float64(2e-15))  # of a row without stiffness, twice mjMINVAL
+
+
+@wp.func
+def _entry(J: wp.array3d(dtype=Any), w: int, r: int, k: int, sparse: int, J_rowadr: wp.array2d(dtype=int)):
+    """Entry k of those that a constraint's row has in the Jacobian."""
+    if sparse == 1:
+        return real(J[w, 0, J_rowadr[w, r] + k])
+    return real(J[w, r, k])
 
 
 @wp.kernel
@@ -42,11 +53,16 @@ def factor(
     J_rownnz: wp.array2d(dtype=int),
     J_rowadr: wp.array2d(dtype=int),
     J_colind: wp.array3d(dtype=int),
+    cone: wp.array2d(dtype=int),
+    hessian: wp.array2d(dtype=vec6),
     # Out:
     L_out: wp.array3d(dtype=real),
 ):
     """Cholesky's factor of the inertia with what constraints now hold, but for a skin's own rows, of which
-    the first of six are `own`; by the threads of a block. Of worlds that are going."""
+    the first of six are `own`; by the threads of a block. Of worlds that are going.
+
+    A contact that slides on its elliptic cone holds by its Hessian: `cone` is the first of its rows, or -1
+    where it is not known, and `hessian` has a row for each. They have their entries in the same columns."""
     w, t = wp.tid()
     if going[w] == 0:
         return
@@ -60,6 +76,10 @@ def factor(
     sync()
     for r in range(wp.min(rows[w], state.shape[1])):
         springs = wp.where(state[w, r] == _QUADRATIC and real(D[w, r]) > _NONE, 1, 0)
+        first = int(-1)
+        if state[w, r] == _CONE:
+            first = cone[w, r]
+            springs = wp.where(first >= 0, 1, 0)
         for k in range(own.shape[0]):
             if own[k, w] >= 0 and r >= own[k, w] and r < own[k, w] + 6:
                 springs = 0
@@ -67,22 +87,23 @@ def factor(
             size = n
             if sparse == 1:
                 size = J_rownnz[w, r]
-            stiff = real(D[w, r])
             for m in range(t, size * size, threads):
                 a = m / size
                 b = m % size
                 i = a
                 j = b
-                product = real(0.0)
                 if sparse == 1:
-                    at = J_rowadr[w, r]
-                    i = J_colind[w, 0, at + a]
-                    j = J_colind[w, 0, at + b]
-                    product = real(J[w, 0, at + a]) * real(J[w, 0, at + b])
+                    i = J_colind[w, 0, J_rowadr[w, r] + a]
+                    j = J_colind[w, 0, J_rowadr[w, r] + b]
+                push = real(0.0)
+                if first < 0:
+                    push = real(D[w, r]) * _entry(J, w, r, b, sparse, J_rowadr)
                 else:
-                    product = real(J[w, r, a]) * real(J[w, r, b])
+                    for k in range(6):
+                        if hessian[w, r][k] != real(0.0):
+                            push += hessian[w, r][k] * _entry(J, w, first + k, b, sparse, J_rowadr)
                 if i >= j:
-                    L_out[w, i, j] = L_out[w, i, j] + stiff * product
+                    L_out[w, i, j] = L_out[w, i, j] + push * _entry(J, w, r, a, sparse, J_rowadr)
             sync()
     sync()
     for j in range(n):

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ...skin.types import real
+from ...skin.types import real, vec6
 from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
 from .compliance import factor
@@ -16,9 +16,7 @@ from .kinematics import row
 __all__ = ["Springs"]
 
 _NEWTON = int(mujoco.mjtSolver.mjSOL_NEWTON)
-_QUADRATIC, _CONE = (
-    int(getattr(mujoco.mjtConstraintState, f"mjCNSTRSTATE_{name}")) for name in ("QUADRATIC", "CONE")
-)
+_CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 _ENTRIES = "J", "J_colind"  # of the constraints' Jacobian; the others are of its rows
 
 
@@ -54,49 +52,50 @@ class Springs:
         for name in ("state", "J", "D", "J_rownnz", "J_rowadr", "J_colind"):
             shape = (1, 1, entries) if name in _ENTRIES else (1, rows)
             made[name] = wp.zeros(shape, dtype=real if name in "JD" else int, device="cpu")
+        cone, hessian = (wp.zeros((1, rows), dtype=kind, device="cpu") for kind in (int, vec6))
+        self._cone, self._hessian = cone.numpy()[0], hessian.numpy()[0]
         self._room, self._factors = (rows, entries), {}
         self._copies = {name: array.numpy().reshape(-1) for name, array in made.items()}
-        self._arrays = list(made.values())
+        self._arrays = [*made.values(), cone, hessian]
         self._arrays.insert(3, 1)  # the Jacobian is sparse, also where MuJoCo's is not
 
     def take(self, inertia: np.ndarray | None) -> None:
         """Takes the rows as they are, and an inertia (nM,) laid out as MuJoCo's M; None: that."""
         rows, here = self._data.rows(), self._here
-        state, weight = self._data.row_states().copy(), rows.efc_D.copy()
+        state = self._data.row_states()
         cones = self._cones(state)
         if self._model.is_sparse:
-            column, count, first = rows.efc_J_colind, rows.efc_J_rownnz, rows.efc_J_rowadr
-            value = rows.efc_J.copy()
-            for begin, root in cones:  # rows of a contact have their entries in the same columns
-                mine = value[first[begin] : first[begin] + len(root) * count[begin]]
-                mine[:] = (root.T @ mine.reshape(len(root), -1)).ravel()
+            value, column, count, first = rows.efc_J, rows.efc_J_colind, rows.efc_J_rownnz, rows.efc_J_rowadr
         else:
-            whole = rows.efc_J.reshape(-1, self._model.nv).copy()
-            for begin, root in cones:
-                whole[begin : begin + len(root)] = root.T @ whole[begin : begin + len(root)]
-            number, column = whole.nonzero()
-            value, count = whole[number, column], np.bincount(number, minlength=len(whole))
-            first = np.cumsum(count) - count
-        for begin, root in cones:
-            state[begin : begin + len(root)], weight[begin : begin + len(root)] = _QUADRATIC, 1.0
+            whole = rows.efc_J.reshape(-1, self._model.nv)
+            there = whole != 0.0
+            for begin, hessian in cones:
+                mine = there[begin : begin + len(hessian)]
+                mine[:] = mine.any(axis=0)
+            (number, column), count = there.nonzero(), there.sum(axis=1)
+            value, first = whole[number, column], np.cumsum(count) - count
         needed = len(count), len(value)
         if needed[0] > self._room[0] or needed[1] > self._room[1]:
             self._make_room(*(2 * n for n in needed))
         here["inertia"][0] = self._data.M if inertia is None else inertia
         here["rows"][0] = needed[0]
-        given = state, value, weight, count, first, column
+        given = state, value, rows.efc_D, count, first, column
         for copy, array in zip(self._copies.values(), given):
             copy[: array.size] = array
+        self._cone[: needed[0]] = -1
+        for begin, hessian in cones:
+            mine, size = slice(begin, begin + len(hessian)), len(hessian)
+            self._cone[mine], self._hessian[mine, size:], self._hessian[mine, :size] = begin, 0.0, hessian
 
     def _cones(self, state):
-        """[(first row, root (n, n) of the Hessian)] of contacts that slide on their elliptic friction cones.
-        MuJoCo's Newton solver leaves the Hessians."""
-        out, sliding = [], (state == _CONE).any() and self._model.opt.solver == _NEWTON
+        """[(first row, Hessian (n, n))] of contacts that slide on their elliptic friction cones. MuJoCo's
+        Newton solver leaves the Hessians."""
+        newton = self._data.is_dual or self._model.opt.solver == _NEWTON
+        out, sliding = [], newton and (state == _CONE).any()
         for contact in contacts_of(self._data) if sliding else ():
             begin, size = int(contact["efc_address"]), int(contact["dim"])
             if begin >= 0 and state[begin] == _CONE:
-                value, vector = np.linalg.eigh(contact["H"].ravel()[: size * size].reshape(size, size))
-                out.append((begin, vector * np.sqrt(np.maximum(value, 0.0))))
+                out.append((begin, contact["H"].ravel()[: size * size].reshape(size, size)))
         return out
 
     def factor(self, skin: int | None) -> None:
