@@ -225,8 +225,8 @@ def search(
     r: Remembered,
     st: Worlds,
 ):
-    """The phase SEARCH: finds the candidates, first at the start of an increment, then at its displacements,
-    until there are no new ones. Where those of a long motion find no room it begins anew with nearer ones:
+    """The phase SEARCH: finds the candidates, first at the start of an increment, then at its displacements
+    while there are new ones. Where those of a long motion find no room it begins anew with nearer ones:
     the searches that follow find which of the others are touched."""
     p = s.solve.stepping[w]
     o = s.solve.increment[w]
@@ -261,21 +261,17 @@ def search(
             o.deep = 1
             looking = 0
     if looking == 1:
-        nface = o.nface
-        ncore = o.ncore
-        new = int(0)
-        if first == 1 or may_be_reached(w, t, threads, o.reach, o.near, geoms, x, touch, c, s):
-            largest = largest_displacement(w, t, threads, x, c)
-            if first == 1 and o.reach * largest > real(0.0):
+        largest = largest_displacement(w, t, threads, x, c)
+        reach = real(0.0)
+        fraction = real(0.0)
+        if first == 1:
+            if o.reach * largest > real(0.0):
                 o.fraction = wp.min(real(1.0), real(1.5) * o.reach / largest)
-            reach = wp.where(first == 1, o.reach, real(0.0))
-            nface, new = find_faces(
-                w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, x, c, s
-            )  # fmt: skip
-        if first == 1 or may_meet_core(w, t, threads, o.fraction, x, touch, c):
-            fraction = wp.where(first == 1, o.fraction, real(0.0))
-            ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
-            new += inner
+            reach = o.reach
+            fraction = o.fraction
+        nface, new = find_faces(w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, x, c, s)
+        ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
+        new += inner
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
         else:
@@ -372,7 +368,7 @@ def _conclude_pass(
     st: Worlds,
 ):
     """Ends a pass of Newton's method; returns the increment and the next phase, BALANCED if the increment has
-    ended."""
+    ended, SEARCH if what was no candidate may be touched now."""
     d = s.solve.newton[w]
     l = d.linear
     o.ok = d.found
@@ -428,7 +424,13 @@ def _conclude_pass(
             s.solve.newton[w] = newton_from(2, d.before, again, p.left - o.spent, d.tolerance)
         return o, NEWTON
     _store(w, t, threads, o.nnode, o.nin, c, s)
-    return o, wp.where(o.ok == CUT, BALANCED, SEARCH)
+    phase = BALANCED
+    if o.ok != CUT:
+        if may_be_reached(w, t, threads, o.reach, o.near, geoms, x, touch, c, s):
+            phase = SEARCH
+        elif may_meet_core(w, t, threads, o.fraction, x, touch, c):
+            phase = SEARCH
+    return o, phase
 
 
 @wp.func
