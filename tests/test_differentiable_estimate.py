@@ -1,6 +1,7 @@
 """Contacts from electrodes: those of the skin's own presses are found again, and intervals hold them; touches
 that are known teach what is a sensor's own."""
 
+import copy
 import csv
 import dataclasses
 import json
@@ -82,6 +83,17 @@ def press(estimator, along, around, share, gain=1.0):
 def pressed(estimator):
     """A press that none of the table is."""
     return press(estimator, -0.0098, 0.17, 0.6)
+
+
+def test_a_table_without_derivatives_has_the_same_presses(estimator):
+    one = copy.copy(estimator.presses)
+    along, around = one._capsule.along[:1], one._capsule.around[:1]
+    one._capsule = dataclasses.replace(one._capsule, along=along, around=around)
+    whole, one._slopes = one._make(), False
+    alone = one._make()
+    assert alone.keys() == {"signal", "outcome"} and len(whole) == 5
+    for name, values in alone.items():
+        np.testing.assert_array_equal(values, whole[name])
 
 
 def test_a_press_is_found_again(estimator, pressed):

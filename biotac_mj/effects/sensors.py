@@ -74,7 +74,7 @@ def take_sensor(settings: dict, seed: ArrayLike = 0, design: Design = BIOTAC) ->
     """Sensor from the settings of readings.
 
     Args:
-      settings: with "sensor" (see `presets.read_sensor`) and "randomise" (see `read_randomise`), or without.
+      settings: may have "sensor" (see `presets.read_sensor`) and "randomise" (see `read_randomise`).
       seed: of random draws, whole numbers. design: of the sensor.
 
     Returns:

@@ -82,12 +82,11 @@ def paired_test(a: ArrayLike, b: ArrayLike) -> dict:
 
 
 def is_better(error: np.ndarray, other: np.ndarray, owner: ArrayLike) -> bool:
-    """Whether the RMS errors of trajectories are smaller than others by more than chance: a paired one-sided
-    test at 5 % (Student's t) of their differences.
+    """Whether one model's RMS errors per trajectory are smaller than another's by more than chance: a paired
+    one-sided t test (Student) at 5 %. False for a single trajectory.
 
     Args:
-      error, other: (n, k) of the same rows. owner: (n,) trajectory of each row; of one alone nothing is
-        known.
+      error, other: (n, k) errors of both models in the same rows. owner: (n,) trajectory of each row.
     """
     _, index = np.unique(owner, return_inverse=True)
     mine, theirs = (np.bincount(index, (e**2).mean(axis=1)) / np.bincount(index) for e in (error, other))

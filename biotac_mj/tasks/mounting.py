@@ -227,9 +227,9 @@ def side_view(
 def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
 ) -> list[np.ndarray] | None:
-    """Three pictures (height, width, 3) uint8: the original link with the replaced geoms in red; then with
-    the BioTac and its axes (x red, before the tip; y green, z blue), from the side and onto its pad. Other
-    fingers are translucent. None if no GL library works.
+    """Three pictures (height, width, 3) uint8: the original link with the replaced geoms in red; the
+    link with the BioTac and its axes (x red, y green, z blue) from the side; the same with a view of its pad.
+    Other fingers are translucent. None if no GL library works.
 
     Args:
       path: MJCF of the hand.

@@ -42,8 +42,8 @@ class SkinGroup:
         return jacobian.reshape(-1, self._rows.shape[1]), held.reshape(-1, self._rows.shape[1])
 
     def evaluate(self, acceleration: np.ndarray) -> None:
-        """Finds where the bodies go with accelerations (nv,), and how far that is from where the skins were
-        solved."""
+        """Finds the poses that the bodies reach with accelerations (nv,), and how far they are from the poses
+        for which the skins were solved."""
         for skin in self._skins:
             skin.evaluate(acceleration)
 

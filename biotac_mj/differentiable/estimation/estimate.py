@@ -129,6 +129,11 @@ class Estimator:
         """Presses all over the skin; simulated on first use, or read from disk."""
         return Presses(self.skin, self.geometry, self.indenter, self.progress)
 
+    @functools.cached_property
+    def _starts(self):
+        """The presses without derivatives, which a fit begins from."""
+        return Presses(self.skin, self.geometry, self.indenter, self.progress, slopes=False)
+
     def learn(self, touches: Sequence[Touch]) -> Belief:
         """Belief about the sensor after known touches, see `belief.learn`."""
         return learn(self.presses, self.geometry, touches)
@@ -155,7 +160,7 @@ class Estimator:
         signal = change if pdc is None else np.append(change, pressure_change(*pdc))
         film = FilmConduction(self.geometry, **(film or {}))
         noise = noise_of(np.asarray(rest, float), rows)[: len(signal)]
-        found = fit(self.presses, film, signal, noise, self.progress)
+        found = fit(self._starts, film, signal, noise, self.progress)
         spread = np.sqrt(np.diag(found.covariance))
         wide_force, wide = OWN_WIDE
         size = float(np.exp(found.outcome[0]))

@@ -15,7 +15,7 @@ import warp as wp
 from scipy.interpolate import RegularGridInterpolator
 from tqdm import tqdm
 
-from ...cache import cached
+from ...cache import Entry, cached
 from ...calibration import plan_indentation
 from ...calibration.forward import Steps, steps_of
 from ...calibration.indentation import Indentation
@@ -139,6 +139,7 @@ class Presses:
     Args:
       skin: with one geom. geometry: of it. indenter: the geom, as in `biotac press --indenter`.
       progress: whether to show a bar while the table is made.
+      slopes: whether derivatives are computed too, which takes as long as the presses.
 
     Attributes:
       at: (n, 3) along [m] and around [rad] the capsule, fraction of the deepest press there.
@@ -151,23 +152,30 @@ class Presses:
         position.
     """
 
-    def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str, progress: bool = False):
+    def __init__(
+        self,
+        skin: Skin,
+        geometry: SkinGeometry,
+        indenter: str,
+        progress: bool = False,
+        slopes: bool = True,
+    ):
         self.skin, self.geometry, self._indenter, self._progress = skin, geometry, indenter, progress
+        self._slopes = slopes
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
         self._capsule = capsule = capsule_of(geometry)
         axes = capsule.along, capsule.around, _FRACTIONS
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
-        table = cached("presses", inputs, self._make, code)
+        table = None if slopes else Entry("presses", inputs, code).load()
+        table = table or cached("presses" if slopes else "presses_alone", inputs, self._make, code)
         along, around, fraction = (
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )
         fraction[0] = _LIGHTEST
         self.at = at = np.stack(np.meshgrid(along, around, fraction, indexing="ij"), -1).reshape(-1, 3)
-        self.signal, self.by_press, self.by_sensor, self.outcome, self.outcome_by = (
-            RegularGridInterpolator(axes, table[name], method="cubic")(at)
-            for name in ("signal", "by_press", "by_sensor", "outcome", "outcome_by")
-        )
+        for name, values in table.items():
+            setattr(self, name, RegularGridInterpolator(axes, values, method="cubic")(at))
         self.outcome[:, 0] += np.log(at[:, 2])
         self.deepest = at[:, 2] == fraction[-1]
         self.weight = np.log(np.cos(capsule.turn(at[:, 0])))
@@ -199,10 +207,10 @@ class Presses:
         the fraction."""
         capsule, width = self._capsule, self.geometry.design.nelectrode + 1
         shape = len(capsule.along), len(capsule.around), len(_FRACTIONS)
-        widths = {
-            "signal": (width,), "by_press": (3, width), "by_sensor": (3, width), "outcome": (7,),
-            "outcome_by": (3, 7),
-        }  # fmt: skip
+        widths = {"signal": (width,), "outcome": (7,)}
+        if self._slopes:
+            widths |= {"by_press": (3, width), "by_sensor": (3, width), "outcome_by": (3, 7)}
+        of_films = [name for name in ("signal", "by_press", "by_sensor") if name in widths]
         table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
         films, n = None, len(self.geometry.vert)
         places = list(itertools.product(enumerate(capsule.along), enumerate(capsule.around)))
@@ -213,29 +221,32 @@ class Presses:
         for (i, along), (j, around) in tqdm(places, "table, once", unit="press", disable=not shown or None):
             with self.skin.lock:
                 trajectory, steps = self.simulate(along, around)
-                tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
+                if self._slopes:
+                    tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
             rest = trajectory.rest
             lies = rest.x[:n, 0].numpy() if rest else self.geometry.vert
-            films = films or _Films(self.geometry, lies)
+            films = films or _Films(self.geometry, lies, self._slopes)
             begin = float(rest.pressure) if rest else 0.0
             for k, end in enumerate(steps.ends[1:], start=1):
                 record, here = trajectory.steps[end], (i, j, k)
+                directions = tangents.nodes[:, 0, end, :n] if self._slopes else None
                 try:
-                    read = films.read(record.x[:n, 0].numpy(), tangents.nodes[:, 0, end, :n])
+                    read = films.read(record.x[:n, 0].numpy(), directions)
                 except NoFilmError:  # deeper than the film allows: use the deepest valid one
-                    read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
-                for name, value in zip(widths, read):
+                    read = [table[name][i, j, k - 1, ..., :-1] for name in of_films]
+                for name, value in zip(of_films, read):
                     table[name][here][..., :-1] = value
                 table["signal"][here][-1] = 1e-3 * (float(record.pressure) - begin)
-                table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
                 wrench, middle = record.wrench[0, 0], torch.from_numpy(self.middle(record.touches))
-                slopes = torch.autograd.functional.jacobian(
-                    functools.partial(outcome_of, middle=middle), wrench
-                )
                 table["outcome"][here] = outcome_of(wrench, middle).numpy()
                 table["outcome"][here][0] -= np.log(_FRACTIONS[k])
-                table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
-        for name in ("outcome", "outcome_by"):
+                if self._slopes:
+                    table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
+                    slopes = torch.autograd.functional.jacobian(
+                        functools.partial(outcome_of, middle=middle), wrench
+                    )
+                    table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
+        for name in {"outcome", "outcome_by"} & table.keys():
             table[name][:, :, 0] = table[name][:, :, 1]
         return table
 
@@ -254,27 +265,32 @@ class Presses:
 
 
 class _Films:
-    """Electrode readings of a skin, for its own sensor and changed ones; rest: (nvert, 3) nodes without
-    contact [m]."""
+    """Electrode readings of a skin, for its own sensor and, with slopes, changed ones; rest: (nvert, 3) nodes
+    without contact [m]."""
 
-    def __init__(self, geometry, rest):
+    def __init__(self, geometry, rest, slopes):
         core, at = CoreSurface(geometry.core_vert, geometry.core_face), geometry.electrode_pos
         films = [FilmConduction(geometry)]
+        self._own, self._own_rest = films[0], np.log(films[0].impedance(rest))
+        if not slopes:
+            return
         films += [FilmConduction(geometry, residual_film=floor) for floor in _FLOORS]
         for axis in np.eye(3)[[0, 2]]:
             for size in (-_MOVED, _MOVED):
                 _, foot, face = core.closest(at + size * axis)
                 moved = {"electrode_pos": foot, "electrode_normal": core.normal[face]}
                 films.append(FilmConduction(dataclasses.replace(geometry, **moved)))
-        self._own, self._others = films[0], films[1:]
-        self._rest = [np.log(film.impedance(rest)) for film in films]
+        self._others = films[1:]
+        self._rest = [np.log(film.impedance(rest)) for film in self._others]
         steps_apart = np.array([np.log(_FLOORS[1] / _FLOORS[0]), 2e3 * _MOVED, 2e3 * _MOVED])
         self._steps_apart = steps_apart[:, None]
 
-    def read(self, x: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Changes of ln Z from rest (nelectrode,), their derivatives along directions (k, nvert, 3) of the
-        nodes (k, nelectrode), and by changes of the sensor (3, nelectrode)."""
+    def read(self, x: np.ndarray, directions: np.ndarray | None) -> tuple[np.ndarray, ...]:
+        """Changes of ln Z from rest (nelectrode,); with directions (k, nvert, 3) of the nodes also their
+        derivatives along these (k, nelectrode), and by changes of the sensor (3, nelectrode)."""
+        if directions is None:
+            return (np.log(self._own.impedance(x)) - self._own_rest,)
         value, slopes = slopes_of_film(self._own, x, directions)
-        others = [np.log(film.impedance(x)) - rest for film, rest in zip(self._others, self._rest[1:])]
+        others = [np.log(film.impedance(x)) - rest for film, rest in zip(self._others, self._rest)]
         by_other = (np.array(others[1::2]) - others[::2]) / self._steps_apart
-        return value - self._rest[0], slopes, by_other
+        return value - self._own_rest, slopes, by_other

@@ -168,10 +168,8 @@ class ProximityQuery:
             inputs = [model.core_vert, model.core(1).struct, geoms.struct]
             self._measure_core = recorded(_measure_core, geoms.count, inputs, [core])
         if geoms.count:
-            left, turned = zeros((ngeom, 1), vec3)[0], zeros((ngeom, 1), mat33)[0]
-            self._left = left.numpy()[:, 0]
-            known = [wp.ones(1, dtype=int, device="cpu"), model.outer.face, model.sample, x, geoms.struct]
-            self._launch_leave_skin = recorded(leave_skin, (ngeom, 1), known, [left, turned], tiled=True)
+            self._left, self._turned = zeros((ngeom, 1), vec3)[0], zeros((ngeom, 1), mat33)[0]
+            self._known = wp.ones(1, dtype=int, device="cpu"), model.outer.face, model.sample, x, geoms.struct
         self._regions = _Regions(geoms.count, center, radius)
         # of a mesh it is the distance here and a lower bound there
         spacing = geoms.struct.grids.spacing.numpy() if geoms.shapes != SOLIDS else np.zeros(1)
@@ -222,9 +220,18 @@ class ProximityQuery:
 
     def _leave_skin(self, pos, mat):
         self.pose(pos, mat)
-        self._left[...] = np.nan
-        self._launch_leave_skin()
-        return self._left.copy()
+        left = self._left.numpy()[:, 0]
+        left[...] = np.nan
+        # not recorded beforehand: few geoms begin in a skin, and the kernel takes 2 s to compile
+        wp.launch_tiled(
+            leave_skin,
+            dim=self._left.shape,
+            inputs=self._known,
+            outputs=[self._left, self._turned],
+            block_dim=1,
+            device="cpu",
+        )
+        return left.copy()
 
     def shallow(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Positions (ngeom, 3) [m] of the geoms. Each one that is too `deep` in the core is moved out, along
