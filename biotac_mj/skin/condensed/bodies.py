@@ -20,9 +20,9 @@ __all__ = [
     "move_nodes",
     "number_bodies",
     "place_bodies",
-    "pose_by_forces",
     "pose_by_load",
     "rigid_column",
+    "sum_forces",
     "touching_group",
 ]
 
@@ -224,18 +224,17 @@ def pose_by_load(
 
 
 @wp.func
-def pose_by_forces(
+def sum_forces(
     w: int,
     t: int,
     threads: int,
-    load_factor: real,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
 ):
-    """Puts the geoms where the forces on all outer nodes that a solve begins with bring their bodies."""
+    """Makes the wrenches `posed` those of the forces on all outer nodes that a solve begins with."""
     b = s.bodies
     groups = b.compliance.shape[0]
     for h in range(groups):
@@ -255,4 +254,3 @@ def pose_by_forces(
         if t == 0:
             b.posed[h, w] = -vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
     sync()
-    place_bodies(w, t, threads, load_factor, geoms, s)

@@ -10,7 +10,7 @@ from ..contact.posed import Geoms
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
 from .balance import CUT, TOLERANCE, newton_from
-from .bodies import find_groups, pose_by_forces, pose_by_load
+from .bodies import find_groups, place_bodies, pose_by_load, sum_forces
 from .broadphase import (
     choose_view,
     find_faces,
@@ -197,11 +197,8 @@ def begin_step(
     if s.bodies.begun.shape[0] > 0:
         for i in range(t, c.node.shape[0], threads):
             s.force[w, i] = r.force[i, w]
-        for g in range(t, geoms.count, threads):
-            geoms.pos[g, w] = s.from_pos[g, w]
-            geoms.mat[g, w] = s.from_mat[g, w]
         sync()
-        pose_by_forces(w, t, threads, real(1.0), geoms, x, touch, c, s)
+        sum_forces(w, t, threads, geoms, x, touch, c, s)
         for h in range(t, s.bodies.begun.shape[0], threads):
             s.bodies.begun[h, w] = s.bodies.posed[h, w]
         sync()
@@ -240,7 +237,8 @@ def search(
         for i in range(t, c.inner.shape[0], threads):
             s.core_force[w, i] = r.core_force[i, w]
         forget_faces(w, t, threads, touch.kept, c, s, r, touch.touching)
-        pose_by_forces(w, t, threads, p.to, geoms, x, touch, c, s)
+        sum_forces(w, t, threads, geoms, x, touch, c, s)
+        place_bodies(w, t, threads, p.to, geoms, s)
         o.solved = r.after[w]
         o.bulge = r.bulge[w]
         if p.known == 1:
