@@ -159,8 +159,10 @@ def test_what_a_law_lacks_goes_with_what_its_effect_does(plain):
     assert len(likelihood.laws([], np.zeros(0))) == 0
 
 
-def test_data_say_how_far_a_law_is_off():
-    """Synthetic: relaxation as the law has it, and 40 % more of it when deep, less when not."""
+@pytest.fixture(scope="module")
+def laws():
+    """Synthetic: relaxation as the law has it, and 40 % more of it when deep, less when not: the effect, and
+    what is fitted to each."""
     relax = by_id("relax")
     hidden = [(relax, {**relax.default(), "g": 0.3, "tau": 0.5})]
     without, true = measured([], n=8), measured(hidden, n=8)
@@ -171,8 +173,24 @@ def test_data_say_how_far_a_law_is_off():
         changed = {k: getattr(b, k) + more * v for k, v in change.items()}
         changed["pdc"] = b.pdc + more[:, 0] * (b.pdc - a.pdc)
         other.append(dataclasses.replace(b, **changed))
-    errors = []
-    for data in (true, other):
-        comparison = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
-        errors += fit_effects(comparison, hidden, np.arange(len(data))).law_errors.tolist()
+    return hidden, [
+        Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
+        for data in (true, other)
+    ]
+
+
+def test_data_say_how_far_a_law_is_off(laws):
+    hidden, compared = laws
+    errors = [fit_effects(one, hidden, np.arange(8)).law_errors[0] for one in compared]
     assert errors[0] < SETTINGS.law < errors[1], errors
+
+
+def test_fits_beside_a_law_that_errs_end_where_the_truth_is(laws):
+    """From no effect as from what is hidden."""
+    hidden, (_, other) = laws
+    chosen = np.arange(8)
+    null = fit_effects(other, [], chosen)
+    none = [(effect, {**theta, "g": 0.0}) for effect, theta in hidden]
+    far, near = (fit_effects(other, start, chosen, null) for start in (none, hidden))
+    assert far.score > near.score - 5 > null.score + 100
+    assert far.effects[0][1]["g"] == pytest.approx(near.effects[0][1]["g"], abs=0.03)

@@ -241,6 +241,11 @@ class _Model:
             amplitude = likelihood.amplitudes(y, whole, amplitude, size)
             variance = likelihood.variance(amplitude, size)
             _, weights, factor = likelihood.evidence(y, whole, variance)
+            if point.done:
+                columns = self._lawful(columns, weights[poses:], law_errors)
+                y = point.y + np.tensordot(point.away, columns, 1)
+                whole = np.concatenate([point.errors, columns])
+                _, weights, factor = likelihood.evidence(y, whole, variance)
             known, law_errors = law_errors, self._law_errors(law_errors, weights, factor)
             laws = likelihood.laws(point.done, law_errors)
             point = dataclasses.replace(point, errors=np.concatenate([point.errors[:poses], laws]))
@@ -257,6 +262,16 @@ class _Model:
             if gain < _DONE and np.array_equal(known, law_errors):
                 break
         return self._finished(point, amplitude, law_errors)
+
+    def _lawful(self, columns, weights, law_errors):
+        """Columns of parameters beside what the laws of their effects lack by these weights: where an effect
+        does more, there is more of that, too."""
+        columns, count = columns.copy(), likelihood.COURSES
+        for j, (k, *_) in enumerate(self.parameters):
+            if k is not None:
+                own = law_errors[k] * weights[k * count : (k + 1) * count]
+                columns[j] = self.likelihood.times(1 + own @ self.likelihood.courses, columns[j])
+        return columns
 
     def _law_errors(self, law_errors, weights, factor):
         """(effects,) most probable errors of laws by coefficients of what they do, and their precision."""

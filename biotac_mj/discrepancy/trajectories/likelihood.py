@@ -96,8 +96,8 @@ class Likelihood:
     """Likelihood of some trajectories of a Comparison.
 
     Attributes:
-      chosen: their indices. size: (width,) by how much the base model is expected to be off [counts, N]
-        under the deepest press; expected: (n,) share of it in each row.
+      chosen: their indices. courses: (k, n) of errors of laws. size: (width,) by how much the base model is
+        expected to be off [counts, N] under the deepest press; expected: (n,) share of it in each row.
     """
 
     def __init__(self, comparison: "Comparison", chosen: np.ndarray):
@@ -108,7 +108,7 @@ class Likelihood:
         values, vectors = np.linalg.eigh(kernel(data, self._rows))
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
         self.expected = np.sqrt(vectors**2 @ self._scale)
-        self._courses = courses(data, self._rows)
+        self.courses = courses(data, self._rows)
         self.noise = comparison.noises
         largest = np.abs(self.stacked(comparison.measured)).max(0)
         self.size = np.concatenate(
@@ -127,6 +127,10 @@ class Likelihood:
         """(..., n, width) in the kernel's eigenvectors."""
         return self._vectors.T @ values
 
+    def times(self, process: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Values (n, width) in the eigenvectors times a process (n,) over rows."""
+        return self._vectors.T @ (process[:, None] * (self._vectors @ values))
+
     def poses(self, offsets: np.ndarray) -> np.ndarray:
         """(m, n, width) what errors of poses do about offsets (trajectories, 3) [m], of one standard
         deviation each, in the eigenvectors: three of every trial. An offset that all share is evidence."""
@@ -142,9 +146,9 @@ class Likelihood:
         out = [
             self.turned(error * change * course[:, None])
             for change, error in zip(changes, errors)
-            for course in self._courses
+            for course in self.courses
         ]
-        return np.array(out).reshape(len(out), len(self._courses[0]), len(self.size))
+        return np.array(out).reshape(len(out), len(self.courses[0]), len(self.size))
 
     def law_errors(self, square: np.ndarray) -> np.ndarray:
         """(effects,) most probable errors of laws whose coefficients (effects, k) have these expected
