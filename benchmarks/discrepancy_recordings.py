@@ -179,7 +179,7 @@ class Judge:
 def judge(case, recording, authors: Authors, protocol=None) -> dict:
     """Diagnoses the recording of one case, by a checkup's protocol if there is one, and scores it."""
     from biotac_mj.discrepancy import diagnose_recording
-    from biotac_mj.discrepancy.recordings.confidence import NAMED
+    from biotac_mj.quality.confidence import NAMED, PAIRS
 
     began = time.process_time()
     d = diagnose_recording(recording, protocol=protocol)
@@ -188,8 +188,8 @@ def judge(case, recording, authors: Authors, protocol=None) -> dict:
     def scored(finding, effect):
         return {name: effect[name] for name in ("id", "ties", "channels", "confidence", "p")} | {
             "right": right(effect | {"places": finding.places}, case, authors),
-            "detector": finding.detector.name,
-            "pair": finding.detector.pair,
+            "detector": finding.detector,
+            "pair": finding.detector in PAIRS,
             "features": finding.features,
         }
 

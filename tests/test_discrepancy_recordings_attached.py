@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from biotac_mj.discrepancy.recordings.amended import _theta
-from biotac_mj.discrepancy.recordings.candidates import Candidate, Detector
+from biotac_mj.discrepancy.recordings.candidates import Candidate
 from biotac_mj.sensor.presets import read_sensor
 
 
 def latency(delay, channels):
     parameters = {"delay": (delay, delay, delay)}
-    return Candidate("latency", channels, parameters, 9.0, 0.0, 0.0, 1.0, Detector("late"), delay=delay)
+    return Candidate("latency", channels, 0.0, 1.0, "", parameters, delay=delay)
 
 
 def test_electrodes_may_drift_against_each_other():

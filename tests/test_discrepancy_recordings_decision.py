@@ -8,27 +8,25 @@ from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search
 from biotac_mj.discrepancy.recordings.candidates import Candidate
 from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
-from biotac_mj.discrepancy.recordings.detectors.jumps import JUMP
-from biotac_mj.discrepancy.recordings.detectors.levels import ONE
 from biotac_mj.quality.confidence import probability
 
 
 def sure(detector, features, beside):
-    return confidence(Candidate("drift", (3,), {}, 9.0, 0.0, 0.0, 1.0, detector, features=features), beside)
+    return confidence(Candidate("drift", (3,), 0.0, 1.0, "", detector=detector, features=features), beside)
 
 
 def test_a_name_is_less_sure_beside_others_of_its_detector():
     features = {"edge": 4.0, "alone": 3.4}
-    alone, three, eight = (sure(JUMP, features, beside) for beside in (0, 2, 7))
+    alone, three, eight = (sure("jump", features, beside) for beside in (0, 2, 7))
     assert alone > NAMED and alone > three > eight
 
 
 def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
     features = {"lead": 3.3, "apart": 2.3}
-    alone, pair, many = (sure(ONE, features, beside) for beside in (0, 1, 6))
+    alone, pair, many = (sure("one", features, beside) for beside in (0, 1, 6))
     assert alone == pair > NAMED > many
     edge = {"edge": 4.0, "alone": 3.4}
-    assert sure(JUMP, edge, 0) > sure(JUMP, edge, 1)
+    assert sure("jump", edge, 0) > sure("jump", edge, 1)
 
 
 @pytest.mark.parametrize(

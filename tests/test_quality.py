@@ -430,7 +430,7 @@ def test_a_line_is_found_by_the_clock_that_sampled_it(clock):
         counts[:, 4] += np.rint(wave(len(counts), LOGGER))
     (found,) = hum(Log(counts, LOGGER))
     assert found.channels == (4,) and abs(found.parameters["frequency"][0] - 46.0) < 0.1
-    rest = found.correct(counts)
+    rest = found.correct(counts, np.arange(len(counts)) / RATE)
     assert np.std(rest[:, 4] - counts[:, 4]) > noise[4] and (rest[:, :4] == counts[:, :4]).all()
     assert hum(Log(through_a_bus(touched()[0]), LOGGER)) == []
 

@@ -71,7 +71,7 @@ def lost_rows(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) 
 def _less(log, faults):
     """The log with correctable faults corrected and invalid samples masked."""
     for fault in faults:
-        log = log.without(fault.mask, None if fault.correct is None else fault.correct(log.counts))
+        log = log.without(fault.mask, None if fault.correct is None else fault.correct(log.counts, log.time))
     return log
 
 

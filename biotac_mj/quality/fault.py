@@ -8,7 +8,7 @@ import numpy as np
 __all__ = ["Fault"]
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Fault:
     """A fault of a log of n rows and c channels.
 
@@ -18,7 +18,7 @@ class Fault:
       channels: from 0. start, end: [s] from the first row. message: one line.
       parameters: name -> (value, low, high), nan if no interval is known.
       mask: (n, c) bool, samples without a measurement, or None.
-      correct: counts (n, c) -> counts without the fault, or None if it cannot be corrected.
+      correct: (counts (n, c), time (n,) [s]) -> counts without the fault, or None if it cannot be corrected.
       places: times of single events [s].
       beyond: side of the true value of masked samples: 1 above the recorded one, -1 below, 0 unknown.
       silent: whether its channels do not respond to contact. held: whether rows repeat or jitter about the
@@ -35,7 +35,7 @@ class Fault:
     message: str
     parameters: dict[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     mask: np.ndarray | None = None
-    correct: Callable[[np.ndarray], np.ndarray] | None = None
+    correct: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     places: tuple[float, ...] = ()
     beyond: int = 0
     silent: bool = False

@@ -32,7 +32,7 @@ def hum(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     for _ in range(_LINES - 1):
         if found is None:
             break
-        log = log.without(None, found.correct(log.counts))
+        log = log.without(None, found.correct(log.counts, log.time))
         found = _line(log)
         if found is not None:
             first = _with_line(first, found)
@@ -47,7 +47,7 @@ def _with_line(fault, line):
         fault,
         channels=channels,
         message=f"{fault.message}; and at {line.parameters['frequency'][0]:.2f} Hz",
-        correct=lambda counts: after(before(counts)),
+        correct=lambda counts, time: after(before(counts, time), time),
     )
 
 
@@ -94,7 +94,7 @@ def _line_by(log, read):
             "frequency": (frequency, frequency - width, frequency + width),
             "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
         },
-        correct=lambda counts: _without_line(counts, read, channels, frequency, rate),
+        correct=lambda counts, time: _without_line(counts, read, channels, frequency, rate),
         detector="line",
         features={"score": min(float(np.log(score)), _PLAIN)},
         nats=float(gain.sum()),

@@ -58,6 +58,11 @@ class Log:
     def channels(self) -> int:
         return self.counts.shape[1]
 
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) [s] from the first row."""
+        return np.arange(len(self)) / self.rate
+
     @functools.cached_property
     def whole(self) -> bool:
         """Whether all counts are whole numbers."""

@@ -24,8 +24,7 @@ def confidence(finding: Candidate, beside: int = 0) -> float:
       beside: other findings of the same detector in the recording. What many electrodes have, each by itself,
         has one cause more often than many.
     """
-    detector = finding.detector
-    return probability(detector.name, finding.features, max(beside - detector.pair, 0), _WEIGHTS)
+    return probability(finding.detector, finding.features, beside, _WEIGHTS)
 
 
 def farthest(features: dict, usual: dict) -> tuple[float, str]:

@@ -128,7 +128,7 @@ def _finding(f: Candidate) -> Finding:
         confirmed=f.verified,
         ties={i: name_of(i) for i in f.ties},
         gap=f.gap,
-        note=f.note,
+        note=f.message,
         start=f.start,
         end=f.end,
     )

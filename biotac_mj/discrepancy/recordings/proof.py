@@ -23,13 +23,13 @@ def prove(session: Session, finding: Candidate) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
     taken_out = finding.correct is not None or finding.mask is not None
-    if finding.detector.of_log:
+    if finding.of_log:
         finding.verified = True  # what is wrong with a log is told by its own samples
     if finding.delay:
         before, after, floor, unit, name = _force(session, finding)
     elif not taken_out:
         return
-    elif finding.detector.of_log:
+    elif finding.of_log:
         before, after, floor, unit, name = _samples(session, finding)
     elif finding.places or finding.end < _aside_from(session):
         return  # it is over by then
@@ -80,9 +80,9 @@ def _counts(session, without, finding):
     before, early_before, after, early_after = out
     better = after < before or early_after < early_before
     # beside a load the level against the others wanders by itself
-    if not better and (finding.detector.beside_load or finding.features.get("turns", 0.0) > _TURNS):
+    if not better and (finding.beside_load or finding.features.get("turns", 0.0) > _TURNS):
         return np.nan, np.nan, floor, "counts", ""
-    if np.isfinite(after) and not finding.detector.sudden:  # that is told in its own rows
+    if np.isfinite(after) and not finding.sudden:  # that is told in its own rows
         finding.verified = better
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
 

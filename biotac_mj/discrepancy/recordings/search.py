@@ -12,13 +12,13 @@ from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ...recordings.protocol import Protocol
 from ..evidence import discoveries
+from .candidates import as_candidates, as_log
 from .confidence import NAMED, confidence
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
 from .detectors.order import slipped
 from .diagnosis import RecordingDiagnosis, concluded
-from .faults import as_candidates, as_log
 from .proof import prove
 from .recording import PlainRecording, as_plain
 from .segments import moved, stretches
@@ -99,7 +99,7 @@ def _levels(session, named):
         if finding is None:
             break
         same = [f for f in session.findings if f.channels == finding.channels]
-        jumps = any(f.detector.sudden for f in same)
+        jumps = any(f.sudden for f in same)
         if jumps or _refined(session, finding, same) or not _take(session, finding, named):
             refused.add((None,) if finding.of_all else finding.channels)
     settle(session)
@@ -144,7 +144,7 @@ def _sure(session, finding):
     """Confidence of a finding beside the others of its detector."""
     others = (f for f in (*session.findings, *session.weak) if f is not finding)
     same = [f for f in others if f.detector == finding.detector]
-    return confidence(finding, sum(not f.detector.sudden or f.start != finding.start for f in same))
+    return confidence(finding, sum(not f.sudden or f.start != finding.start for f in same))
 
 
 def _refined(session, finding, same):
@@ -167,7 +167,7 @@ def _proved(session):
     tested = [*session.findings, *session.weak]
     enough = discoveries([f.p for f in tested])
     # what is wrong with the log is said whatever else was tested
-    chance = [f for f, yes in zip(session.findings, enough) if not (yes or f.detector.of_log)]
+    chance = [f for f, yes in zip(session.findings, enough) if not (yes or f.of_log)]
     contradicted = [f for f in session.findings if f.verified is False or f in chance]
     if contradicted:
         session = session.without(*contradicted)
@@ -196,9 +196,7 @@ def _told(finding, known):
     level there: an exchange, a loss of liquid or a jump looks like a drift in a part."""
     level = finding.trend is not None
     return any(
-        f.id == finding.id or level and not f.delay and not f.detector.of_log
-        for f in known
-        if _alike(f, finding)
+        f.id == finding.id or level and not f.delay and not f.of_log for f in known if _alike(f, finding)
     )
 
 
@@ -223,7 +221,7 @@ def _late(session, named):
         sudden = finding.trend.kind != "smooth" and finding.trend.onset > _LAST * begin
         if sudden and finding.confidence >= max(named, _LATE):
             finding.verified, finding.start = None, float(finding.trend.onset)
-            finding.note += "; it begins so late that nothing is left to confirm it"
+            finding.message += "; it begins so late that nothing is left to confirm it"
             found.append(finding)
             whole.accept(finding)
     return found

@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d
 from ....quality.beside import last_measured, line_ends
 from ....quality.noise import noise_level
 from ....recordings.recording import designed
-from ..candidates import Candidate, Detector
+from ..candidates import Candidate
 from ..conditional import Conditional
 from ..session import Session
 from .together import MOST, beyond, neighbours
@@ -39,9 +39,6 @@ _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 _CURVED = 0.18
 # standard errors of a gain: with less a level alone has changed, with more nothing is known of the gain
 _SURE, _UNSURE = 0.2, 0.5
-
-
-JUMP = Detector("jump", sudden=True)
 
 
 class Edge:
@@ -200,13 +197,14 @@ def jumped(session: Session) -> list[Candidate]:
             Candidate(
                 "drift",
                 (k,),
-                {"change": (last if abs(last) > 0.3 * largest else largest, np.nan, np.nan)},
-                float(sum(np.log(e.times) ** 2 for e in mine)),
-                float(np.prod([len(session.counts) ** -0.5 / e.times for e in mine])),
                 float(at[0]),
                 float(at[-1] if abs(last) < 0.3 * largest else session.recording.time[-1]),
-                JUMP,
                 f"from one row to the next it jumps, alone of all: {places}",
+                {"change": (last if abs(last) > 0.3 * largest else largest, np.nan, np.nan)},
+                nats=float(sum(np.log(e.times) ** 2 for e in mine)),
+                p=float(np.prod([len(session.counts) ** -0.5 / e.times for e in mine])),
+                detector="jump",
+                sudden=True,
                 features={
                     "edge": float(np.log(max(e.times for e in mine))),
                     "alone": float(np.log(max(e.alone for e in mine))),

@@ -20,7 +20,7 @@ from ....effects.effect import shifted
 from ....sensor.channels import log_impedance
 from ...evidence import sign_flip
 from ...trajectories.base.nuisance import ages
-from ..candidates import Candidate, Detector
+from ..candidates import Candidate
 from ..conditional import Components
 from ..recording import FORCE_MOVED
 from ..session import Session
@@ -43,9 +43,6 @@ _LEAST = 15.0  # [s]: in less two logs that have nothing in common may look alik
 # correlation of how much force and electrodes move, in 12 to 190 s of two real sensors: 0.70 to 0.96 as they
 # are; with the force put 3.4 s off at least 0.68 there and 0.48 at most in time; turned around 0.57 at most
 _FAR, _LESS, _NOTHING = 0.6, 0.15, 0.25
-
-
-LATE = Detector("late")
 
 
 class ForceView:
@@ -133,14 +130,14 @@ def delayed(session: Session) -> Candidate | None:
     return Candidate(
         "latency",
         tuple(range(session.counts.shape[1])),
-        {"delay": (delay, float(low), float(high))},
-        # half the summed log-error ratio, per independent second of a block
-        float(0.5 * 3 * gain.sum() * min(max(1.0, seconds / _BLOCKS), 20)),
-        p,
         0.0,
         float(session.recording.time[-1]),
-        LATE,
         f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks",
+        {"delay": (delay, float(low), float(high))},
+        # half the summed log-error ratio, per independent second of a block
+        nats=float(0.5 * 3 * gain.sum() * min(max(1.0, seconds / _BLOCKS), 20)),
+        p=p,
+        detector="late",
         ties=("lowpass",) if tied else (),
         delay=delay,
         features={

@@ -14,7 +14,7 @@ from ....geometry.electrodes import electrode_positions
 from ....recordings.recording import designed
 from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ...evidence import sign_flip
-from ..candidates import Candidate, Detector
+from ..candidates import Candidate
 from ..model import Model
 from ..session import Session
 from .process import process
@@ -38,10 +38,6 @@ _NATS = 12.0  # of a drift beside a load
 _ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _MOSTLY = 0.6  # of a trend that what all do explains, which may be a share of it
-
-
-ONE = Detector("one", pair=True)
-PROCESS = Detector("process", beside_load=True)
 
 
 def levels(session: Session, refused: set) -> Candidate | None:
@@ -99,7 +95,7 @@ def _beside(session, refused, common):
             continue
         finding = _single(session, trend, k, [(1.0, k, None), (1.0, -1, None)])
         answers = every.answers(int(i))
-        finding.detector = PROCESS
+        finding.detector, finding.beside_load = "process", True
         finding.features["likelier"] = float(nats[i] / len(trend.gain))
         if answers > _ANSWERS * nats[i]:
             finding.ties = ("gain",)
@@ -109,7 +105,7 @@ def _beside(session, refused, common):
 
 def _drifting(session):
     """Electrodes that drift beside a load: what they do in the held-out rows is not taken out."""
-    return frozenset(f.channels[0] for f in session.findings if f.detector.beside_load)
+    return frozenset(f.channels[0] for f in session.findings if f.beside_load)
 
 
 def _own_share(session, trend, size, *common):
@@ -149,14 +145,14 @@ def _single(session, trend, k, options):
     return Candidate(
         "drift",
         (k,),
-        {"change": (change, change - error, change + error)},
-        trend.nats,
-        trend.p,
         trend.start,
         time[-1],
-        ONE,
         f"{'a step' if trend.kind == 'step' else 'a trend over time'} of "
         f"{trend.size * m.slope[i]:.0f} counts against what the other electrodes say",
+        {"change": (change, change - error, change + error)},
+        nats=trend.nats,
+        p=trend.p,
+        detector="one",
         features=_features(session, trend)
         | {"apart": _apart(m, k, designed(session.counts))}
         | {"lead": float(np.clip(lead, -1, _PLAINLY))},
@@ -181,7 +177,7 @@ def settle(session: Session) -> None:
             common = finding.share is not None
             if not common and not len(place):
                 continue
-            every = process(m, _drifting(other)) if finding.detector.beside_load else None
+            every = process(m, _drifting(other)) if finding.beside_load else None
             if every is not None:
                 trend = every.trend(int(place[0]))
             else:
@@ -195,7 +191,7 @@ def settle(session: Session) -> None:
                 else _single(other, trend, finding.channels[0], options)
             )
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
-            finding.nats, finding.p, finding.note = again.nats, again.p, again.note
+            finding.nats, finding.p, finding.message = again.nats, again.p, again.message
             finding.features |= {k: v for k, v in again.features.items() if k != "lead"}
             finding.trend, finding.share = again.trend, again.share
             if common:
@@ -233,14 +229,12 @@ def _shared(session, trend, options):
     finding = Candidate(
         "",  # named below
         tuple(range(len(share))),
-        {},
-        trend.nats,
-        trend.p,
         trend.start,
         time[-1],
-        Detector(""),
         f"ln Z of all electrodes changes by {change:+.3f} ({size:.0f} counts); shares "
         f"{share[m.used].min():.2f} to {share[m.used].max():.2f}",
+        nats=trend.nats,
+        p=trend.p,
         features=_features(session, trend)
         | {
             "lead": float(np.log(_energy_of_all(options) / max(others, 1e-9))),
@@ -320,7 +314,7 @@ def _name_shared(session, finding, trend, change):
     found = {e.id: e.of_trend(trend, change, m.slope, middle) for e in alike}
     best, *ties = [e for e in alike if e.possible(found[e.id])] or alike
     finding.id, finding.parameters, ties = best.id, found[best.id], [e.id for e in ties]
-    finding.detector = Detector(alike[0].detector)  # by which way all go, whatever is possible
+    finding.detector = alike[0].detector  # by which way all go, whatever is possible
     ties = _by_temperature(session, finding, trend, ties)
     if not session.recording.absolute:  # the patterns follow from the levels, the sign from the sign
         alike = [e.id for e in SHARED if not e.rises or change > 0 or not session.recording.signed]
@@ -368,7 +362,7 @@ def _by_temperature(session, finding, trend, ties):
         return [*ties, "thermal"] if alike else ties
     if gain.sum() <= _TOLD * finding.nats:
         return [*ties, "thermal"]
-    finding.detector = Detector(Thermal.detector)  # another channel tells it, whatever its cause
+    finding.detector = Thermal.detector  # another channel tells it, whatever its cause
     slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
     spread = float(np.sqrt(np.mean(out**2)) / (np.std(warm) * np.sqrt(len(warm))))
     alpha = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}

@@ -5,7 +5,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ....quality.noise import noise_level
-from ..candidates import Candidate, Detector
+from ..candidates import Candidate
 from ..session import Session
 
 __all__ = ["slipped"]
@@ -16,9 +16,6 @@ _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where ano
 _JUMPS, _EACH = 10.0, 2.5
 _ELSE = 4.0  # others jump by no more
 _RARE = 3  # of these in a recording: what comes and goes is none
-
-
-SLIP = Detector("slip", sudden=True)
 
 
 def slipped(session: Session) -> Candidate | None:
@@ -63,13 +60,14 @@ def slipped(session: Session) -> Candidate | None:
     return Candidate(
         "swap",
         tuple(int(k) for k in channels),
-        {"onset": (begins, begins - 1 / r.rate, begins + 1 / r.rate)},
-        float((size**2).sum() / 2),
-        float(np.exp(-len(moved))) / len(rows),
         begins,
         ends,
-        SLIP,
         f"{read}: each goes on there from one row to the next",
+        {"onset": (begins, begins - 1 / r.rate, begins + 1 / r.rate)},
+        nats=float((size**2).sum() / 2),
+        p=float(np.exp(-len(moved))) / len(rows),
+        detector="slip",
+        sudden=True,
         correct=correct,
         verified=True,  # by the rows themselves
     )
