@@ -342,10 +342,9 @@ class Inhomogeneity(Effect):
     }
     equivalents, answers = ("gain", "spots"), ("along", "across")
     confusable = {
-        "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
-        "sensor",
+        "misalign": "mount the sensor again: misalignment changes, the material's map moves with the sensor",
         "gain": "force over depth from place to place: gains of electrodes do not change it",
-        "spots": "a row of presses along the finger",
+        "spots": "a row of presses along the sensor",
     }
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
@@ -372,7 +371,7 @@ class Spots(Inhomogeneity):
     physics = "the rubber is stiffer or softer in spots of some millimetres: wear, cuts, glue"
     equivalents = ("gain", "inhomog")
     confusable = {
-        "inhomog": "a row of presses along the finger",
+        "inhomog": "a row of presses along the sensor",
         "gain": "force over depth from place to place: gains of electrodes do not change it",
     }
 

@@ -69,7 +69,7 @@ class Bubble(Effect):
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
     physics = (
-        "liquid is lost with the session's clock: the film gets thinner and the fingertip softer; "
+        "liquid is lost with the session's clock: the film gets thinner and the sensor softer; "
         "or the skin sinks to the core, equally everywhere"
     )
     params = {

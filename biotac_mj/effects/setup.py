@@ -48,7 +48,7 @@ class Misalignment(Effect):
     params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in "xyz"} | {
         k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
     }
-    confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
+    confusable = {"inhomog": "mount the sensor again", "gain": "another place"}
 
     def apply(self, run: Run, theta: dict) -> None:
         turn = np.array([theta["roll"], theta["yaw"], theta["pitch"]])
@@ -95,7 +95,7 @@ class Mount(Effect):
 
 
 class Rocking(Effect):
-    id, name, stage = "rocking", "rocking of the fingertip", "B"
+    id, name, stage = "rocking", "rocking of the sensor", "B"
     moves_object = True
     physics = "the sensor is shifted and tilted in proportion to the force, always in one direction"
     params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in "xyz"} | {
@@ -132,9 +132,9 @@ def _load_feedback(run, moved):
 
 
 class RockingTorque(Effect):
-    id, name, stage = "rocking_torque", "rocking of the fingertip by its torque", "B"
+    id, name, stage = "rocking_torque", "rocking of the sensor by its torque", "B"
     moves_object = True
-    physics = "a clamp behind the fingertip rotates by the torque about it, with a compliance per axis"
+    physics = "a clamp behind the sensor rotates by the torque about it, with a compliance per axis"
     params = {
         k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)
         for k in ("roll", "yaw", "pitch")

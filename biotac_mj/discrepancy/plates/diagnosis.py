@@ -3,8 +3,10 @@ one number more say in which stage the rest disagrees, and several sensors wheth
 model's."""
 
 import dataclasses
+import itertools
 
 import numpy as np
+from scipy.stats import PermutationMethod, pearsonr
 from tqdm import tqdm
 
 from ...effects.effect import STAGES
@@ -308,13 +310,12 @@ def _alike(sensors):
     """Lowest correlation of two sensors' slopes, and its p under permutations of the electrodes."""
     if len(sensors) < 2:
         return None
-    rng, out = np.random.default_rng(0), []
-    for i, a in enumerate(sensors):
-        for b in sensors[:i]:
-            r = np.corrcoef(a.slope, b.slope)[0, 1]
-            chance = [np.corrcoef(rng.permutation(a.slope), b.slope)[0, 1] for _ in range(_TIMES)]
-            out.append((float(r), float((1 + np.sum(np.array(chance) >= r)) / (1 + _TIMES))))
-    return min(out)
+    by = PermutationMethod(n_resamples=_TIMES, rng=np.random.default_rng(0))
+    pairs = (
+        pearsonr(a.slope, b.slope, alternative="greater", method=by)
+        for a, b in itertools.combinations(sensors, 2)
+    )
+    return min((float(pair.statistic), float(pair.pvalue)) for pair in pairs)
 
 
 def _listed(electrodes):

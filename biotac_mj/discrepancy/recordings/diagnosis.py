@@ -64,7 +64,7 @@ def concluded(
     """The diagnosis of a session from which all that is named has been taken out."""
     r, left, found = session.recording, rest(session), [*session.findings, *late]
     seconds = len(r) / r.rate
-    data = f"{r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
+    data = f"read as {r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
     data += ", with force" if r.force is not None else ""
     return RecordingDiagnosis(
         kind="plain recording",

@@ -3,6 +3,8 @@ side do not meet, on no other electrode at that row but a few that jump with it 
 (`together.py`), and it stays where it has jumped to. A touch that one electrode alone feels makes such an
 edge as well; when the load is as it was it is gone, and a jump is not."""
 
+import typing
+
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
@@ -41,12 +43,14 @@ _CURVED = 0.18
 _SURE, _UNSURE = 0.2, 0.5
 
 
-class Edge:
+class Edge(typing.NamedTuple):
     """A jump: time [s], step [counts], how many times what is around it (times) and what is on others
     (alone; of those that jump together the product)."""
 
-    def __init__(self, time: float, step: float, times: float, alone: float):
-        self.time, self.step, self.times, self.alone = time, step, times, alone
+    time: float
+    step: float
+    times: float
+    alone: float
 
 
 def edges(session: Session) -> dict[int, list[Edge]]:

@@ -51,13 +51,14 @@ def levels(session: Session, refused: set) -> Candidate | None:
     if finding is not None:
         return finding
     weight = everyone @ m.given.precision[:number, :number] @ everyone
-    options = [(_energy(best, time) * weight, None, level)]
+    tried = [(_energy(best, time) * weight, None, level)]
     alone, _ = m.levels(m.alone())
     for i, k in enumerate(m.used):
         best = trends(alone[:, i], time)[0]
-        options.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), alone[:, i]))
-    options.sort(key=lambda o: -o[0])
-    tried = [o for o in options if (o[1],) not in refused]
+        tried.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), alone[:, i]))
+    tried.sort(key=lambda o: -o[0])
+    size = {k: float(np.log(max(energy, 1e-12))) for energy, k, _ in tried}
+    tried = [o for o in tried if (o[1],) not in refused]
     # of single electrodes the levels wander with a load as well
     for energy, k, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
         trend = trends(level, time, thorough=True, kinds=_SHAPES if k is None else _ALL_SHAPES)[0]
@@ -73,8 +74,20 @@ def levels(session: Session, refused: set) -> Candidate | None:
             continue
         if k is None and trend.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             trend = trend.parts()[0]
-        return _shared(session, trend, options) if k is None else _single(session, trend, k, options)
+        finding = _shared(session, trend) if k is None else _single(session, trend, k)
+        finding.features["lead"] = _lead(size, k, designed(session.counts))
+        return finding
     return None
+
+
+def _lead(size, k, design):
+    """Logarithm of the energy of electrode k, None of all alike, over the next one's, by logarithms of all:
+    number -> size."""
+    others = {j: s for j, s in size.items() if j is not None}
+    if k is None:
+        return size[None] - max(others.values())
+    lead = ahead(np.array([*others.values()]), np.array([*others]), k, design)
+    return float(np.clip(lead, -1, _PLAINLY))
 
 
 def _beside(session, refused, common):
@@ -93,7 +106,7 @@ def _beside(session, refused, common):
         trend = every.trend(int(i))
         if trend.size * m.slope[i] < _LEAST or _own_share(session, trend, trend.size, common):
             continue
-        finding = _single(session, trend, k, [(1.0, k, None), (1.0, -1, None)])
+        finding = _single(session, trend, k)
         answers = every.answers(int(i))
         finding.detector, finding.beside_load = "process", True
         finding.features["likelier"] = float(nats[i] / len(trend.gain))
@@ -125,7 +138,7 @@ def _energy(trend, time):
     return float(((y - y.mean()) ** 2).sum())
 
 
-def _single(session, trend, k, options):
+def _single(session, trend, k):
     m = session.model()
     i = int(np.flatnonzero(m.used == k)[0])
     time = session.recording.time
@@ -137,10 +150,6 @@ def _single(session, trend, k, options):
         return out
 
     change = -float(trend.sampled()[-1] - trend.sampled()[0]) * m.slope[i]
-    single = {o[1]: o[0] for o in options if o[1] is not None}
-    lead = ahead(
-        np.log(np.maximum([*single.values()], 1e-12)), np.array([*single]), k, designed(session.counts)
-    )
     error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
     return Candidate(
         "drift",
@@ -153,9 +162,7 @@ def _single(session, trend, k, options):
         nats=trend.nats,
         p=trend.p,
         detector="one",
-        features=_features(session, trend)
-        | {"apart": _apart(m, k, designed(session.counts))}
-        | {"lead": float(np.clip(lead, -1, _PLAINLY))},
+        features=_features(session, trend) | {"apart": _apart(m, k, designed(session.counts))},
         correct=correct,
         trend=trend,
     )
@@ -184,15 +191,10 @@ def settle(session: Session) -> None:
                 series = m.shared(finding.share[m.used]) if common else m.alone()[:, int(place[0])]
                 kinds = _ALL_SHAPES if not common else (finding.trend.kind,)
                 trend = trends(*m.levels(series), thorough=True, kinds=kinds)[0]
-            options = [(1.0, None, None), (1.0, finding.channels[0], None), (1.0, -1, None)]
-            again = (
-                _shared(other, trend, options)
-                if common
-                else _single(other, trend, finding.channels[0], options)
-            )
+            again = _shared(other, trend) if common else _single(other, trend, finding.channels[0])
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.message = again.nats, again.p, again.message
-            finding.features |= {k: v for k, v in again.features.items() if k != "lead"}
+            finding.features |= again.features
             finding.trend, finding.share = again.trend, again.share
             if common:
                 finding.id, finding.ties, finding.detector = again.id, again.ties, again.detector
@@ -212,7 +214,7 @@ def _features(session, trend):
     }
 
 
-def _shared(session, trend, options):
+def _shared(session, trend):
     m, time = session.model(), session.recording.time
     share = np.ones(session.counts.shape[1])
     own = {f.channels[0] for f in session.findings if len(f.channels) == 1 and f.correct is not None}
@@ -225,7 +227,6 @@ def _shared(session, trend, options):
     sampled = trend.sampled()
     change = float(sampled[-1] - sampled[0])
     size = trend.size * float(m.slope.mean())
-    others = max((o[0] for o in options if o[1] is not None), default=1.0)
     finding = Candidate(
         "",  # named below
         tuple(range(len(share))),
@@ -237,7 +238,6 @@ def _shared(session, trend, options):
         p=trend.p,
         features=_features(session, trend)
         | {
-            "lead": float(np.log(_energy_of_all(options) / max(others, 1e-9))),
             "uneven": _uneven(m, trend),
             "seconds": float(np.log(session.fit.sum() / session.recording.rate)),
         },
@@ -259,11 +259,6 @@ def _uneven(m, trend):
     each = level.T @ (y - y.mean())
     spread = 1.4826 * np.median(np.abs(each - np.median(each)))
     return float(np.log(np.clip(spread / max(abs(np.median(each)), 1e-12), 0.05, 5)))
-
-
-def _energy_of_all(options: list) -> float:
-    """Energy of the direction that all electrodes share."""
-    return next(o[0] for o in options if o[1] is None)
 
 
 def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarray:
