@@ -21,7 +21,8 @@ wp.set_module_options({"enable_backward": False})
 
 def _deep_module():
     """Module and compiler options of the product on the CPU. Warp limits LLVM's search for SIMD operations to
-    a depth of 4; a depth of 12 saves a quarter of this kernel's time."""
+    a depth of 4; a depth of 12 saves a sixth of this kernel's time for the corotational law, 2 % of a press,
+    and nothing for the others."""
     flags = wp.config.cpu_compiler_flags
     deep = flags and flags.replace("-slp-recursion-max-depth=4", "-slp-recursion-max-depth=12")
     return {"module": "unique", "module_options": {"cpu_compiler_flags": deep}}
