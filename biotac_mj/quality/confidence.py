@@ -57,10 +57,10 @@ def probability(detector: str, features: dict, others: int = 0, weights: dict = 
     return min(1 / (1 + float(np.exp(-_NEW * logit))), _MOST)
 
 
-def confidence(fault: Fault, others: int = 0) -> float:
-    """Probability that the fault is correctly named. others: see `probability`. 1 for a detector without
-    weights."""
-    return probability(fault.detector, fault.features, others) if fault.detector else _MOST
+def confidence(fault: Fault, others: int = 0, weights: dict = WEIGHTS) -> float:
+    """Probability that the fault is correctly named. others, weights: see `probability`. 1 without a
+    detector."""
+    return probability(fault.detector, fault.features, others, weights) if fault.detector else _MOST
 
 
 def clear(fault: Fault, named: float = NAMED) -> bool:

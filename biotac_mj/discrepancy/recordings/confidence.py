@@ -1,11 +1,12 @@
 """Probability that a finding's name is right: a logistic regression of its detector's features, fitted to the
 hidden effects of several authors (`benchmarks/discrepancy_confidence.py`)."""
 
+import functools
 import json
 import pathlib
 
-from ...quality.confidence import NAMED, WEIGHTS, probability
-from .candidates import Candidate
+from ...quality import confidence as of_log
+from ...quality.confidence import NAMED, WEIGHTS
 
 __all__ = ["NAMED", "USUAL", "confidence", "farthest"]
 
@@ -16,15 +17,8 @@ USUAL: dict = _FITTED["usual"]
 _WEIGHTS = WEIGHTS | {name: (w["intercept"], w["features"]) for name, w in _FITTED["weights"].items()}
 _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 
-
-def confidence(finding: Candidate, beside: int = 0) -> float:
-    """Probability that the name is right.
-
-    Args:
-      beside: other findings of the same detector in the recording. What many electrodes have, each by itself,
-        has one cause more often than many.
-    """
-    return probability(finding.detector, finding.features, beside, _WEIGHTS)
+# of a candidate's name; what many electrodes have, each by itself, has one cause more often than many
+confidence = functools.partial(of_log.confidence, weights=_WEIGHTS)
 
 
 def farthest(features: dict, usual: dict) -> tuple[float, str]:

@@ -22,24 +22,25 @@ _NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simu
 def prove(session: Session, finding: Candidate) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
-    taken_out = finding.correct is not None or finding.mask is not None
     if finding.of_log:
         finding.verified = True  # what is wrong with a log is told by its own samples
     if finding.delay:
-        before, after, floor, unit, name = _force(session, finding)
-    elif not taken_out:
+        gap = _force(session, finding)
+    elif finding.correct is None and finding.mask is None:
         return
     elif finding.of_log:
-        before, after, floor, unit, name = _samples(session, finding)
+        gap = _samples(session, finding)
     elif finding.places or finding.end < _aside_from(session):
         return  # it is over by then
     else:
-        before, after, floor, unit, name = _counts(session, session.without(finding), finding)
-    if not np.isfinite(before):
-        return
-    finding.gap = Gap(unit, before, after, floor, name)
-    if finding.verified is None and np.isfinite(after):
-        finding.verified = bool(after < before)
+        gap = _counts(session, session.without(finding), finding)
+    finding.gap = gap
+    if gap is not None and finding.verified is None:
+        finding.verified = gap.after < gap.before
+
+
+def _rms(x):
+    return float(np.sqrt(np.mean(x**2)))
 
 
 def _aside(session):
@@ -57,34 +58,30 @@ def _counts(session, without, finding):
     """RMS of the finding's electrodes about what the others, or for a shared effect their own level, say."""
     m, aside = _aside(session)
     bare = without.model()
-    if len(bare.used) != len(m.used):
-        return np.nan, np.nan, np.nan, "counts", ""
+    mine = np.flatnonzero(np.isin(m.used, finding.channels))
+    if len(bare.used) != len(m.used) or not len(mine):
+        return None
     # how a trend goes on is less sure the later: its first quarter may confirm what the whole does not
     first = aside & (np.cumsum(aside) <= aside.sum() / 4)
-    out = []
+    noise, out = m.noise * m.slope, []
     for value in (bare.value + bare.mean - m.mean, m.value):
         if finding.of_all:
             series = m.shared(np.ones(len(m.used)), value)[:, None] * m.slope.mean()
-            floor = float(np.sqrt(np.mean((m.noise * m.slope) ** 2) / len(m.used)))
         else:
-            mine = np.flatnonzero(np.isin(m.used, finding.channels))
             series = m.alone(value)[:, mine] * m.slope[mine]
-            floor = float(np.sqrt(np.mean((m.noise * m.slope)[mine] ** 2))) if len(mine) else np.nan
-        for rows in (aside, first):
-            out.append(float(np.sqrt(np.mean(series[rows] ** 2))) if series.shape[1] else np.nan)
-    what = (
-        "the electrodes' common part about its level"
-        if finding.of_all
-        else "electrode against what the others say"
-    )
+        out += [_rms(series[rows]) for rows in (aside, first)]
+    if finding.of_all:
+        what, floor = "the electrodes' common part about its level", _rms(noise) / np.sqrt(len(noise))
+    else:
+        what, floor = "electrode against what the others say", _rms(noise[mine])
     before, early_before, after, early_after = out
     better = after < before or early_after < early_before
     # beside a load the level against the others wanders by itself
     if not better and (finding.beside_load or finding.features.get("turns", 0.0) > _TURNS):
-        return np.nan, np.nan, floor, "counts", ""
-    if np.isfinite(after) and not finding.sudden:  # that is told in its own rows
+        return None
+    if not finding.sudden:  # that is told in its own rows
         finding.verified = better
-    return before, after, floor, "counts", f"RMS of {what} in the part fitted"
+    return Gap("counts", before, after, floor, f"RMS of {what} in the part fitted")
 
 
 def _samples(session, finding):
@@ -103,10 +100,11 @@ def _samples(session, finding):
     for counts, which in ((session.without(finding).counts, touched), (session.counts, left)):
         error = (counts[late] - expected)[which]
         error = error[np.isfinite(error)]
-        out.append(float(np.sqrt(np.mean(error**2))) if len(error) >= _FEWEST else np.nan)
-    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
-    before, after = out if np.isfinite(out).all() else (np.nan, np.nan)
-    return before, after, floor, "counts", "RMS of samples against what the others say"
+        if len(error) < _FEWEST:
+            return None
+        out.append(_rms(error))
+    floor = _rms(noise_level(session.recording.electrodes[session.fit]))
+    return Gap("counts", *out, floor, "RMS of samples against what the others say")
 
 
 def _force(session, finding):
@@ -114,13 +112,13 @@ def _force(session, finding):
     out."""
     view = force_view(session, ~session.fit)
     if view is None:
-        return np.nan, np.nan, np.nan, "N", ""
+        return None
     each = [view.errors().mean(1), view.at_delay(finding.delay)]
     out, worse = [float(np.exp(0.5 * e.mean())) for e in each], each[1] - each[0]
     if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
-        return np.nan, np.nan, np.nan, "N", ""
+        return None
     floor = float(np.mean(noise_level(session.recording.force[session.fit], None, _NOISELESS)))
-    return *out, floor, "N", "RMS error of force from electrodes, by blocks of that part"
+    return Gap("N", *out, floor, "RMS error of force from electrodes, by blocks of that part")
 
 
 def views(session: Session) -> dict[str, Gap]:
@@ -154,11 +152,10 @@ def views(session: Session) -> dict[str, Gap]:
 
 def _view(name, each, noise):
     before, after = (float(np.sqrt(np.nanmean(e**2))) for e in each)
-    floor = float(np.sqrt(np.mean(noise**2)))
     unit, channels = "N", ("Fx", "Fy", "Fz")
     if len(each[0]) != len(channels):
         unit, channels = "counts", electrode_names(range(len(each[0])))
-    return Gap(unit, before, after, floor, name, channels, *(tuple(e.tolist()) for e in each))
+    return Gap(unit, before, after, _rms(noise), name, channels, *(tuple(e.tolist()) for e in each))
 
 
 def _alone(s):

@@ -8,7 +8,6 @@ import tqdm
 
 from ...quality.check import lost_rows, sample_faults
 from ...quality.confidence import clear
-from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ...recordings.protocol import Protocol
 from ..evidence import discoveries
@@ -113,7 +112,7 @@ def _beside(session, checked, named):
     # an exchange or a jump is no lost row, nor what begins on all electrodes
     begun = tuple(f.start for f in session.findings if f.of_all and f.trend is None and f.start > 0)
     for fault in lost_rows(as_log(session.recording, session.counts, session.masked), checked.faults, begun):
-        fault.confidence = confidence_of(fault)
+        fault.confidence = confidence(fault)
         _adopt(session, *(([fault], []) if clear(fault, named) else ([], [fault])))
     if offset := clock_offset(session):
         session.unnamed.append(offset)
