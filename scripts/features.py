@@ -322,8 +322,8 @@ _COUPLING = (
      "resimulate)"),
     ("The round that came closest counts. At first touch a skin lends no energy",
      "attach, condensed, batch"),
-    ("A round that went too far goes back. Where MuJoCo's PGS solver stops early, skin and bodies are solved "
-     "without its constraint rows", "attach, condensed; mujoco_warp has no PGS"),
+    ("A round that went too far goes back. Where MuJoCo's solver is a dual one (PGS, noslip) the balance is "
+     "found with its Newton solver and acts as forces", "attach, condensed; mujoco_warp has no PGS"),
     ("A skin at rest is first solved where a geom begins to touch it, and then as deep as the core allows. "
      "The energy in a skin into which a body was put is unknown until a balance is found",
      "attach (on the CPU), condensed, batch; attach on CUDA: as deep as the force on the way allows"),
