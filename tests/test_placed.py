@@ -171,3 +171,50 @@ def test_in_a_batch_who_begins_in_the_skin_begins_as_in_one(shape, x, y, quat, t
     one, many = np.swapaxes(forces, 0, 1)
     assert np.abs(one).max() > 0.5
     np.testing.assert_allclose(many[:, :3], one[:, :3], atol=bound * np.abs(one).max())
+
+
+LOW = 8.31e-3 + 4e-3 * np.sqrt(2)  # height [m] of a box on its edge that just touches
+SLIDES_IN = (-0.0062, -3e-4, LOW + 1e-4), (-0.0062, 0.0, LOW - 4e-4)
+
+
+def on_its_edge(attach, **settings):
+    edge = BODY.format(shape='box" size=".004 .004 .004" friction=".5').replace("<freejoint/>", "")
+    spec = mujoco.MjSpec.from_string(
+        edge.replace('name="body">', 'name="body" mocap="true" quat="0.924 0.383 0 0">', 1)
+    )
+    handle = attach(spec, site="mount", skin="coarse", **settings)
+    return spec.compile(), handle
+
+
+def slid_in(tier):
+    model, handle = on_its_edge(biotac_mj.attach, tier=tier, readings=False, liquid=False)
+    data, forces = mujoco.MjData(model), []
+    for pos in SLIDES_IN:
+        data.mocap_pos[0] = pos
+        mujoco.mj_step(model, data)
+        forces.append(handle.read(data, "contact_force")[:3].copy())
+    assert not forces[0].any() and handle.read(data, "status")[0] == 1
+    return forces[1]
+
+
+def test_an_edge_close_to_the_skin_slides_in():
+    """In the full tier it came from the shortest way out of the skin, without its friction."""
+    full, condensed = slid_in("full"), slid_in("condensed")
+    assert abs(condensed[2]) > 0.5 * abs(condensed[1])
+    assert full[2] == pytest.approx(condensed[2], rel=0.01)
+
+
+@pytest.mark.slow
+def test_in_a_batch_an_edge_close_to_the_skin_slides_in():
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    mjm, _ = on_its_edge(batch.add)
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=1)
+        hand = batch.attach(mjm, m, d, tier="full", skin="coarse", readings=False, liquid=False)
+        for pos in SLIDES_IN:
+            d.mocap_pos.assign(np.array([[pos]], np.float32))
+            mjw.step(m, d)
+        one = slid_in("full")
+        np.testing.assert_allclose(-hand.wrench[0, 0, :3], one, atol=1e-3 * np.abs(one).max())

@@ -353,12 +353,12 @@ class FemStepper:
     def _met_at(self, state, geom_pos, geom_mat):
         """Poses about where geoms on their way to these begin to touch the skin at rest: what they did before
         is none of its friction's."""
+        if not self._part(state, "started")[0]:
+            return self._proximity.outside(geom_pos, geom_mat), geom_mat
         last = self.came_to(state)
-        if self._part(state, "started")[0] and self._proximity.clear(*last, self._reach):
-            if _travel(*last, geom_pos, geom_mat) < _SHORT:
-                return last
-            return self._proximity.last_clear(*last, geom_pos, geom_mat, self._reach)
-        return self._proximity.outside(geom_pos, geom_mat), geom_mat
+        if _travel(*last, geom_pos, geom_mat) < _SHORT or not self._proximity.clear(*last, self._reach):
+            return last
+        return self._proximity.last_clear(*last, geom_pos, geom_mat, self._reach)
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:
