@@ -37,7 +37,6 @@ class Linear:
 class LoadStepping:
     """Load stepping of a step, in fractions of the geoms' motion."""
 
-    known: int  # whether the previous poses are known
     holds: int  # whether the skin keeps its last state, since no equilibrium was found
     deep: int  # whether a geom is in the core
     iterations: int

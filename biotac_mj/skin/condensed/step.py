@@ -6,7 +6,6 @@ import types
 import warp as wp
 
 from ..bodies import make_bodies
-from ..contact import penetration
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..model import SkinModel, SkinOptions
@@ -31,7 +30,7 @@ def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, in
     `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
     kernels = [kernel.module for kernel in vars(phases(shapes)).values()]
     block = block_of(SkinOptions.samples)  # another number compiles when it is launched
-    return [(module, block) for module in [*kernels, results]] + [(penetration, 256)]
+    return [(module, block) for module in [*kernels, results]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,8 +124,6 @@ class CondensedStep:
         """First part: on the CPU the whole solve; on CUDA, call `go_on` until all worlds have finished."""
         m, d, geoms = self._model, self._data, self._geoms
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
-        from_outside = [c.center, c.radius, geoms.struct]
-        launcher.launch(penetration.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
         if self._phases:
             known = [m.law, geoms.struct, c, d.x, self.touch, self.remembered, d.worlds]
             launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=self._block)

@@ -154,16 +154,12 @@ def begin_step(
         return
     p = LoadStepping()
     p.modulus = modulus_of(law, st.mu[w], st.lam[w])
-    p.known = 1
     finite = wp.where(wp.isfinite(p.modulus + st.kappa[w]) and p.modulus > real(0.0), 1, 0)
     for g in range(geoms.count):
         at = geoms.pos[g, w]
         R = geoms.mat[g, w]
         if not wp.isfinite(at[0] + at[1] + at[2] + wp.ddot(R, R) + geoms.friction[g, w]):
             finite = 0
-        last = geoms.pos_last[g, w]
-        if not wp.isfinite(last[0] + last[1] + last[2]):
-            p.known = 0
     sync()
     if finite == 0:
         if t == 0:
@@ -178,19 +174,14 @@ def begin_step(
     for g in range(t, geoms.count, threads):
         s.pos[g, w] = geoms.pos[g, w]
         s.mat[g, w] = geoms.mat[g, w]
-        if p.known == 1:
-            s.from_pos[g, w] = geoms.pos_last[g, w]
-            s.from_mat[g, w] = geoms.mat_last[g, w]
-        else:
-            s.from_mat[g, w] = geoms.mat[g, w]
+        last = geoms.pos_last[g, w]
+        if not wp.isfinite(last[0] + last[1] + last[2]):  # it begins where it is
             geoms.pos_last[g, w] = geoms.pos[g, w]
             geoms.mat_last[g, w] = geoms.mat[g, w]
+        s.from_pos[g, w] = geoms.pos_last[g, w]
+        s.from_mat[g, w] = geoms.mat_last[g, w]
     sync()
-    if p.known == 1:
-        for g in range(geoms.count):
-            turn = s.mat[g, w] - s.from_mat[g, w]
-            travel = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
-            p.length = wp.max(p.length, travel)
+    p.length = _largest_motion(w, geoms)
     p.longest = real(1.0)
     if p.length > _PART:
         p.longest = wp.max(_PART / p.length, _SHORTEST)
@@ -230,7 +221,7 @@ def search(
     sync()
     first = wp.where(o.searches == 0, 1, 0)
     looking = int(1)
-    moved = _PART
+    moved = real(0.0)
     if first == 1:
         for i in range(t, c.node.shape[0], threads):
             s.force[w, i] = r.force[i, w]
@@ -241,9 +232,7 @@ def search(
         place_bodies(w, t, threads, p.to, geoms, s)
         o.solved = r.after[w]
         o.bulge = r.bulge[w]
-        if p.known == 1:
-            moved = real(2.0) * _largest_motion(w, geoms)
-        moved *= wp.pow(real(0.5), real(o.halved))
+        moved = wp.pow(real(0.5), real(o.halved - 1)) * _largest_motion(w, geoms)
         for g in range(t, geoms.count, threads):
             s.sought_pos[g, w] = geoms.pos[g, w]
             s.sought_mat[g, w] = geoms.mat[g, w]
@@ -294,7 +283,7 @@ def search(
         before = _linear_of(w, r.solved[w], r.bulge[w], p.modulus, c, st)
         count, own = gather_load(w, t, threads, 3 * o.nnode + o.nin, F, c, s)
         l = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
-        if first == 1 and p.known == 1 and count > 0 and p.holds == 0:
+        if first == 1 and count > 0 and p.holds == 0:
             foretold = 1
             if before.bulk_stiffness > real(0.0):  # what it was when the pressure was found
                 before.bulge = -r.pressure[w] / before.bulk_stiffness - before.scale * own
@@ -432,7 +421,7 @@ def _conclude_pass(
 
 
 @wp.func
-def _go_on(w: int, t: int, threads: int, most: real, p: LoadStepping, o: Increment, geoms: Geoms, s: Scratch):
+def _go_on(most: real, p: LoadStepping, o: Increment):
     """Accepts or cuts back the load increment, and chooses the next; returns whether there is one."""
     on = int(1)
     arrived = o.ok  # whether what was found last is where the load goes on
@@ -448,18 +437,7 @@ def _go_on(w: int, t: int, threads: int, most: real, p: LoadStepping, o: Increme
             on = 0
     else:
         p.deep = wp.max(p.deep, o.deep)
-        if p.known == 0:  # from where they come nobody knows: from outside
-            p.known = 1
-            p.length = real(0.0)
-            for g in range(geoms.count):
-                at = s.from_pos[g, w]
-                p.length = wp.max(p.length, wp.length(s.pos[g, w] - at))
-                if t == 0:
-                    geoms.pos_last[g, w] = at
-            sync()
-            p.part = wp.min(p.longest, wp.max(_PART / wp.max(p.length, _PART), _SHORTEST))
-            p.longest = p.part
-        elif p.at == real(0.0) and p.part == real(1.0) and p.length > real(0.0):
+        if p.at == real(0.0) and p.part == real(1.0) and p.length > real(0.0):
             p.part = wp.min(real(0.5), wp.max(_FIRST, _SHORT / p.length))
         else:
             p.part = real(0.5) * p.part
@@ -510,7 +488,7 @@ def conclude_balance(
         for i in range(t, x.shape[0], threads):
             x[i, w] = touch.x_last[i, w]
         sync()
-    p, on = _go_on(w, t, threads, s.most[w], p, o, geoms, s)
+    p, on = _go_on(s.most[w], p, o)
     if on == 1:
         if t == 0:
             s.solve.stepping[w] = _begin_increment(p, s.most[w])

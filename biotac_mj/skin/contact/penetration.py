@@ -9,7 +9,6 @@ from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
 
 __all__ = [
-    "come_from_outside",
     "core_clearance",
     "mark_crushed",
     "start_path_outside",
@@ -159,17 +158,3 @@ def start_path_outside(
 
 
 # in a module of its own: only the condensed tier needs it
-@wp.kernel(module=f"{__name__}.come_from_outside", enable_backward=False)
-def come_from_outside(
-    # In:
-    center: vec3,
-    radius: real,
-    geoms: Geoms,
-    # Out:
-    pos_out: wp.array2d(dtype=vec3),
-):
-    """Start position of a geom without a previous pose: clear of a ball around the skin [m]."""
-    g, w = wp.tid()
-    last = geoms.pos_last[g, w]
-    if not wp.isfinite(last[0] + last[1] + last[2]):
-        pos_out[g, w] = _outside(geoms, g, center, radius, geoms.pos[g, w], geoms.mat[g, w])
