@@ -10,7 +10,7 @@ from ..geometry.rigid_warp import is_finite
 from ..skin.block import block_max
 from ..skin.contact.broadphase import ALL, contact_range, face_clearance, sample_clearance
 from ..skin.contact.faces import Laws
-from ..skin.contact.penetration import core_clearance
+from ..skin.contact.penetration import geoms_core_clearance
 from ..skin.contact.posed import Geoms, bound_to, place_on
 from ..skin.data import SkinData
 from ..skin.geoms import GeomSet
@@ -145,12 +145,8 @@ def measure_clearance(
         else:
             part = (part + 1) % parts
     inside = real(wp.inf)
-    points = wp.where(core_vert.shape[0] > 0 and skin >= reach, core_vert.shape[0] + 1, 0)
-    for i in range(t, points, threads):
-        for g in range(geoms.count):
-            at = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], core, core_vert)
-            inside = wp.min(inside, at)
-    inside = -block_max(-inside)
+    if skin >= reach:
+        inside = geoms_core_clearance(w, t, threads, geoms, ALL, core, core_vert)
     if t == 0:
         touched[w] = part
         clearance_out[w] = wp.vec2d(skin, inside)

@@ -14,7 +14,7 @@ from ..contact.broadphase import (
 )
 from ..contact.faces import Contact
 from ..contact.meshes import TRILINEAR, smooth_distance
-from ..contact.penetration import core_clearance
+from ..contact.penetration import geoms_core_clearance
 from ..contact.posed import SKIN, Geoms, face_radius
 from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
@@ -94,7 +94,7 @@ def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
         )
         s.far[w, view, f] = clearance
         s.seen[w, view, f] = within
-    depth = _depth(w, t, threads, near, geoms, c)
+    depth = -geoms_core_clearance(w, t, threads, geoms, near, c.core, c.core_vert)
     for g in range(t, geoms.count, threads):
         s.seen_pos[view, g, w] = geoms.pos[g, w]
         s.seen_mat[view, g, w] = geoms.mat[g, w]
@@ -479,20 +479,6 @@ def measure_core(
 
 
 @wp.func
-def _depth(w: int, t: int, threads: int, near: wp.int64, geoms: Geoms, c: Constants):
-    """Largest penetration of the core by a geom of a set, or by one of its vertices [m]; negative if there is
-    none."""
-    deep = real(-1.0)
-    n = c.core_vert.shape[0]
-    for i in range(t, wp.where(n > 0, n + 1, 0), threads):
-        for g in range(geoms.count):
-            if has(near, g):
-                clearance = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], c.core, c.core_vert)
-                deep = wp.max(deep, -clearance)
-    return block_max(deep)
-
-
-@wp.func
 def is_deep(
     w: int,
     t: int,
@@ -508,4 +494,4 @@ def is_deep(
     `choose_view`."""
     if _is_clear(w, view, travel, near, geoms, c, s):
         return False
-    return _depth(w, t, threads, near, geoms, c) > c.core_depth
+    return geoms_core_clearance(w, t, threads, geoms, near, c.core, c.core_vert) < -c.core_depth

@@ -3,13 +3,16 @@ is not known."""
 
 import warp as wp
 
+from ..block import block_max
 from ..types import mat33, real, vec3
+from .broadphase import has
 from .meshes import TRILINEAR, grid_value
 from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
 
 __all__ = [
     "core_clearance",
+    "geoms_core_clearance",
     "mark_crushed",
     "start_path_outside",
     "mark_deep_geoms",
@@ -81,6 +84,22 @@ def core_clearance(
         else:  # a ring, which may lie around the core
             bound = real(1.0)
     return bound
+
+
+@wp.func
+def geoms_core_clearance(
+    w: int, t: int, threads: int, geoms: Geoms, near: wp.int64, core: Geoms, core_vert: wp.array(dtype=vec3)
+):
+    """Least `core_clearance` of a set of geoms over all points of the core [m], by the threads of a block;
+    infinite where there is no core."""
+    least = real(wp.inf)
+    points = wp.where(core_vert.shape[0] > 0, core_vert.shape[0] + 1, 0)
+    for i in range(t, points, threads):
+        for g in range(geoms.count):
+            if has(near, g):
+                at = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], core, core_vert)
+                least = wp.min(least, at)
+    return -block_max(-least)
 
 
 @wp.kernel

@@ -18,7 +18,7 @@ from ..types import mat33, real, vec3
 from .broadphase import ALL, geoms_within, sample_clearance
 from .meshes import TRILINEAR
 from .outside import leave_skin
-from .penetration import core_clearance
+from .penetration import geoms_core_clearance
 from .posed import Geoms
 from .touch import SOLIDS
 
@@ -72,13 +72,7 @@ def _measure_core(
     # Out:
     clearance_out: wp.array(dtype=real),
 ):
-    """Least `core_clearance` of geom g over all points of the core [m]."""
-    g = wp.tid()
-    least = real(1.0)
-    for i in range(core_vert.shape[0] + 1):
-        at = core_clearance(i, geoms, g, geoms.pos[g, 0], geoms.mat[g, 0], core, core_vert)
-        least = wp.min(least, at)
-    clearance_out[g] = least
+    clearance_out[0] = geoms_core_clearance(0, 0, 1, geoms, ALL, core, core_vert)
 
 
 def poses(geoms: GeomSet) -> tuple[np.ndarray, ...]:
@@ -157,7 +151,7 @@ class ProximityQuery:
         count, self._count = zeros(1, int)
         reach, self._reach = zeros(2, real)
         clearance, self._clearance = zeros(nface, real)
-        core, self._core = zeros(ngeom, real)
+        core, self._core = zeros(1, real)
         x = wp.array(self._rest[:, None], dtype=vec3, device="cpu")
         points = self._rest[self._face.ravel()]
         center = (points.min(0) + points.max(0)) / 2
@@ -166,7 +160,7 @@ class ProximityQuery:
         self._measure_faces = recorded(_measure_faces, 1, faces, [clearance])
         if model.has_core and geoms.count:
             inputs = [model.core_vert, model.core(1).struct, geoms.struct]
-            self._measure_core = recorded(_measure_core, geoms.count, inputs, [core])
+            self._measure_core = recorded(_measure_core, 1, inputs, [core])
         if geoms.count:
             self._left, self._turned = zeros((ngeom, 1), vec3)[0], zeros((ngeom, 1), mat33)[0]
             self._known = wp.ones(1, dtype=int, device="cpu"), model.outer.face, model.sample, x, geoms.struct
@@ -280,7 +274,7 @@ class ProximityQuery:
         if any(region.core - 2 * moved > least for region, moved in self._regions.since(pos, mat)):
             return False
         self._measure_core()
-        least = float(self._core.min())
+        least = float(self._core[0])
         if least > -limit:  # stored for the next steps
             self._regions.add(pos, mat, _Region(_NONE, _NONE, -1.0, least))
         return -least > limit
@@ -302,7 +296,7 @@ class ProximityQuery:
         core = -1.0
         if self._model.has_core:
             self._measure_core()
-            core = float(self._core.min())
+            core = float(self._core[0])
         region = _Region(faces, found[faces], width, core)
         self._regions.add(pos, mat, region)
         return region, 0.0
