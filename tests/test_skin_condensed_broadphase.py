@@ -10,10 +10,12 @@ import warp as wp
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, SkinModel, SkinOptions
 from biotac_mj.skin.condensed import LinearSkin
-from biotac_mj.skin.condensed.broadphase import _may_meet_core, _meets_core, may_meet_core
-from biotac_mj.skin.condensed.structs import Constants
+from biotac_mj.skin.condensed.broadphase import _may_meet_core, _meets_core, may_be_touched
+from biotac_mj.skin.condensed.states import Increment
+from biotac_mj.skin.condensed.structs import Constants, Scratch
 from biotac_mj.skin.contact.faces import Contact
 from biotac_mj.skin.contact.meshes import mesh_distance
+from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.types import real, vec3
 
 
@@ -85,11 +87,16 @@ def ask(
     share: real,
     c: Constants,
     x: wp.array2d(dtype=vec3),
+    geoms: Geoms,
     touch: Contact,
+    s: Scratch,
     may_out: wp.array(dtype=bool),
 ):
     w = wp.tid()
-    may_out[w] = may_meet_core(w, 0, 1, share, x, touch, c)
+    o = Increment()
+    o.reach = real(1.0)
+    o.fraction = share
+    may_out[w] = may_be_touched(w, 0, 1, o, geoms, x, touch, c, s)
 
 
 def test_faces_that_come_to_the_core_unsought_were_candidates():
@@ -102,7 +109,7 @@ def test_faces_that_come_to_the_core_unsought_were_candidates():
     x = last + share / 3**0.5 * np.where(np.arange(60) < 30, 0.999, 1.001)[:, None] * way
     touch, may = Contact(), wp.zeros(60, dtype=bool, device="cpu")
     nodes, touch.x_last = (wp.array(a, dtype=vec3, device="cpu") for a in (x, last))
-    wp.launch(ask, 60, [share, c, nodes, touch], [may], device="cpu")
+    wp.launch(ask, 60, [share, c, nodes, Geoms(), touch, Scratch()], [may], device="cpu")
     np.testing.assert_array_equal(may.numpy(), np.arange(60) >= 30)
     candidate, before, now = near_core(share, c, last)[0], near_core(0, c, last)[1], near_core(0, c, x)[1]
     assert (now > before).sum() > 20

@@ -19,6 +19,7 @@ from ..contact.posed import SKIN, Geoms, face_radius
 from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
 from .lanes import keep_rows
+from .states import Increment
 from .structs import BACK, Constants, Remembered, Scratch
 
 __all__ = [
@@ -30,8 +31,7 @@ __all__ = [
     "forget_faces",
     "is_deep",
     "largest_displacement",
-    "may_be_reached",
-    "may_meet_core",
+    "may_be_touched",
     "measure_core",
 ]
 
@@ -316,52 +316,38 @@ def find_faces(
 
 
 @wp.func
-def may_be_reached(
+def may_be_touched(
     w: int,
     t: int,
     threads: int,
-    reach: real,
-    near: wp.int64,
+    o: Increment,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
 ):
-    """Whether a face that was not within reach of a geom [m] when the increment began may have come to one
-    since, by how far nodes and near geoms have moved at most."""
+    """Whether a face that was no candidate when the increment began may have come to a geom since, or an
+    inner one to the core, by how far nodes and near geoms have moved at most."""
     nodes = real(0.0)
     for k in range(t, c.node.shape[0], threads):
         i = c.node[k]
         nodes = wp.max(nodes, wp.length_sq(x[i, w] - touch.x_last[i, w]))
     posed = real(0.0)
     for g in range(geoms.count):
-        if has(near, g):
+        if has(o.near, g):
             moved = motion_bound(
                 s.sought_pos[g, w], s.sought_mat[g, w], geoms.pos[g, w], geoms.mat[g, w], c.center, c.radius
             )
             posed = wp.max(posed, moved)
-    return ROOT3 * (wp.sqrt(block_max(nodes)) + posed) >= reach
-
-
-@wp.func
-def may_meet_core(
-    w: int,
-    t: int,
-    threads: int,
-    fraction: real,
-    x: wp.array2d(dtype=vec3),
-    touch: Contact,
-    c: Constants,
-):
-    """Whether an inner face that was not nearer to the core than a fraction of its displacement when the
-    increment began may have come to it since, by how far its nodes have moved."""
+    if ROOT3 * (wp.sqrt(block_max(nodes)) + posed) >= o.reach:
+        return True
     over = real(0.0)
     for k in range(t, c.inner.shape[0], threads):
         i = c.inner[k]
-        moved = wp.length_sq(x[i, w] - touch.x_last[i, w])
+        went = wp.length_sq(x[i, w] - touch.x_last[i, w])
         before = wp.length_sq(touch.x_last[i, w] - c.rest[i, 0])
-        over = wp.max(over, ROOT3 * ROOT3 * moved - fraction * fraction * before)
+        over = wp.max(over, ROOT3 * ROOT3 * went - o.fraction * o.fraction * before)
     return block_max(over) > real(0.0)
 
 

@@ -19,8 +19,7 @@ from .broadphase import (
     forget_faces,
     is_deep,
     largest_displacement,
-    may_be_reached,
-    may_meet_core,
+    may_be_touched,
     measure_core,
 )
 from .correction import is_measured
@@ -411,13 +410,10 @@ def _conclude_pass(
             s.solve.newton[w] = newton_from(2, d.before, again, p.left - o.spent, d.tolerance)
         return o, NEWTON
     _store(w, t, threads, o.nnode, o.nin, c, s)
-    phase = BALANCED
     if o.ok != CUT:
-        if may_be_reached(w, t, threads, o.reach, o.near, geoms, x, touch, c, s):
-            phase = SEARCH
-        elif may_meet_core(w, t, threads, o.fraction, x, touch, c):
-            phase = SEARCH
-    return o, phase
+        if may_be_touched(w, t, threads, o, geoms, x, touch, c, s):
+            return o, SEARCH
+    return o, BALANCED
 
 
 @wp.func
