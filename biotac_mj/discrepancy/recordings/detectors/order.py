@@ -19,7 +19,7 @@ _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where ano
 _JUMPS, _EACH = 10.0, 2.5
 _ELSE = 4.0  # others jump by no more
 _RARE = 3  # of these in a recording: what comes and goes is none
-_ALIKE = 5.0  # [mm] between electrodes that feel a touch alike: 3 and 8 part them as well
+_ALIKE = 5.0  # [mm] between electrodes that feel a touch alike; with 8 as many exchanges are told
 _BLOCKS = 16
 _CHANCE = 0.02  # of as much among all exchanges and signs
 # correlation of how alike electrodes change with how near they are, once they are put right, from which on
