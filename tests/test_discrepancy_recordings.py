@@ -571,7 +571,7 @@ def test_an_effect_is_searched_or_said_to_be_untold():
     assert not untold & {"stuck channel", "noise of single electrodes", "liquid lost over the session"}
     for effect in (*entries("poses"), *LOGGED):
         effect = KINDS.get(effect.id, effect)
-        has = {"rest", "sign", "time"}  # raw counts for a minute, and nothing else
+        has = {"rest", "sign", "time", "long"}  # raw counts for a minute, and nothing else
         assert (effect.name in untold) == bool(effect.asks - has), effect.id
 
 

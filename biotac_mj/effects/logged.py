@@ -150,7 +150,7 @@ class Level(Logged):
 
 class Flip(Logged):
     id, name = "flip", "sign of an electrode reversed"
-    asks = frozenset({"sign", "time", "load"})
+    asks = frozenset({"sign", "load", "long"})
     physics = "an electrode responds to the load with the opposite sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
     confusable = {"gain": "press next to the electrode"}
@@ -163,7 +163,7 @@ class ExchangeInLog(Logged):
     """Each of its electrodes shows the next one, from the start on."""
 
     id, name = "swap", "exchanged channels"
-    wiring, asks = True, frozenset({"sign", "time", "load"})
+    wiring, asks = True, frozenset({"sign", "load", "long"})
     physics = "electrodes carry each other's signal: cable or channel order"
     params = {"onset": _TIME}
     confusable = {"gain": "an exchange changes two channels at once"}

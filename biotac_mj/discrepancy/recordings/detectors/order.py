@@ -9,9 +9,10 @@ from ....geometry.electrodes import electrode_positions
 from ....quality.noise import noise_level
 from ...evidence import max_t
 from ..candidates import Candidate
+from ..model import WINDOW
 from ..session import Session
 
-__all__ = ["miswired", "slipped"]
+__all__ = ["PLACED", "miswired", "slipped"]
 
 _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where another was
 # of the same: by this much it jumps, in the median of those exchanged and each. In 740 recordings of four
@@ -21,6 +22,7 @@ _ELSE = 4.0  # others jump by no more
 _RARE = 3  # of these in a recording: what comes and goes is none
 _ALIKE = 5.0  # [mm] between electrodes that feel a touch alike; with 8 as many exchanges are told
 _BLOCKS = 16
+PLACED = _BLOCKS * WINDOW[0]  # [s] fitted, in which places tell: no block is shorter than a touch
 _CHANCE = 0.02  # of as much among all exchanges and signs
 # correlation of how alike electrodes change with how near they are, once they are put right, from which on
 # places tell them apart: 0.44 to 0.61 in presses at many places of two real sensors
@@ -95,7 +97,7 @@ def miswired(session: Session) -> Candidate | None:
     near = (near - near[other].mean()) * other
     _, moment, _, middle = m.moments(every=True)
     fit, moment = middle <= m.time[m.inside][-1], moment[:, :number, :number]
-    if fit.sum() < _BLOCKS or fit.all():
+    if m.time[m.inside][-1] < PLACED or fit.all():
         return None
     parts = [*np.array_split(moment[fit], _BLOCKS), moment[~fit]]
     moment = np.array([part.mean(0) for part in (moment[fit], *parts)])
