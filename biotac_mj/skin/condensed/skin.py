@@ -35,8 +35,6 @@ _VIEWS = 16  # stored views of the broad phase, for several BioTacs that share a
 _FAR = 1e-3  # motion above which geoms that leave the skin are not followed [m]
 _LEVER = 1e-2  # lever arm of rotations, about the size of a fingertip [m]
 _EFFORT = 1200.0  # limit of the first solve of a step, in evaluations: about 0.25 s on the coarse skin
-_ANOTHER = 0.5  # limit of a second solve over that of the first
-_SPENT = 0.95  # fraction of the effort after which no second solve is started
 
 
 class CondensedSkin:
@@ -83,7 +81,7 @@ class CondensedSkin:
         of_items |= {"sample_force": d.outer.sample_force, "touched_by": touched_by}
         of_items |= {name: getattr(g, name) for name in ("pos", "mat", "pos_last")}
         out = {name: array.numpy()[:, 0] for name, array in of_items.items()}
-        scalars = {"most": self._step.most, "spent": self._step.spent, "deep": self._step.deep}
+        scalars = {"most": self._step.most, "spent": self._step.spent}
         scalars |= {"tier": self._step.tier, "load_factor": d.worlds.load_factor}
         scalars |= {name: getattr(d.worlds, name) for name in ("iterations", "error", "reason")}
         bodies = self._step.bodies
@@ -136,8 +134,7 @@ class CondensedSkin:
             known = memory if memory.started else self.outside(shallow, mat)
             out = self._follow(known, shallow, mat, effort)
             out = dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
-        spent = allowed * self._first - effort[0]
-        out.cost = spent / ((1 + _ANOTHER) * self._first)
+        out.cost = allowed - effort[0] / self._first
         return out
 
     def _follow(self, memory, pos, mat, effort, bodies=None):
@@ -153,25 +150,14 @@ class CondensedSkin:
         if not len(memory.forces) or far > _FAR:
             if self.untouched(*let_go):  # the geoms do not touch the skin, or leave it
                 return self.at_rest(*let_go)
-        most = effort[0]
-        out, blocked = self._solve(memory, pos, mat, most)
+        out = self._solve(memory, pos, mat, effort[0])
         effort[0] -= self._views["spent"][0]
-        if out.load_factor == 1.0 or (memory.started and out.load_factor > 0 and not blocked):
-            return out
-        if self.untouched(*let_go):
+        if not out.converged and self.untouched(*let_go):
             return self.at_rest(*let_go)
-        presses = memory.started and len(memory.forces)
-        if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
-            return out
-        # the path leads through the core, has no first equilibrium, or is not known
-        another, _ = self._solve(self.outside(pos, mat), pos, mat, _ANOTHER * most)
-        effort[0] -= self._views["spent"][0]
-        # an equilibrium with contact is preferred to one with hardly any, or none
-        keeps = another.load_factor == 0 or (far <= _FAR and not another.converged)
-        return out if presses and keeps else another
+        return out
 
     def _solve(self, memory, pos, mat, most):
-        """Solves from a state to poses, as far as possible; returns also whether a geom is in the core."""
+        """Solves from a state to poses, as far as possible."""
         v = self._views
         self._load(memory)
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
@@ -182,7 +168,7 @@ class CondensedSkin:
             memory = self._read()
             self._held = memory.contents()
             self._keep(memory, v["x"].copy())
-        out = Outcome(
+        return Outcome(
             memory=memory,
             wrench=v["wrench"].copy(),
             tangent=self._tangent[:, 0].copy(),
@@ -194,7 +180,6 @@ class CondensedSkin:
             load=np.linalg.norm(v["sample_force"][memory.contacts[:, 0].astype(int)], axis=1),
             load_factor=load_factor,
         )
-        return out, v["deep"][0] == 1
 
     def _load(self, memory):
         """Loads a state."""

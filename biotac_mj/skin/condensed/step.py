@@ -95,7 +95,7 @@ class CondensedStep:
             room = room or Room.of_worlds(nworld)
             self._scratch = _scratch(model, linear, nworld, geoms.count, room, groups)
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
-        self.most, self.spent, self.deep = self._scratch.most, self._scratch.spent, self._scratch.deep
+        self.most, self.spent = self._scratch.most, self._scratch.spent
         self.bodies = self._scratch.bodies
         self.most.fill_(float(model.options.max_work))
         self._going = wp.zeros(1, dtype=int, device=model.device)
