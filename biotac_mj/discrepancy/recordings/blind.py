@@ -49,7 +49,7 @@ def _lacking(session):
         out["load"] = "not loaded"
     if session.fit.sum() / r.rate < PLACED:
         least = math.ceil(PLACED / session.fit.mean())
-        out["long"] = f"too short to tell electrodes by their places, record {least} s or more"
+        out["long"] = f"too few touches to tell electrodes by their places, record {least} s or more"
     out["change"] = "told only where it begins or ends here, not where it holds throughout or comes slowly"
     out["poses"] = "no poses of what touched, with which `diagnose` searches these"
     out["search"] = "not searched in any data"
