@@ -275,7 +275,7 @@ class Hook:
                 Launcher(device).launch_blocks(integrator.find_amiss, worlds, known, again, threads)
 
             def go_on():
-                self._slope.find(m, d, self._integrator.inertia, correction)
+                self._slope.find(m, d, self._integrator, correction)
                 self._find_accelerations(m, d, moving, correction.going)
                 compare()
 

@@ -4,11 +4,13 @@ the bodies: `coupling/implicit/integrator.py` for all worlds at once, by mujoco_
 The rows answer to the former, a, but the skins to the latter, a'. The force c = beta h^2 S J (a - a')
 corrects that. It moves the bodies too: Newton's method finds it, with the slope
 1 - beta h^2 S J (R - H^-1 M R), where R are the accelerations by unit wrenches on the bodies while all rows
-hold, and H is the integrator's matrix."""
+hold, and H is the integrator's matrix: of free bodies all of it, since fast spin makes much of it
+antisymmetric, of other trees its symmetric part."""
 
 import typing
 
 import mujoco
+import numpy as np
 import warp as wp
 
 from ...coupling.implicit.compliance import substitute
@@ -157,11 +159,14 @@ def respond(
     rownnz: wp.array(dtype=int),
     rowadr: wp.array(dtype=int),
     colind: wp.array(dtype=int),
+    free: wp.array(dtype=int),
+    dofadr: wp.array(dtype=int),
+    driven: wp.array3d(dtype=float),
     # In and out:
     c: Correction,
 ):
     """Accelerations by a unit wrench on a body. held, damped: factors of M with all rows, of the
-    integrator's matrix."""
+    integrator's matrix. free, driven: see `Integrator`."""
     w, column = wp.tid()
     if c.going[w] == 0:
         return
@@ -178,6 +183,21 @@ def respond(
             if i != j:
                 c.moved[w, column, j] = c.moved[w, column, j] + m * c.found[w, column, i]
     substitute(damped, w, column, c.moved)
+    for b in range(free.shape[0]):
+        first = dofadr[free[b]]
+        force = vec6()
+        for i in range(first, first + 6):
+            for k in range(rownnz[i]):
+                j = colind[rowadr[i] + k]
+                m = real(inertia[w, rowadr[i] + k])
+                force[i - first] = force[i - first] + m * c.found[w, column, j]
+                if i != j:
+                    force[j - first] = force[j - first] + m * c.found[w, column, i]
+        for i in range(first, first + 6):
+            moved = real(0.0)
+            for k in range(6):
+                moved += real(driven[k, w, i]) * force[k]
+            c.moved[w, column, i] = moved
 
 
 @wp.kernel
@@ -231,15 +251,15 @@ class Slope:
     def __init__(self, m: "mjw.Model", nworld: int, cones: Cones):
         self._held, self._damped = (Factor(m, nworld, cones) for _ in range(2))
 
-    def find(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, c: Correction) -> None:
-        """Corrects the forces, after mujoco_warp's constraint solver and `find_amiss`; inertia: see
-        `Integrator`. Launches only."""
+    def find(self, m: "mjw.Model", d: "mjw.Data", integrator: "Integrator", c: Correction) -> None:
+        """Corrects the forces, after mujoco_warp's constraint solver and `find_amiss`. Launches only."""
         device = d.qpos.device
         self._held.find(m, d, c.going, d.M)
-        self._damped.find(m, d, c.going, inertia, springs=False)
+        self._damped.find(m, d, c.going, integrator.inertia, springs=False)
         factors = [self._held.L, self._damped.L, d.M, m.M_rownnz, m.M_rowadr, m.M_colind]
+        free = [integrator.free, m.body_dofadr, integrator.driven]
         worlds, columns = c.found.shape[:2]
-        wp.launch(respond, (worlds, columns), [*factors, c], device=device)
+        wp.launch(respond, (worlds, columns), [*factors, *free, c], device=device)
         wp.launch(write_slope, (worlds, columns // 6, columns), [c], device=device)
         Launcher(device).launch_blocks(step, [worlds], [c], block_dim=BLOCK)
 
@@ -279,6 +299,8 @@ class Integrator:
       differs: whether they are others than the constraint solver's.
       qacc: (nworld, nv) wp.array float, what `integrate` found.
       inertia: (nworld, nM) wp.array float, M - h D as far as that is symmetric, laid out as mujoco_warp's M.
+      free: wp.array int, numbers of the free bodies, whose velocity products it has in D. driven: (6, nworld,
+        nv) wp.array float, their accelerations by a unit of the force on each of their degrees of freedom.
     """
 
     def __init__(self, m: "mjw.Model", d: "mjw.Data"):
@@ -293,6 +315,13 @@ class Integrator:
         if not self.differs:
             return
         self.qacc, self._found = wp.zeros_like(d.qacc), wp.zeros_like(d.qacc)
+        free = m.body_freeadr.numpy() if kind in (_FAST, _IMPLICIT) else np.zeros(0, np.int32)
+        unit = np.zeros((6, *d.qacc.shape), np.float32)
+        for k, force in enumerate(unit):
+            force[:, m.body_dofadr.numpy()[free] + k] = 1.0
+        with wp.ScopedDevice(d.qacc.device):
+            self.free, self._unit = wp.array(free, dtype=int), wp.array(unit, dtype=float)
+            self.driven = wp.zeros_like(self._unit)
         self._matrix, self._now = wp.zeros_like(d.M), wp.zeros_like(d.M)
         self._factor, self._diagonal = wp.zeros_like(d.qLD), wp.zeros_like(d.qLDiagInv)
         self.inertia = self._matrix
@@ -325,6 +354,9 @@ class Integrator:
             )
             rows = [m.opt.timestep, m.M_rownnz, m.M_rowadr, self._damping]
             self._launch(forward._euler_damp_qfrc, self._damping.shape, rows)
+        if len(self.free):
+            for k in range(6):
+                forward.implicit_free_body(m, d, self._unit[k], self.driven[k], solve=True)
 
     def integrate(self, m: "mjw.Model", d: "mjw.Data", going: wp.array) -> None:
         """Finds `qacc` of the worlds that are going (nworld,), after mujoco_warp's constraint solver.
