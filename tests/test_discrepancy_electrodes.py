@@ -8,11 +8,10 @@ from test_discrepancy_recordings import ids
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.detectors.levels import levels
-from biotac_mj.discrepancy.recordings.detectors.order import miswired, slipped
+from biotac_mj.discrepancy.recordings.detectors.order import slipped
 from biotac_mj.discrepancy.recordings.detectors.together import ahead
 from biotac_mj.discrepancy.recordings.rest import rest
 from biotac_mj.discrepancy.recordings.session import Session
-from biotac_mj.geometry.design import BIOTAC
 
 RATE = 100.0
 
@@ -20,32 +19,6 @@ RATE = 100.0
 def session(counts, share=0.6):
     fit = np.arange(len(counts)) < share * len(counts)
     return Session(PlainRecording(counts, rate=RATE), fit)
-
-
-def felt(seed, seconds=120):
-    """Counts of touches at random places, which electrodes feel the more the nearer they are."""
-    rng, t = np.random.default_rng(seed), np.arange(int(seconds * RATE)) / RATE
-    place = np.array(BIOTAC.electrodes_mm)
-    where = place[rng.integers(19, size=seconds)] + rng.normal(0, 2, (seconds, 3))
-    how_much = np.exp(-((np.linalg.norm(where[:, None] - place, axis=2) / 7) ** 2))
-    counts = 2900 - 400 * np.repeat(how_much, int(RATE), axis=0) * np.sin(np.pi * t)[:, None] ** 2
-    return noisy(counts + rng.uniform(-300, 300, 19), rng)
-
-
-@pytest.mark.parametrize("moved", [(), (3, 12), (5,)])
-def test_channels_wrong_throughout_are_told_by_their_places(moved):
-    counts, k = felt(1), [*moved]
-    counts[:, k] = counts[:, k[::-1]] if len(k) > 1 else 2 * np.median(counts[:, k], axis=0) - counts[:, k]
-    found = diagnose_recording(PlainRecording(counts, rate=RATE)).findings
-    name = {0: [], 1: ["flip"], 2: ["swap"]}[len(k)]
-    assert [f.id for f in found] == name and [f.channels for f in found] == [moved] * len(name)
-    put_right = found[0].correct(counts, np.arange(len(counts)) / RATE) if found else counts
-    np.testing.assert_allclose(put_right, felt(1), atol=1.0)
-
-
-def test_channels_without_places_are_not_put_in_order():
-    counts, _, rng = pressed(5)
-    assert miswired(session(noisy(counts, rng))) is None
 
 
 @pytest.mark.parametrize("back", (pytest.param(False, marks=pytest.mark.slow), True))

@@ -568,10 +568,10 @@ def test_an_effect_is_searched_or_said_to_be_untold():
     e, rng = unloaded()
     d = diagnose_recording(PlainRecording(noisy(e, rng)))
     untold = {name for line in d.notes for name in line.partition(": ")[2].split(", ")}
-    assert not untold & {"stuck channel", "noise of single electrodes", "liquid lost over the session"}
+    assert not untold & {"stuck channel", "drift or jump of an electrode", "liquid lost over the session"}
     for effect in (*entries("poses"), *LOGGED):
         effect = KINDS.get(effect.id, effect)
-        has = {"rest", "sign", "time", "long"}  # raw counts for a minute, and nothing else
+        has = {"rest", "sign", "time"}  # raw counts for a minute, and nothing else
         assert (effect.name in untold) == bool(effect.asks - has), effect.id
 
 

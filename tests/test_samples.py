@@ -8,6 +8,7 @@ import pytest
 
 from biotac_mj import cli, samples
 from biotac_mj.data import TactileSet
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.learning.instants.examples import from_recording
 from biotac_mj.learning.instants.reader import judge_in_time
 from biotac_mj.learning.instants.real import evaluate_recording
@@ -34,6 +35,15 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     assert logged.object_pos.shape == (len(logged), 3) and np.ptp(logged.object_pos, axis=0).min() > 1e-3
     with TactileSet(folder / "set") as made:
         assert len(made) == samples.TOUCHES == 50 and made.labelled.all() and made["converged"][:].all()
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(6000)])
+def test_the_samples_without_force_show_the_warm_up_alone(tmp_path, rows):
+    """No sound electrode has its sign reversed, nor drifts by the warm-up seen through a reversed sign."""
+    samples.make_samples(tmp_path)
+    counts = np.loadtxt(tmp_path / "electrodes.txt")[rows]
+    found = diagnose_recording(PlainRecording(counts, rate=100.0)).findings
+    assert [f.id for f in found] == ["warmup"] and found[0].of_all
 
 
 def test_samples_take_no_simulation(tmp_path):

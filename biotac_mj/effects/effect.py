@@ -190,8 +190,8 @@ class Effect(abc.ABC):
       alike: whether a running sensor has it equally on all electrodes. most: {parameter: largest value that a
         running sensor can have}.
       asks: what a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of the counts;
-        "time" in which touches are told from drift; "load"; "long", for touches at many places; "change",
-        that it begins or ends there; "poses", where nothing else will do; "search", where nothing searches
+        "time" in which touches are told from drift; "load"; "change", that it begins or ends there;
+        "throughout", that it does not; "poses", where nothing else will do; "search", where nothing searches
         it.
       detector: class of evidence in logs, which sets a name's confidence
         (`discrepancy.recordings.confidence`).

@@ -150,7 +150,7 @@ class Level(Logged):
 
 class Flip(Logged):
     id, name = "flip", "sign of an electrode reversed"
-    asks = frozenset({"sign", "load", "long"})
+    asks = frozenset({"sign", "change"})
     physics = "an electrode responds to the load with the opposite sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
     confusable = {"gain": "press next to the electrode"}
@@ -163,7 +163,7 @@ class ExchangeInLog(Logged):
     """Each of its electrodes shows the next one, from the start on."""
 
     id, name = "swap", "exchanged channels"
-    wiring, asks = True, frozenset({"sign", "load", "long"})
+    wiring, asks = True, frozenset({"change"})
     physics = "electrodes carry each other's signal: cable or channel order"
     params = {"onset": _TIME}
     confusable = {"gain": "an exchange changes two channels at once"}
@@ -263,7 +263,7 @@ class Hum(Logged):
 
 
 class NoiseInLog(Noise, Logged):
-    fits, asks = _LOG, frozenset()
+    fits, asks = _LOG, frozenset({"throughout"})
     params = {"size": Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)}
     confusable = Noise.confusable | {"gain": "press next to the electrode: a gain makes touches larger, too"}
     apply = Logged.apply

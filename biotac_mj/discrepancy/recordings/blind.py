@@ -4,7 +4,6 @@ import math
 
 from ...effects.catalogue import entries
 from ...effects.logged import LOGGED
-from .detectors.order import PLACED
 from .model import LEAST, WINDOW
 from .recording import FORCE_MOVED
 from .session import Session
@@ -47,10 +46,8 @@ def _lacking(session):
         )
     elif not session.loaded:
         out["load"] = "not loaded"
-    if session.fit.sum() / r.rate < PLACED:
-        least = math.ceil(PLACED / session.fit.mean())
-        out["long"] = f"too few touches to tell electrodes by their places, record {least} s or more"
     out["change"] = "told only where it begins or ends here, not where it holds throughout or comes slowly"
+    out["throughout"] = "told only where it holds throughout, not where it begins or ends here"
     out["poses"] = "no poses of what touched, with which `diagnose` searches these"
     out["search"] = "not searched in any data"
     return out

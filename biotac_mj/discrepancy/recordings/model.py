@@ -126,10 +126,10 @@ class Model:
         c = len(self.used)
         return self.whole if value is None else np.concatenate([value, self.whole[:, c:]], axis=1)
 
-    def moments(self, every: bool = False) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-        """Moments of changes within windows of the fitted bins, or of all: rows of a window, moments (w, q,
-        q) of electrodes and products, floor (q,) of a window's noise, and centres (w,) [s]."""
-        whole = self.whole if every else self.whole[self.inside]
+    def moments(self) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        """Moments of changes within windows of the fitted bins: rows of a window, moments (w, q, q) of
+        electrodes and products, floor (q,) of a window's noise, and centres (w,) [s]."""
+        whole = self.whole[self.inside]
         span = max(4, int(min(CHANGES / self.period, len(whole) // 32)))
         w = len(whole) // span
         cells = whole[: w * span].reshape(w, span, -1)

@@ -16,7 +16,7 @@ from .confidence import NAMED, confidence
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
-from .detectors.order import miswired, slipped
+from .detectors.order import slipped
 from .diagnosis import RecordingDiagnosis, concluded
 from .proof import prove
 from .recording import PlainRecording, as_plain
@@ -90,9 +90,6 @@ def _levels(session, named):
     """Channels that are exchanged, jumps, and trends over time, the strongest first."""
     if (finding := slipped(session)) is not None:
         _take(session, finding, named)
-    for _ in range(_MOST):
-        if (finding := miswired(session)) is None or not _take(session, finding, named):
-            break
     for finding in jumped(session):
         _take(session, finding, named)
     refused = set()

@@ -1,18 +1,14 @@
 """Channels that are not what they are called: each goes on, from one row to the next, where another was,
-which needs no model of the load nor a long recording; or touches that electrodes beside each other feel alike
-say so of the whole recording (`miswired`)."""
+which needs no model of the load nor a long recording."""
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ....geometry.electrodes import electrode_positions
 from ....quality.noise import noise_level
-from ...evidence import max_t
 from ..candidates import Candidate
-from ..model import WINDOW
 from ..session import Session
 
-__all__ = ["PLACED", "miswired", "slipped"]
+__all__ = ["slipped"]
 
 _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where another was
 # of the same: by this much it jumps, in the median of those exchanged and each. In 740 recordings of four
@@ -20,13 +16,6 @@ _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where ano
 _JUMPS, _EACH = 10.0, 2.5
 _ELSE = 4.0  # others jump by no more
 _RARE = 3  # of these in a recording: what comes and goes is none
-_ALIKE = 5.0  # [mm] between electrodes that feel a touch alike; with 8 as many exchanges are told
-_BLOCKS = 16
-PLACED = _BLOCKS * WINDOW[0]  # [s] fitted, in which places tell: no block is shorter than a touch
-_CHANCE = 0.02  # of as much among all exchanges and signs
-# correlation of how alike electrodes change with how near they are, once they are put right, from which on
-# places tell them apart: 0.44 to 0.61 in presses at many places of two real sensors
-_PLACES = 0.35
 
 
 def slipped(session: Session) -> Candidate | None:
@@ -82,75 +71,6 @@ def slipped(session: Session) -> Candidate | None:
         correct=correct,
         verified=True,  # by the rows themselves
     )
-
-
-def miswired(session: Session) -> Candidate | None:
-    """Two channels that are exchanged, or one whose sign is reversed, throughout: with it put right, changes
-    within seconds are more alike the nearer electrodes are to each other, in every part of the recording."""
-    m, r = session.model(), session.recording
-    number = len(m.used)
-    if not session.loaded or number < 7 or not r.signed:
-        return None
-    place = electrode_positions(r.design)[m.used]
-    near = np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / _ALIKE)
-    other = ~np.eye(number, dtype=bool)
-    near = (near - near[other].mean()) * other
-    _, moment, _, middle = m.moments(every=True)
-    fit, moment = middle <= m.time[m.inside][-1], moment[:, :number, :number]
-    if m.time[m.inside][-1] < PLACED or fit.all():
-        return None
-    parts = [*np.array_split(moment[fit], _BLOCKS), moment[~fit]]
-    moment = np.array([part.mean(0) for part in (moment[fit], *parts)])
-    size = np.sqrt(np.maximum(np.einsum("bii->bi", moment), 1e-12))
-    whole, *alike = moment / (size[:, :, None] * size[:, None])
-    gain, cells = _put_right(np.array(alike) * other, near)
-    t, p = max_t(gain[:-1])
-    clear = np.flatnonzero((t > 0) & (p < _CHANCE))
-    if not len(clear):
-        return None
-    best = clear[gain[:-1, clear].mean(0).argmax()]
-    order, sign = np.arange(number), np.ones(number)
-    order[cells[best]] = cells[best][::-1]
-    sign[cells[best]] = -1.0 if len(cells[best]) == 1 else 1.0
-    right = whole[np.ix_(order, order)] * np.outer(sign, sign)
-    if np.corrcoef(right[other], near[other])[0, 1] < _PLACES:
-        return None
-    channels = [int(k) for k in m.used[cells[best]]]
-    rest = np.median(r.electrodes[session.fit][:, channels], axis=0)
-
-    def correct(counts, at):
-        out = counts.copy()
-        mine = counts[:, channels[::-1]]
-        out[:, channels] = mine if len(channels) > 1 else 2 * rest - mine
-        return out
-
-    names = " and ".join(f"e{k + 1}" for k in channels)
-    said = f"{names} are exchanged" if len(channels) > 1 else f"the sign of {names} is reversed"
-    return Candidate(
-        "swap" if len(channels) > 1 else "flip",
-        tuple(channels),
-        0.0,
-        float(r.time[-1]),
-        f"touches are felt alike by electrodes beside each other if {said} throughout",
-        {"onset": (0.0, 0.0, 0.0)} if len(channels) > 1 else {"factor": (-1.0, np.nan, np.nan)},
-        nats=float(-np.log(p[best])),
-        p=float(p[best]),
-        detector="wired",
-        correct=correct,
-        verified=bool(gain[-1, best] > 0),
-    )
-
-
-def _put_right(alike, near):
-    """By how much correlations (b, c, c), zero on the diagonal, go better with how near (c, c) electrodes
-    are, with two exchanged or the sign of one reversed: gain (b, c (c + 1) / 2); and the electrodes of
-    each."""
-    felt = alike @ near
-    own = np.einsum("bii->bi", felt)
-    i, j = np.triu_indices(len(near), 1)
-    change = felt[:, j, i] + felt[:, i, j] - own[:, i] - own[:, j]
-    gain = [2 * change + 4 * alike[:, i, j] * near[i, j], -4 * own]
-    return np.concatenate(gain, axis=1), [*np.stack([i, j], axis=1), *np.arange(len(near))[:, None]]
 
 
 def _goes_on(off):
