@@ -46,6 +46,16 @@ def test_the_samples_without_force_show_the_warm_up_alone(tmp_path, rows):
     assert [f.id for f in found] == ["warmup"] and found[0].of_all
 
 
+def test_an_exchange_is_found_beside_electrodes_alike(tmp_path):
+    """Others that go on where they were could as well go on where the exchanged ones are."""
+    samples.make_samples(tmp_path)
+    counts = np.loadtxt(tmp_path / "electrodes.txt")
+    counts[4500:, [2, 13]] = counts[4500:, [13, 2]]
+    swap, warmup = diagnose_recording(PlainRecording(counts, rate=100.0)).findings
+    assert (swap.id, swap.channels, warmup.id) == ("swap", (2, 13), "warmup")
+    assert abs(swap.start - 45) < 0.02
+
+
 def test_samples_take_no_simulation(tmp_path):
     """Those of the default seed: the solver is not even loaded."""
     code = f"import sys; from biotac_mj.cli import main; main(['data', 'samples', {str(tmp_path / 's')!r}]); "

@@ -83,11 +83,13 @@ def _goes_on(off):
     fits = off[straight, rotation] < _ON
     if fits.sum() > 0.8 * number and np.median(np.diag(off)) > _JUMPS:
         return rotation
-    order = linear_sum_assignment(np.minimum(off, 50) ** 2)[1]
-    out = straight.copy()
+    order, out = straight.copy(), straight.copy()
+    # what goes on where it was is not exchanged with others that happen to be there as well
+    jumped = np.flatnonzero(np.diag(off) > _EACH)
+    order[jumped] = jumped[linear_sum_assignment(np.minimum(off[np.ix_(jumped, jumped)], 50) ** 2)[1]]
     for cycle in _cycles(order):
         now, then = np.diag(off)[cycle], off[cycle, order[cycle]]
-        if then.max() < _ON and np.median(now) > _JUMPS and now.min() > _EACH:
+        if then.max() < _ON and np.median(now) > _JUMPS:
             out[cycle] = order[cycle]
     return out
 
