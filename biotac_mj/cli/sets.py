@@ -1,4 +1,4 @@
-"""The verbs `biotac data generate`, `import-data` and `export-data`."""
+"""The verbs `biotac data generate`, `import` and `export`."""
 
 import argparse
 

@@ -241,7 +241,8 @@ def _read_hdf5(path, rate, objects):
     names, schema = _holds(path)
     if schema.startswith("biotac_mj.data"):
         raise ValueError(
-            f"{path} is a shard of a data set, no recording: `biotac learn train` and `export-data` take it"
+            f"{path} is a shard of a data set, no recording: `biotac learn train` and `biotac data export` "
+            "take it"
         )
     if names & _NVIDIA:
         return read_nvidia(path, rate, objects)
