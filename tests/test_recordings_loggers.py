@@ -8,7 +8,7 @@ import scipy.io
 from recorded import synthetic, write_bag, write_btd
 
 from biotac_mj import cli
-from biotac_mj.recordings import load
+from biotac_mj.recordings import faults, load
 from biotac_mj.recordings.formats.names import is_time, place_of
 
 ONE = synthetic()
@@ -61,7 +61,16 @@ def test_rows_that_lack_an_electrode_are_left_out(tmp_path):
     rows = np.delete(np.arange(len(E)), [7, 20, 21, 22, 23])
     same(one, rows)
     np.testing.assert_allclose(one.force, F[rows], atol=1e-6)
-    said(one, "left out 5 rows that lack an electrode")
+    said(one, "1 rows lack an electrode, mostly e4: they were left out")
+    said(one, "left out 4 rows that have no electrode")
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_rows_that_lack_an_electrode_were_not_lost_by_the_logger(lost, tmp_path):
+    gaps = E.copy()
+    gaps[40:44, slice(None) if lost else 3] = np.nan
+    one = read(table(tmp_path / "r.csv", [T, gaps], ["time", *NAMES]))
+    assert ("lost_rows" in [fault.id for fault in faults(one)]) == lost
 
 
 def test_logs_that_were_merged_by_time(tmp_path):

@@ -140,13 +140,18 @@ def _without_gaps(stream):
     if there.all():
         return [stream]
     some = np.isfinite(electrodes).any(1) & ~there
+    least = int(np.isfinite(electrodes[some]).sum(0).argmin())
+    lack = f"rows lack an electrode, mostly e{least + 1}"
     if some.sum() > there.sum():
-        least = int(np.isfinite(electrodes).sum(0).argmin())
         raise ValueError(
-            f"{stream.source}: {some.sum()} of {len(there)} rows lack an electrode, mostly e{least + 1}: a "
-            f"gap cannot be guessed; all {electrodes.shape[1]} are needed in a row"
+            f"{stream.source}: {some.sum()} of {len(there)} {lack}: a gap cannot be guessed; all "
+            f"{electrodes.shape[1]} are needed in a row"
         )
-    stream.notes.append(f"{stream.source}: left out {(~there).sum()} rows that lack an electrode")
+    # rows without any electrode are another sensor's, or were lost
+    if some.any():
+        stream.notes.append(f"{stream.source}: {some.sum()} {lack}: they were left out")
+    if none := (~there & ~some).sum():
+        stream.notes.append(f"{stream.source}: left out {none} rows that have no electrode")
     others = []
     for name in [name for name in stream.fields if name not in CHANNELS]:
         value = stream.fields[name]
