@@ -55,8 +55,11 @@ class Parser(argparse.ArgumentParser):
                         meant = ["--skin biotac_sp/coarse"]
                     near = (meant + difflib.get_close_matches(given, known, 1))[:1]
                     self.error(f"no option {given}{f': did you mean {near[0]}?' if near else ''}")
-        if self._subparsers and not (sys.argv[1:] if args is None else args):
+        words = sys.argv[1:] if args is None else args
+        if self._subparsers and not words:
             self.print_help()  # without a verb, print the verbs
+        elif self._subparsers and re.match("--.", words[0]) and words[0] not in self._option_string_actions:
+            self.error(f"{words[0]} stands before the verb: give the verb first, then its options")
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"nothing takes {' '.join(unknown)}")
@@ -241,9 +244,9 @@ def output_file(suffix: str = "", new: bool = False, picture: bool = False) -> C
     """
 
     def check(text):
+        check_output_file(text)
         if new:
             refuse_existing(text)
-        check_output_file(text)
         if picture:
             picture_kind(text)
         if not text.endswith(suffix):

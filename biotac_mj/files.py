@@ -212,7 +212,7 @@ def picture_kind(path: pathlib.Path | str) -> str:
 
 def refuse_existing(*paths: pathlib.Path | str) -> None:
     """Raises ValueError if one of these exists. Results replace earlier ones of the same name; recordings,
-    bags, sets and designs never do."""
+    bags, sets, designs and protocols never do."""
     for path in paths:
         if os.path.lexists(path):
             raise ValueError(f"{path} is there already: give a new name, or remove it")

@@ -125,6 +125,9 @@ def test_a_checkup_is_printed_and_diagnosed_from_the_cli(tmp_path, capsys):
     assert cli.main(["checkup", "--out", str(plan)]) == 0
     said = capsys.readouterr().out
     assert all(step.line in said for step in STEPS.values()) and "recording record" in said
+    with pytest.raises(SystemExit):  # whose times may have been measured
+        cli.main(["checkup", "--out", str(plan)])
+    assert "is there already: give a new name" in capsys.readouterr().err
     counts, log = session(put(4, drifting_at_rest)), tmp_path / "log.h5"
     write(log, [Recording(50.0 + np.arange(len(counts)) / RATE, counts, name="log")])
     write_protocol(plan, PROTOCOL)

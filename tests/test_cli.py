@@ -47,6 +47,7 @@ OUTPUTS = {
 NEVER_REPLACED = {
     "recording import --out": "",
     "recording record --out": "",
+    "checkup --out": "",
     "recording export --ros1": "",
     "recording export --ros2": "",
     "data import --out": "shard-00000.h5",
@@ -249,6 +250,10 @@ def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):
         (["press", "--qqq"], "no option --qqq (`biotac press --help`"),
         (["press", "deep"], "nothing takes deep (`biotac press --help`"),
         (["pres"], "invalid choice: 'pres'"),
+        (
+            ["--skin", "coarse", "press"],
+            "--skin stands before the verb: give the verb first, then its options",
+        ),
     ],
 )
 def test_what_a_verb_does_not_know_it_says_itself(words, text, capsys):
@@ -264,6 +269,14 @@ def test_view_without_a_display_says_what_to_do(capsys, monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     assert cli.main(["view"]) == 2
     assert "no display to open a window on: use `biotac view --render FILE.png`" in capsys.readouterr().err
+
+
+def test_a_press_in_which_most_steps_fail_says_so(capsys, tmp_path):
+    deep = "press --depth 15mm --skin coarse --tier condensed --timestep 20ms --no-render --quiet --out"
+    assert cli.main([*deep.split(), str(tmp_path)]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "steps did not converge, their readings may be wrong: press less deep" in last
+    assert (tmp_path / "readings.csv").exists()
 
 
 def test_press_writes_readings_skin_and_picture(capsys, tmp_path, monkeypatch):

@@ -153,7 +153,7 @@ def _tidy(ended):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a verb; bad input is one line on stderr and exit code 2.
+    """Runs a verb; bad input, and a press in which most steps fail, is one line on stderr and exit code 2.
 
     Unexpected errors are one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows the
     traceback.

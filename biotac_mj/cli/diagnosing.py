@@ -159,8 +159,9 @@ def add_checkup(verbs: argparse._SubParsersAction) -> None:
         "Print the steps of a checkup of a sensor, three minutes by hand, and write them as a protocol.",
     )
     verb.add_argument("--against", metavar="NAME", help="object that the sensor will be pressed on")
+    out = output_file(new=True)
     verb.add_argument(
-        "--out", type=output_file(), default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
+        "--out", type=out, default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
     )
 
 

@@ -28,8 +28,8 @@ TASKS = ("roll_rod", "insert_peg", "follow_edge")
 CONFIGURATIONS = ("deformable_shell", "shell_with_core", "solid_with_core", "solid")
 INDENTER_HELP = (
     f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's "
-    "sphere, capsule, cylinder, "
-    "ellipsoid, box or plane and its half-sizes, as in geom:capsule:3mm,5mm; or mesh:FILE in metres"
+    "sphere, capsule, cylinder, ellipsoid, box or plane and its half-sizes, as in geom:capsule:3mm,5mm, and "
+    "geom:sphere:2.5mm for a sphere of that radius; or mesh:FILE in metres"
 )
 LOCATION_HELP = (
     "where: X; or X and ANGLE around the finger, 0 on the pad's midline, positive towards +z, as in -12mm "

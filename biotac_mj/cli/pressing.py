@@ -134,6 +134,12 @@ def _press(args):
             "press.png shows the surfaces drawn by matplotlib (libosmesa6 or libegl1 would do)"
         )
     print(report.table(record, files))
+    failed, steps = int(record.nonconverged[-1]), len(record.time)
+    wrong = f"{failed} of {steps} steps did not converge, their readings may be wrong: press less deep"
+    if 2 * failed > steps:
+        raise ValueError(wrong)
+    if failed:
+        say(wrong)
 
 
 def add_samples(verbs: argparse._SubParsersAction) -> None:

@@ -150,7 +150,8 @@ def make_indenter(text: str) -> Indenter:
     if text not in INDENTERS:
         raise ValueError(
             f"unknown indenter {text!r}: "
-            f"choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
+            f"choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...] "
+            "(geom:sphere:2.5mm is a sphere of that radius), or mesh:FILE"
         )
     shape = indenter(text)
     return Indenter(

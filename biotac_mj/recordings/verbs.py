@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Callable
 
-from ..arguments import output_file, quantity, real, whole
+from ..arguments import output_file, output_folder, quantity, real, whole
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -38,7 +38,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     bag = v.add_mutually_exclusive_group(required=True)
     bag.add_argument("--ros1", type=output_file(".bag", new=True), metavar="OUT.bag", help="a bag of ROS 1")
     bag.add_argument(
-        "--ros2", type=output_file(new=True), metavar="OUT", help="a bag of ROS 2: a folder to make"
+        "--ros2", type=output_folder(new=""), metavar="OUT", help="a bag of ROS 2: a folder to make"
     )
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")

@@ -202,9 +202,8 @@ def check_counts(counts: np.ndarray, where: str, first: int = 0) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise ValueError(
-            f"{where}: e{column + 1} of row {first + row} is {counts[row, column]:g}: "
-            "raw counts 0..4095 "
-            "are needed, not tared, scaled or in ohm"
+            f"{where}: e{column + 1} of row {first + row} is {counts[row, column]:g}: raw counts 0..4095 are "
+            "needed, not tared, scaled or in ohm; import counts of 16 bits with --scale 0.0625"
         )
     if counts.size and counts.max() <= _LEAST:
         raise ValueError(
