@@ -83,7 +83,7 @@ def test_diagnose_takes_one_finger_and_says_which_it_is(tmp_path):
     assert first.design == second.design == SP
     np.testing.assert_allclose((first.electrodes - second.electrodes).mean(0), 50, atol=2)
     said = diagnose_recording(second, progress=False)
-    assert said.data.startswith("BioTac SP (24 electrodes), 400 rows")
+    assert said.data.startswith("read as BioTac SP (24 electrodes), 400 rows")
     assert said.details["recording"]["design"] == "biotac_sp"
 
 
