@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from blocks import boundary, box, faces_on, skin
 
 from biotac_mj.geometry.rigid import displace
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.newton import bodies
+from biotac_mj.skin.newton.worlds import BLOCK
+from biotac_mj.skin.types import real
 
 HEIGHT, R = 4e-3, 5e-3
 POS = np.array([[3e-3, 5e-3, HEIGHT + R + 1e-4], [8e-3, 5e-3, HEIGHT + R + 1e-4]])
@@ -90,3 +94,28 @@ def test_bodies_that_cannot_move_are_posed(pad):
     data, _ = solved(pad, "sparse", (np.zeros((2, 2, 6, 6)), np.zeros((2, 6))))
     there, _ = solved(pad, "sparse")
     np.testing.assert_allclose(data.wrench, there.wrench, rtol=1e-4, atol=1e-5)
+
+
+@wp.kernel
+def inverted(n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=int)):
+    w, t = wp.tid()
+    bodies._invert(w, t, n, M, pivot)
+
+
+@pytest.mark.parametrize("idle", [[], [0], [1, 3], [0, 1, 2, 3]])
+def test_idle_bodies_are_left_out_of_the_elimination(idle):
+    """1 + S A of four bodies, S zero for those that are idle, against numpy's inverse."""
+    rng, n = np.random.default_rng(0), 24
+    stiffness, compliance = np.zeros((n, n)), (root := rng.normal(size=(n, n))) @ root.T
+    pivot = np.zeros((1, n), int)
+    for g in range(4):
+        own = slice(6 * g, 6 * g + 6)
+        if g in idle:
+            pivot[0, own] = -1
+        else:
+            stiffness[own, own] = (root := rng.normal(size=(6, 6))) @ root.T
+    matrix = np.eye(n) + stiffness @ compliance
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        M, p = wp.array(matrix[None], dtype=real), wp.array(pivot, dtype=int)
+        wp.launch_tiled(inverted, dim=[1], inputs=[n, M, p], block_dim=BLOCK)
+        np.testing.assert_allclose(M.numpy()[0], np.linalg.inv(matrix), atol=1e-10)
