@@ -623,37 +623,43 @@ def test_a_light_stick_gains_nothing_from_open_pgs_rows():
     assert touched >= 2
 
 
+def thin_plate(number):
+    """A plate thrown at the finger under PGS, begun number * 0.1 nm higher: its largest kinetic energy
+    over that at the start, steps that push, and its height and speed at the end."""
+    pos = " ".join(map(repr, [-0.00716, -0.00117, 0.02765 + 1e-10 * number]))
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><option timestep=".003" solver="PGS" iterations="3"/><worldbody>
+        <site name="tip" quat="1 -1 0 0"/>
+        <body pos="{pos}" quat="-0.25046 -0.85244 0.41404 0.19798"><freejoint/>
+        <geom type="box" size="0.00875 0.0119 0.00126" mass="0.00076" friction="0.2"/></body>
+        </worldbody></mujoco>"""
+    )
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier="full")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:3] = 0.074, 0.1209, -1.9015
+    mujoco.mj_forward(model, data)
+    start, most, pushed = kinetic(model, data), 0.0, 0
+    for _ in range(6):
+        mujoco.mj_step(model, data)
+        pushed += np.linalg.norm(handle.read(data, "contact_force")[:3]) > 0.05
+        most = max(most, kinetic(model, data))
+    return most / start, pushed, data.qpos[2], data.qvel[2]
+
+
 @pytest.mark.slow  # quick: a light stick and PGS
 def test_thin_plates_stay_out_of_the_core_with_open_pgs_rows():
     """0.8 g at 1.9 m/s, 6 mm a step: what PGS made of the rows led a round to where nothing touches, and the
     plate went through the skin without a force. Its solves are cut off, and where one ends hangs on 1e-10 m
     of the plate's place, with MuJoCo's Newton solver as well: the median of five."""
-    quat, start = "-0.25046 -0.85244 0.41404 0.19798", np.array([-0.00716, -0.00117, 0.02765])
-    pushes, height, speed, energy = [], [], [], []
-    for number in range(5):
-        pos = " ".join(map(repr, (start + [0, 0, 1e-10 * number]).tolist()))
-        spec = mujoco.MjSpec.from_string(
-            f"""<mujoco><option timestep=".003" solver="PGS" iterations="3"/><worldbody>
-            <site name="tip" quat="1 -1 0 0"/><body pos="{pos}" quat="{quat}"><freejoint/>
-            <geom type="box" size="0.00875 0.0119 0.00126" mass="0.00076" friction="0.2"/></body>
-            </worldbody></mujoco>"""
-        )
-        handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier="full")
-        model = spec.compile()
-        data = mujoco.MjData(model)
-        data.qvel[:3] = 0.074, 0.1209, -1.9015
-        mujoco.mj_forward(model, data)
-        start_energy, most, pushed = kinetic(model, data), 0.0, []
-        for _ in range(6):
-            mujoco.mj_step(model, data)
-            pushed.append(np.linalg.norm(handle.read(data, "contact_force")[:3]))
-            most = max(most, kinetic(model, data))
-        energy.append(most / start_energy)
-        pushes.append(np.sum(np.array(pushed) > 0.05))
-        height.append(data.qpos[2])
-        speed.append(data.qvel[2])
-    assert np.median(energy) < 1.05
-    assert np.median(pushes) >= 2 and np.median(height) > 6.5e-3 and np.median(speed) > -0.3
+    energy, pushes, height, speed = np.median([thin_plate(number) for number in range(5)], axis=0)
+    assert energy < 1.05 and pushes >= 2 and height > 6.5e-3 and speed > -0.3
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="from the first of five places it gains 10 %")
+def test_no_thin_plate_gains_energy_with_open_pgs_rows():
+    assert max(thin_plate(number)[0] for number in range(5)) < 1.05
 
 
 @pytest.mark.parametrize("mass", [0.01, 0.1])
