@@ -258,8 +258,8 @@ class Loads:
         self._data.naconmax, self._data.njmax = room, rows
 
     def write(self, m: "mjw.Model", d: "mjw.Data", batches: list) -> None:
-        """Writes them, when each `Batch` has found what acts; of those that move bodies: by mujoco_warp's own
-        functions on its contacts and those of the skins. Launches only."""
+        """Writes the force quantities, after each `Batch` has computed the forces that act on its bodies.
+        mujoco_warp's own functions evaluate them, on its contacts and those of the skins. Launches only."""
         from mujoco_warp._src import sensor
         from mujoco_warp._src.smooth import rne_postconstraint
 

@@ -217,7 +217,8 @@ class BatchSkin:
         self.release.end()
 
     def come_to_rest(self) -> None:
-        """After `solve_skins`: resets skins without contact, and of worlds that were reset. Launches only."""
+        """Resets the skins that have no contact, and those of worlds that were reset. Call it after
+        `solve_skins`. Launches only."""
         if self.release.possible:
             wp.capture_if(self.release.any, self._put_to_rest)
 

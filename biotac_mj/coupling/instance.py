@@ -275,9 +275,10 @@ class Instance:
 
     @property
     def _may_wait(self):
-        """Whether a solve may be dear, since less was in vain in the last step: the skin did not move on,
-        and nothing that it pushes can give way; or it did not settle against another skin, which gives way as
-        it does: such contact is wide, and what is not solved goes on until cores meet."""
+        """Whether a solve may take `PATIENT` times the work, because the last step failed with less. Either
+        the skin kept its last state and no touching body can move; or it did not converge against another
+        skin: such contacts are wide, and without an equilibrium the skins approach until their cores
+        meet."""
         if not self.two_way:
             return False
         head, models, _, _ = self.parts

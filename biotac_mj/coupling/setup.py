@@ -155,8 +155,8 @@ class Setup:
 
 
 def state_size(model: ModelView, index: int) -> int:
-    """Upper bound of the plugin state of instance `index`, in doubles; MuJoCo asks for it while it compiles
-    the model."""
+    """Upper bound of the size of the plugin state of instance `index`, in doubles. MuJoCo calls this while it
+    compiles the model."""
     global _asked
     forget_notes(model)
     if index <= _asked:

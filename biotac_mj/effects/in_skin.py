@@ -83,7 +83,8 @@ def moduli(
 
 
 def stiffening(c2: float, already: float) -> float:
-    """c2 / c1 of the rubber whose force has an apparent `c2` in addition to the existing one."""
+    """Ratio c2 / c1 of rubber whose force stiffens by the apparent `c2` more than that of rubber with the
+    ratio `already`."""
     return float(np.interp(c2 + np.interp(already, _STIFFENING, _C2), _C2, _STIFFENING))
 
 

@@ -126,7 +126,7 @@ def build_hand(
 
 
 def _ball_before(spec, mount, geometry):
-    """A body without gravity that springs push against the pad of a mounted BioTac, in the BioTac frame."""
+    """Adds a body without gravity, which springs press against the pad of a mounted BioTac."""
     from ..tasks.hands import find_link
 
     model = spec.copy().compile()

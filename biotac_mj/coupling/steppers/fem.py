@@ -27,7 +27,7 @@ __all__ = ["CLEAR", "PATIENT", "FemStepper", "geom_set", "rest_geometry", "share
 
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
-PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
+PATIENT = 4  # times that, for a skin whose last step failed and would fail again
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
 CLEAR = 1e-3
@@ -427,7 +427,7 @@ def skin_settings(config: Config) -> Settings:
 
 
 def _in_time(config, settings):
-    """Two-way, somebody waits for the step, and a body that nothing holds can be met again in the next."""
+    """Settings with a bound on the work of a step for two-way coupling, where the simulation waits for it."""
     rubber, options, modulus = settings
     if config.coupling == "two-way" and "max_work" not in config.options.get("skin", {}):
         options = dataclasses.replace(options, max_work=_allowed(rubber.poissons_ratio))
@@ -435,8 +435,8 @@ def _in_time(config, settings):
 
 
 def _allowed(nu):
-    """Work of a step. What conjugate gradients ask for grows as the square root of how much stiffer volume is
-    than shape; a bound that steps meet in vain saves nothing, and the skin lets go."""
+    """Work of a step. The iterations of conjugate gradients grow as the square root of the ratio of bulk to
+    shear stiffness. A lower bound would save nothing: steps would reach it without an equilibrium."""
     stiffer = max(nu, 0.0) / (1 - 2 * nu)
     return round(_WORK * min(max(stiffer**0.5, 1.0), _MORE))
 

@@ -251,7 +251,7 @@ def find_faces(
     at most [m]."""
     free = reach + ROOT3 * travel
     most = free + ROOT3 * moved
-    if most > _AWAY:  # so far nobody has looked
+    if most > _AWAY:  # not computed yet
         most = real(wp.inf)
         free = most
         near = ALL

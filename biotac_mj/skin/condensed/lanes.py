@@ -259,7 +259,7 @@ MOST_EQUATIONS = 1024  # that `eliminate` has room for
             }}
         }}
     }}
-    // solutions are listed in the last row, whose factors nobody needs any more
+    // the last row, whose factors are no longer needed, stores the solutions
     float* x = a + (long long)(n - 1) * width;
     const float last = x[n - 1];
     for (int k = n; k < width; ++k)

@@ -228,7 +228,7 @@ def find_tangents(
         if room == 1:
             for k in range(t, outer, threads):
                 fraction = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
-                s.vector[w, DU, k] = fraction  # which nobody needs any more
+                s.vector[w, DU, k] = fraction  # no longer needed
                 most = wp.max(most, fraction)
         most = block_max(most)
         solved = int(0)

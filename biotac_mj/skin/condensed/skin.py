@@ -218,8 +218,8 @@ class CondensedSkin:
         return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
 
     def outside(self, pos: np.ndarray, mat: np.ndarray) -> Memory:
-        """State of the skin without contact, with the geoms moved out of it from (ngeom, 3) [m], (ngeom, 3,
-        3)."""
+        """State without contact: geoms at positions (ngeom, 3) [m] and rotations (ngeom, 3, 3) are moved out
+        of the skin."""
         out = self.proximity.outside(pos, mat)
         return self.at_rest(out, mat).memory
 

@@ -269,7 +269,8 @@ class RubberMemory:
         return self.rubber.worst.numpy().copy()
 
     def raise_energy(self, largest_energy: np.ndarray, x: wp.array) -> None:
-        """Raises the largest energy densities of points at x to at least these, after `forget`."""
+        """Raises the points' largest energy densities so far to at least these, at x. Call it after
+        `forget`."""
         if largest_energy.size:
             self.rubber.worst.assign(np.maximum(largest_energy, self.rubber.worst.numpy()))
             self.recall(x)

@@ -66,7 +66,7 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     step = right - left
     size = np.abs(step) / noise / spread
     peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
-    times = np.zeros_like(size)  # elsewhere nobody asks
+    times = np.zeros_like(size)  # not used elsewhere
     times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
     near = maximum_filter1d(size, 3, axis=0)
     log = np.log(np.maximum(near, 1.0))
@@ -226,7 +226,7 @@ def _gains(session, k, since):
     the load from then on, against what the others say of its changes within windows."""
     m = session.model()
     if not m.dimensions or k not in m.used:
-        return ()  # nothing moves: an offset, and a gain that nobody sees
+        return ()  # nothing moves: an offset; a gain would have no effect
     i = int(np.flatnonzero(m.used == k)[0])
     _, moment, floor, middle = m.moments()
     after = middle > since

@@ -117,7 +117,7 @@ def _beside(session, refused, common):
 
 
 def _drifting(session):
-    """Electrodes that drift beside a load: what they do in the held-out rows is not taken out."""
+    """Electrodes that drift while they are loaded. Their drift is not removed from the held-out rows."""
     return frozenset(f.channels[0] for f in session.findings if f.beside_load)
 
 
