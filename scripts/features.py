@@ -385,7 +385,7 @@ to real sensors (docs/lab/real_match.md), rubber, filling and electrodes, on eve
 Rubber that relaxes, and inertia, take their time step from: `mj_step`'s timestep (attach, batch, press),
 `time_s` of an indentation (calibrate, compare; planned ones have 20 ms a sample), 1 / rate (generate), `time`
 of a trajectory (diagnose), shared among the steps between two rows. `skin.step` takes dt, a number or one for
-each world. What comes before the first row takes as long as what comes after it.
+each world. The interval before the first row is as long as the one after it.
 
 `batch.attach(worlds={...})` and `skin.per_world.make_worlds` take (nworld,) numbers by name; `biotac data
 generate

@@ -1,9 +1,9 @@
 """Finds the kernels that a step launches, without launching any, so that they can be compiled beside each
 other. Otherwise Warp compiles each when a step first meets it, and some take a minute.
 
-Of mujoco_warp's, collisions of convex shapes take longest, with one kernel for each pair of types. So these
-come first, and are compiled one level below the compiler's highest. That takes half as long, and a step takes
-as long as before (docs/lab/batch.md)."""
+mujoco_warp's collisions of convex shapes take longest, with one kernel for each pair of types. So these are
+compiled first, one level below the compiler's highest. That takes half as long, and does not slow a step down
+(docs/lab/batch.md)."""
 
 import contextlib
 import threading
@@ -25,9 +25,9 @@ _CONVEX, _LEVEL = "ccd_kernel", 2  # of 3
 def kernels_of_step(
     mjm: mujoco.MjModel, m: "mjw.Model", callback: object | None = None
 ) -> list[tuple[wp.Module, int]]:
-    """Modules of the kernels of a step of the model and of a reset, each with the threads of the blocks that
-    it is launched by, what takes long first: what `skin.program.compile_ahead` takes. What is launched over
-    nothing, which Warp passes over, is left out.
+    """Modules of the kernels of a step of the model and of a reset, each with the block size of its launches,
+    slow ones first: the argument of `skin.program.compile_ahead`. Launches of size zero, which Warp skips,
+    are left out.
 
     Args:
       callback: mujoco_warp's, called instead of the model's; None: none is called.

@@ -1,10 +1,10 @@
-"""Leaves skins at rest alone while nothing reaches them: the plugin's idle skins (`coupled.py`), for all
-worlds at once. Where that holds for every world, none of the skin's kernels runs.
+"""Sleep and wake of skins in all worlds: a skin at rest is not solved until a geom reaches it (the plugin's
+idle skins, `coupled.py`). If the skins of every world sleep, none of their kernels runs.
 
-A skin rests once it has found itself in balance where it was, untouched, and from a reset on. Without inertia
-and memory the next step would find the same, unless something touches the skin or changes it. What is nearer
-than accelerations may bring it in a step wakes the skin at first; where it does not touch any skin of the
-world where the bodies go, nothing is solved in that world."""
+A skin falls asleep after a reset, and once a step without contact has left its equilibrium unchanged. Without
+inertia and memory the next step would find the same, unless something touches or changes the skin. A geom
+that accelerations could bring to the skin in a step wakes it; if no skin of a world is touched at the
+predicted poses of the bodies, nothing is solved in that world."""
 
 import warp as wp
 

@@ -16,7 +16,7 @@ __all__ = ["set_solids"]
 
 def set_solids(mjm: mujoco.MjModel, m: "mjw.Model", core: int, friction: np.ndarray, priority: int) -> None:
     """Gives the geoms of body `core`, and their pairs, the skins' friction (nworld,) and contact priority, as
-    `biotac_mj.attach` does. What is no longer as `add` left it was set by somebody, and stays."""
+    `biotac_mj.attach` does. Values that differ from those of `add` were set by the user, and stay."""
     left = Config()
     solid = np.flatnonzero(mjm.geom_bodyid == core)
     _set(m, "geom_friction", solid, slice(0, 1), np.full(len(solid), left.friction), friction[:, None])

@@ -76,11 +76,11 @@ class Config:
       device: Warp device of the skin.
       options: what the keyword `options` says by part: "skin", "modulus" (a list, or a .npy file), "film",
         "readings" with the sensor in it, "loss", "rounds" and "threads". In two-way coupling a skin is
-        solved 16 times in a step at most where nothing is said. Fewer bound what a step costs; where they do
-        not lead to a balance of bodies and skin, the last model acts. Of several skins in `mj_step`, which
-        are solved together, the largest number counts. So it does of threads, 1 where nothing is said.
-      on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
-        on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
+        solved at most "rounds" times in a step (default: 16). A smaller number limits the cost of a step; if
+        bodies and skin then do not reach an equilibrium, the last model acts. `mj_step` solves several skins
+        together, with the largest of their numbers of rounds and of threads (default: 1).
+      on_error: effect of an exception inside `mj_step`: "warn" warns, keeps it for `plugin.check()` and
+        continues without this skin's force, with status -1; "raise" raises it once MuJoCo has returned.
     """
 
     skin: str = "default"

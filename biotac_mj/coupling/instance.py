@@ -1,8 +1,7 @@
 """One BioTac in one mjData: poses in, skin solved, wrenches and readings out.
 
-What must outlive a step is in `mjData.plugin_state`. All else that an `Instance` holds can be recomputed
-from it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own
-state."""
+The state between steps is in `mjData.plugin_state`. Everything else in an `Instance` can be recomputed from
+it, so mj_getState, mj_copyData, mj_resetData, rollouts and threads work on MuJoCo's own state alone."""
 
 import copy
 import dataclasses

@@ -1,7 +1,7 @@
 """The engine plugin "biotac_mj.skin": MuJoCo's plugin interface, served from Python through ctypes.
 
 MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter
-lock for each call. What they raise comes back by way of `errors`, and the status sensor shows -1."""
+lock for each call. `errors` returns the exceptions that they raise, and the status sensor shows -1."""
 
 import atexit
 import ctypes

@@ -90,7 +90,7 @@ class HeatParameters:
       conductivity: of the rubber [W/(m K)]; capacity: its density times specific heat [J/(m^3 K)].
       gap: liquid to skin at rest [W/(m^2 K)]; film: core to skin where the skin is pressed on it.
       air: skin to air [W/(m^2 K)].
-      contact: skin to body at 10 kPa, over the mean conductivity of the two [1/m] (`contact_conductance`).
+      contact: skin to body at 10 kPa, over the mean conductivity of the two [1/m].
     """
 
     power: float = 0.81

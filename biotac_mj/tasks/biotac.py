@@ -98,7 +98,7 @@ class BioTac(composer.Entity):
             and on_error="raise", which ends the episode with the error of a step ("warn" continues without
             touch).
           keywords: the same by name, see `biotac_mj.attach`. Names of geoms in geoms, rounding, thermal and
-            textures are those of the whole model. Of a list of materials or textures every reset draws one,
+            textures are those of the whole model. Every reset draws one of a list of materials or textures
             from the environment's random state, like sensor="random" and the effects of `randomise`.
 
         Raises:

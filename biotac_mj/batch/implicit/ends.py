@@ -1,6 +1,6 @@
-"""Predicts where the integrator will take the bodies of a batch. Joints move along arcs, while the skin is
-solved along straight lines. `World._arrive` looks after the step; here mujoco_warp's own kernels find the end
-before it integrates, since no callback comes after it."""
+"""Predicts the poses to which the integrator will move the bodies of a batch. Joints move along arcs, while
+the skin is solved along straight lines. mujoco_warp's own kernels find these poses before it integrates,
+since it has no callback after that."""
 
 import copy
 import typing

@@ -59,7 +59,7 @@ def factor(
     L_out: wp.array3d(dtype=real),
 ):
     """Cholesky's factor of the inertia with what constraints now hold, but for a skin's own rows, of which
-    the first of six are `own`; by the threads of a block. Of worlds that are going.
+    the first of six are `own`; by the threads of a block, in worlds that have not finished.
 
     A contact that slides on its elliptic cone holds by its Hessian: `cone` is the first of its rows, or -1
     where it is not known, and `hessian` has a row for each. They have their entries in the same columns."""

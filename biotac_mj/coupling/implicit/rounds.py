@@ -339,8 +339,8 @@ def look(
     r: Rounds,
     going: MarkedWorlds,
 ):
-    """After the first solve: counts it; marks worlds that need a second look, since the bodies do not go
-    where they were thought to go. What else holds them leaves less of a change than their inertia."""
+    """After the first solve: counts it, and marks worlds that need another one, since their bodies do not
+    move as predicted. Other constraints on the bodies make the change smaller than their inertia alone."""
     w = wp.tid()
     if awake[w] == 0:
         return

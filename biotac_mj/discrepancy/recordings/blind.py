@@ -1,4 +1,4 @@
-"""What a plain recording does not tell: effects of the catalogue that ask for what it lacks."""
+"""Effects of the catalogue that a plain recording cannot show, because it lacks data that they require."""
 
 import math
 

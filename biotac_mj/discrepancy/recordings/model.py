@@ -1,9 +1,9 @@
 """The joint model of 19 electrodes: rest + load on few dimensions + what develops over time + noise.
 
 Electrodes and the products of their principal components are one Gaussian (`conditional.py`) whose covariance
-is taken from changes *within* cells of a few seconds, so that nothing slow enters it. Of all directions p the
-true one has the most energy in units of 1 / sqrt(p'P p) (Cauchy-Schwarz), which is how an effect is charged
-to the channel that has it and not to those that feel it through the others."""
+is taken from changes *within* cells of a few seconds, so that nothing slow enters it. The true direction p of
+an effect has the most energy in units of 1 / sqrt(p'P p) (Cauchy-Schwarz). So an effect is assigned to the
+channel that has it, and not to channels that are correlated with it."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
-"""A finding, a verdict, and what verdict.json holds of them (`schema.json`).
+"""Findings, verdicts, and their form in verdict.json (`schema.json`).
 
-What is found in recordings, in trajectories and in presses of a flat plate is a `Verdict` with what only that
-kind of data has; text (`text.py`), page and files (`files.py`) are made from any of them."""
+Diagnoses of recordings, of trajectories and of presses of a flat plate are each a `Verdict` with additions of
+their kind of data. Text (`text.py`), page and files (`files.py`) are made from any of them."""
 
 import base64
 import dataclasses

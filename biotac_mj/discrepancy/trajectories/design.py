@@ -54,8 +54,8 @@ class Separation:
     With x = r_k - r_j what k leaves where j is true, k may still move its parameters, of which `information`
     is known: D = (x'x - g'(L + S'S)^-1 g) / 2 with g = S'x, all sums over contacts.
 
-    unseen: of the first explanation with one more effect each. What no data show yet is as likely as it was
-    before them, so a contact that would show it is worth as much as one that tells names apart."""
+    unseen: of the first explanation with one more effect each. An effect that the data do not show yet keeps
+    its prior probability, so a contact that would show it has the same value as one that separates names."""
 
     def __init__(
         self,

@@ -26,8 +26,8 @@ def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[
     """The contacts of recordings that hold the object's pose, and notes on what was assumed.
 
     Where the sensor's pose is there too, object and force are taken to its frame, else they are in it. A
-    force that pulls in touch is the one on the sensor and is turned round. Of each contact at most 40 rows
-    are kept, evenly by travel and time, behind one on the way there in which nothing touches.
+    force that pulls during contact is that on the sensor, and its sign is changed. At most 40 rows of each
+    contact are kept, evenly by travel and time, after one row of the approach in which nothing touches.
 
     Args:
       skin: whose resting surface tells what is a touch.

@@ -22,10 +22,10 @@ class Comparison:
     """Data against a simulator: trajectories, noise, fields.
 
     The pose error b_i of every trial is marginalised: C_i = diag(sigma^2) + J_i S_b J_i', with J_i the
-    fields' differences (Woodbury, rank 3). What lies in the span of J_i is kept apart from the rest of the
-    residual: three numbers of unit variance, each of which weighs as much as a row. So the scatter of poses
-    is nobody's finding, and an offset that all trials share is evidence. Electrodes are compared about their
-    rest: the mean over all trajectories of row 0.
+    fields' differences (Woodbury, rank 3). The part of the residual in the span of J_i is separated from the
+    rest: three numbers of unit variance, each of which has the weight of a row. So the scatter of poses is
+    not attributed to an effect, and an offset that all trials share is evidence. Electrodes are compared
+    relative to their rest: the mean over all trajectories of row 0.
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
     noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories

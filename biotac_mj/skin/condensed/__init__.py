@@ -4,15 +4,14 @@ Displacements are u = C (s f + c p g): C the inverse of the stiffness at rest, f
 nodes (Coulomb friction) and of inner nodes against the core (normal only), p the liquid's pressure above that
 at rest, g the gradient of its volume at rest, s >= 1 and c <= 1 corrections, fitted to the full FEM
 (`correction`). The liquid's pressure follows in closed form from p = -K (g.u + q) / V0, with q what the exact
-volume of the deformed cavity adds to its linear part. What is left is the contact law f = F(u) over the
-candidates, tens of coordinates, solved by Newton's method with a search along the step (a semi-smooth Newton
-method; the contact law is that of the full skin, `contact.touch_faces`).
+volume of the deformed cavity adds to its linear part. The unknowns that remain are those of the contact law
+f = F(u) over the candidates, tens of coordinates. Newton's method with a line search solves it (a semi-smooth
+Newton method; the contact law is that of the full skin, `contact.touch_faces`).
 
-A block of threads has a skin, which goes its own way through Newton's method without waiting for others; on
-the CPU one thread does the same. `step` is what others use of it, for many worlds or one (`skin`); `way`
-follows the geoms, `balance` has Newton's method and `system` its equations, `candidates` and `results` what
-comes before and after it, `lanes` what the threads of a block do together; `linear` is what they know of a
-model."""
+A block of threads solves a skin, and does not wait for other skins; on the CPU a block is one thread. Other
+packages use `step`, for many worlds, or `skin`, for one. `stepping` moves the geoms, `broadphase` finds the
+candidates, `balance` has Newton's method and `system` its equations, `results` evaluates the equilibrium.
+`lanes` has the linear algebra of a block, and `linear` the constants of a model."""
 
 import typing
 

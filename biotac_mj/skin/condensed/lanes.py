@@ -530,8 +530,8 @@ def sum_rows(  # noqa: F811
     ...
 
 
-# Of sums over rows that are listed: the loads of sixteen rows are under way at once, since one takes long.
-# The order of the sum is the same everywhere.
+# Sums over listed rows load sixteen rows at once, since a load takes long. The order of the sum is the same
+# everywhere.
 _DOT = """
     const int* at = listed.data + (long long)world * listed.shape[1];
     const float* f = factor.data + (long long)world * factor.shape[1];

@@ -152,10 +152,10 @@ def _stays(x, without=(), rows=slice(None)):
 
 
 def _kept(session, k, at, total, jumping):
-    """Share of the jumps of electrode k, at times (s,) [s] to total (s + 1,) [counts], that is there where
-    all others read as they did on the other side of one: of the bins that are matched best, a fifth, at most
-    this much in three quarters. What else is jumping (j,) says nothing of the load: were its jumps taken out,
-    a touch that several electrodes feel alike would stand beside one that none of them felt."""
+    """Fraction of the jumps of electrode k, at times (s,) [s] to total (s + 1,) [counts], that remains where
+    all other electrodes read the same on both sides of a jump: the upper quartile of it over the fifth of the
+    bins that match best. Electrodes `jumping` (j,) are not compared. Removing their jumps instead would match
+    a touch that several electrodes feel with one that none of them felt."""
     r = session.recording
     width = max(1, round(_MATCH * r.rate))
     n = len(session.counts) // width

@@ -53,9 +53,9 @@ class Simulator:
       skin, tier, material: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
       material: may also be a dict of Material's fields or a .json file. sensor: a name as for `biotac press`
-        (None: the design's own) but "random", or a dict of `sensor.presets.Sensor`'s fields, of which rests
-        and noise may be other ones than those of the design's own. Of one that was measured these are
-        taken, and not how it warms up.
+        (None: the design's own) except "random", or a dict of fields of `sensor.presets.Sensor`, whose
+        counts at rest and noise may differ from the design's. A measured sensor supplies these two, but not
+        its warm-up.
       options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`, and "film", see
         `sensor.film.read_film`.
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
