@@ -109,15 +109,20 @@ def test_recording_says_the_steps_and_keeps_their_times(tmp_path, serial_port, c
     plan, out = tmp_path / "protocol.yaml", tmp_path / "r.h5"
     write_protocol(plan, Protocol((Segment("rest", 0.1, 0.3, "air"), Segment("taps", 0.4, 0.6, "pen"))))
     command = ["recording", "record", "--serial", "/dev/x", "--protocol", str(plan), "--out", str(out)]
+    written, times = plan.read_text(), tmp_path / "r_timeline.yaml"
     assert cli.main(command) == 0
+    assert plan.read_text() == written  # a plan serves many recordings
     said = capsys.readouterr().out
     assert STEPS["rest"].line in said and f"against pen: {STEPS['taps'].line}" in said
-    assert f"biotac diagnose {out} --protocol {plan}" in said
-    (one,), timeline = read(out), read_protocol(plan)
+    assert f"biotac diagnose {out} --protocol {times}" in said
+    (one,), timeline = read(out), read_protocol(times)
     assert [s.kind for s in timeline.segments] == ["rest", "taps"] and timeline.segments[1].against == "pen"
     assert timeline.segments[0].start == pytest.approx(0.1, abs=0.09)
     rows = timeline.rows(one.time - one.time[0])
     assert len(rows) == 2 and all(len(some) > 10 for some in rows)
+    out.unlink()
+    assert cli.main(command) == 2  # before it records
+    assert f"{times} is there already: give a new name" in capsys.readouterr().err and not out.exists()
 
 
 def test_a_checkup_is_printed_and_diagnosed_from_the_cli(tmp_path, capsys):

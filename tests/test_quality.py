@@ -608,6 +608,14 @@ def test_what_is_wrong_is_said_of_recordings_in_other_units():
     ]
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_log_in_which_nothing_has_noise_is_read_in_silence():
+    """Eighteen constant columns and one that counts rows: numpy warned of slices that are all NaN."""
+    counts = np.full((300, 19), 3000.0)
+    counts[:, 18] += np.arange(300)
+    assert "never changes" in findings(Recording(np.arange(300) / 450, counts))[-1]
+
+
 def test_a_clock_that_cannot_be_right_misses_no_row(tmp_path):
     """One that leaps is said once; one that starts anew or stands still does not count rows."""
     counts, _, _ = touched(seconds=20)

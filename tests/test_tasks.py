@@ -274,6 +274,7 @@ def test_props_after_the_robot_are_asked_for_by_number():
     with pytest.raises(ValueError, match="2 bodies can touch .* give slots=2 to attach or tasks.BioTac"):
         Props(2, slots=1)
     Props(2, slots=2).close()
+    Props(12).close()  # of themselves there is room for 64
 
 
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -39,7 +39,7 @@ def attach(
 ) -> Handle:
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 
-    Add the objects that it shall touch first: the model gets room for the bodies that are in it now.
+    Objects may come before or after it: there is room for those that are in the model now and for 64 more.
 
         biotac_mj.attach(spec, site="fingertip", skin="coarse", tier="condensed", thermal={"mug": "ceramic"})
 
@@ -49,7 +49,7 @@ def attach(
         world.
       pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame at that site or body.
       prefix: of every name that is added. Give each BioTac of a model its own.
-      slots: how many bodies may touch two-way. None: as many as are in `spec`, and some more.
+      slots: how many bodies may touch two-way. None: as many as are in `spec`, and 64 more.
       settings: what the BioTac is made with, for code that gives the same to several functions: Settings, a
         dict of its fields, or a .json file of them.
       keywords: the same by name, on top of `settings`; `coupling.Settings` says what each may be. Skin:

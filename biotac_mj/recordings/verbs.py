@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 
 from ..arguments import output_file, output_folder, quantity, real, whole
+from ..files import refuse_existing
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -70,10 +71,9 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     )
     v.add_argument(
         "--protocol",
-        type=output_file(".yaml"),
         metavar="FILE.yaml",
-        help="announce the steps of a checkup, from this file if it exists (`biotac checkup`), and "
-        "write their times into it",
+        help="announce the steps of a checkup from this plan (`biotac checkup`); when each was done is "
+        "written beside the recording, as OUT_timeline.yaml",
     )
     v.add_argument("--object", metavar="NAME", help="what touches")
     v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="the recording")
@@ -157,16 +157,17 @@ def _record(args):
     from .inspection import findings
     from .recording import write
 
-    if args.protocol:
-        recordings = _prompted(args)
+    timeline = f"{os.path.splitext(args.out)[0]}_timeline.yaml" if args.protocol else None
+    if timeline:
+        recordings = _prompted(args, timeline)
     else:
         recordings = _recorded(args, args.seconds or 10.0)
     write(args.out, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
     print(f"written: {args.out}; see it with `biotac recording show {args.out}`")
-    if args.protocol:
-        print(f"written: {args.protocol}; next: biotac diagnose {args.out} --protocol {args.protocol}")
+    if timeline:
+        print(f"written: {timeline}; next: biotac diagnose {args.out} --protocol {timeline}")
 
 
 def _recorded(args, seconds):
@@ -177,13 +178,13 @@ def _recorded(args, seconds):
     return record_serial(args.serial, args.baud, seconds, args.columns, args.object)
 
 
-def _prompted(args):
+def _prompted(args, timeline):
     """Records while the steps of the protocol are announced; writes their timeline."""
-    from .protocol import Prompter, Protocol, read_protocol, write_protocol
+    from .protocol import Prompter, read_protocol, write_protocol
 
-    there = os.path.exists(args.protocol)
-    plan = read_protocol(args.protocol) if there else Protocol.planned(args.object or "")
+    plan = read_protocol(args.protocol)
+    refuse_existing(timeline)
     with Prompter(plan, lambda line: print(line, flush=True)) as prompter:
         recordings = _recorded(args, args.seconds or plan.seconds)
-    write_protocol(args.protocol, prompter.timeline(recordings[0].time))
+    write_protocol(timeline, prompter.timeline(recordings[0].time))
     return recordings

@@ -10,6 +10,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
 from .. import plugin
+from ..coupling.config import TO_COME
 from ..coupling.handle import SENSORS
 from ..effects.sensors import take_sensor
 from ..fields import refuse_unknown
@@ -84,7 +85,7 @@ class BioTac(composer.Entity):
     def _build(
         self,
         name="biotac",
-        slots=8,
+        slots=TO_COME,
         noise=True,
         settings=None,
         **keywords,

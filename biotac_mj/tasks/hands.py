@@ -134,7 +134,7 @@ def attach_to_hand(
     and are not drawn. Contact pairs with them are removed: the skin touches their other geom instead.
 
     Args:
-      spec: the MjSpec that holds the hand. Add the objects first, as for `attach`.
+      spec: the MjSpec that holds the hand. With batch=True add the objects first.
       hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, aero_hand, robotiq_2f85: Menagerie's
         models, left or right), or {finger: Mount} for any other. "shadow_hand_authentic" is shadow_hand with
         that variant.
@@ -150,7 +150,7 @@ def attach_to_hand(
         coupling and geoms are then used.
       prefix: each finger's names begin with link_prefix + prefix + finger + "_".
       slots: number of bodies that may touch each BioTac with two-way coupling; None: number of those outside
-        the hand.
+        the hand, and 64 more.
       settings, keywords: as for `biotac_mj.attach`, for every finger (each has its own noise seed).
 
     Returns:
