@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 DESIGNS = ("biotac", "biotac_sp")  # shipped with the package
-MOST_DISCS = 32  # electrodes and excitation: the number of columns of a tile in which the film is solved
+MOST_DISCS = 32  # electrodes and excitation; more were never simulated
 MOST_EXCITATION = 4
 SINGLES = ("pdc", "pac", "tdc", "tac")  # columns of stored counts after the electrodes
 _LEAST_SLOTS = 2  # PAC's, and one channel's

@@ -13,10 +13,10 @@ between b and the electrode's radius a. A sheet is exact only if it is thinner t
 `spreading_resistance` is the additional resistance of a slab of thickness h.
 
 `FilmConduction` holds the constants of one skin and evaluates one deformed skin at a time; `BatchFilm`
-evaluates many on one device. Both launch the kernels of `kernels.py`: distances from the core's triangles and
-the sheet Laplacian. Its Cholesky factor is stored as suits the device (`systems.py`). The solver is direct:
-conjugate gradients would need tens of iterations, since a film pressed to a twentieth of its thickness
-differs much from the one at rest."""
+evaluates many on one device. Both launch two kernels: distances from the core's triangles (`kernels.py`), and
+the sheet's Laplacian with its Cholesky factor (`systems.py`). The solver is direct: conjugate gradients would
+need tens of iterations, since a film pressed to a twentieth of its thickness differs much from the one at
+rest."""
 
 import functools
 import threading
@@ -41,8 +41,8 @@ from biotac_mj.geometry.tet_mesh import connected_cells
 from biotac_mj.launches import recorded
 from biotac_mj.sensor.channels import impedance_from_counts
 from biotac_mj.sensor.film import kernels
-from biotac_mj.sensor.film.kernels import TILE, real, vec3, vec4
-from biotac_mj.sensor.film.systems import BandLayout, SparseLayout, edges
+from biotac_mj.sensor.film.kernels import real, vec3
+from biotac_mj.sensor.film.systems import THREADS, Pattern, edges, make_pattern, solve_sheet
 from biotac_mj.sensor.presets import Sensor, read_sensor
 
 from ...short_repr import short_repr
@@ -189,12 +189,8 @@ class FilmConduction:
         )
 
     @functools.cached_property
-    def _band(self):
-        return BandLayout(self.face, len(self.node))
-
-    @functools.cached_property
-    def _sparse(self):
-        return SparseLayout(self.face, len(self.node), len(self._pos))
+    def _pattern(self):
+        return make_pattern(self.face, len(self.node), self._pair, len(self._pos))
 
     def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Geometry of the film under the skin.
@@ -352,8 +348,6 @@ class BatchFilm:
       film: `FilmConduction` that supplies the constants.
       nworld: number of worlds.
       device: Warp device.
-      band: whether the Laplacian is solved as a band of tiles, else by its sparse factor (CPU only); None:
-        only on CUDA.
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
@@ -365,15 +359,11 @@ class BatchFilm:
       nbytes: device memory of all worlds.
     """
 
-    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
+    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu"):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
         self.design = film.design
         self._record = None  # list that collects launches instead of running them
-        band = self.device.is_cuda if band is None else band
-        layout, n = film._band if band else film._sparse, len(film.node)
-        self._layout = layout
-        electrode, face = film._pair
-        order = np.argsort(electrode, kind="stable")
+        n, (disc, face) = len(film.node), film._pair
         table_step, table = spreading_table()
         geometry = film.geometry
         with wp.ScopedDevice(self.device):
@@ -386,44 +376,34 @@ class BatchFilm:
             self._node = wp.array(film.node, dtype=int)
             self._rest_thickness = wp.array(film._rest_thickness, dtype=real)
             self._face = wp.array(film.face, dtype=wp.vec3i)
-            self._gather = [
-                wp.array(layout.entry, dtype=wp.vec2i),
-                wp.array(layout.sign, dtype=real),
-                wp.array(layout.start, dtype=int),
-                wp.array(layout.slot, dtype=int),
-            ]
+            self._pattern = Pattern()
+            for name, variable in Pattern.vars.items():
+                given = film._pattern[name].astype(np.int32)
+                setattr(self._pattern, name, wp.array(given, dtype=variable.type.dtype))
             self._discs = kernels.Discs()
             self._discs.pos = wp.array(film._pos, dtype=vec3)
             self._discs.tangent = wp.array(film._tangent, dtype=vec3, ndim=2)
-            starts = np.searchsorted(electrode[order], np.arange(len(film._pos) + 1))
+            starts = np.searchsorted(disc, np.arange(len(film._pos) + 1))
             self._discs.pair_start = wp.array(starts, dtype=int)
-            self._discs.pair_face = wp.array(face[order], dtype=int)
+            self._discs.pair_disc = wp.array(disc, dtype=int)
+            self._discs.pair_face = wp.array(face, dtype=int)
             self._discs.sample = wp.array(film._disc, dtype=wp.vec2d)
             self._discs.footprint = film._footprint
-            self._local_network = [
-                wp.array(table, dtype=real),
-                table_step,
-                film.electrode_radius,
-                film._footprint,
-                film.conductivity,
-                wp.array(film.cell_constant[None], dtype=real),
-            ]
+            self._network = kernels.Network()
+            self._network.spreading, self._network.step = wp.array(table, dtype=real), table_step
+            self._network.radius, self._network.footprint = film.electrode_radius, film._footprint
+            self._cell_constant = wp.array(film.cell_constant[None], dtype=real)
             self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=real)
             self.valid = wp.ones(nworld, dtype=int)
             self.middle = wp.zeros((n, nworld), dtype=vec3)
             self.thickness = wp.zeros((n, nworld), dtype=real)
             self.local = wp.zeros((len(film._pos), nworld), dtype=real)
-            self._edge = wp.zeros((3 * len(film.face), nworld), dtype=real)
-            self._quads = wp.zeros((nworld, layout.rows * TILE // 4), dtype=vec4)
-            self._resistance = wp.zeros((nworld, TILE, TILE), dtype=real)
-        self._system = wp.array(
-            ptr=self._quads.ptr,
-            dtype=real,
-            shape=(nworld, layout.rows, TILE),
-            device=self.device,
-            copy=False,
-        )
-        per_world = [self.middle, self.thickness, self.local, self._edge, self._quads, self._resistance]
+            self._given = wp.zeros((nworld, 3 * (len(film.face) + len(face))), dtype=real)
+            self._over = wp.zeros((nworld, len(face)), dtype=int)
+            self._factor = wp.zeros((nworld, len(film._pattern["entry"]) - 1), dtype=real)
+            self._trial = wp.zeros_like(self.impedance)
+        of_film = [self.middle, self.thickness, self.local]
+        per_world = [*of_film, self._given, self._over, self._factor, self._trial]
         self.nbytes = sum(array.capacity for array in per_world)
 
     def calibrate(self, x: wp.array) -> None:
@@ -441,7 +421,7 @@ class BatchFilm:
             raise NoFilmError(f"no liquid film over an electrode in world {world} at rest: take less filling")
         own = self.film.cell_constant * self.rest / self.impedance.numpy()
         with wp.ScopedDevice(self.device):
-            self._local_network[-1] = wp.array(own, dtype=real)
+            self._cell_constant = wp.array(own, dtype=real)
             self.impedance.assign(np.tile(self.rest, (self.nworld, 1)))
 
     def lay(self, x: wp.array, due: wp.array) -> None:
@@ -475,17 +455,10 @@ class BatchFilm:
           ValueError: an array is on another device.
         """
         self.lay(x, due)
-        layout, surface, system = self._layout, [self.middle, self.thickness], self._system
-        sheet = [due, self._face, self.film.conductivity, *surface]
-        self._launch(kernels.face_conductance, (len(self._face), self.nworld), sheet, [self._edge])
-        self._launch(kernels.clear_system, self._quads.shape, [due], [self._quads])
-        entries = len(layout.entry), self.nworld
-        self._launch(kernels.assemble, entries, [due, *self._gather, self._edge], [system])
-        discs = [due, self._discs, self._face, layout.rhs, *surface]
-        self._launch(kernels.cover_discs, self.local.shape, discs, [system, self.local])
-        layout.solve(self._launch, due, system, self._resistance)
-        network = [due, self._resistance, self.local, *self._local_network]
-        self._launch(kernels.driving_point, self.nworld, network, [self.impedance, self.valid])
+        known = [due, self._face, self.film.conductivity, self._discs, self._network, self._pattern]
+        known += [self._cell_constant, self.middle, self.thickness]
+        found = [self._given, self._over, self.local, self._factor, self._trial, self.impedance, self.valid]
+        self._launch(solve_sheet, self.nworld, known, found, wp.launch_tiled, THREADS)
 
     def recorded(self, x: wp.array, due: wp.array) -> list[Callable[[], None]]:
         """The launches of `solve_film` with these arrays as functions (CPU). Packing the arguments once saves

@@ -1,35 +1,29 @@
-"""Kernels of `conduction.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item,
-world], except tiles.
-
-A world's system is an array of rows of TILE numbers: its Laplacian in a layout of `systems.py`, followed by
-the right-hand sides, one column for each disc."""
+"""Film over the core, and functions of a world's thread for `systems.py`: sheet, discs, network. Arrays over
+worlds are [item, world], but those of the linear system [world, item]."""
 
 import warp as wp
 
 from biotac_mj.geometry.core_surface import Core, NearestTriangles, nearest_listed_on_core
-from biotac_mj.geometry.design import MOST_DISCS, MOST_EXCITATION
+from biotac_mj.geometry.design import MOST_EXCITATION
 
 __all__ = [
     "NSAMPLE",
-    "TILE",
-    "assemble",
-    "clear_system",
-    "cover_discs",
+    "Discs",
+    "Network",
     "driving_point",
     "face_conductance",
     "film_surface",
+    "samples_over",
+    "weights_over",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
 NSAMPLE = 24  # sample points of equal area on a disc
-TILE = MOST_DISCS  # rows of a tile, and columns of right-hand sides: the discs, padded
 # barycentric tolerance for a sample on an edge: both faces accept it under rounding
 _ON_EDGE = 1e-9
 real = wp.float64
 vec3 = wp.vec3d
-vec4 = wp.vec4d
-samples = wp.types.vector(NSAMPLE, int)
 grounded = wp.types.vector(MOST_EXCITATION, wp.float64)
 
 # `rough_thickness`, `sheet_scale` and `near_resistance` also run on tensors, for gradients
@@ -100,200 +94,157 @@ def film_surface(
     thickness_out[i, w] = thickness
 
 
-@wp.kernel
+@wp.func
 def face_conductance(
-    # In:
-    due: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
+    corner: wp.vec3i,
+    w: int,
     conductivity: real,
     middle: wp.array2d(dtype=vec3),
     thickness: wp.array2d(dtype=real),
-    # Out:
-    edge_out: wp.array2d(dtype=real),
 ):
-    """Conductance times cot / 2 of the angle opposite each edge, [3 face + corner, world]."""
-    f, w = wp.tid()
-    if due[w] == 0:
-        return
-    t = face[f]
-    e0 = middle[t[2], w] - middle[t[1], w]
-    e1 = middle[t[0], w] - middle[t[2], w]
-    e2 = middle[t[1], w] - middle[t[0], w]
+    """Conductance of a face times cot / 2 of the angle opposite each edge."""
+    e0 = middle[corner[2], w] - middle[corner[1], w]
+    e1 = middle[corner[0], w] - middle[corner[2], w]
+    e2 = middle[corner[1], w] - middle[corner[0], w]
     area = wp.length(wp.cross(e0, e1))
     # keeps a degenerate face finite
     area = wp.max(area, real(1.0e-6) * (wp.length_sq(e0) + wp.length_sq(e1) + wp.length_sq(e2)))
-    scale = sheet_scale(conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area)
-    edge_out[3 * f, w] = -scale * wp.dot(e1, e2)
-    edge_out[3 * f + 1, w] = -scale * wp.dot(e2, e0)
-    edge_out[3 * f + 2, w] = -scale * wp.dot(e0, e1)
-
-
-@wp.kernel
-def clear_system(
-    # In:
-    due: wp.array(dtype=int),
-    # Out:
-    quads_out: wp.array2d(dtype=vec4),
-):
-    """Clears the systems of the worlds that are due, four numbers per thread."""
-    w, i = wp.tid()
-    if due[w] != 0:
-        quads_out[w, i] = vec4()
-
-
-@wp.kernel
-def assemble(
-    # In:
-    due: wp.array(dtype=int),
-    entry: wp.array(dtype=wp.vec2i),
-    sign: wp.array(dtype=real),
-    start: wp.array(dtype=int),
-    slot: wp.array(dtype=int),
-    edge: wp.array2d(dtype=real),
-    # Out:
-    system_out: wp.array3d(dtype=real),
-):
-    """Sums the Laplacian's entries over the faces' edges; padding has a unit diagonal."""
-    e, w = wp.tid()
-    if due[w] == 0:
-        return
-    total = real(0.0)
-    for k in range(start[e], start[e + 1]):
-        total += edge[slot[k], w]
-    value = sign[e] * total
-    if start[e] == start[e + 1]:
-        value = real(1.0)
-    if e == 0:
-        # fixes the free constant; no current flows through it, so the impedances do not depend on it
-        value = real(2.0) * value
-    system_out[w, entry[e][0], entry[e][1]] = value
-
-
-@wp.func
-def _where_on_disc(q: vec3, pos: vec3, tangent1: vec3, tangent2: vec3):
-    return wp.vec2d(wp.dot(q - pos, tangent1), wp.dot(q - pos, tangent2))
+    total = thickness[corner[0], w] + thickness[corner[1], w] + thickness[corner[2], w]
+    return -sheet_scale(conductivity, total, area) * vec3(wp.dot(e1, e2), wp.dot(e2, e0), wp.dot(e0, e1))
 
 
 @wp.struct
 class Discs:
-    """Electrodes as discs: where current enters the sheet."""
+    """Electrodes as discs, where current enters the sheet. A pair is a disc and a face that may lie over
+    it."""
 
     pos: wp.array(dtype=vec3)  # (ndisc,) centres [m]
     tangent: wp.array2d(dtype=vec3)  # (ndisc, 2) axes
-    pair_start: wp.array(dtype=int)  # (ndisc + 1,) range of each disc in pair_face
-    pair_face: wp.array(dtype=int)  # candidate faces
+    pair_start: wp.array(dtype=int)  # (ndisc + 1,) range of each disc in the pairs
+    pair_disc: wp.array(dtype=int)
+    pair_face: wp.array(dtype=int)
     sample: wp.array(dtype=wp.vec2d)  # (NSAMPLE,) points on a disc [m]
     footprint: real  # radius [m]
 
 
-@wp.kernel
-def cover_discs(
-    # In:
-    due: wp.array(dtype=int),
+@wp.func
+def _where_on_disc(discs: Discs, e: int, q: vec3):
+    off = q - discs.pos[e]
+    return wp.vec2d(wp.dot(off, discs.tangent[e, 0]), wp.dot(off, discs.tangent[e, 1]))
+
+
+@wp.func
+def _on_disc(k: int, w: int, discs: Discs, face: wp.array(dtype=wp.vec3i), middle: wp.array2d(dtype=vec3)):
+    """Corners of a pair's face in the disc's plane, as rows."""
+    e = discs.pair_disc[k]
+    t = face[discs.pair_face[k]]
+    return wp.matrix_from_rows(
+        _where_on_disc(discs, e, middle[t[0], w]),
+        _where_on_disc(discs, e, middle[t[1], w]),
+        _where_on_disc(discs, e, middle[t[2], w]),
+    )
+
+
+@wp.func
+def _barycentric(corner: wp.types.matrix((3, 2), wp.float64), p: wp.vec2d):
+    e1 = corner[1] - corner[0]
+    e2 = corner[2] - corner[0]
+    d = p - corner[0]
+    area = e1[0] * e2[1] - e1[1] * e2[0]
+    u = (d[0] * e2[1] - d[1] * e2[0]) / area
+    v = (e1[0] * d[1] - e1[1] * d[0]) / area
+    return vec3(real(1.0) - u - v, u, v)
+
+
+@wp.func
+def samples_over(
+    k: int, w: int, discs: Discs, face: wp.array(dtype=wp.vec3i), middle: wp.array2d(dtype=vec3)
+):
+    """The samples over which a pair's face lies, as bits."""
+    corner = _on_disc(k, w, discs, face, middle)
+    low = wp.min(corner[0], wp.min(corner[1], corner[2]))
+    high = wp.max(corner[0], wp.max(corner[1], corner[2]))
+    over = int(0)
+    if wp.max(low[0], low[1]) <= discs.footprint and wp.min(high[0], high[1]) >= -discs.footprint:
+        for i in range(NSAMPLE):
+            if wp.min(_barycentric(corner, discs.sample[i])) >= real(-_ON_EDGE):
+                over |= 1 << i
+    return over
+
+
+@wp.func
+def weights_over(
+    k: int,
+    w: int,
     discs: Discs,
     face: wp.array(dtype=wp.vec3i),
-    rhs: int,
     middle: wp.array2d(dtype=vec3),
-    thickness: wp.array2d(dtype=real),
-    # Out:
-    system_out: wp.array3d(dtype=real),
-    local_out: wp.array2d(dtype=real),
+    over: wp.array2d(dtype=int),
 ):
-    """Mean over each disc as weights of nodal values (columns of the right-hand side, from row `rhs` on), and
-    mean thickness [disc, world]."""
-    e, w = wp.tid()
-    if due[w] == 0:
-        return
-    hits = samples()
-    covered = int(0)
-    local = real(0.0)
-    for sweep in range(2):  # count the faces over each sample, then divide its weight
-        for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
-            t = face[discs.pair_face[k]]
-            a = _where_on_disc(middle[t[0], w], discs.pos[e], discs.tangent[e, 0], discs.tangent[e, 1])
-            b = _where_on_disc(middle[t[1], w], discs.pos[e], discs.tangent[e, 0], discs.tangent[e, 1])
-            c = _where_on_disc(middle[t[2], w], discs.pos[e], discs.tangent[e, 0], discs.tangent[e, 1])
-            low = wp.min(a, wp.min(b, c))
-            high = wp.max(a, wp.max(b, c))
-            if wp.max(low[0], low[1]) <= discs.footprint and wp.min(high[0], high[1]) >= -discs.footprint:
-                e1 = b - a
-                e2 = c - a
-                area = e1[0] * e2[1] - e1[1] * e2[0]
-                for i in range(NSAMPLE):
-                    d = discs.sample[i] - a
-                    u = (d[0] * e2[1] - d[1] * e2[0]) / area
-                    v = (e1[0] * d[1] - e1[1] * d[0]) / area
-                    if wp.min(wp.min(u, v), real(1.0) - u - v) >= real(-_ON_EDGE):
-                        if sweep == 0:
-                            if hits[i] == 0:
-                                covered += 1
-                            hits[i] += 1
-                        else:
-                            weight = real(1.0) / real(hits[i] * covered)
-                            system_out[w, rhs + t[0], e] = (
-                                system_out[w, rhs + t[0], e] + (real(1.0) - u - v) * weight
-                            )
-                            system_out[w, rhs + t[1], e] = system_out[w, rhs + t[1], e] + u * weight
-                            system_out[w, rhs + t[2], e] = system_out[w, rhs + t[2], e] + v * weight
-                            mean = (
-                                (real(1.0) - u - v) * thickness[t[0], w]
-                                + u * thickness[t[1], w]
-                                + v * thickness[t[2], w]
-                            )
-                            local += weight * mean
-    local_out[e, w] = local  # zero if no film is over the disc
+    """Weights of the corners of a pair's face in the mean over its disc. Faces over one sample share it."""
+    weights = vec3()
+    if over[w, k] != 0:
+        e = discs.pair_disc[k]
+        corner = _on_disc(k, w, discs, face, middle)
+        covered = int(0)
+        for n in range(discs.pair_start[e], discs.pair_start[e + 1]):
+            covered |= over[w, n]
+        ncovered = int(0)
+        for i in range(NSAMPLE):
+            ncovered += (covered >> i) & 1
+        for i in range(NSAMPLE):
+            if ((over[w, k] >> i) & 1) == 1:
+                hits = int(0)
+                for n in range(discs.pair_start[e], discs.pair_start[e + 1]):
+                    hits += (over[w, n] >> i) & 1
+                weights += _barycentric(corner, discs.sample[i]) / real(hits * ncovered)
+    return weights
 
 
-@wp.kernel
+@wp.struct
+class Network:
+    """Resistance near a disc that the mesh does not resolve, see `near_resistance`."""
+
+    spreading: wp.array(dtype=real)
+    step: real
+    radius: real
+    footprint: real
+
+
+@wp.func
 def driving_point(
-    # In:
-    due: wp.array(dtype=int),
-    resistance: wp.array3d(dtype=real),
+    e: int,
+    w: int,
+    n: int,
+    place: wp.array2d(dtype=int),
+    factor: wp.array2d(dtype=real),
     local: wp.array2d(dtype=real),
-    spreading: wp.array(dtype=real),
-    spreading_step: real,
-    radius: real,
-    footprint: real,
+    network: Network,
     conductivity: real,
-    cell_constant: wp.array2d(dtype=real),
-    # Out:
-    impedance_out: wp.array2d(dtype=real),
-    valid_out: wp.array(dtype=int),
 ):
-    """Impedance of each sensing disc against the grounded ones, [world, electrode]. If the film cannot be
-    solved, the last values stay."""
-    w = wp.tid()
-    if due[w] == 0:
-        return
-    n = impedance_out.shape[1]
-    m = local.shape[0] - n
+    """Impedance of a sensing disc, of n, against the grounded ones. The sheet's resistances are - factor at
+    `place`."""
+    m = place.shape[0] - n
     # of the grounded electrodes among themselves; those that are not there stay apart
     among = wp.identity(n=MOST_EXCITATION, dtype=real)
     one = grounded()
+    into = grounded()
     for i in range(m):
         for j in range(m):
-            among[i, j] = resistance[w, n + i, n + j]
-        near = near_resistance(local[n + i, w], spreading, spreading_step, radius, footprint, conductivity)
-        among[i, i] = among[i, i] + near
+            among[i, j] = -factor[w, place[n + i, n + j]]
+        among[i, i] = among[i, i] + _near(local[n + i, w], network, conductivity)
         one[i] = real(1.0)
+        into[i] = -factor[w, place[n + i, e]]
     inverse = wp.inverse(among)
     equal = inverse * one  # currents of equal potentials
-    for sweep in range(2):  # check all, then write
-        for e in range(n):
-            z = resistance[w, e, e] + near_resistance(
-                local[e, w], spreading, spreading_step, radius, footprint, conductivity
-            )
-            into = grounded()
-            for i in range(m):
-                into[i] = resistance[w, n + i, e]
-            # their common potential, at which they take the whole current
-            potential = (wp.dot(equal, into) - real(1.0)) / wp.dot(equal, one)
-            z -= wp.dot(into, inverse * (into - potential * one)) + potential
-            z = cell_constant[w % cell_constant.shape[0], e] * z
-            if sweep == 0:
-                if not (z > real(0.0) and z < real(1.0e12)):
-                    valid_out[w] = 0
-                    return
-            else:
-                impedance_out[w, e] = z
-    valid_out[w] = 1
+    # their common potential, at which they take the whole current
+    potential = (wp.dot(equal, into) - real(1.0)) / wp.dot(equal, one)
+    z = _near(local[e, w], network, conductivity) - factor[w, place[e, e]]
+    return z - wp.dot(into, inverse * (into - potential * one)) - potential
+
+
+@wp.func
+def _near(thickness: real, network: Network, conductivity: real):
+    return near_resistance(
+        thickness, network.spreading, network.step, network.radius, network.footprint, conductivity
+    )

@@ -1,26 +1,47 @@
-"""Storage and solution of the film's Laplacian: a band of tiles, one thread block per world (CUDA), or a
-sparse factor, one world after the other (CPU). Both are direct, in double precision, and give W' A^-1 W for
-the discs W.
+"""The film's linear system: its Laplacian A with the discs' weights W as further rows, eliminated by
+Cholesky's method down to -W' A^-1 W. Direct, in double precision. The pattern and the order of elimination
+are those of the skin's mesh: all worlds share them."""
 
-A layout gives the row and column of each entry of A in a world's system [row, TILE] (`entry`), the edges of
-faces that each entry sums (`slot`, `start`, `sign`), and the first row of the right-hand sides, which have
-one row per node and one column per disc (`rhs`)."""
-
-from collections.abc import Callable
+import functools
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from biotac_mj.sensor.film.kernels import TILE, real
+from biotac_mj.sensor.film.kernels import (
+    Discs,
+    Network,
+    driving_point,
+    face_conductance,
+    real,
+    samples_over,
+    vec3,
+    weights_over,
+)
 
-__all__ = ["BandLayout", "SparseLayout", "edges"]
+__all__ = ["THREADS", "Pattern", "edges", "make_pattern", "solve_sheet"]
 
 wp.set_module_options({"enable_backward": False})
 
-_LANES = 8  # SIMD width in numbers
-_THREADS = 128  # of a block that solves a band
+THREADS = 512  # of the block that solves a world's film
+_LANES = 8  # that sum an entry on CUDA
+
+
+@wp.struct
+class Pattern:
+    """Entries of the factor, column by column in the order of elimination. A world keeps them row by row, so
+    that what is multiplied lies side by side.
+
+    Columns of one level do not change each other. The last level has the discs' rows among themselves.
+    """
+
+    level: wp.array(dtype=int)  # first entry of each level
+    # of each entry: its place, that of its column's diagonal (-1: is not eliminated), its first slot and run
+    entry: wp.array(dtype=wp.vec4i)
+    slot: wp.array(dtype=int)  # numbers that sum to the entry, but for the sign of those beside the diagonal
+    run: wp.array(dtype=wp.vec3i)  # products to subtract: places of the first factors, and how many
+    disc: wp.array2d(dtype=int)  # place of each entry of -W' A^-1 W
 
 
 def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -28,97 +49,72 @@ def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.roll(face, -1, axis=1).ravel(), np.roll(face, -2, axis=1).ravel()
 
 
-def _sums(face, n):
-    """Entries of A: row <= column (nentry,) each, and for each the list of slots (3 face + corner) that it
-    sums."""
+def make_pattern(face: np.ndarray, n: int, pair: tuple[np.ndarray, np.ndarray], ndisc: int) -> dict:
+    """Arrays of `Pattern`.
+
+    Args:
+      face: (m, 3) of nodes. n: nodes. pair: disc and face (k,) each of those that may lie over each other.
+      ndisc: number of discs.
+
+    Slots of edges are 3 face + corner, those of the discs' weights 3 (m + k) + corner.
+    """
     i, j = edges(face)
-    low, high = np.minimum(i, j), np.maximum(i, j)
-    # a diagonal entry sums all edges at its node
-    keys = np.concatenate([low * (n + 1), high * (n + 1), low * n + high])
-    used, number = np.unique(keys, return_inverse=True)
-    order = np.argsort(number, kind="stable")
-    slot = np.split(np.tile(np.arange(len(low)), 3)[order], np.cumsum(np.bincount(number))[:-1])
-    return used // n, used % n, slot
+    which, over = pair
+    # an entry on the diagonal sums all edges at its node; once more at node 0, which fixes the free constant:
+    # no current flows through that, so the impedances do not depend on it
+    first, own = np.arange(len(i)), np.flatnonzero((i == 0) | (j == 0))
+    row = np.concatenate([i, i, j, np.zeros(len(own), int), np.repeat(n + which, 3)])
+    column = np.concatenate([j, i, j, np.zeros(len(own), int), face[over].ravel()])
+    slot = np.concatenate([first, first, first, own, len(i) + np.arange(3 * len(over))])
 
+    place = np.arange(n + ndisc)
+    place[_minimum_degree(row[row < n], column[row < n], n)] = np.arange(n)
+    low, high = np.minimum(place[row], place[column]), np.maximum(place[row], place[column])
+    a, b = np.tril_indices(ndisc)
+    start, rows = _fill(np.concatenate([low, n + b]), np.concatenate([high, n + a]), n + ndisc)
+    columns = np.repeat(np.arange(n + ndisc), np.diff(start))
 
-class BandLayout:
-    """Tiles of the band; the lower ones are stored transposed under their column's diagonal.
+    # a column's parent is the first row below its diagonal; leaves are of level 0
+    level = np.zeros(n + ndisc, int)
+    for k in range(n):
+        parent = rows[start[k] + 1]
+        level[parent] = max(level[parent], level[k] + 1)
+    level[n:] = level.max()
 
-    Args:
-      face: (m, 3) of nodes in an order of small bandwidth. n: nodes.
+    order = np.lexsort((rows, columns, level[columns]))
+    number = np.full((n + ndisc, n + ndisc), -1)
+    number[rows[order], columns[order]] = np.arange(len(rows))
+    at = np.empty(len(rows), int)
+    at[np.lexsort((columns, rows))] = np.arange(len(rows))
+    pivot = np.where(columns < n, at[start[columns]], -1)
 
-    Attributes:
-      entry (nentry, 2): row and column in a world's system; entry 0 is the first diagonal. sign (nentry,),
-        start (nentry + 1,), slot: edges of faces (3 face + corner) that each entry sums, none for padding.
-      rhs: first row of the right-hand sides. rows: of the system in all.
-    """
+    # the entry (high, low) loses the product of the entries of both rows in each column that has both
+    changed, left, right = [], [], []
+    triangle = functools.cache(np.tril_indices)
+    for k in range(n):
+        below = slice(start[k] + 1, start[k + 1])
+        a, b = triangle(int(start[k + 1] - start[k] - 1))
+        changed.append(number[rows[below][a], rows[below][b]])
+        left.append(at[below][a])
+        right.append(at[below][b])
+    changed, left, right = (np.concatenate(one) for one in (changed, left, right))
+    sort = np.argsort(changed.astype(np.int64) * len(rows) + right)
+    changed, left, right = changed[sort], left[sort], right[sort]
+    begins = (np.diff(changed, prepend=-1) != 0) | (np.diff(left, prepend=-1) != 1)
+    begins = np.flatnonzero(begins | (np.diff(right, prepend=-1) != 1))
+    length = np.diff(begins, append=len(changed))
 
-    def __init__(self, face: np.ndarray, n: int):
-        row, column, slot = _sums(face, n)
-        self._nblock = -(-n // TILE)
-        self._reach = max(int((column // TILE - row // TILE).max()), 1)
-        padding = np.arange(n, self._nblock * TILE)
-        row, column = np.concatenate([row, padding]), np.concatenate([column, padding])
-        slot += [np.zeros(0, int)] * len(padding)
-        # Cholesky's factor of a diagonal tile also needs its lower triangle
-        within = np.flatnonzero((column // TILE == row // TILE) & (row != column))
-        row, column = np.concatenate([row, column[within]]), np.concatenate([column, row[within]])
-        slot += [slot[k] for k in within]
-        self.slot, self.start = np.concatenate(slot), np.cumsum([0, *map(len, slot)])
-        self.sign = np.where(row == column, 1.0, -1.0)
-        block, down = row // TILE, column // TILE - row // TILE
-        self.entry = np.stack([(block * (self._reach + 1) + down) * TILE + row % TILE, column % TILE], axis=1)
-        self.rhs = self._nblock * (self._reach + 1) * TILE
-        self.rows = self.rhs + self._nblock * TILE
-
-    def solve(self, launch: Callable, due: wp.array, system: wp.array, resistance: wp.array) -> None:
-        """Resistance (nworld, TILE, TILE) of the worlds that are due; overwrites the system."""
-        band = [due, self._nblock, self._reach, system]
-        launch(solve_band, [system.shape[0]], band, [resistance], wp.launch_tiled, _THREADS)
-
-
-class SparseLayout:
-    """Columns of the sparse factor one after the other, in minimum-degree order, which needs a twentieth of
-    the band's operations.
-
-    Args:
-      face, n: as for `BandLayout`. columns: number of right-hand sides.
-
-    Attributes: as for `BandLayout`.
-    """
-
-    def __init__(self, face: np.ndarray, n: int, columns: int):
-        row, column, slot = _sums(face, n)
-        self._n, self._columns = n, columns
-        self._order = _minimum_degree(row, column, n)
-        place = np.empty(n, int)
-        place[self._order] = np.arange(n)
-        low, high = np.minimum(place[row], place[column]), np.maximum(place[row], place[column])
-        self._start, self._row = _fill(low, high, n)
-        key = np.repeat(np.arange(n), np.diff(self._start)) * n + self._row
-        at = np.searchsorted(key, low * n + high)
-        self.slot, self.start = np.concatenate(slot), np.cumsum([0, *map(len, slot)])
-        self.sign = np.where(row == column, 1.0, -1.0)
-        self.entry = np.stack([at // TILE, at % TILE], axis=1)
-        self.rhs = -(-len(self._row) // TILE)
-        self.rows = self.rhs + n + -(-n // TILE)  # and a column of scratch
-        # entries left of the diagonal, row by row: their place in their column, and its end
-        of = np.repeat(np.arange(n), np.diff(self._start))
-        left = np.argsort(self._row, kind="stable")
-        left = left[of[left] != self._row[left]]
-        self._left_start = np.searchsorted(self._row[left], np.arange(n + 1))
-        self._left = np.stack([left, self._start[of[left] + 1]], axis=1)
-        self._kept = None
-
-    def solve(self, launch: Callable, due: wp.array, system: wp.array, resistance: wp.array) -> None:
-        """As `BandLayout.solve`, on the CPU."""
-        if self._kept is None:
-            lists = self._start, self._row, self._order[self._row], self._left_start
-            with wp.ScopedDevice("cpu"):
-                self._kept = [wp.array(a.astype(np.int32), dtype=int) for a in lists]
-                self._kept.append(wp.array(self._left.astype(np.int32), dtype=wp.vec2i))
-        sizes = [self._columns, self._n, self.rhs]
-        launch(solve_sparse, system.shape[0], [due, *sizes, *self._kept, system], [resistance])
+    owner = number[high, low]
+    sort, every = np.argsort(owner, kind="stable"), np.arange(len(rows) + 1)
+    firsts = np.searchsorted(owner[sort], every), np.searchsorted(changed[begins], every)
+    entry = [np.append(at[order], 0), np.append(pivot[order], 0), *firsts]
+    return {
+        "level": np.append(np.searchsorted(level[columns[order]], np.arange(level.max() + 1)), len(rows)),
+        "entry": np.stack(entry, axis=1),
+        "slot": slot[sort],
+        "run": np.stack([left[begins], right[begins], length], axis=1),
+        "disc": at[order][np.maximum(number[n:, n:], number[n:, n:].T)],
+    }
 
 
 def _minimum_degree(row, column, n):
@@ -151,266 +147,146 @@ def _fill(low, high, n):
     return np.cumsum([0, *map(len, columns)]), np.concatenate(columns)
 
 
-# For each tile along the diagonal: factor the tile, solve for the tiles right of it and its right-hand sides,
-# and update the tiles further on. One thread block per world on CUDA, one thread elsewhere. Warp's own tiles
-# do the same, but take CUDA over a minute to compile. A pivot that is not positive leaves nan, which marks
-# the film invalid. On CUDA one warp factors a tile, one row per lane in registers: a block would wait at two
-# barriers for each column. Products use tensor cores, which have double precision from sm_80 on.
-_SOLVE_BAND = (
-    """
+# An entry is summed by some lanes of a warp on CUDA, where a world is a block of threads, else by one thread.
+# A pivot that is not positive leaves nan, which marks the film invalid.
+_ELIMINATE = """
 #if defined(__CUDA_ARCH__)
-    #define SHARED __shared__
-    #define TOGETHER __syncthreads();
-    const int t = threadIdx.x, threads = THREADS;
+    const int lanes = LANES, thread = threadIdx.x, threads = blockDim.x;
 #else
-    #define SHARED
-    #define TOGETHER
-    const int t = 0, threads = 1;
+    typedef double quad __attribute__((vector_size(32), aligned(8)));
+    const int lanes = 1, thread = 0, threads = 1;
 #endif
-    const int size = TILE * TILE, kept = 4;
-    // rows of tiles that are kept are so far apart that four of them lie in different banks
-    SHARED double factor[TILE * PITCH], inverse[TILE], tile[kept][TILE * PITCH];
-    double* base = system.data + (long long)world * system.shape[1] * TILE;
-    double* rhs = base + (long long)nblock * (reach + 1) * size;
-    double* out = resistance.data + (long long)world * size;
-    for (int i = t; i < size; i += threads) out[i] = 0.0;
-    for (int k = 0; k < nblock; ++k) {
-        double* first = base + (long long)k * (reach + 1) * size;
-        const int beside = reach < nblock - 1 - k ? reach : nblock - 1 - k;
-        TOGETHER
-        // factor[c][r] is the factor's entry (r, c)
+    const double* summand = given.data + (long long)world * given.shape[1];
+    double* value = factor.data + (long long)world * factor.shape[1];
+    const int part = thread % lanes, together = threads / lanes;
+    for (int l = 0; l + 1 < level.shape[0]; ++l) {
+        const int begin = level.data[l], end = level.data[l + 1];
+        for (int first = begin; first < end; first += together) {
+            const int e = first + thread / lanes;
+            double sum = 0.0;
+            int place = 0, pivot = 0;
+            if (e < end) {
+                const auto own = entry.data[e], next = entry.data[e + 1];
+                place = own.c[0];
+                pivot = own.c[1];
+                for (int k = own.c[2] + part; k < next.c[2]; k += lanes) sum += summand[slot.data[k]];
+                if (place != pivot) sum = -sum;
+#if !defined(__CUDA_ARCH__)
+                quad four = {};
+#endif
+                for (int r = own.c[3]; r < next.c[3]; ++r) {
+                    const auto at = run.data[r];
+                    const double *a = value + at.c[0], *b = value + at.c[1];
+                    int k = part;
+#if !defined(__CUDA_ARCH__)
+                    for (; k + 4 <= at.c[2]; k += 4) four -= *(const quad*)(a + k) * *(const quad*)(b + k);
+#endif
+                    for (; k < at.c[2]; k += lanes) sum -= a[k] * b[k];
+                }
+#if !defined(__CUDA_ARCH__)
+                sum += (four[0] + four[1]) + (four[2] + four[3]);
+#endif
+            }
 #if defined(__CUDA_ARCH__)
-        if (t < TILE) {
-            double own[TILE];
-            #pragma unroll
-            for (int c = 0; c < TILE; ++c) own[c] = first[c * TILE + t];
-            #pragma unroll
-            for (int c = 0; c < TILE; ++c) {
-                const double pivot = 1.0 / sqrt(__shfl_sync(0xffffffffu, own[c], c));
-                const double entry = own[c] * pivot;
-                factor[c * PITCH + t] = entry;
-                if (t == c) inverse[c] = pivot;
-                __syncwarp();
-                #pragma unroll
-                for (int d = c + 1; d < TILE; ++d) own[d] -= entry * factor[c * PITCH + d];
-            }
-        }
+            for (int far = lanes / 2; far > 0; far /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, far);
 #else
-        for (int c = 0; c < TILE; ++c) {
-            const double pivot = 1.0 / sqrt(first[c * TILE + c]);
-            inverse[c] = pivot;
-            for (int r = c; r < TILE; ++r) factor[c * PITCH + r] = first[r * TILE + c] * pivot;
-            for (int d = c + 1; d < TILE; ++d) {
-                const double entry = factor[c * PITCH + d];
-                for (int r = d; r < TILE; ++r) first[r * TILE + d] -= factor[c * PITCH + r] * entry;
-            }
-        }
+            if (place != pivot && pivot >= 0) sum *= value[pivot];
 #endif
-        TOGETHER
-        // a column of the right-hand sides, or of a tile beside, for each thread
-        for (int i = t; i < (beside + 1) * TILE; i += threads) {
-            const int which = i / TILE, c = i - which * TILE, apart = which < kept ? PITCH : TILE;
-            double* source = which ? first + (long long)which * size : rhs + (long long)k * size;
-            double* target = which < kept ? tile[which] : source;
-            double y[TILE];
-            #pragma unroll
-            for (int a = 0; a < TILE; ++a) y[a] = source[a * TILE + c];
-            #pragma unroll
-            for (int a = 0; a < TILE; ++a) {
-                y[a] *= inverse[a];
-                #pragma unroll
-                for (int b = a + 1; b < TILE; ++b) y[b] -= factor[a * PITCH + b] * y[a];
-                target[a * apart + c] = y[a];
-            }
+            if (e < end && part == 0) value[place] = place == pivot ? 1.0 / sqrt(sum) : sum;
         }
-        TOGETHER
-        for (int i = 0; i <= beside; ++i)
-            for (int j = 0; j <= i; ++j) {
-                const double* left = i < kept ? tile[i] : first + (long long)i * size;
-                const double* right = j < kept ? tile[j] : first + (long long)j * size;
-                int left_apart = i < kept ? PITCH : TILE, right_apart = j < kept ? PITCH : TILE;
-                double* target = out;
-                if (i > 0) {
-                    target = rhs + (long long)(k + i) * size;
-                    if (j > 0) {
-                        target = base + ((long long)(k + j) * (reach + 1) + i - j) * size;
-                        const double* other = left;
-                        left = right;
-                        right = other;
-                        const int apart = left_apart;
-                        left_apart = right_apart;
-                        right_apart = apart;
-                    }
-                }
-                const double sign = i > 0 ? -1.0 : 1.0;
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-                // a quarter for each of four warps, by eight rows and columns: four lanes have a row of the
-                // first factor, and two neighbours in one of the result
-                const int lane = t & 31, far = lane / 4, near = lane & 3;
-                const int row = t / 64 * 16 + far, column = t / 32 % 2 * 16;
-                double sum[2][2][2] = {};
-                #pragma unroll
-                for (int a = near; a < TILE; a += 4)
-                    #pragma unroll
-                    for (int m = 0; m < 2; ++m)
-                        #pragma unroll
-                        for (int n = 0; n < 2; ++n) {
-                            const double x = left[a * left_apart + row + 8 * m];
-                            const double y = right[a * right_apart + column + far + 8 * n];
-                            asm("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 "
-                                "{%0, %1}, {%2}, {%3}, {%0, %1};"
-                                : "+d"(sum[m][n][0]), "+d"(sum[m][n][1]) : "d"(x), "d"(y));
-                        }
-                #pragma unroll
-                for (int m = 0; m < 2; ++m)
-                    #pragma unroll
-                    for (int n = 0; n < 2; ++n) {
-                        double* at = target + (row + 8 * m) * TILE + column + 8 * n + 2 * near;
-                        at[0] += sign * sum[m][n][0];
-                        at[1] += sign * sum[m][n][1];
-                    }
-#else
-                for (int part = t; part < size / 8; part += threads) {
-                    const int c = part & (TILE - 1), r = part / TILE * 8;
-                    double sum[8] = {};
-                    for (int a = 0; a < TILE; ++a) {
-                        const double y = right[a * right_apart + c];
-                        #pragma unroll
-                        for (int b = 0; b < 8; ++b) sum[b] += left[a * left_apart + r + b] * y;
-                    }
-                    #pragma unroll
-                    for (int b = 0; b < 8; ++b) target[(r + b) * TILE + c] += sign * sum[b];
-                }
+#if defined(__CUDA_ARCH__)
+        __syncthreads();
+        for (int e = begin + thread; e < end; e += threads) {
+            const auto own = entry.data[e];
+            if (own.c[0] != own.c[1] && own.c[1] >= 0) value[own.c[0]] *= value[own.c[1]];
+        }
+        __syncthreads();
 #endif
-            }
-        TOGETHER
     }
-    #undef SHARED
-    #undef TOGETHER
-""".replace("THREADS", str(_THREADS))
-    .replace("TILE", str(TILE))
-    .replace("PITCH", str(TILE + 4))
-)
+""".replace("LANES", str(_LANES))
 
 
-@wp.func_native(_SOLVE_BAND)
-def _eliminate_band(
-    world: int, nblock: int, reach: int, system: wp.array3d(dtype=real), resistance: wp.array3d(dtype=real)
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def _together(): ...
+
+
+@wp.func_native(_ELIMINATE)
+def _eliminate(
+    world: int,
+    level: wp.array(dtype=int),
+    entry: wp.array(dtype=wp.vec4i),
+    slot: wp.array(dtype=int),
+    run: wp.array(dtype=wp.vec3i),
+    given: wp.array2d(dtype=real),
+    factor: wp.array2d(dtype=real),
 ): ...
 
 
 # launched with its own block size: in this module all kernels would be compiled for both sizes
 @wp.kernel(module="unique", enable_backward=False)
-def solve_band(
+def solve_sheet(
     # In:
     due: wp.array(dtype=int),
-    nblock: int,
-    reach: int,
-    # In, out:
-    system: wp.array3d(dtype=real),
+    face: wp.array(dtype=wp.vec3i),
+    conductivity: real,
+    discs: Discs,
+    network: Network,
+    pattern: Pattern,
+    cell_constant: wp.array2d(dtype=real),
+    middle: wp.array2d(dtype=vec3),
+    thickness: wp.array2d(dtype=real),
     # Out:
-    resistance: wp.array3d(dtype=real),
+    given_out: wp.array2d(dtype=real),
+    over_out: wp.array2d(dtype=int),
+    local_out: wp.array2d(dtype=real),
+    factor_out: wp.array2d(dtype=real),
+    trial_out: wp.array2d(dtype=real),
+    impedance_out: wp.array2d(dtype=real),
+    valid_out: wp.array(dtype=int),
 ):
-    """W' A^-1 W of the discs W by Cholesky's factor, one thread block per world; A has `reach` tiles beside
-    the diagonal."""
-    w, _t = wp.tid()
-    if due[w] != 0:
-        _eliminate_band(w, nblock, reach, system, resistance)
-
-
-# For each column: subtract the updates of the columns left of it, scale by its pivot, then solve the
-# right-hand sides of its node, which are complete by then. A pivot that is not positive leaves nan, which
-# marks the film invalid.
-_SOLVE = """
-    const int width = WIDTH, parts = width / 8;
-    double* value = system.data + (long long)world * system.shape[1] * tile;
-    double* y = value + (long long)rhs * tile;
-    double* work = y + (long long)n * tile;
-    for (int j = 0; j < n; ++j) {
-        const int begin = start.data[j], end = start.data[j + 1];
-        for (int q = begin; q < end; ++q) work[row.data[q]] = value[q];
-        for (int t = left_start.data[j]; t < left_start.data[j + 1]; ++t) {
-            const int from = left.data[t].c[0], to = left.data[t].c[1];
-            const double s = value[from];
-            for (int q = from; q < to; ++q) work[row.data[q]] -= s * value[q];
-        }
-        const double pivot = 1.0 / sqrt(work[j]);
-        value[begin] = pivot;
-        double* own = y + node.data[begin] * tile;
-        lanes v[parts];
-        for (int i = 0; i < parts; ++i) {
-            v[i] = pivot * ((lanes*)own)[i];
-            ((lanes*)own)[i] = v[i];
-        }
-        for (int q = begin + 1; q < end; ++q) {
-            const double s = value[q] = work[row.data[q]] * pivot;
-            lanes* other = (lanes*)(y + node.data[q] * tile);
-            for (int i = 0; i < parts; ++i) other[i] -= s * v[i];
-        }
-    }
-    double* out = resistance.data + (long long)world * tile * tile;
-    for (int a = 0; a < width; a += 8) {
-        lanes sum[8][parts];
-        for (int b = 0; b < 8; ++b)
-            for (int i = 0; i < parts; ++i) sum[b][i] = lanes{};
-        for (int k = 0; k < n; ++k) {
-            const double* own = y + k * tile;
-            #pragma unroll
-            for (int b = 0; b < 8; ++b) {
-                #pragma unroll
-                for (int i = 0; i < parts; ++i) sum[b][i] += own[a + b] * ((const lanes*)own)[i];
-            }
-        }
-        for (int b = 0; b < 8; ++b)
-            for (int i = 0; i < parts; ++i) ((lanes*)(out + (a + b) * tile))[i] = sum[b][i];
-    }
-"""
-# the discs are columns of right-hand sides: loops are compiled for each number of SIMD lanes
-_SOLVE = "\n".join(
-    [
-        f"typedef double lanes __attribute__((vector_size(64), aligned(8)));\nconst int tile = {TILE};",
-        *(
-            f"if (columns > {width - _LANES} && columns <= {width}) {{{_SOLVE.replace('WIDTH', str(width))}}}"
-            for width in range(_LANES, TILE + 1, _LANES)
-        ),
-    ]
-)
-
-
-@wp.func_native(_SOLVE)
-def _eliminate(
-    world: int,
-    columns: int,
-    n: int,
-    rhs: int,
-    start: wp.array(dtype=int),
-    row: wp.array(dtype=int),
-    node: wp.array(dtype=int),
-    left_start: wp.array(dtype=int),
-    left: wp.array(dtype=wp.vec2i),
-    system: wp.array3d(dtype=real),
-    resistance: wp.array3d(dtype=real),
-): ...
-
-
-@wp.kernel
-def solve_sparse(
-    # In:
-    due: wp.array(dtype=int),
-    columns: int,
-    n: int,
-    rhs: int,
-    start: wp.array(dtype=int),
-    row: wp.array(dtype=int),
-    node: wp.array(dtype=int),
-    left_start: wp.array(dtype=int),
-    left: wp.array(dtype=wp.vec2i),
-    # In, out:
-    system: wp.array3d(dtype=real),
-    # Out:
-    resistance: wp.array3d(dtype=real),
-):
-    """W' A^-1 W of the discs W by Cholesky's sparse factor, one thread per world."""
-    w = wp.tid()
-    if due[w] != 0:
-        _eliminate(w, columns, n, rhs, start, row, node, left_start, left, system, resistance)
+    """Impedances of a film whose surface is known, [world, electrode], by a block of threads; if the film
+    cannot be solved, the last values stay."""
+    w, t = wp.tid()
+    if due[w] == 0:
+        return
+    threads = wp.block_dim()
+    nface = face.shape[0]
+    for f in range(t, nface, threads):
+        edge = face_conductance(face[f], w, conductivity, middle, thickness)
+        for c in range(3):
+            given_out[w, 3 * f + c] = edge[c]
+    for k in range(t, discs.pair_face.shape[0], threads):
+        over_out[w, k] = samples_over(k, w, discs, face, middle)
+    _together()
+    for k in range(t, discs.pair_face.shape[0], threads):
+        weights = weights_over(k, w, discs, face, middle, over_out)
+        for c in range(3):
+            given_out[w, 3 * (nface + k) + c] = weights[c]
+    _together()
+    for e in range(t, local_out.shape[0], threads):
+        local = real(0.0)  # of a disc that no film is over
+        for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
+            if over_out[w, k] != 0:  # where a corner is not finite the face is over no sample
+                corner = face[discs.pair_face[k]]
+                for c in range(3):
+                    local += given_out[w, 3 * (nface + k) + c] * thickness[corner[c], w]
+        local_out[e, w] = local
+    _eliminate(w, pattern.level, pattern.entry, pattern.slot, pattern.run, given_out, factor_out)
+    for e in range(t, trial_out.shape[1], threads):
+        trial_out[w, e] = cell_constant[w % cell_constant.shape[0], e] * driving_point(
+            e, w, trial_out.shape[1], pattern.disc, factor_out, local_out, network, conductivity
+        )
+    _together()
+    if t == 0:
+        valid = int(1)
+        for e in range(trial_out.shape[1]):
+            if not (trial_out[w, e] > real(0.0) and trial_out[w, e] < real(1.0e12)):
+                valid = 0
+        if valid == 1:
+            for e in range(trial_out.shape[1]):
+                impedance_out[w, e] = trial_out[w, e]
+        valid_out[w] = valid
