@@ -227,7 +227,7 @@ def _eliminate(
 
 
 # launched with its own block size: in this module all kernels would be compiled for both sizes
-@wp.kernel(module="unique", enable_backward=False)
+@wp.kernel(module="unique", enable_backward=False, launch_bounds=(THREADS, 2))
 def solve_sheet(
     # In:
     due: wp.array(dtype=int),
