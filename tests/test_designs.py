@@ -44,7 +44,7 @@ def test_the_code_has_no_nineteen_of_its_own():
     found = [
         f"{name}, line {node.lineno}"
         for name, path in modules().items()
-        if name.removeprefix("biotac_mj.") not in OTHERS
+        if name.removeprefix("biotac_mj.") not in OTHERS and "19" in path.read_text()
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Constant) and type(node.value) is int and node.value == 19
     ]

@@ -24,6 +24,7 @@ from biotac_mj.geometry import (
 from biotac_mj.geometry.card import skin_numbers
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.importing import read_obj
+from biotac_mj.geometry.skins import design_of
 from biotac_mj.geometry.surface import face_areas, node_areas, node_normals
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 
@@ -455,3 +456,15 @@ def test_a_skin_without_a_core_is_refused(tmp_path):
         load_skin(skin.save(tmp_path / "skin.npz"))
     with pytest.raises(ValueError, match="the core of skin 'coarse' has no faces"):
         biotac_mj.attach(mujoco.MjSpec(), body="world", skin=skin)
+
+
+def test_a_stored_skin_is_read_again_only_when_it_changes(shell, tmp_path, monkeypatch):
+    read, path = [], dataclasses.replace(shell, name="first").save(tmp_path / "skin.npz")
+    load = SkinGeometry.load
+    monkeypatch.setattr(SkinGeometry, "load", lambda file: read.append(file) or load(file))
+    skin = load_skin(path)
+    skin.vert[:] = 0.0
+    np.testing.assert_array_equal(load_skin(path).vert, shell.vert)  # callers have copies of their own
+    assert design_of(path) == shell.design and len(read) == 1
+    dataclasses.replace(shell, name="other").save(path)
+    assert load_skin(path).name == "other" and len(read) == 2

@@ -32,33 +32,39 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
       FileNotFoundError: no such skin.
       ValueError: the file is not a stored skin, or the name is unknown.
     """
+    return copy.deepcopy(_loaded(name_or_path))  # callers may change their copy
+
+
+def _loaded(name_or_path):
+    """The skin of `load_skin`, cached in the process: each `attach` loads it three times, and each
+    `Handle.read` takes its design."""
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(
             f"skin is {short_repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
+    path = _file(name_or_path)
+    state = path.stat() if path.exists() else None
+    return _read(path, state and (state.st_ino, state.st_mtime_ns, state.st_size))
+
+
+@functools.lru_cache(maxsize=2 * len(_SHIPPED))
+def _read(path, state):
+    """The skin in a file; state: tells the file from later ones of this path."""
+    return SkinGeometry.load(path)
+
+
+def _file(name_or_path):
+    """The file of a shipped or a stored skin, of a folder made by `biotac design new` the one in it."""
     if name_or_path in _SHIPPED:
-        return copy.deepcopy(_shipped(name_or_path))  # callers may change their copy
-    return SkinGeometry.load(_file(name_or_path))
-
-
-def _file(path):
-    """The stored skin's file, of a folder made by `biotac design new` the one in it."""
-    path = pathlib.Path(path)
+        folder, _, mesh = name_or_path.rpartition("/")
+        return asset_path(f"designs/{folder}/{mesh}.npz" if folder else f"skins/{mesh}.npz")
+    path = pathlib.Path(name_or_path)
     return path / "default.npz" if (path / "design.json").is_file() else path
-
-
-@functools.lru_cache(maxsize=len(_SHIPPED))
-def _shipped(name):
-    """A shipped skin, cached in the process, since each `attach` loads it three times."""
-    folder, _, mesh = name.rpartition("/")
-    return SkinGeometry.load(asset_path(f"designs/{folder}/{mesh}.npz" if folder else f"skins/{mesh}.npz"))
 
 
 def design_of(skin: pathlib.Path | str | SkinGeometry) -> Design:
     """Design of a skin, given as for `load_skin` or `skin_reference`."""
-    if isinstance(skin, str) and skin in _SHIPPED:
-        return _shipped(skin).design
-    return skin.design if isinstance(skin, SkinGeometry) else load_skin(skin).design
+    return skin.design if isinstance(skin, SkinGeometry) else _loaded(skin).design
 
 
 def shipped_skin(design: Design, mesh: str = "default") -> str:
