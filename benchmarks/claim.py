@@ -190,12 +190,14 @@ def head(t, one, kind, dropout, log=True):
     pods = t.code("pod", one.split)
     if kind == "local":
         modes = min(32, pods.shape[1])
-        net = network(lambda: LocalHead(t.local.shape[-1], modes), one.seed, t.device, dropout)
+        net = network(
+            lambda: LocalHead(t.local.shape[-1], modes, t.counts.shape[1]), one.seed, t.device, dropout
+        )
         everything = t.rows(np.r_[one.train, one.unpaired], False)
         net.scale.copy_(t.local[everything].square().mean((0, 1)).sqrt() + 1e-6)
         output = lambda rows: net(t.local[rows], pods[rows][:, :modes])  # noqa: E731
     else:
-        make = lambda: PointNet(t.place, np.arange(len(t.place)))  # noqa: E731
+        make = lambda: PointNet(t.place, np.arange(len(t.place)), t.counts.shape[1])  # noqa: E731
         net = network((lambda: FromRest(make())) if log else make, one.seed, t.device, dropout)
         output = lambda rows: net(t.points[rows])  # noqa: E731
 
@@ -220,7 +222,7 @@ def latent(t, one, code, dropout, unpaired=True, log=True, decoded=False):
     tare_row = (torch.arange(len(y), device=t.device) == t.first)[:, None]
     y = torch.where(tare_row, 0.0, y)
     labelled, check = t.rows(one.train), t.spread(t.rows(one.choose), _CHECKED)
-    vae = network(ElectrodeVAE, one.seed, t.device)
+    vae = network(lambda: ElectrodeVAE(t.counts.shape[1]), one.seed, t.device)
 
     def vae_loss(rows):
         got, mean, log_variance = vae(y[rows])

@@ -75,10 +75,14 @@ DESIGN_ROWS = {
     "what electrodes tell (`learn train` of recordings, `predict`)": ("yes", "yes", "yes, in Python"),
     "networks from skin to electrodes and back (`learn train` of sets)": (
         "yes",
-        "no: they are built for the BioTac's electrodes",
-        "no, likewise",
+        "yes",
+        "yes, where it has electrodes",
     ),
-    'signal "learned"': ("yes", "no: its weights are of a BioTac's skin", "no, likewise"),
+    'signal "learned", "latent_projection", or a file of weights': (
+        "yes",
+        "a file of its own: those that ship are of the BioTac",
+        "a file of its own, likewise",
+    ),
     "`biotac data samples`": ("yes", "no: its sensor is a BioTac", "no, likewise"),
     "messages of ROS": ("biotac_sensors, tactile_msgs", "tactile_msgs", "tactile_msgs"),
 }

@@ -49,7 +49,9 @@ def sp_skin(
     inner = outer[0] - thickness, outer[1]
     mesh = dome_shell(outer, inner, rings)
     solid = dome_core(core, 40, FACET)
-    backing = plate(*(1.05 * np.take(outer[0], [0, 2])), BACKING)
+    angle = 2 * np.pi * (np.arange(64) + 0.5) / 64
+    rim = 1.05 * np.take(outer[0], [0, 2]) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    backing = plate(rim, BACKING)
     metres = [(1e-3 * vert, face) for vert, face in (solid, backing)]
     skin = assemble(name, TetMesh(1e-3 * mesh.vert, mesh.elem), *metres, design=design)
 

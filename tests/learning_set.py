@@ -6,7 +6,6 @@ import numpy as np
 from biotac_mj.data import Interaction, shard_path, write_shard
 from biotac_mj.data.contact import contact_labels
 from biotac_mj.geometry import load_skin
-from biotac_mj.sensor.channels import REST_COUNTS
 
 OBJECTS = ("sphere_7mm", "cube_14mm", "ring_7mm", "cylinder_long_7mm")
 
@@ -23,10 +22,10 @@ def dent(geometry, centre, depth, radius, slide):
 
 
 def log_change(geometry, u):
-    """(19,): the rule. 600 per metre of the mean inward motion of the inner nodes within 2.5 mm of an
+    """(nelectrode,): the rule. 600 per metre of the mean inward motion of the inner nodes within 2.5 mm of an
     electrode."""
     inner = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
-    out = np.empty(19)
+    out = np.empty(len(geometry.electrode_pos))
     for e, (place, normal) in enumerate(zip(geometry.electrode_pos, geometry.electrode_normal)):
         w = np.exp(-0.5 * ((geometry.vert[inner] - place) ** 2).sum(1) / 1.5e-3**2)
         out[e] = -600 * (w @ (u[inner] @ normal)) / w.sum()
@@ -41,7 +40,7 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
     outer = np.unique(geometry.outer_face)
     pad = geometry.vert[outer]
     pad = pad[(pad[:, 1] < -3e-3) & (pad[:, 0] < 0)]
-    rest = REST_COUNTS["2"]
+    n, rest = geometry.design.nelectrode, np.array(geometry.design.rests[1 % len(geometry.design.rests)])
     z0 = np.log(4095 / rest - 1)
     groups = {True: [], False: []}
     for k in range(count):
@@ -52,8 +51,8 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
         radius = (1.5e-3, 3e-3, 2e-3, 2.5e-3)[k % 4]
         u = np.array([dent(geometry, centre, d, radius, s) for d, s in zip(depth, slide)])
         d = np.array([log_change(geometry, x) for x in u])
-        counts = np.full((steps, 23), 2000.0)
-        counts[:, :19] = np.rint(4095 / (1 + np.exp(z0 + 0.8 * d)))
+        counts = np.full((steps, len(geometry.design.channels)), 2000.0)
+        counts[:, :n] = np.rint(4095 / (1 + np.exp(z0 + 0.8 * d)))
         bell = np.exp(-0.5 * ((geometry.vert[outer] - centre) ** 2).sum(1) / radius**2)
         force = (depth[:, None] * 1e3 * np.where(bell > 0.4, bell, 0) / bell.sum())[..., None] * [
             0.0,
@@ -85,10 +84,10 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
         )
         if flag:
             measured = counts.copy()
-            measured[:, :19] = np.rint(
-                4095 / (1 + np.exp(z0 + gain * d)) + noise * rng.normal(size=(steps, 19))
+            measured[:, :n] = np.rint(
+                4095 / (1 + np.exp(z0 + gain * d)) + noise * rng.normal(size=(steps, n))
             )
-            measured[0, :19] = rest
+            measured[0, :n] = rest
             one |= dict(measured_counts=measured, measured_wrench=np.zeros((steps, 6)))
         groups[flag].append(Interaction(**one))
     for number, part in enumerate(g for g in groups.values() if g):

@@ -58,9 +58,9 @@ def test_another_shape_is_refused_by_name(points):
 
     skin = load_skin("coarse")
     moved = dataclasses.replace(skin, vert=skin.vert + [0, 3e-3, 0])
-    with pytest.raises(ValueError, match="has not the BioTac's shape in the BioTac frame"):
+    with pytest.raises(ValueError, match="has not the shape of the network's, 'coarse', in"):
         points.reading(moved)
-    with pytest.raises(ValueError, match="take a skin of the BioTac with 19"):
+    with pytest.raises(ValueError, match="and skin .biotac_sp.* is of BioTac SP .24"):
         load_forward(shipped(NAME), load_skin("biotac_sp/coarse"))
 
 
@@ -193,7 +193,7 @@ def test_pointnets_weights_know_no_way_back(tmp_path, points):
     path = tmp_path / "pointnet.safetensors"
     whole = SkinPoints(np.random.default_rng(0).permutation(load_skin("coarse").vert)[:200], points.levels,
                        points.spread)  # fmt: skip
-    save_points_model(path, make_pointnet(whole, config), whole, config, {})
+    save_points_model(path, make_pointnet(whole, config, 19), whole, config, {})
     skin = load_skin("coarse")
     u = torch.tensor(1e3 * pressed(skin)[None], dtype=torch.float32)
     assert load_forward(path, skin).log_change(u).shape == (1, 19)

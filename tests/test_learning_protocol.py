@@ -22,8 +22,8 @@ def test_errors_are_averaged_within_an_interaction_first():
         interaction_errors(predicted, truth, [7, 7, 9, 9, 9])
     with pytest.raises(ValueError, match="test part of the split is empty"):
         interaction_errors(truth[:0], truth[:0], [])
-    with pytest.raises(ValueError, match=r"\(n, 19\)"):
-        interaction_errors(truth[:, :18], truth[:, :18], np.zeros(5))
+    with pytest.raises(ValueError, match=r"\(n, nelectrode\)"):
+        interaction_errors(truth[:, :18], truth, np.zeros(5))
 
 
 def test_quartiles():

@@ -1,6 +1,7 @@
 """Training on a small set whose rule is known, files of weights, use in MuJoCo, and everything that can be
 wrong with the input."""
 
+import dataclasses
 import json
 import shutil
 import sys
@@ -14,25 +15,28 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from learning_set import dent, log_change, make_set  # noqa: E402
+from readers_files import GROUND, SIX  # noqa: E402
 from ship_weights import ship  # noqa: E402
 
 import biotac_mj  # noqa: E402
 from biotac_mj import cli  # noqa: E402
 from biotac_mj.data import TactileSet  # noqa: E402
 from biotac_mj.geometry import load_skin  # noqa: E402
-from biotac_mj.learning.patch import contact_patch  # noqa: E402
+from biotac_mj.learning.patch import contact_patch, estimate  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkFilm  # noqa: E402
 from biotac_mj.learning.training import fitting  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.experiment import train_all  # noqa: E402
+from biotac_mj.learning.training.features import mirror_order  # noqa: E402
 from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains, fit_mixing  # noqa: E402
 from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
+from biotac_mj.sensor.own_design import PadShape, new_design  # noqa: E402
 
 SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
 
@@ -391,8 +395,40 @@ def test_contact_patch_finds_the_touch(trained, tmp_path):
         contact_patch(source, tmp_path / "out", row=9)
     with pytest.raises(ValueError, match="raw counts 0..4095 are needed"):
         log_change_of(np.full((1, 19), np.nan), rest)
-    with pytest.raises(ValueError, match="19 electrodes"):
+    with pytest.raises(ValueError, match="give the same electrodes of both"):
         log_change_of(np.zeros((1, 18)), rest)
+
+
+@pytest.fixture(scope="module")
+def dome(tmp_path_factory):
+    """A pad of six electrodes, one of them without a mirror image."""
+    folder = tmp_path_factory.mktemp("pads") / "dome"
+    places = [*SIX[:3], [3.5, 2.0, -4.4], *SIX[4:]]
+    new_design(folder, PadShape(dome=(9.0, 9.0, 9.0), core=(6.0, 6.0, 6.0), edge=2.4), places, GROUND)
+    return str(folder)
+
+
+@pytest.mark.parametrize("skin", ["biotac_sp/coarse", "dome"])
+def test_networks_of_other_designs_are_trained_and_serve_them(skin, dome, tmp_path):
+    skin = dome if skin == "dome" else skin
+    geometry = load_skin(skin)
+    assert (mirror_order(geometry) is None) == (skin == dome)
+    folder = make_set(tmp_path / "set", count=40, labelled=30, skin=skin)
+    small = {"paper_steps": 3, "mesh_steps": 3, "mesh_points": 150, "mesh_factors": (2, 2)}
+    small |= {"mesh_channels": (4, 4), "mesh_first": 4}
+    config, out = LearningConfig(**dataclasses.asdict(SMALL) | small), tmp_path / "trained"
+    train_all(folder, out, (0,), ("trajectory",), config, paper=True, progress=False)
+    rows = evaluate_models(out)["splits"]["trajectory"]["models"]
+    assert rows["tare"]["median"] > 2 * rows["local_taught"]["median"]
+    vert = geometry.vert + dent(geometry, geometry.vert[geometry.vert[:, 1].argmin()], 6e-4, 2e-3, 0.0)
+    for weights in ("forward-trajectory", "latent_projection-trajectory"):
+        film = NetworkFilm(geometry, out / f"{weights}.safetensors")
+        assert film.impedance(vert).shape == film.rest.shape == (geometry.design.nelectrode,)
+    counts = np.array(geometry.design.rests[0])
+    found = estimate(counts[None] - 20, counts, geometry, out / "inverse-trajectory.safetensors")
+    assert found.displacement.shape == (1, geometry.nvert, 3)
+    with pytest.raises(ValueError, match="was trained with channels e1 .* is of BioTac .19 electrodes"):
+        load_forward(out / "forward-trajectory.safetensors", load_skin("coarse"))
 
 
 @pytest.mark.parametrize("with_force", [True, False])

@@ -46,7 +46,9 @@ def test_shapes_of_pads_are_closed_and_have_their_volume():
     shell = dome_shell((np.array([9.0, 9.0, 9.0]), 0.0), (np.array([8.0, 8.0, 8.0]), 0.0), 16).check()
     assert shell.volumes.sum() == pytest.approx(2 / 3 * np.pi * (9**3 - 8**3), rel=0.01)
     assert block((10, 4, 8), (3, 2, 3)).check().volumes.sum() == pytest.approx(320)
-    assert enclosed_volume(*plate(3.0, 2.0, 1.0)) == pytest.approx(6 * np.pi, rel=0.01)
+    vert, face = plate([[-3, -2], [3, -2], [3, 2], [-3, 2]], 1.0)
+    check_closed(face)
+    assert enclosed_volume(vert, face) == pytest.approx(24)
 
 
 def test_a_dome_of_six_electrodes_feels_where_it_is_pressed(tmp_path):
@@ -176,6 +178,9 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
     up = written(tmp_path / "up.tet", cube.vert + [0, 8, 0], cube.elem)
     with pytest.raises(ValueError, match="the mesh ends at y = 8 mm, and a pad is held on the plane y = 0"):
         new_design(tmp_path / "pad", PadShape(mesh=up))
+    ridge = written(tmp_path / "ridge.tet", cube.vert - [0, 1, 0] * (5 + cube.vert[:, :1]), cube.elem)
+    with pytest.raises(ValueError, match="the mesh meets the plane y = 0 in a point or a line"):
+        new_design(tmp_path / "pad", PadShape(mesh=ridge))
     pair = np.r_[cube.vert, cube.vert + [30, 0, 0]], np.r_[cube.elem, cube.elem + len(cube.vert)]
     with pytest.raises(ValueError, match="the mesh has 2 separate parts"):
         new_design(tmp_path / "pad", PadShape(mesh=written(tmp_path / "two.tet", *pair)))
@@ -191,6 +196,28 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
         ValueError, match="the core's largest dimension is 1.2e.04 mm, .* is it in millimetres"
     ):
         new_design(tmp_path / "pad", PadShape(mesh=tmp_path / "shell.tet", core=core), SIX, GROUND)
+
+
+def test_a_mesh_of_any_outline_is_held_at_its_whole_rim(tmp_path):
+    """A box open to the backing; an ellipse of its width would hold the middles of its sides only."""
+    x, z = [-8, -6, 0, 6, 8], [-6, -4, 0, 4, 6]
+    full = block((16, 4, 12), (4, 2, 4))
+    nodes = np.stack([np.interp(full.vert[:, 0], np.linspace(-8, 8, 5), x), full.vert[:, 1],
+                      np.interp(full.vert[:, 2], np.linspace(-6, 6, 5), z)], axis=1)  # fmt: skip
+    centre = nodes[full.elem].mean(1)
+    hollow = (np.abs(centre[:, 0]) < 6) & (np.abs(centre[:, 2]) < 4) & (centre[:, 1] > -2)
+    kept, elem = np.unique(full.elem[~hollow], return_inverse=True)
+    mesh = written(tmp_path / "box.tet", nodes[kept], elem.reshape(-1, 4))
+    vert = np.array([[i, j, k] for i in (-5, 5) for j in (-1.2, 0) for k in (-3, 3)])
+    face = np.array([[0, 3, 1], [0, 2, 3], [4, 7, 6], [4, 5, 7], [0, 5, 4], [0, 1, 5], [2, 7, 3], [2, 6, 7],
+                     [0, 6, 2], [0, 4, 6], [1, 7, 5], [1, 3, 7]])  # fmt: skip
+    write_obj(tmp_path / "core.obj", 1e-3 * vert, face)
+    places = [[i, k, -1.2] for i in (-3, 0, 3) for k in (-1.5, 1.5)]
+    shape = PadShape(mesh=mesh, core=tmp_path / "core.obj")
+    new_design(tmp_path / "box", shape, places, [[4.5, 0, -1.2], [-4.5, 0, -1.2]])
+    skin = biotac_mj.load_skin(tmp_path / "box")
+    back = np.flatnonzero(np.abs(skin.vert[:, 1]) < 1e-9)
+    assert set(back) <= set(skin.fixed) and len(skin.inner_face)
 
 
 def test_a_design_is_not_overwritten(tmp_path):

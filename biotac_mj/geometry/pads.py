@@ -81,13 +81,14 @@ def dome_core(shape: tuple, rings: int, facet: tuple | None = None) -> tuple[np.
     return np.vstack([vert, np.zeros((1, 3))]), np.concatenate([face, top]).astype(np.int32)
 
 
-def plate(half_x: float, half_z: float, thickness: float, sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """An elliptical plate on the plane y = 0, upwards, or a square one of four sides whose corners lie on the
-    ellipse: vert (n, 3), face (m, 3), closed."""
-    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    ring = np.stack([half_x * np.cos(angle), np.zeros(sides), half_z * np.sin(angle)], axis=1)
+def plate(outline: ArrayLike, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """A plate on the plane y = 0, upwards, of a convex outline (n, 2) in x and z, anticlockwise as x, z are
+    drawn: vert (2 n + 2, 3), face (4 n, 3), closed."""
+    x, z = np.transpose(outline)
+    sides, centre = len(x), np.array([x.mean(), 0.0, z.mean()])
+    ring = np.stack([x, np.zeros(sides), z], axis=1)
     up = np.array([0.0, thickness, 0.0])
-    vert = np.vstack([ring, ring + up, [np.zeros(3), up]])
+    vert = np.vstack([ring, ring + up, [centre, centre + up]])
     i, j = np.arange(sides), np.roll(np.arange(sides), -1)
     low, high = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
     sheets = (i, j, low), (j + sides, i + sides, high), (j, i, i + sides), (j, i + sides, j + sides)

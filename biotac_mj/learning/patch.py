@@ -9,6 +9,7 @@ import torch
 
 from ..files import save_figure, write_json
 from ..geometry import load_skin
+from ..geometry.design import check_nelectrode
 from ..geometry.surface import face_areas, node_areas
 from ..recordings import load_one
 from .predictor import PointsModel
@@ -51,12 +52,14 @@ def estimate(
     """Displacements and contact of raw counts.
 
     Args:
-      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin. weights: file, a name of
-        `weights.SHIPPED`; None is "inverse", for the default skin.
+      counts: (n, nelectrode) raw; tare: (nelectrode,) the sensor at rest. geometry: the skin. weights:
+        file, a name of `weights.SHIPPED`; None is "inverse", for the default skin.
 
     Raises:
-      ValueError: not 19 channels, values that are not finite or not raw counts, or weights of another skin.
+      ValueError: another number of electrodes, values that are not finite or not raw counts, or weights
+        of another skin.
     """
+    check_nelectrode(geometry.design, np.shape(counts)[-1], "a row")
     change = log_change_of(counts, tare)
     head = load_inverse(find_weights(weights, "inverse"), geometry)
     with torch.no_grad():

@@ -40,8 +40,8 @@ class _Served(nn.Module):
             )
 
     def counts(self, displacement: torch.Tensor, tare: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """(n, 19) fractional counts for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
-        (n, 19)."""
+        """(n, nelectrode) fractional counts for displacements (n, nvert, 3) [mm] and counts at rest, tare
+        (nelectrode,) or (n, nelectrode)."""
         tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
         return counts_change(self.log_change(displacement), tare) + tare
 
@@ -80,13 +80,13 @@ class PointsModel(_Served):
 
     @torch.no_grad()
     def log_change(self, displacement: torch.Tensor) -> torch.Tensor:
-        """d ln Z (n, 19) relative to rest, for displacements (n, nvert, 3) [mm]; raises like
+        """d ln Z (n, nelectrode) relative to rest, for displacements (n, nvert, 3) [mm]; raises like
         `ForwardModel.log_change`."""
         self._check(displacement)
         return self.electrodes(self.unit * self.to_points.fields(displacement))
 
     def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) predicted change of counts in rows of a set."""
+        """(k, nelectrode) predicted change of counts in rows of a set."""
         output = self.log_change(arrays.field[rows].float())
         return network_change(output, arrays.tare[rows], self.config)
 
@@ -98,8 +98,8 @@ class PointsModel(_Served):
 
     @torch.no_grad()
     def forward(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Displacements (n, nvert, 3) [mm] for d ln Z (n, 19), and indentation of the outer nodes (n, nouter)
-        [mm], at least 0."""
+        """Displacements (n, nvert, 3) [mm] for d ln Z (n, nelectrode), and indentation of the outer nodes
+        (n, nouter) [mm], at least 0."""
         field = self.to_nodes.fields(self.field(log_change)) / self.unit
         return field, (field[:, self.outer] * self.inward).sum(2).clamp(min=0)
 
@@ -115,12 +115,12 @@ class ForwardModel(_Served):
         super().__init__()
         self.meta, self.nvert = meta, geometry.nvert
         self.pod, self.film = Pod(geometry.nvert, modes), FilmFeatures(geometry)
-        heads = (LocalHead(FilmFeatures.count, modes, meta["width"]) for _ in range(meta["members"]))
-        self.members = nn.ModuleList(heads)
+        sizes = self.film.count, modes, geometry.design.nelectrode, meta["width"]
+        self.members = nn.ModuleList(LocalHead(*sizes) for _ in range(meta["members"]))
 
     @torch.no_grad()
     def log_change(self, displacement: torch.Tensor) -> torch.Tensor:
-        """d ln Z (n, 19) relative to rest.
+        """d ln Z (n, nelectrode) relative to rest.
 
         Args:
           displacement: (n, nvert, 3) tensor [mm].

@@ -5,8 +5,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t, wilcoxon
 
-from ..sensor.channels import NELECTRODE
-
 __all__ = [
     "check_changes",
     "conformal_width",
@@ -23,7 +21,7 @@ def interaction_errors(
     """RMS over the electrodes of each row, averaged over the rows of each interaction.
 
     Args:
-      predicted, truth: (n, 19) tared counts. owner: (n,) interaction of each row.
+      predicted, truth: (n, nelectrode) tared counts. owner: (n,) interaction of each row.
 
     Returns:
       interactions (k,) and their errors (k,) [counts].
@@ -32,15 +30,10 @@ def interaction_errors(
       ValueError: shapes that differ, no rows, or values that are not finite.
     """
     predicted, truth, owner = np.asarray(predicted, float), np.asarray(truth, float), np.asarray(owner)
-    if (
-        predicted.shape != truth.shape
-        or truth.ndim != 2
-        or truth.shape[1] != NELECTRODE
-        or len(owner) != len(truth)
-    ):
+    if predicted.shape != truth.shape or truth.ndim != 2 or len(owner) != len(truth):
         raise ValueError(
             f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: "
-            "(n, 19), (n, 19) and (n,) are needed"
+            "(n, nelectrode), the same and (n,) are needed"
         )
     if not len(truth):
         raise ValueError("there are no rows to judge: the test part of the split is empty")
@@ -106,18 +99,18 @@ def check_changes(source: str, force: np.ndarray) -> None:
 
 
 def conformal_width(error: np.ndarray, owner: ArrayLike, alpha: float = 0.1) -> np.ndarray:
-    """Half widths (19,) [counts] of intervals that cover a new interaction's rows with mean probability 1 -
-    alpha.
+    """Half widths (nelectrode,) [counts] of intervals that cover a new interaction's rows with mean
+    probability 1 - alpha.
 
     Rows of one interaction are similar, so the interactions are the exchangeable units: the distribution
     functions of their absolute errors are averaged, with one more interaction of infinite error (pooling of
     distribution functions, Dunn, Wasserman and Ramdas, 2022).
 
     Args:
-      error: (n, 19) predicted - truth on the validation interactions. owner: (n,).
+      error: (n, nelectrode) predicted - truth on the validation interactions. owner: (n,).
 
     Returns:
-      (19,); infinite if there are too few interactions for alpha.
+      (nelectrode,); infinite if there are too few interactions for alpha.
     """
     error, owner = np.abs(np.asarray(error, float)), np.asarray(owner)
     which, index = np.unique(owner, return_inverse=True)

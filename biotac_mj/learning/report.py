@@ -8,7 +8,7 @@ import numpy as np
 from ..fields import check_entries
 from ..files import save_figure, write_json
 from ..reading import Array, check_arrays, read_json, read_npz
-from ..sensor.channels import NELECTRODE, electrode_noise
+from ..sensor.channels import electrode_noise
 from .protocol import conformal_width, interaction_errors, paired_test, quartiles
 
 __all__ = ["PAPER", "draw_errors", "evaluate_models", "predictions_of", "report_of", "table"]
@@ -81,8 +81,8 @@ _REPORT = {
 _MESH = {"all": dict[str, float], "objects": dict[str, dict[str, float]]}
 _ERRORS = {"mean": float, "moved": float}  # [mm]
 _PREDICTIONS = {
-    "truth": Array(("n", NELECTRODE)),
-    "tare": Array(("n", NELECTRODE)),
+    "truth": Array(("n", "nelectrode")),
+    "tare": Array(("n", "nelectrode")),
     "time": Array(("n",)),
     "owner": Array(("n",), "index"),
     "object": Array(("n",), "text"),
@@ -104,10 +104,10 @@ def report_of(path: pathlib.Path) -> dict:
 
 
 def predictions_of(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Its predictions, each (n, 19)."""
+    """Its predictions, each (n, nelectrode)."""
     what = "file of predictions"
     found = read_npz(path, what, _AGAIN)
-    wanted = {name: Array(("n", NELECTRODE)) for name in found if name.startswith("predicted_")}
+    wanted = {name: Array(("n", "nelectrode")) for name in found if name.startswith("predicted_")}
     check_arrays(path, found, _PREDICTIONS | wanted, _AGAIN)
     if not wanted or not found["test"].any() or found["test"].all():
         raise ValueError(f"{path} has no predictions, or none of both parts: {_AGAIN}")

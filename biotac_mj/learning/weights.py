@@ -12,8 +12,8 @@ import torch
 
 from ..fields import check_entries
 from ..files import replacing
+from ..geometry.skins import design_of
 from ..reading import reading
-from ..sensor.channels import ELECTRODES, NELECTRODE
 
 if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
@@ -145,16 +145,22 @@ def save_points_model(
     more = {"direction": "points", "kind": {"kind": kind}, "config": dataclasses.asdict(config)}
     graph = {f"points.{k}": torch.from_numpy(np.asarray(v)) for k, v in points.arrays().items()}
     graph = {k: v.float() if v.is_floating_point() else v.int() for k, v in graph.items()}
-    _save(path, dict(net.state_dict()), None, about | more | {"reference": points.reference}, graph)
+    meta = about | more | _channels(design_of(points.reference)) | {"reference": points.reference}
+    _write(path, net.state_dict(), meta, graph)
 
 
-def _save(path, tensors, geometry, meta, graph=()):
+def _channels(design):
+    return {"channels": list(design.electrodes)}
+
+
+def _save(path, tensors, geometry, meta):
+    where = {"mesh": mesh_key(geometry), "skin": geometry.name}
+    _write(path, tensors, meta | where | _channels(geometry.design))
+
+
+def _write(path, tensors, meta, graph=()):
     big = lambda v: v.half() if v.is_floating_point() and v.numel() > 4096 else v  # noqa: E731
-    tensors = {k: big(v.detach()).cpu() for k, v in tensors.items()} | dict(graph)
-    meta = meta | {"channels": list(ELECTRODES)}
-    if geometry is not None:
-        meta |= {"mesh": mesh_key(geometry), "skin": geometry.name}
-    write_tensors(path, tensors, meta)
+    write_tensors(path, {k: big(v.detach()).cpu() for k, v in tensors.items()} | dict(graph), meta)
 
 
 def write_tensors(path: pathlib.Path | str, tensors: dict[str, torch.Tensor], meta: dict) -> None:
@@ -249,19 +255,15 @@ def _refuse_other(meta, path, geometry, direction):
             f"{_kind(meta)}"
         )
     check_entries(f"the description of {path}", meta, _DESCRIPTION | _DESCRIPTION_OF[stated])
-    if meta["channels"] != list(ELECTRODES):
+    if meta["channels"] != list(geometry.design.electrodes):
         raise ValueError(
-            f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
+            f"{path} was trained with channels {' '.join(meta['channels'])}, and skin {geometry.name!r} is "
+            f"of {geometry.design.title}: take a skin of those electrodes, or train on a set of this one"
         )
     if stated == "points":  # they fit any skin of the shape, which is checked on first use
         if not meta["config"].get("logarithm"):
             raise ValueError(
                 f"{path} was trained on counts and serves no sensor: train with logarithm true in the config"
-            )
-        if tuple(meta["channels"]) != geometry.design.electrodes:
-            raise ValueError(
-                f"{path} has {len(meta['channels'])} electrodes and skin {geometry.name!r} "
-                f"{geometry.design.nelectrode}: take a skin of the BioTac with {NELECTRODE}"
             )
         return
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
@@ -317,7 +319,7 @@ def _points_model(path, meta, tensors, geometry):
         config = LearningConfig(**meta["config"])
         points = SkinPoints.of_arrays({k: v.double().numpy() for k, v in graph.items()}, meta["reference"])
         make = LatentProjection if _kind(meta) == "latent_projection" else make_pointnet
-        net = make(points, config)
+        net = make(points, config, geometry.design.nelectrode)
     _fill(net, {k: v for k, v in tensors.items() if not k.startswith("points.")}, path)
     return PointsModel(net, points, geometry, config, meta).eval()
 
@@ -336,7 +338,7 @@ def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Inverse
         outer = len(np.unique(geometry.outer_face))
         if meta["nouter"] != outer:
             raise ValueError(f"{meta['nouter']} outer nodes, the skin has {outer}")
-        head = InverseHead(Pod(geometry.nvert, modes[0]), modes[1], outer)
+        head = InverseHead(Pod(geometry.nvert, modes[0]), modes[1], outer, geometry.design.nelectrode)
     _fill(head, tensors, path)
     return head.eval()
 

@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist, squareform
 
 from ..files import refuse_existing, write_json
@@ -99,8 +100,7 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
         mesh = read_tet_mesh(shape.mesh)
         mesh = TetMesh(1e3 * mesh.vert, mesh.elem)
         _check_mesh(mesh)
-    wide = 1.05 * np.abs(mesh.vert[:, [0, 2]]).max(0)
-    backing = plate(*np.sqrt(2) * wide, _BACKING, sides=4) if shape.block else plate(*wide, _BACKING)
+    backing = plate(_outline(mesh), _BACKING)
     core = EMPTY
     if isinstance(shape.core, tuple):
         core = dome_core((np.array(_xyz(shape.core)), 0.0), 30)
@@ -177,6 +177,17 @@ def new_design(
     skin.save(folder / "default.npz")
     write_json(folder / "design.json", json.loads(design.text))
     return design
+
+
+def _outline(mesh):
+    """Outline (n, 2) in x and z of a backing that holds all of the mesh's back, and 5 % more."""
+    back = mesh.vert[np.abs(mesh.vert[:, 1]) < 1e3 * FIXED_WITHIN][:, [0, 2]]
+    if np.linalg.matrix_rank(back - back[0]) < 2:
+        raise ValueError(
+            "the mesh meets the plane y = 0 in a point or a line: a pad is held there by its rim or its back"
+        )
+    outline = back[ConvexHull(back).vertices]
+    return outline + 0.05 * (outline - outline.mean(0))
 
 
 def _check_mesh(mesh):

@@ -27,7 +27,7 @@ _COUNT = 4 / FULL_SCALE  # change of ln Z per count at mid-range: the resolution
 
 
 def compressed(change: np.ndarray) -> np.ndarray:
-    """(n, 19) changes of ln Z, compressed so that light and hard touches are equally dense."""
+    """(n, nelectrode) changes of ln Z, compressed so that light and hard touches are equally dense."""
     return np.arcsinh(change / _KNEE)
 
 
@@ -41,7 +41,8 @@ class StuckDetector:
     1954): it grows while others move and falls when the electrode does.
 
     Attributes:
-      weight: (19, 19) coefficients of each electrode (a column) on the others. spread: (19,) its usual error.
+      weight: (nelectrode, nelectrode) coefficients of each electrode (a column) on the others. spread:
+        (nelectrode,) its usual error.
       most: () largest evidence in known rows, of any electrode.
     """
 

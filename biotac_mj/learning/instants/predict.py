@@ -7,7 +7,6 @@ import torch
 
 from ...files import hdf5, replacing
 from ...recordings import load_one
-from ...sensor.channels import NELECTRODE
 from ..protocol import conformal_width
 from ..report import predictions_of, report_of
 from ..training.arrays import load_arrays
@@ -64,10 +63,10 @@ def _forward(model, source, meta):
     if "half" not in meta:
         raise ValueError(f"{model} has no intervals: write it with `biotac learn train TRAINED --out FILE`")
     check_intervals(model, meta, {"half": list[float], "usual": float})
-    if len(meta["half"]) != NELECTRODE:
+    if len(meta["half"]) != len(meta["channels"]):
         raise ValueError(
-            f"half of the description of {model} has {len(meta['half'])} numbers, {NELECTRODE} are needed: "
-            "write it with `biotac learn train TRAINED --out FILE`"
+            f"half of the description of {model} has {len(meta['half'])} numbers, "
+            f"{len(meta['channels'])} are needed: write it with `biotac learn train TRAINED --out FILE`"
         )
     arrays = load_arrays(source)
     network = load_forward(model, arrays.geometry)

@@ -94,7 +94,7 @@ def evaluate_recording(
 
 
 def _usable(recording):
-    """(recording, (n, 19) counts, notes): the rows with all evaluated quantities."""
+    """(recording, (n, nelectrode) counts, notes): the rows with all evaluated quantities."""
     notes = []
     if recording.force is not None:
         there = np.isfinite(recording.force).all(1)
@@ -156,7 +156,8 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
 
 
 def _through_code(counts, ntrain, vae, seed, steps, bar):
-    """(n, 19) counts through a code of 8; the network is trained on the first ntrain rows for so many steps.
+    """(n, nelectrode) counts through a code of 8; the network is trained on the first ntrain rows for so many
+    steps.
 
     vae: the paper's, on counts. Otherwise an autoencoder without sampling on ln Z, in which warm-up is a
     straight line, initialised as principal components; its loss is on counts."""
@@ -170,14 +171,18 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
     steep = -counts * (1 - counts / FULL_SCALE) / size  # change of counts with a common change of ln Z
     tensor = lambda value: torch.tensor(value, dtype=torch.float32)  # noqa: E731
     if vae:
-        net, x, common = ElectrodeVAE(), tensor((counts - counts[:ntrain].mean(0)) / size), tensor(steep)
+        net, x, common = (
+            ElectrodeVAE(counts.shape[1]),
+            tensor((counts - counts[:ntrain].mean(0)) / size),
+            tensor(steep),
+        )
         read = lambda y: y  # noqa: E731
     else:
         log_z, slope = log_impedance(counts), steep[:ntrain].mean(0)
         mean = log_z[:ntrain].mean(0)
         rows = (log_z - mean) * slope
         axes = principal_components(rows[:ntrain])[1][:, :_CODE]
-        net, x = ElectrodeVAE(linear=tensor(axes.T)), tensor(rows)
+        net, x = ElectrodeVAE(counts.shape[1], linear=tensor(axes.T)), tensor(rows)
         common, mean, slope = tensor(np.broadcast_to(slope, rows.shape).copy()), tensor(mean), tensor(slope)
         read = lambda y: FULL_SCALE / size / (1 + torch.exp(mean + y / slope))  # noqa: E731
 

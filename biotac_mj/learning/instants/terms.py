@@ -19,8 +19,8 @@ KINDS = [
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Terms:
-    """Features: ln Z (n, 19), products of its first components, and random Fourier features (of a Gaussian
-    kernel).
+    """Features: ln Z (n, nelectrode), products of its first components, and random Fourier features (of a
+    Gaussian kernel).
 
     Attributes:
       common: 1.0 subtracts the mean over the electrodes, which warm-up changes.

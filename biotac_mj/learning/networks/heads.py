@@ -4,7 +4,6 @@ skin at rest."""
 import torch
 from torch import nn
 
-from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["FromRest", "LocalHead", "steady"]
@@ -40,28 +39,30 @@ class LocalHead(nn.Module):
     """One head for all electrodes on the features over each, a linear layer for each electrode, and a small
     residual on the whole mesh.
 
-    The shared head has 19 times the data of separate heads, and cannot recognise an indenter.
+    The shared head has the data of all electrodes, separate ones that of one each; and it cannot recognise an
+    indenter.
 
     Args:
-      features: per electrode. modes: components of the mesh for the residual. width: of its layers.
+      features: per electrode. modes: components of the mesh for the residual. nelectrode: electrodes.
+      width: of its layers.
 
     Attributes:
       damp: (modes,) factors on the components: at unit variance, the last ones would be mostly noise.
     """
 
-    def __init__(self, features: int, modes: int, width: int = 128, dropout: float = 0.1):
+    def __init__(self, features: int, modes: int, nelectrode: int, width: int = 128, dropout: float = 0.1):
         super().__init__()
         self.register_buffer("scale", torch.ones(features))
         self.register_buffer("damp", torch.ones(modes))
-        self.embedding = nn.Parameter(0.1 * torch.randn(NELECTRODE, 8))
+        self.embedding = nn.Parameter(0.1 * torch.randn(nelectrode, 8))
         self.shared = mlp([features + 8, width, width, 1], dropout)
-        self.own = nn.Parameter(torch.zeros(NELECTRODE, features))
-        self.residual = mlp([modes, width, NELECTRODE], 0.3)
+        self.own = nn.Parameter(torch.zeros(nelectrode, features))
+        self.residual = mlp([modes, width, nelectrode], 0.3)
         with torch.no_grad():
             self.residual[-1].weight.mul_(0.1)
 
     def forward(self, local: torch.Tensor, pod: torch.Tensor) -> torch.Tensor:
-        """(n, 19) of local (n, 19, features) and pod (n, modes)."""
+        """(n, nelectrode) of local (n, nelectrode, features) and pod (n, modes)."""
         x = local / self.scale
         own = (x * self.own).sum(-1)
         return (

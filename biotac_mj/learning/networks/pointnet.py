@@ -8,7 +8,6 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
-from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["PointNet", "farthest_points"]
@@ -30,11 +29,11 @@ class PointNet(nn.Module):
     """Displacements of all nodes -> electrodes, through set abstraction over 128, 32 and 8 points.
 
     Args:
-      vert: (nvert, 3) rest positions [m]. free: nodes to sample from (those that can move). dropout: in the
-        head.
+      vert: (nvert, 3) rest positions [m]. free: nodes to sample from (those that can move).
+      nelectrode: electrodes. dropout: in the head.
     """
 
-    def __init__(self, vert: np.ndarray, free: np.ndarray, dropout: float = 0.3):
+    def __init__(self, vert: np.ndarray, free: np.ndarray, nelectrode: int, dropout: float = 0.3):
         super().__init__()
         vert, free = np.asarray(vert, float), np.asarray(free)
         if len(free) < _POINTS[0]:
@@ -65,10 +64,10 @@ class PointNet(nn.Module):
             "place", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False
         )
         self.whole = nn.Sequential(mlp([width + 3, 256, 256]), nn.ELU())
-        self.head = mlp([256, 256, 128, NELECTRODE], dropout)
+        self.head = mlp([256, 256, 128, nelectrode], dropout)
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
-        """(batch, 19) of u (batch, nvert, 3), displacements divided by their scale."""
+        """(batch, nelectrode) of u (batch, nvert, 3), displacements divided by their scale."""
         x = u[:, self.sample]
         for i, stage in enumerate(self.stages):
             x = x[:, getattr(self, f"group{i}")]

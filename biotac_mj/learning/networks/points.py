@@ -1,4 +1,4 @@
-"""Fixed points of a BioTac's skin, at which networks read the displacements of any mesh.
+"""Fixed points of a design's skin, at which networks read the displacements of any mesh.
 
 The points are nodes of a reference skin, chosen by geodesic farthest-point sampling. A mesh's displacements
 are interpolated to them by the shape functions of its tetrahedra, and from them to its nodes through the
@@ -17,9 +17,11 @@ from .hierarchy import Level, build_hierarchy
 if typing.TYPE_CHECKING:
     from ...geometry.skin_geometry import SkinGeometry
 
-__all__ = ["SkinPoints", "shape_values"]
+__all__ = ["SAME_SHAPE", "SkinPoints", "shape_values"]
 
-_OFF = 0.5e-3  # [m] half the thickness of the skin: at a larger distance the points belong to another skin
+SAME_SHAPE = (
+    0.5e-3  # [m] half the thickness of the skin: at a larger distance the points belong to another skin
+)
 
 
 def shape_values(vert: np.ndarray, tets: np.ndarray, target: np.ndarray) -> csr_matrix:
@@ -71,11 +73,11 @@ class SkinPoints:
         """
         out = shape_values(geometry.vert, geometry.tets, self.place)
         off = np.linalg.norm(out @ geometry.vert - self.place, axis=1)
-        if np.mean(off > _OFF) > 0.02:
+        if np.mean(off > SAME_SHAPE) > 0.02:
             raise ValueError(
-                f"skin {geometry.name!r} has not the BioTac's shape in the BioTac frame: "
-                f"{np.mean(off > _OFF):.0%} of the network's points lie over {1e3 * _OFF:g} mm beside it; "
-                "take skin 'default' or 'coarse'"
+                f"skin {geometry.name!r} has not the shape of the network's, {self.reference!r}, in the "
+                f"BioTac frame: {np.mean(off > SAME_SHAPE):.0%} of the network's points lie over "
+                f"{1e3 * SAME_SHAPE:g} mm beside it; take that skin, or another of its design"
             )
         return out
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ...sensor.channels import CHANNELS, NELECTRODE, check_counts, counts_from_impedance, log_impedance
+from ...sensor.channels import check_counts, counts_from_impedance, log_impedance
 from ..networks.graph import SparseMatrix
 
 if typing.TYPE_CHECKING:
@@ -26,9 +26,10 @@ class Arrays:
       field: (n, nvert, 3) float16 displacements [mm]; (n, npoint, 3) of `at_points`.
       owner: (n,) number of the interaction; first: (n,) row of its first step; time: (n,) seconds since then.
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
-      counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the
-        interaction's first row.
-      simulated: (n, 19) counts of the simulation's own film, without noise if the set has its impedances.
+      counts: (n, nelectrode) float32 measured counts, NaN where not labelled; tare: (n, nelectrode) those of
+        the interaction's first row.
+      simulated: (n, nelectrode) counts of the simulation's own film, without noise if the set has its
+        impedances.
       force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
       geometry: SkinGeometry. path: of the set. sensor: "real" if resimulated recordings have the measured
         counts, else "synthetic".
@@ -77,15 +78,16 @@ class Arrays:
         return rows
 
     def change(self, rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) tared measured counts of rows."""
+        """(k, nelectrode) tared measured counts of rows."""
         return self.counts[rows] - self.tare[rows]
 
     def log_change(self, rows: torch.Tensor) -> torch.Tensor:
-        """(k, 19) d ln Z of rows relative to their tare."""
+        """(k, nelectrode) d ln Z of rows relative to their tare."""
         return self._log_impedance(self.counts[rows], self.tare[rows])
 
     def film_change(self) -> torch.Tensor:
-        """(n, 19) d ln Z of all rows relative to their interaction's first, by the simulation's own film."""
+        """(n, nelectrode) d ln Z of all rows relative to their interaction's first, by the simulation's own
+        film."""
         return self._log_impedance(self.simulated, self.simulated[self.first])
 
     def _log_impedance(self, counts, rest):
@@ -151,12 +153,13 @@ def load_arrays(
 
     with TactileSet(path) as data:
         check_columns(data)
+        names, n = data.design.channels, data.design.nelectrode
         for file in data._files:
             channels = [c.decode() if isinstance(c, bytes) else str(c) for c in file.attrs["channels"]]
-            if tuple(channels) != CHANNELS:
+            if tuple(channels) != names:
                 raise ValueError(
                     f"{file.filename} has its channels in the order {' '.join(channels)}: "
-                    f"{' '.join(CHANNELS)} is needed"
+                    f"{' '.join(names)} is needed"
                 )
         stop = len(data) if limit is None else min(limit, len(data))
         nstep = int(data.stop[stop - 1])
@@ -173,8 +176,8 @@ def load_arrays(
                 f"{path} holds displacements that are not finite: "
                 "make the set again, or leave those interactions out"
             )
-        measured = data["measured_counts"][keep][:, :NELECTRODE]
-        counts = data["counts"][keep][:, :NELECTRODE]
+        measured = data["measured_counts"][keep][:, :n]
+        counts = data["counts"][keep][:, :n]
         check_counts(counts, f"simulated counts of {path}")
         check_counts(np.where(np.isnan(measured), counts, measured), f"measured counts of {path}")
         labelled = np.asarray(data.labelled[:stop])

@@ -6,18 +6,16 @@ import typing
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 from torch import nn
 
-from ...geometry.design import BIOTAC
-from ...sensor.channels import NELECTRODE
-from ..networks.points import shape_values
+from ..networks.points import SAME_SHAPE, shape_values
 
 if typing.TYPE_CHECKING:
     from ...geometry.skin_geometry import SkinGeometry
 
-__all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix", "orthogonal_modes"]
+__all__ = ["FilmFeatures", "Pod", "mirror_matrix", "mirror_order", "orthogonal_modes"]
 
-ELECTRODE_MIRROR = BIOTAC.mirror  # e1..e6 are opposite e11..e16 and e8 opposite e9; the others on the midline
 _RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
 _FILM = 50e-6  # [m] residual film where the skin touches the core, as in sensor.film
 
@@ -77,16 +75,17 @@ class FilmFeatures(nn.Module):
     (linearised), at least 50 um. Gaussian patches of three radii around each electrode give: mean ln(h / h0),
     mean h0 / h - 1, displacement along the electrode's normal and two tangents [mm]; the gradient of the
     displacement over the middle patch (6, the skin's local strain and tilt); and mean ln(h / h0) near the
-    four excitation electrodes and over the whole film (5), which all currents cross.
+    k excitation electrodes and over the whole film (k + 1), which all currents cross.
 
     The second tangent points away from the midplane, so that an electrode and its mirror image have equal
     features.
 
     Args:
       geometry: SkinGeometry.
-    """
 
-    count = 5 * len(_RADII) + 6 + 5
+    Attributes:
+      count: features of one electrode.
+    """
 
     def __init__(self, geometry: "SkinGeometry"):
         super().__init__()
@@ -110,7 +109,7 @@ class FilmFeatures(nn.Module):
             np.abs(geometry.electrode_pos[:, 2]) < 5e-4, 1.0, np.sign(geometry.electrode_pos[:, 2])
         )
         across *= (np.sign(across[:, 2]) * side)[:, None]
-        frame = np.stack([normal, along, across], 1)  # (19, 3, 3): rows are directions
+        frame = np.stack([normal, along, across], 1)  # (nelectrode, 3, 3): rows are directions
 
         # over an electrode: distance along the surface from the skin point on its normal; points across the
         # finger are far in depth
@@ -128,23 +127,26 @@ class FilmFeatures(nn.Module):
             )
             patches.append(w / w.sum(1, keepdims=True))
         w = patches[1]
-        tangent = np.einsum("enk,eak->ena", offset, frame[:, 1:])  # (19, n, 2)
+        tangent = np.einsum("enk,eak->ena", offset, frame[:, 1:])  # (nelectrode, n, 2)
         centred = tangent - np.einsum("en,ena->ea", w, tangent)[:, None]
         spread = np.einsum("en,ena,enb->eab", w, centred, centred)
-        # (19, 2, n)
+        # (nelectrode, 2, n)
         slope = np.einsum("en,ena,eab->ebn", w, centred, np.linalg.inv(spread + 1e-9 * np.eye(2)))
         operators = [w_[:, None] for w_ in patches] + [1e-3 * slope]
-        operator = np.concatenate(operators, 1)  # (19, 5, n) acts on each component in the electrode's frame
-        linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(NELECTRODE * operator.shape[1] * 3, -1)
+        # (nelectrode, 5, n) acts on each component in the electrode's frame
+        operator = np.concatenate(operators, 1)
+        linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(3 * operator[..., 0].size, -1)
 
         seeds = excitation_places(geometry.design.excitation, geometry.design, published=True)
         g = np.exp(-0.5 * (np.linalg.norm(place[None] - seeds[:, None], axis=2) / 3e-3) ** 2)
         g = np.concatenate([g, np.ones((1, len(node)))])
         g /= g.sum(1, keepdims=True)
-        # each electrode's own side first
-        order = np.where(
-            geometry.electrode_pos[:, 2:] * np.sign(seeds[1, 2]) > 0, [[1, 0, 3, 2, 4]], [[0, 1, 2, 3, 4]]
-        )
+        # an electrode and its mirror image see the excitation electrodes in mirrored order
+        k, lead = len(seeds), seeds[np.abs(seeds[:, 2]).argmax(), 2]
+        mirrored = cKDTree(seeds).query(seeds * [1, 1, -1])[1]
+        other = geometry.electrode_pos[:, 2:] * np.sign(lead) < 0
+        order = np.where(other, [*mirrored, k], np.arange(k + 1))
+        self.count = 5 * len(_RADII) + 6 + k + 1
         self.register_buffer("order", torch.as_tensor(order), persistent=False)
         for name, value in (
             ("linear", linear),
@@ -157,15 +159,15 @@ class FilmFeatures(nn.Module):
         self.register_buffer("node", torch.as_tensor(node), persistent=False)
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
-        """(n, 19, count) of u (n, nvert, 3) [mm]."""
+        """(n, nelectrode, count) of u (n, nvert, 3) [mm]."""
         inner = u[:, self.node].float()
         n = len(u)
-        linear = (inner.flatten(1) @ self.linear.T).view(n, NELECTRODE, -1)
+        linear = (inner.flatten(1) @ self.linear.T).view(n, len(self.order), -1)
         film = torch.clamp(self.gap + (inner * self.away).sum(2), min=1e3 * _FILM)
         thinner = torch.log(film / self.gap)
         inverse = self.gap / film - 1
         local = torch.cat([thinner, torch.log1p(inverse.clamp(min=-0.9))], 0)
-        local = (local @ self.patch.T).view(2, n, len(_RADII), NELECTRODE).permute(1, 3, 0, 2).flatten(2)
+        local = (local @ self.patch.T).view(2, n, len(_RADII), -1).permute(1, 3, 0, 2).flatten(2)
         mean_inverse = (
             torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), -1).transpose(1, 2)
         )
@@ -179,3 +181,12 @@ def mirror_matrix(geometry: "SkinGeometry") -> csr_matrix:
     """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0. Curved surfaces do not map
     onto themselves exactly."""
     return shape_values(geometry.vert, geometry.tets, geometry.vert * [1, 1, -1])
+
+
+def mirror_order(geometry: "SkinGeometry") -> np.ndarray | None:
+    """(nelectrode,) electrode that is the mirror image of each one in z = 0; None for a fingertip that is
+    not symmetric, whose mirrored touches say nothing of it."""
+    flip = np.array([1, 1, -1])
+    off, order = cKDTree(geometry.electrode_pos).query(geometry.electrode_pos * flip)
+    beside = np.linalg.norm(mirror_matrix(geometry) @ geometry.vert - geometry.vert * flip, axis=1)
+    return order if max(off.max(), np.quantile(beside, 0.98)) < SAME_SHAPE else None

@@ -21,20 +21,20 @@ _PENALTIES = np.geomspace(1e-4, 1e2, 13)  # of a mixing, relative to the mean sq
 
 
 def fit_gains(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Gains (19,) by least squares of changes of counts, predicted and measured (n, 19)."""
+    """Gains (nelectrode,) by least squares of changes of counts, predicted and measured (n, nelectrode)."""
     return (predicted * measured).sum(0) / np.maximum((predicted**2).sum(0), 1e-9)
 
 
 def fit_mixing(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """Matrix (19, k) from predicted changes of counts (n, k) to measured ones (n, 19): gains, cross-talk and
-    common coupling of a sensor, and, for k > 19, coefficients of the further columns.
+    """Matrix (nelectrode, k) from predicted changes of counts (n, k) to measured ones (n, nelectrode): gains,
+    cross-talk and common coupling of a sensor, and coefficients of further columns.
 
     Ridge regression towards gains (Hoerl and Kennard, 1970). Leave-one-touch-out cross-validation selects the
     penalty, and whether the gains are common or one per electrode. Fewer than three touches give the common
     gain only.
 
     Args:
-      predicted: (n, k), k at least 19, the first 19 are the electrodes. owner: (n,) touch of each row.
+      predicted: (n, k), the electrodes first. owner: (n,) touch of each row.
 
     Raises:
       ValueError: incompatible shapes, or no rows.

@@ -8,12 +8,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from ...geometry.design import BIOTAC
-from ...sensor.channels import NELECTRODE, check_counts, log_impedance
+from ...sensor.channels import check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
 from . import fitting
-from .features import ELECTRODE_MIRROR, orthogonal_modes
+from .features import mirror_order, orthogonal_modes
 from .fitting import Checkpoints, TrainingOptions, root_mean_square
 
 if typing.TYPE_CHECKING:
@@ -36,26 +35,34 @@ PATCH = 0.15  # fraction of the largest nodal force above which a node is in the
 
 
 class InverseHead(nn.Module):
-    """d ln Z of the 19 electrodes -> displacements of all nodes and contact force on the outer ones, through
+    """d ln Z of the electrodes -> displacements of all nodes and contact force on the outer ones, through
     components of both.
 
     Args:
-      pod: Pod of the displacements. force_modes: components of the force. nouter: outer nodes. width,
-        dropout: of the network.
+      pod: Pod of the displacements. force_modes: components of the force. nouter: outer nodes.
+      nelectrode: electrodes. width, dropout: of the network.
     """
 
-    def __init__(self, pod: "Pod", force_modes: int, nouter: int, width: int = 256, dropout: float = 0.2):
+    def __init__(
+        self,
+        pod: "Pod",
+        force_modes: int,
+        nouter: int,
+        nelectrode: int,
+        width: int = 256,
+        dropout: float = 0.2,
+    ):
         super().__init__()
         self.pod = pod
         self.modes = pod.basis.shape[1]
         self.register_buffer("force_basis", torch.zeros(nouter, force_modes))
         self.register_buffer("force_scale", torch.ones(force_modes))
-        self.register_buffer("scale", torch.ones(NELECTRODE))
-        self.net = mlp([NELECTRODE, width, width, self.modes + force_modes], dropout)
+        self.register_buffer("scale", torch.ones(nelectrode))
+        self.net = mlp([nelectrode, width, width, self.modes + force_modes], dropout)
 
     def codes(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Components of displacement (n, modes), relative to the root mean square of the first, and of force,
-        for d ln Z (n, 19)."""
+        for d ln Z (n, nelectrode)."""
         out = self.net(log_change / self.scale) - steady(self.net, torch.zeros_like(log_change[:1]))
         return out.split([self.modes, self.force_basis.shape[1]], 1)
 
@@ -77,8 +84,9 @@ def train_inverse(
     seed: int = 0,
     checkpoints: Checkpoints | None = None,
 ) -> InverseHead:
-    """Trains on the simulation's own film of all training interactions, labelled or not, and of their mirror
-    images, then on labelled ones. pod: (Pod, components of all rows, those of the mirrored touches).
+    """Trains on the simulation's own film of all training interactions, labelled or not, and, where the
+    fingertip is symmetric, of their mirror images, then on labelled ones. pod: (Pod, components of all rows,
+    those of the mirrored touches).
 
     The loss weighs components by their size, so it is the error of the fields.
     """
@@ -87,7 +95,7 @@ def train_inverse(
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     force = arrays.force[rows].float()
     modes = min(64, *force.shape)
-    head = InverseHead(basis, modes, force.shape[1]).to(arrays.device)
+    head = InverseHead(basis, modes, force.shape[1], arrays.counts.shape[1]).to(arrays.device)
     for kept, found in zip((head.force_basis, head.force_scale), orthogonal_modes(force, modes)):
         kept.copy_(found)
     log_change = torch.zeros_like(arrays.counts)
@@ -99,7 +107,7 @@ def train_inverse(
     for chunk in torch.cat([every, check]).split(4096):
         forces[chunk] = arrays.force[chunk].float() @ head.force_basis / head.force_scale[0]
     size = basis.scale / basis.scale[0]
-    order = torch.as_tensor(ELECTRODE_MIRROR, device=arrays.device)
+    order = mirror_order(arrays.geometry)
 
     def error(r, flip=False, source=log_change):
         x = source[r]
@@ -108,7 +116,8 @@ def train_inverse(
         return value if flip else value + 0.3 * root_mean_square(f - forces[r])
 
     def symmetric(r):
-        return error(r, source=film) + 0.5 * error(r, True, film)
+        value = error(r, source=film)
+        return value if order is None else value + 0.5 * error(r, True, film)
 
     options = TrainingOptions(2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed)
     fitting.train(head, symmetric, every, options, checkpoints=checkpoints)
@@ -182,16 +191,16 @@ def inverse_errors(arrays: "Arrays", model: Callable, rows: torch.Tensor, patch:
 
 
 def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:
-    """d ln Z (n, 19) of raw counts (n, 19) relative to the counts at rest, tare (19,) or (n, 19).
+    """d ln Z (n, nelectrode) of raw counts (n, nelectrode) relative to the counts at rest, tare (nelectrode,)
+    or (n, nelectrode).
 
     Raises:
-      ValueError: not 19 channels, values that are not finite, or outside 0..4095.
+      ValueError: different channels, values that are not finite, or outside 0..4095.
     """
     counts, tare = np.asarray(counts, float), np.asarray(tare, float)
-    if counts.shape[-1:] != (NELECTRODE,) or tare.shape[-1:] != (NELECTRODE,):
+    if counts.shape[-1:] != tare.shape[-1:]:
         raise ValueError(
-            f"counts have shape {counts.shape} and the tare {tare.shape}: these weights are of a "
-            f"{BIOTAC.title}, give e1..e{NELECTRODE}"
+            f"counts have shape {counts.shape} and the tare {tare.shape}: give the same electrodes of both"
         )
     for name, value in (("counts", counts), ("tare", tare)):
         check_counts(np.atleast_2d(value), name)

@@ -7,11 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from ...geometry.design import designs
+from ...geometry.skins import shipped_skin, skin_reference
 from ...sensor.channels import FULL_SCALE
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead
 from . import fitting
-from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
+from .features import FilmFeatures, mirror_matrix, mirror_order
 from .fitting import Checkpoints, TrainingOptions, root_mean_square
 
 if typing.TYPE_CHECKING:
@@ -26,15 +28,15 @@ MODES = 32  # components of the mesh that a head reads
 
 
 def film_with_gains(arrays: "Arrays", fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    """Change of counts (n, 19) of the simulation's own film in rows (n,), with one gain of d ln Z for each
-    electrode fitted to labelled rows `fit`."""
+    """Change of counts (n, nelectrode) of the simulation's own film in rows (n,), with one gain of d ln Z for
+    each electrode fitted to labelled rows `fit`."""
     z = arrays.film_change()
     gain = (z[fit] * arrays.log_change(fit)).sum(0) / z[fit].square().sum(0).clamp(min=1e-9)
     return counts_change(gain * z[rows], arrays.tare[rows])
 
 
 def counts_change(log_change: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
-    """Change of counts (n, 19) from d ln Z (n, 19) and the counts at rest, `tare` (n, 19)."""
+    """Change of counts from d ln Z and the counts at rest, `tare`, each (n, nelectrode)."""
     tare = tare.clamp(0.5, FULL_SCALE - 0.5)
     return FULL_SCALE / (1 + (FULL_SCALE / tare - 1) * log_change.exp()) - tare
 
@@ -46,7 +48,8 @@ class Features:
       arrays: Arrays. config: LearningConfig.
 
     Attributes:
-      film: FilmFeatures. local: (n, 19, k) of all rows. mirrored: the same for the mirrored touches.
+      film: FilmFeatures. local: (n, nelectrode, k) of all rows. mirrored: the same for the mirrored
+        touches.
     """
 
     def __init__(self, arrays: "Arrays", config: "LearningConfig"):
@@ -81,7 +84,11 @@ class Features:
         """Points at which the paper's networks read the skin, and the set there."""
         from ..networks.points import SkinPoints
 
-        points = SkinPoints.choose(self.config.mesh_points, self.config.mesh_factors)
+        design = self.arrays.geometry.design
+        own = (
+            shipped_skin(design, "coarse") if design in designs() else skin_reference(self.arrays.geometry)[0]
+        )
+        points = SkinPoints.choose(self.config.mesh_points, self.config.mesh_factors, own)
         return points, self.arrays.at_points(points)
 
 
@@ -95,20 +102,20 @@ def train_head(
     checkpoints: Checkpoints | None = None,
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Trains one head: first on d ln Z of the simulation's own film in all training interactions, labelled or
-    not, and in their mirror images, since the simulation is symmetric; then on the sensor.
+    not, and in their mirror images if the fingertip is symmetric; then on the sensor.
 
     Args:
       features: Features. train, validation: numbers of interactions.
       pod: (Pod, components, mirrored components), fitted on the training interactions.
 
     Returns:
-      function (rows) -> (k, 19) predicted change of counts; the head is its attribute `head`.
+      function (rows) -> (k, nelectrode) predicted change of counts; the head is its attribute `head`.
     """
     a = features.arrays
     torch.manual_seed(seed)
     pod, now, then = pod
-    order = torch.as_tensor(ELECTRODE_MIRROR, device=a.device)
-    head = LocalHead(features.film.count, min(MODES, now.shape[1]), config.width).to(a.device)
+    order, nelectrode = mirror_order(a.geometry), a.counts.shape[1]
+    head = LocalHead(features.film.count, min(MODES, now.shape[1]), nelectrode, config.width).to(a.device)
     head.scale.copy_(features.local[a.rows(train)].square().mean((0, 1)).sqrt() + 1e-6)
     head.damp.copy_((pod.scale / pod.scale[0]).sqrt()[: len(head.damp)])
 
@@ -128,6 +135,8 @@ def train_head(
 
     def teacher_loss(rows):
         value = root_mean_square(output(rows) - target[rows])
+        if order is None:
+            return value
         return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
 
     options = TrainingOptions(2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed)

@@ -35,10 +35,10 @@ class LatentProjection(nn.Module):
     """Displacements -> code of 128 -> code of 8 -> electrodes, and back.
 
     Args:
-      points: SkinPoints. config: LearningConfig.
+      points: SkinPoints. config: LearningConfig. nelectrode: electrodes.
     """
 
-    def __init__(self, points: "SkinPoints", config: "LearningConfig"):
+    def __init__(self, points: "SkinPoints", config: "LearningConfig", nelectrode: int):
         super().__init__()
         self.mesh = MeshVAE(
             points.levels,
@@ -49,33 +49,36 @@ class LatentProjection(nn.Module):
             config.mesh_latent,
             config.mesh_order,
         )
-        self.electrode = ElectrodeVAE(hidden=config.electrode_hidden, latent=config.electrode_latent)
+        self.electrode = ElectrodeVAE(
+            nelectrode, hidden=config.electrode_hidden, latent=config.electrode_latent
+        )
         self.to_electrode = mlp(
             [self.mesh.latent, *config.forward_hidden, self.electrode.latent], config.dropout
         )
         self.to_mesh = mlp([self.electrode.latent, *config.inverse_hidden, self.mesh.latent], config.dropout)
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:
-        """(n, 19) for u (n, npoint, 3), displacements / mesh_scale: d ln Z, or tared counts / 2048."""
+        """(n, nelectrode) for u (n, npoint, 3), displacements / mesh_scale: d ln Z, or tared counts /
+        2048."""
         return self.electrode.decode(self.to_electrode(self.mesh.encode(u)[0]))
 
     def inverse(self, y: torch.Tensor) -> torch.Tensor:
-        """(n, npoint, 3) displacements / mesh_scale for y (n, 19)."""
+        """(n, npoint, 3) displacements / mesh_scale for y (n, nelectrode)."""
         return self.mesh.decode(self.to_mesh(self.electrode.encode(y)[0]))
 
 
-def make_pointnet(points: "SkinPoints", config: "LearningConfig") -> PointNet:
+def make_pointnet(points: "SkinPoints", config: "LearningConfig", nelectrode: int) -> PointNet:
     """The baseline, on 128 of the points."""
-    return PointNet(points.place, np.arange(len(points.place)), dropout=config.dropout)
+    return PointNet(points.place, np.arange(len(points.place)), nelectrode, dropout=config.dropout)
 
 
 def network_target(arrays: "Arrays", rows: torch.Tensor, config: "LearningConfig") -> torch.Tensor:
-    """(k, 19) target of the networks in rows of a set."""
+    """(k, nelectrode) target of the networks in rows of a set."""
     return arrays.log_change(rows) if config.logarithm else arrays.change(rows) / config.scale
 
 
 def network_change(output: torch.Tensor, tare: torch.Tensor, config: "LearningConfig") -> torch.Tensor:
-    """(k, 19) change of counts from a network's output, for counts `tare` (k, 19) at rest."""
+    """Change of counts from a network's output, for counts `tare` at rest, each (k, nelectrode)."""
     return counts_change(output, tare) if config.logarithm else config.scale * output
 
 
@@ -104,7 +107,7 @@ def train_latent_projection(
       the networks, and the validation curves of the four trainings: {name: [[step, error]]}.
     """
     torch.manual_seed(seed)
-    model = LatentProjection(points, config).to(arrays.device)
+    model = LatentProjection(points, config, arrays.counts.shape[1]).to(arrays.device)
     curves = {name: [] for name in ("mesh", "electrode", "to_electrode", "to_mesh")}
     unit = 1e-3 / config.mesh_scale
     mesh_rows, mesh_check = arrays.rows(train), spread_rows(arrays.rows(validation), 512)
@@ -184,7 +187,7 @@ def train_pointnet(
     those of `LatentProjection`."""
     torch.manual_seed(seed)
     unit = 1e-3 / config.mesh_scale
-    net = make_pointnet(points, config).to(arrays.device)
+    net = make_pointnet(points, config, arrays.counts.shape[1]).to(arrays.device)
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     from_rest = FromRest(net)
 
