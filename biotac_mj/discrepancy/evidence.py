@@ -6,7 +6,17 @@ from scipy.stats import false_discovery_control
 
 from ..quality.evidence import sign_flip
 
-__all__ = ["ODDS", "RATE", "asked", "discoveries", "log_ratio", "max_t", "sign_flip", "signed_root_t"]
+__all__ = [
+    "ODDS",
+    "RATE",
+    "asked",
+    "discoveries",
+    "further_off",
+    "log_ratio",
+    "max_t",
+    "sign_flip",
+    "signed_root_t",
+]
 
 RATE = 1 / 21  # of false discoveries
 ODDS = (1 - RATE) / RATE  # how much likelier than all else an explanation has to be
@@ -32,6 +42,20 @@ def discoveries(p: np.ndarray) -> np.ndarray:
     """Discoveries among tests with p-values p (tests, ...), at a rate of false discoveries of `RATE`
     (Benjamini and Hochberg 1995)."""
     return false_discovery_control(np.asarray(p, float), axis=0) <= RATE
+
+
+def further_off(before: np.ndarray, after: np.ndarray, chance: np.ndarray | None = None) -> bool:
+    """Whether a model is further off from held-out data than the one without what was found, in any group of
+    channels by more than chance: nothing is written that is.
+
+    Args:
+      before, after: (units, groups) squares of errors of blocks of time or of trajectories.
+      chance: (groups,) standard deviation of the change of their sums; None: as the units say, at least two.
+    """
+    change = np.subtract(after, before)
+    if chance is None:
+        chance = change.std(0, ddof=1) * np.sqrt(len(change))
+    return bool((change.sum(0) > chance).any())
 
 
 def signed_root_t(gain: np.ndarray) -> float:

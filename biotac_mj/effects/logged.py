@@ -301,17 +301,18 @@ class WarmUpInLog(WarmUp, SharedLevel):
     confusable = WarmUp.confusable | _LEVELS
 
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """a, tau of the a (1 - exp(-t / tau)) closest to the trend. A straight line has no end: of all
-        that are as close it is the one with the least a."""
+        """a, tau of the a (1 - exp(-t / tau)) closest to the trend. A straight line has no end: of all that
+        are nearly as close it is the one with the least a; the interval has those that are less close."""
         time, bounds = np.linspace(trend.knots[0], trend.knots[-1], 200), self.params["tau"]
         y = trend(time) - trend(time[:1])
         fits = []
-        for tau in np.unique(np.clip(np.geomspace(0.05, 20, 60) * time[-1], bounds.low, bounds.high)):
+        for tau in np.unique(np.clip(np.geomspace(0.05, 20, 240) * time[-1], bounds.low, bounds.high)):
             basis = np.column_stack([1 - np.exp(-time / tau), np.ones(len(time))])
             w, *_ = np.linalg.lstsq(basis, y, rcond=None)
             fits.append((float(((y - basis @ w) ** 2).sum()), tau, w[0]))
-        near = [f for f in fits if f[0] < 1.5 * min(fits)[0] + 1e-4 * (y**2).sum()]
-        least = min(near, key=lambda f: abs(f[2]))
+        off = 0.5 * min(fits)[0] + 1e-4 * (y**2).sum()
+        near, nearly = ([f for f in fits if f[0] < min(fits)[0] + part * off] for part in (1.0, 0.5))
+        least = min(nearly, key=lambda f: abs(f[2]))
         return {
             name: (least[i], min(f[i] for f in near), max(f[i] for f in near))
             for name, i in (("a", 2), ("tau", 1))

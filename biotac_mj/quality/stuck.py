@@ -26,6 +26,8 @@ _STANDS = 8.0  # [counts] most jitter of a constant channel
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
 _ALIVE = 1.2  # [counts] of noise, four times that of rounding
+_MOVED = 6.0  # times its noise, that a channel with a limit moves by
+_OFTEN = 2.0  # times what noise repeats a value, that a channel stays at its limit
 
 
 def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
@@ -64,9 +66,13 @@ def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     # a row that repeats another has the same state
     before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
     sure = _thrown_to_an_end(log) | _long_constant(log, log.read[rows])[before]
+    side = _limits(log, rows)
     found = []
-    for k in np.flatnonzero(single | limited | sure.any(0)):
+    for k in np.flatnonzero(single | limited | sure.any(0) | (side != 0)):
         if k in known:
+            continue
+        if side[k]:
+            found.append(_limited(log, int(k), int(side[k])))
             continue
         at = np.zeros(len(rows), bool)
         at[1:-1] = quiet[:, k] & (single | limited)[k]
@@ -83,6 +89,35 @@ def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
             if single[k] or f.beyond or sure[:, k].any()
         ]
     return found
+
+
+def _limits(log, rows):
+    """(c,) side of the channels that stand still at an end of what they read in rows (n,), and elsewhere do
+    not: 1 the upper, -1 the lower end, 0 none. However often that is: a channel may rest at its limit."""
+    x = log.read[rows]
+    same = np.diff(x, axis=0) == 0
+    out = np.zeros(log.channels, int)
+    noise = sound_noise(np.median(x, axis=0))
+    alive = (noise > _ALIVE) & (np.ptp(x, axis=0) > _MOVED * noise)
+    for side in (1, -1) if log.signed else (1,):
+        end = side * (side * x).max(0)
+        at = x[1:] == end
+        stays = (same & at).sum(0)
+        chance = ((same & ~at).sum(0) + 1) / ((~at).sum(0) + 1)  # noise repeats a value as often elsewhere
+        often = np.maximum(chance, np.median(chance))
+        sure = (stays * -np.log(often) > _CHANCE + np.log(x.size)) & (stays > _OFTEN * often * at.sum(0))
+        for k in np.flatnonzero(sure & alive & (out == 0)):
+            ends = _moving_range(x[1:][~at[:, k], k])
+            comes = len(runs(at[:, k])[0])
+            if comes > 1 and _at_ends(end[[k]], ends)[side > 0].all():
+                out[k] = side
+    return out
+
+
+def _limited(log, k, side):
+    """Fault of channel k with a limit at one side of what it reads."""
+    start, length = runs(log.read[:, k] == side * (side * log.read[:, k]).max())
+    return _constant_fault(log, k, side, log.read[start, k], start, length)
 
 
 def _long_constant(log, x):

@@ -18,7 +18,7 @@ from ...quality.noise import noise_level
 from ...skin import Material
 from ...skin.rubber.material import PRESETS
 from ...skin.settings import plain
-from ..evidence import RATE, asked, discoveries, sign_flip
+from ..evidence import RATE, asked, discoveries, further_off, sign_flip
 from ..recordings.diagnosis import RecordingDiagnosis
 from ..recordings.recording import PlainRecording
 from ..report import plots
@@ -143,6 +143,12 @@ class Tried:
         return min(t.nats for t in self.tested)
 
     @property
+    def further_off(self) -> bool:
+        """Whether it is further off than the base model from what a sensor held out."""
+        rms = [t.locked["all"] for t in self.tested if t.locked]
+        return any(further_off([[before**2]], [[after**2]], np.zeros(1)) for before, after in rms)
+
+    @property
     def attached(self) -> list[dict] | None:
         """Arguments of `biotac_mj.attach` for a sensor with the effect, by sensor; None if no running sensor
         can have it."""
@@ -168,8 +174,10 @@ class PlateDiagnosis(Verdict):
 
     @property
     def acting(self) -> Tried | None:
-        """The named effect with most evidence that can act in a model, tied or not."""
-        return max((f for f in self.named if f.attached), key=lambda f: f.evidence, default=None)
+        """The named effect with most evidence that can act in a model, tied or not, and is no further off
+        with what was held out."""
+        some = (f for f in self.named if f.attached and not f.further_off)
+        return max(some, key=lambda f: f.evidence, default=None)
 
     def beside(self, first: RecordingDiagnosis) -> "PlateDiagnosis":
         """This one with what was found in its first recording alone."""

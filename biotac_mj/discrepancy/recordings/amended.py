@@ -23,7 +23,7 @@ def amended_sensor(session: Session) -> SensorFile:
     """
     r = session.recording
     without, recorded = (rest_of(counts, r.rate, r.force) for counts in (session.filled(), r.electrodes))
-    drifts = any(f.kind.drifts for f in session.findings)
+    drifts = any(f.kind.drifts and f.written for f in session.findings)
     own = recorded if drifts else without
     # what was named is no noise; and no electrode rests where it has never been
     seen = r.electrodes.min(0), r.electrodes.max(0)
@@ -49,12 +49,13 @@ def amended_sensor(session: Session) -> SensorFile:
 
 def running(session: Session) -> tuple[list, list[str]]:
     """[(Effect, theta)] of the effects found that act in a running sensor, without its baseline, trend and
-    noise; and ids of the others: faults of the logger or of the force sensor, and single events."""
+    noise; and ids of the others: faults of the logger or of the force sensor, single events, and what
+    held-out rows are further off with."""
     design, effects, left = designed(session.recording.electrodes), [], []
     for finding in session.findings:
-        if finding.kind.drifts or finding.kind.silent or finding.kind.is_noise:
+        if finding.written and (finding.kind.drifts or finding.kind.silent or finding.kind.is_noise):
             continue
-        theta = _theta(finding)
+        theta = _theta(finding) if finding.written else None
         if theta is None:
             left.append(finding.id)
         else:

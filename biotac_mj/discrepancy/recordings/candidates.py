@@ -39,7 +39,8 @@ class Candidate(Fault):
       delay: [s] by which the electrodes follow the force later.
       trend: of levels over time, or None; share: (19,) of it that each electrode has, None of a single one.
       gap: on the held-out rows, None where nothing there measures it; verified: whether they confirm it,
-        None where they cannot.
+        None where they cannot; written: whether it is in the amended sensor, with which the held-out rows are
+        no further off.
     """
 
     of_log: bool = False
@@ -50,6 +51,7 @@ class Candidate(Fault):
     share: np.ndarray | None = None
     gap: Gap | None = None
     verified: bool | None = None
+    written: bool = True
 
     @property
     def kind(self) -> Effect:

@@ -42,7 +42,7 @@ class RecordingDiagnosis(Verdict):
     @property
     def findings(self) -> list[Candidate]:
         """Named, the largest gap closed first."""
-        return self.session.findings
+        return self.session.ordered
 
     @property
     def rejected(self) -> list[Candidate]:
@@ -62,7 +62,7 @@ def concluded(
     session: Session, locked: float, late: list[Candidate], protocol: Protocol | None = None
 ) -> RecordingDiagnosis:
     """The diagnosis of a session from which all that is named has been taken out."""
-    r, left, found = session.recording, rest(session), [*session.findings, *late]
+    r, left, found = session.recording, rest(session), [*session.ordered, *late]
     seconds = len(r) / r.rate
     data = f"read as {r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
     data += ", with force" if r.force is not None else ""
@@ -82,7 +82,7 @@ def concluded(
         remainder=left.text,
         unknown=left.significant,
         notes=untold(session) + _order(r),
-        next_experiment=_next(session.findings, protocol),
+        next_experiment=_next(session.ordered, protocol),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(session),
         details={
@@ -155,7 +155,7 @@ def _amended(session):
     if left := running(session)[1]:
         lines.append(
             f"not in sensor_amended.yaml: {', '.join(left)}: of the logger, of the force or of the moment, "
-            "or no running sensor has it"
+            "or no running sensor has it, or held-out rows are further off with it"
         )
     return lines
 

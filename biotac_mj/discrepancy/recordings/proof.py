@@ -6,6 +6,7 @@ import numpy as np
 from ...effects.effect import shifted
 from ...quality.noise import noise_level
 from ...sensor.channels import counts_from_log_impedance, log_impedance
+from ..evidence import further_off
 from ..report.verdict import Gap, electrode_names
 from .candidates import Candidate
 from .detectors.latency import force_view
@@ -14,14 +15,16 @@ from .session import Session
 
 __all__ = ["prove", "views"]
 
+_BLOCKS = 8  # of the held-out rows, whose errors are compared
+
 _FEWEST = 5  # samples
 _TURNS = 0.3  # logarithm of way over range: how a trend goes on that has turned nobody knows
 _NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 
 
 def prove(session: Session, finding: Candidate) -> None:
-    """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
-    with it."""
+    """Fills `gap`, `verified` and `written` of a finding: its number on rows that took no part in any fit,
+    without and with it, and whether all electrodes are no further off there with it."""
     if finding.of_log:
         finding.verified = True  # what is wrong with a log is told by its own samples
     if finding.delay:
@@ -33,7 +36,9 @@ def prove(session: Session, finding: Candidate) -> None:
     elif finding.places or finding.end < _aside_from(session):
         return  # it is over by then
     else:
-        gap = _counts(session, session.without(finding), finding)
+        without = session.without(finding)
+        gap = _counts(session, without, finding)
+        finding.written = not further_off(*_blocks(without, session))
     finding.gap = gap
     if gap is not None and finding.verified is None:
         finding.verified = gap.after < gap.before
@@ -123,17 +128,17 @@ def _force(session, finding):
 
 def views(session: Session) -> dict[str, Gap]:
     """Numbers that the whole model says of the held-out part without having been given them, before and
-    after the findings."""
+    after the findings that are written."""
     bare = session.without(*session.findings)
+    session = session.without(*(f for f in session.findings if not f.written))
     out = {}
     sample = noise_level(session.recording.electrodes[session.fit])
+    each = [_errors(s) for s in (bare, session)]
     if session.loaded:
-        each = [_alone(s) for s in (bare, session)]
         out["each electrode from the others"] = _view(
             "what each electrode reads beside the others", each, sample / np.sqrt(session.model().width)
         )
     else:
-        each = [_at_rest(s) for s in (bare, session)]
         out["electrodes at rest"] = _view("the electrodes at rest", each, sample)
     if session.recording.force is not None and session.recording.force.std(0).max() > FORCE_MOVED:
         # a drift that load has blurred may be right for the electrodes and wrong for the force, whose own
@@ -142,15 +147,18 @@ def views(session: Session) -> dict[str, Gap]:
         late = fit[int(0.7 * len(fit)) :]
         still = session.without(*(f for f in session.findings if f.trend is not None))
         best = min(
-            (session, still), key=lambda s: np.sum(_force_said(s, fit[: int(0.7 * len(fit))], late) ** 2)
+            (session, still), key=lambda s: np.sum(_force_errors(s, fit[: int(0.7 * len(fit))], late) ** 2)
         )
-        each = [_force_said(s, fit, np.flatnonzero(~s.fit)) for s in (bare, best)]
+        each = [_force_errors(s, fit, np.flatnonzero(~s.fit)) for s in (bare, best)]
         noise = noise_level(session.recording.force[session.fit], None, _NOISELESS)
         out["force from electrodes"] = _view("the force as the electrodes tell it", each, noise)
     return out
 
 
-def _view(name, each, noise):
+def _view(name, errors, noise):
+    each = [_by_channel(e) for e in errors]
+    both = np.isfinite(each[0]) & np.isfinite(each[1])  # a channel that is no measurement has no error
+    each = [np.where(both, e, np.nan) for e in each]
     before, after = (float(np.sqrt(np.nanmean(e**2))) for e in each)
     unit, channels = "N", ("Fx", "Fy", "Fz")
     if len(each[0]) != len(channels):
@@ -158,24 +166,37 @@ def _view(name, each, noise):
     return Gap(unit, before, after, _rms(noise), name, channels, *(tuple(e.tolist()) for e in each))
 
 
-def _alone(s):
-    m, aside = _aside(s)
-    out = np.full(s.counts.shape[1], np.nan)
-    out[m.used] = np.sqrt((m.alone()[aside] ** 2).mean(0)) * m.slope
-    return out
-
-
-def _at_rest(s):
-    rows, late = s.fit, ~s.fit
-    level = counts_from_log_impedance(log_impedance(s.counts[rows]).mean(0))
-    error = np.where(s.masked, np.nan, s.counts - level)[late]
-    known = np.isfinite(error)
-    square = np.where(known, error**2, 0).sum(0) / np.maximum(known.sum(0), 1)
+def _by_channel(errors):
+    """(c,) RMS of errors (n, c), nan of channels of which nothing is known."""
+    known = np.isfinite(errors)
+    square = np.where(known, errors**2, 0).sum(0) / np.maximum(known.sum(0), 1)
     return np.where(known.any(0), np.sqrt(square), np.nan)
 
 
-def _force_said(s, fit, judged):
-    """(3,) RMS error [N] on some rows of a linear map from ln Z, fitted on others."""
+def _blocks(*sessions):
+    """Mean squares (blocks, 1) of the errors of held-out rows in each session, of what is known in all."""
+    errors = [_errors(s) for s in sessions]
+    known = np.logical_and.reduce([np.isfinite(e) for e in errors])
+    return [
+        np.array([[part.mean()] for part in np.array_split(np.where(known, e**2, 0), _BLOCKS)])
+        for e in errors
+    ]
+
+
+def _errors(s):
+    """(n, 19) errors [counts] of the held-out part, nan where nothing was measured: of bins, what each
+    electrode reads beside the others; unloaded, of rows, about the level of the rows fitted."""
+    if s.loaded:
+        m, aside = _aside(s)
+        out = np.full((aside.sum(), s.counts.shape[1]), np.nan)
+        out[:, m.used] = m.alone()[aside] * m.slope
+        return out
+    level = counts_from_log_impedance(log_impedance(s.counts[s.fit]).mean(0))
+    return np.where(s.masked, np.nan, s.counts - level)[~s.fit]
+
+
+def _force_errors(s, fit, judged):
+    """(n, 3) errors [N] on some rows of a linear map from ln Z, fitted on others."""
     z, force = log_impedance(s.filled()), s.recording.force
     z = shifted(z, s.recording.time, -sum(f.delay for f in s.findings))
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
@@ -183,4 +204,4 @@ def _force_said(s, fit, judged):
     ridge = 1e-3 * len(fit) * np.eye(A.shape[1])
     ridge[0, 0] = 0
     said = A @ np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ force[fit])
-    return np.sqrt(((said - force)[judged] ** 2).mean(0))
+    return (said - force)[judged]

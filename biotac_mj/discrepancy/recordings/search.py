@@ -13,7 +13,7 @@ from ...recordings.protocol import Protocol
 from ..evidence import discoveries
 from .candidates import as_candidates, as_log
 from .confidence import NAMED, confidence
-from .detectors.jumps import jumped
+from .detectors.jumps import jumped, jumped_alike
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
 from .detectors.order import slipped
@@ -90,6 +90,8 @@ def _levels(session, named):
     """Channels that are exchanged, jumps, and trends over time, the strongest first."""
     if (finding := slipped(session)) is not None:
         _take(session, finding, named)
+    if (finding := jumped_alike(session)) is not None:
+        _take(session, finding, named)
     for finding in jumped(session):
         _take(session, finding, named)
     refused = set()
@@ -98,7 +100,7 @@ def _levels(session, named):
         if finding is None:
             break
         same = [f for f in session.findings if f.channels == finding.channels]
-        jumps = any(f.sudden for f in same)
+        jumps = not finding.of_all and any(f.sudden for f in same)
         if jumps or _refined(session, finding, same) or not _take(session, finding, named):
             refused.add((None,) if finding.of_all else finding.channels)
     settle(session)
@@ -171,7 +173,6 @@ def _proved(session):
     if contradicted:
         session = session.without(*contradicted)
         session.weak = [*contradicted, *session.weak]
-    session.findings.sort(key=lambda f: -_taken(f))
     return session
 
 
@@ -224,9 +225,3 @@ def _late(session, named):
             found.append(finding)
             whole.accept(finding)
     return found
-
-
-def _taken(finding):
-    """Counts RMS that a candidate takes away from held-out rows, 0 of what is measured in another unit."""
-    gap = finding.gap
-    return gap.taken if gap is not None and gap.unit == "counts" and np.isfinite(gap.after) else 0.0

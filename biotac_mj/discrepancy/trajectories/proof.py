@@ -6,7 +6,7 @@ import typing
 
 import numpy as np
 
-from ..evidence import ODDS
+from ..evidence import ODDS, further_off
 from . import likelihood
 from .base.nuisance import Nuisance
 from .fitting import changes
@@ -134,17 +134,18 @@ def _compared(comparison, fit, rows):
 def _worse(comparison, before, after, aside) -> bool:
     """Whether the error of a group of channels has grown, by more than chance within the comparison's
     resolution."""
-    rows = [len(comparison.trajectories[i].time) for i in aside]
-    independent = [_independent(comparison, i) for i in aside]
-    for part in comparison.groups.values():
-        first, last = (
-            sum(((r / comparison.sigmas[i])[:, part] ** 2).mean(1).sum() for i, r in zip(aside, residuals))
-            for _, residuals, _ in (before, after)
+    parts, rows = comparison.groups.values(), [len(comparison.trajectories[i].time) for i in aside]
+    first, last = (
+        np.array(
+            [
+                [((r / comparison.sigmas[i])[:, part] ** 2).mean(1).sum() for part in parts]
+                for i, r in zip(aside, residuals)
+            ]
         )
-        chance = np.sqrt(sum(2 * n**2 / values[part].sum() for n, values in zip(rows, independent)))
-        if last - first > chance:
-            return True
-    return False
+        for _, residuals, _ in (before, after)
+    )
+    independent = np.array([[_independent(comparison, i)[part].sum() for part in parts] for i in aside])
+    return further_off(first, last, np.sqrt((2 * np.square(rows)[:, None] / independent).sum(0)))
 
 
 def _independent(comparison, i):

@@ -16,7 +16,7 @@ from ..conditional import Conditional
 from ..session import Session
 from .together import MOST, beyond, neighbours
 
-__all__ = ["Edge", "edges", "jumped"]
+__all__ = ["Edge", "edges", "jumped", "jumped_alike"]
 
 _LINE = 6  # rows of a line
 _AROUND = 36  # rows on either side
@@ -37,6 +37,8 @@ _MATCH, _BINS = 0.05, 1000
 # anything where the load never is
 _KEPT = 0.5
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
+# times the noise and what electrodes differ by, that all jump alike
+_ALIKE = 8.0
 # logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
 _CURVED = 0.18
 # standard errors of a gain: with less a level alone has changed, with more nothing is known of the gain
@@ -219,6 +221,55 @@ def jumped(session: Session) -> list[Candidate]:
             )
         )
     return out
+
+
+def jumped_alike(session: Session) -> Candidate | None:
+    """The plainest jump of all electrodes by the same counts, or by the same share of them: a touch moves
+    some more than others, what feeds them all does not."""
+    r = session.recording
+    rows = np.flatnonzero(~r.repeated)
+    if len(rows) < 200 or session.masked.mean() > 0.5:
+        return None
+    x = last_measured(session.counts[rows], session.masked[rows])
+    noise = np.maximum(noise_level(x), 0.7)
+    left, right, spread = line_ends(x, _LINE)
+    step = right - left
+    level = np.maximum(left + right, 1) / 2
+    offset, gain = (np.median(s, axis=1) for s in (step, step / level))
+    error = np.median(noise) * spread
+    apart = [np.median(np.abs(step - made), axis=1) for made in (offset[:, None], gain[:, None] * level)]
+    alike = np.abs(offset) / np.maximum(np.minimum(*apart) * 1.4826, error)
+    i = int(np.argmax(alike))
+    if alike[i] < _ALIKE:
+        return None
+    at, change = i + _LINE, float(offset[i])
+    stays = np.median(x[at : at + _STAYS].mean(0) - x[max(at - _STAYS, 0) : at].mean(0))
+    if not 0.5 < stays / change < 1.6 or rows[at] - rows[at - 1] > _HELD:
+        return None
+    by_gain = apart[1][i] < apart[0][i]
+    share, since = float(gain[i]), rows[at] / r.rate
+    error = float(error / np.sqrt(x.shape[1]))
+
+    def correct(counts, time):
+        late = (time >= since - 0.5 / r.rate)[:, None]
+        return counts / (1 + share * late) if by_gain else counts - change * late
+
+    what, width = (share, error / float(np.median(level[i]))) if by_gain else (change, error)
+    return Candidate(
+        "count_gain" if by_gain else "count_offset",
+        tuple(range(x.shape[1])),
+        since,
+        float(r.time[-1]),
+        f"from one row to the next all electrodes jump alike, by {change:+.0f} counts in the median",
+        {"change": (what, what - 2 * width, what + 2 * width)},
+        nats=float(alike[i] ** 2 / 2),
+        p=float(len(x) * np.exp(-(alike[i] ** 2) / 2)),
+        detector="slip",
+        sudden=True,
+        ties=("count_offset" if by_gain else "count_gain",),
+        correct=correct,
+        verified=True,  # by the rows themselves
+    )
 
 
 def _gains(session, k, since):

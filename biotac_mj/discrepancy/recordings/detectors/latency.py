@@ -56,7 +56,7 @@ class ForceView:
     def __init__(
         self, counts: np.ndarray, force: np.ndarray, rows: np.ndarray, usable: np.ndarray, rate: float
     ):
-        rows, self.rate = np.flatnonzero(rows), rate
+        rows, self.rate, self.usable = np.flatnonzero(rows), rate, usable
         z = log_impedance(counts[np.ix_(rows, usable)])
         z = z - z.mean(0)
         x = np.concatenate([z, Components(z, _AXES).products(z)], axis=1)
@@ -86,6 +86,10 @@ class ForceView:
     def at_delay(self, delay: float) -> np.ndarray:
         """(blocks,) mean of `errors` over components where the electrodes are `delay` [s] late."""
         return self.errors(lambda x: shifted(x, self.time, -delay)).mean(1)
+
+    def spread(self) -> np.ndarray:
+        """(blocks,) the same where the electrodes say nothing."""
+        return self.errors(np.zeros_like).mean(1)
 
     def at_low_pass(self, tau: float) -> np.ndarray:
         """(blocks,) the same where they follow the force by a first-order low-pass of tau [s]."""
@@ -165,13 +169,19 @@ def _vertex(x, y):
 
 
 def clock_offset(session: Session) -> str | None:
-    """Finds the delay between force and electrodes of a loaded sensor; None if there is none."""
+    """Line on force and electrodes of a loaded sensor that were logged by two clocks; None if they were not.
+    Touches that come again move both as well seconds later: where they do, the electrodes also tell the force
+    better."""
     r = session.recording
     n = len(r)
     if r.force is None or not session.loaded or r.force.std(0).max() < FORCE_MOVED or n / r.rate < _LEAST:
         return None
+    view = force_view(session, np.ones(n, bool))
+    if view is None:
+        return None
     step = max(1, round(r.rate / _MOVES))
-    a, b = (_activity(x, r.rate)[::step] for x in (session.counts, r.force))
+    a, b = (_activity(x, r.rate)[::step] for x in (session.counts[:, view.usable], r.force))
+    met = view.at_delay(0.0)
     m, rate = len(a), r.rate / step
     size = 2 * m  # zeros behind: the end of a recording says nothing of its beginning
     both = np.fft.irfft(np.fft.rfft(a, size).conj() * np.fft.rfft(b, size), size)
@@ -183,13 +193,14 @@ def clock_offset(session: Session) -> str | None:
         return None
     best = np.flatnonzero(far)[c[far].argmax()]
     here, there = c[near].max(), c[best]
-    if there >= _FAR and there - here >= _LESS:
+    late = -lag[best] / rate
+    if there >= _FAR and there - here >= _LESS and sign_flip(met - view.at_delay(late)) < _P:
         when = "after" if lag[best] > 0 else "before"
         return (
             f"force and electrodes do not meet: it moves best as they do {abs(lag[best]) / rate:.1f} s "
             f"{when} them; were they logged by two clocks, or is one from another row on?"
         )
-    if here < _NOTHING:
+    if here < _NOTHING and sign_flip(view.spread() - met) >= _P:
         return "force and electrodes move at different times: are they of the same touches?"
     return None
 

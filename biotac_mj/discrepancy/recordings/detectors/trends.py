@@ -109,7 +109,8 @@ def trends(
         gain = compare(null, left_out @ level, block, scale)
         knots = np.linspace(time[0], time[-1], k)
         found.append(Trend("smooth", np.nan, knots, weights @ level, 0.0, gain, sign_flip(gain)))
-    for knots in (time[[0, -1]], *([np.linspace(time[0], time[-1], 7)] if thorough else [])):
+    smooth = max(found, key=lambda c: c.nats).knots
+    for knots in (time[[0, -1]], *([smooth] if thorough else [])):
         basis = hats(time, knots) if len(knots) > 2 else np.ones((w, 1))
         residual = np.empty(w)
         for b in range(block[-1] + 1):
