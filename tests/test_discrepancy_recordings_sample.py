@@ -58,7 +58,7 @@ def test_touches_that_come_again_are_no_second_clock(sample, seconds):
         assert clock_offset(Session(part, np.arange(rows) < 0.7 * rows)) is None
 
 
-def test_what_held_out_rows_are_further_off_with_is_not_written(sample):
+def test_what_makes_held_out_rows_worse_is_not_written(sample):
     """A warm-up that is taken back as soon as the rows fitted end."""
     counts, _ = sample
     last = round(0.6 * len(counts))
