@@ -31,7 +31,7 @@ def test_many_electrodes_may_rest_at_a_limit(sample):
     assert {f.id for f in found} == {"saturate", "stuck", "warmup"}
 
 
-def test_a_step_of_all_electrodes_is_an_offset_beside_the_warm_up(sample):
+def test_a_step_of_all_is_an_offset_beside_the_warm_up(sample):
     counts, force = sample
     stepped = counts - 40.0 * (np.arange(len(counts)) >= len(counts) // 2)[:, None]
     diagnosis = diagnose_recording(PlainRecording(stepped, force, rate=100.0))
