@@ -2,6 +2,7 @@
 # make test        style and the quick tests;  make test-all: the slow ones too
 # make test-wheel  what CI runs: the same as test, of the wheel as a user has it, and not of this folder
 # make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with; of the package that pip makes
+# make test-neighbours  the pages and tests that need JAX or mjlab
 # make docs        the site, in docs/_build/html: warnings and broken links are errors
 # make benchmarks  accuracy and speed, tables and JSON in out/benchmarks
 # make assets      make the meshes in biotac_mj/assets/ again (needs the extra "mesh")
@@ -11,6 +12,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 NEWEST := $(VENV)-newest
+NEIGHBOURS := $(VENV)-neighbours
 # modules are compiled as they are first imported: all of them would take as long as the rest of the set-up
 PIP := -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 ARGS ?=
@@ -20,12 +22,12 @@ ON_MUJOCO := $(addprefix tests/test_,package.py plugin.py attach.py coupling.py 
 # of what is installed: nothing of this folder is imported, neither by the tests nor by processes that they start
 INSTALLED := PYTHONSAFEPATH=1 BIOTAC_TEST_INSTALLED=1
 OF_INSTALLED := $(PYTEST) --override-ini pythonpath=
-test test-all test-wheel test-newest: export OMP_NUM_THREADS := 1
+test test-all test-wheel test-newest test-neighbours: export OMP_NUM_THREADS := 1
 # modules are compiled once, and not in each process again: 8 s for what the tests import of this folder alone, 20 s and more in a
 # fresh environment
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: press test test-all test-wheel test-newest docs benchmarks assets clean
+.PHONY: press test test-all test-wheel test-newest test-neighbours docs benchmarks assets clean
 
 press: $(VENV)/.installed
 	@echo "a press takes 20 s of processor time; the first on a machine 40, its kernels are compiled"
@@ -52,6 +54,10 @@ test-newest: $(NEWEST)/.installed
 	$(NEWEST)/bin/python $(PIP) --force-reinstall --no-deps .
 	$(INSTALLED) $(NEWEST)/bin/$(OF_INSTALLED) $(ARGS) $(wildcard $(ON_MUJOCO))
 
+test-neighbours: $(NEIGHBOURS)/.installed
+	$(NEIGHBOURS)/bin/python -m $(PYTEST) -m "slow or not slow" $(ARGS) tests/test_mjx.py tests/test_differentiable_jax.py \
+	  tests/test_documents.py -k "jax or mjx or mjlab or gradients.md"
+
 docs: $(VENV)/.installed-docs
 	$(BIN)/python scripts/api.py
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going docs docs/_build/html
@@ -67,7 +73,7 @@ assets: $(VENV)/.installed-mesh
 	$(BIN)/python scripts/make_assets.py $(ARGS)
 
 clean:
-	rm -rf out build dist docs/_build *.egg-info .pytest_cache .ruff_cache $(VENV) $(NEWEST)
+	rm -rf out build dist docs/_build *.egg-info .pytest_cache .ruff_cache $(VENV) $(NEWEST) $(NEIGHBOURS)
 
 # Each stamp stands for one set of extras, installed once and again when the requirements change.
 $(BIN)/python:
@@ -94,4 +100,11 @@ $(VENV)/.installed-docs: pyproject.toml constraints.txt | $(BIN)/python
 $(NEWEST)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(NEWEST)
 	$(NEWEST)/bin/python $(PIP) ".[batch,data,web,test]"
+	touch $@
+
+# mjlab asks for another MuJoCo, so it comes without what it asks for
+$(NEIGHBOURS)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(NEIGHBOURS)
+	$(NEIGHBOURS)/bin/python $(PIP) --editable ".[batch,learning,mjx,test]" "mujoco<4" "mujoco-warp<4" imageio-ffmpeg mediapy prettytable tyro
+	$(NEIGHBOURS)/bin/python $(PIP) --no-deps mjlab
 	touch $@

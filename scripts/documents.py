@@ -27,12 +27,12 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 _MINUTES = 20  # more than any page takes
 
 _SCENE = """<mujoco><worldbody>
-  <body name="index_tip"><joint/><geom size="0.004" mass="0.01" contype="0" conaffinity="0"/>
+  <body name="index_tip"><joint name="bend"/><geom size="0.004" mass="0.01" contype="0" conaffinity="0"/>
     <site name="fingertip" quat="1 -1 0 0"/><site name="tip" pos="0 0.1 0" quat="1 -1 0 0"/></body>
   <body pos="-0.01 0 0.0135"><joint type="slide" axis="0 0 1"/><geom size="0.005" mass="0.1"/></body>
   <geom name="mug" size="0.005" pos="0.3 0 0"/><geom name="block" size="0.005" pos="0.4 0 0"/>
   <geom name="file" size="0.005" pos="0.5 0 0"/><geom name="thing" size="0.005" pos="0.6 0 0"/>
-</worldbody></mujoco>"""
+</worldbody><actuator><motor joint="bend"/></actuator></mujoco>"""
 
 # All Python of a page is one session, as in a notebook. An error names the page and its line.
 _RUNNER = """

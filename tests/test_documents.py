@@ -4,6 +4,7 @@ what stands in the page. What cannot run in a test is named, with the reason; it
 import argparse
 import ast
 import functools
+import importlib.util
 import os
 import pathlib
 import re
@@ -20,9 +21,9 @@ from biotac_mj.view import find_gl
 REPO = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [REPO / "README.md", REPO / "CONTRIBUTING.md", *sorted((REPO / "docs").rglob("*.md"))]
 PAGES = [page for page in PAGES if page.name != "api.md" and "_build" not in page.parts]
-NEEDS = {"ros.md": "rosbags", "mjlab.md": "mjlab", "isaaclab.md": "mujoco_warp", "mjx.md": "jax"}
-NEEDS |= {"recordings.md": "rosbags"}
-NOT_IN_TESTS = ("mjlab.md", "mjx.md")  # whose libraries are none of the extra `test` or of those beside it
+NEEDS = {"ros.md": "rosbags", "recordings.md": "rosbags", "isaaclab.md": "mujoco_warp"}
+NEIGHBOURS = {"mjlab.md": "mjlab", "mjx.md": "jax"}  # `make test-neighbours` runs them, and JAX of gradients.md
+FENCE = re.compile(r"^ *```.*?^ *```$", re.M | re.S)
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")).resolve() / "shadow_hand"
 # page and beginning of a block -> why no test of the pages runs it, and what tests it
 LEFT_OUT = {
@@ -40,6 +41,7 @@ LEFT_OUT = {
     ("rendering.md", "biotac play insert_peg"): "minutes; test_tasks_batched.py",
     ("checkup.md", "# prompts them"): "a sensor; test_checkup.py",
     ("experiments.md", "biotac diagnose"): "a sensor; test_discrepancy_rounds.py",
+    ("mjlab.md", "pip install"): "a network; `make test-neighbours` has installed it",
     ("cluster.md", "pip install"): "a network; test_shards.py has three nodes",
     ("cluster.md", "ray start"): "machines; test_shards.py has three nodes",
     ("isaaclab.md", "tip = robot"): "Isaac Lab",
@@ -55,6 +57,8 @@ def left_out(page, text):
             return why
     if "shadow_hand/" in text and not HAND.is_dir():
         return "MuJoCo Menagerie, in MENAGERIE_ROOT"
+    if text.startswith("import jax\n") and importlib.util.find_spec("jax") is None:
+        return "JAX, of the extra mjx"
     if re.search(r"Offscreen|--render", text) and find_gl() is None:
         return "a GL library"
     return None
@@ -145,7 +149,7 @@ def test_every_block_runs_or_is_named():
         kinds = set(re.findall(r"^ *```([^\n`]+)$", page.read_text(), re.M))
         assert kinds <= {"sh", "python", "py", "text", "yaml", "bibtex", "{toctree}"}, (page.name, kinds)
         if page.parent.name != "lab":  # what measures for hours stands there, and is understood
-            assert not re.search(r"^    (biotac|python|pip|make) ", page.read_text(), re.M), page.name
+            assert not re.search(r"\n\n    \S", FENCE.sub("", page.read_text())), f"{page.name}: use a fence"
     found = [(page.name, text) for page in PAGES for _, _, text, _ in blocks(page.read_text())]
     for (name, begin), why in LEFT_OUT.items():
         assert any(n == name and text.startswith(begin) for n, text in found), (name, begin, why)
@@ -155,7 +159,7 @@ def test_what_prints_shows_what_it_prints():
     """Known before a page runs: an output that is not written after its block."""
     for page in PAGES:
         for language, line, text, written in blocks(page.read_text()):
-            if language != "sh" and page.name not in NOT_IN_TESTS and not left_out(page, text):
+            if language != "sh" and not left_out(page, text):
                 assert written or "print(" not in text, (
                     f"{page.name}:{line} prints, and no output stands there"
                 )
@@ -248,8 +252,8 @@ def test_scripts_and_tests_that_pages_name_exist():
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name)
 def test_blocks_run_in_order(path, tmp_path):
-    if path.name in NEEDS:
-        pytest.importorskip(NEEDS[path.name], reason=f"{path.name} needs {NEEDS[path.name]}")
+    for needed in filter(None, (NEEDS.get(path.name), NEIGHBOURS.get(path.name))):
+        pytest.importorskip(needed, reason=f"{path.name} needs {needed}")
     name, text = str(path.relative_to(REPO)), path.read_text()
     found = [block for block in blocks(text) if not left_out(path, block[2])]
     lay(path.name, tmp_path)
