@@ -22,7 +22,7 @@ REPO = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [REPO / "README.md", REPO / "CONTRIBUTING.md", *sorted((REPO / "docs").rglob("*.md"))]
 PAGES = [page for page in PAGES if page.name != "api.md" and "_build" not in page.parts]
 NEEDS = {"ros.md": "rosbags", "recordings.md": "rosbags", "isaaclab.md": "mujoco_warp"}
-NEIGHBOURS = {"mjlab.md": "mjlab", "mjx.md": "jax"}  # `make test-neighbours` runs them, and JAX of gradients.md
+NEIGHBOURS = {"mjlab.md": "mjlab", "mjx.md": "jax"}  # and JAX of gradients.md: `make test-neighbours`
 FENCE = re.compile(r"^ *```.*?^ *```$", re.M | re.S)
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")).resolve() / "shadow_hand"
 # page and beginning of a block -> why no test of the pages runs it, and what tests it
