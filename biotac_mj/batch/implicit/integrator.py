@@ -62,7 +62,7 @@ class Correction:
     amiss: wp.array2d(dtype=vec6)
     rounds: wp.array(dtype=int)
     going: wp.array(dtype=int)  # whether another is to be found
-    # [world, unit wrench, dof] accelerations of the constraint solver, of the integrator
+    # [world, dof, unit wrench] accelerations of the constraint solver, of the integrator
     found: wp.array3d(dtype=real)
     moved: wp.array3d(dtype=real)
     matrix: wp.array2d(dtype=float)  # the slope of each world, what is amiss being the last entry of a row
@@ -79,7 +79,7 @@ def corrections(groups: int, nworld: int, nv: int) -> Correction:
     out, n = Correction(), 6 * groups
     out.force, out.amiss = (wp.zeros((groups, nworld), dtype=vec6) for _ in range(2))
     out.rounds, out.going = (wp.zeros(nworld, dtype=int) for _ in range(2))
-    out.found, out.moved = (wp.zeros((nworld, n, nv), dtype=real) for _ in range(2))
+    out.found, out.moved = (wp.zeros((nworld, nv, n), dtype=real) for _ in range(2))
     out.matrix = wp.zeros((nworld, n * (n + 1)), dtype=float)
     out.acts, out.square = wp.ones(groups, dtype=int), wp.zeros((groups, nworld), dtype=real)
     out.jacobian = wp.zeros((groups, nworld, nv), dtype=vec6)
@@ -172,16 +172,16 @@ def respond(
         return
     n = c.jacobian.shape[2]
     for i in range(n):
-        c.found[w, column, i] = c.jacobian[column / 6, w, i][column % 6]
-        c.moved[w, column, i] = real(0.0)
+        c.found[w, i, column] = c.jacobian[column / 6, w, i][column % 6]
+        c.moved[w, i, column] = real(0.0)
     substitute(held, w, column, c.found)
     for i in range(n):
         for k in range(rownnz[i]):
             j = colind[rowadr[i] + k]
             m = real(inertia[w, rowadr[i] + k])
-            c.moved[w, column, i] = c.moved[w, column, i] + m * c.found[w, column, j]
+            c.moved[w, i, column] = c.moved[w, i, column] + m * c.found[w, j, column]
             if i != j:
-                c.moved[w, column, j] = c.moved[w, column, j] + m * c.found[w, column, i]
+                c.moved[w, j, column] = c.moved[w, j, column] + m * c.found[w, i, column]
     substitute(damped, w, column, c.moved)
     for b in range(free.shape[0]):
         first = dofadr[free[b]]
@@ -190,14 +190,14 @@ def respond(
             for k in range(rownnz[i]):
                 j = colind[rowadr[i] + k]
                 m = real(inertia[w, rowadr[i] + k])
-                force[i - first] = force[i - first] + m * c.found[w, column, j]
+                force[i - first] = force[i - first] + m * c.found[w, j, column]
                 if i != j:
-                    force[j - first] = force[j - first] + m * c.found[w, column, i]
+                    force[j - first] = force[j - first] + m * c.found[w, i, column]
         for i in range(first, first + 6):
             moved = real(0.0)
             for k in range(6):
                 moved += real(driven[k, w, i]) * force[k]
-            c.moved[w, column, i] = moved
+            c.moved[w, i, column] = moved
 
 
 @wp.kernel
@@ -206,12 +206,12 @@ def write_slope(c: Correction):
     w, k, column = wp.tid()
     if c.going[w] == 0:
         return
-    n = c.found.shape[1]
+    n = c.found.shape[2]
     motion = vec6()
     lacks = vec6()
     if c.acts[k] == 1:
         for i in range(c.jacobian.shape[2]):
-            motion += c.square[k, w] * (c.found[w, column, i] - c.moved[w, column, i]) * c.jacobian[k, w, i]
+            motion += c.square[k, w] * (c.found[w, i, column] - c.moved[w, i, column]) * c.jacobian[k, w, i]
         motion = c.model.tangent0[k, w] * motion
         lacks = -c.amiss[k, w]
     for b in range(6):
@@ -229,7 +229,7 @@ def step(c: Correction):
     w, t = wp.tid()
     if c.going[w] == 0:
         return
-    n = c.found.shape[1]
+    n = c.found.shape[2]
     if eliminate(c.matrix, w, n, 1) == 0:
         return
     for k in range(t, c.force.shape[0], wp.block_dim()):
@@ -258,7 +258,7 @@ class Slope:
         self._damped.find(m, d, c.going, integrator.inertia, springs=False)
         factors = [self._held.L, self._damped.L, d.M, m.M_rownnz, m.M_rowadr, m.M_colind]
         free = [integrator.free, m.body_dofadr, integrator.driven]
-        worlds, columns = c.found.shape[:2]
+        worlds, _, columns = c.found.shape
         wp.launch(respond, (worlds, columns), [*factors, *free, c], device=device)
         wp.launch(write_slope, (worlds, columns // 6, columns), [c], device=device)
         Launcher(device).launch_blocks(step, [worlds], [c], block_dim=BLOCK)

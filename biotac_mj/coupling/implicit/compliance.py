@@ -95,6 +95,8 @@ def factor(
                 if sparse == 1:
                     i = J_colind[w, 0, J_rowadr[w, r] + a]
                     j = J_colind[w, 0, J_rowadr[w, r] + b]
+                if i < j:
+                    continue
                 push = real(0.0)
                 if first < 0:
                     push = real(D[w, r]) * _entry(J, w, r, b, sparse, J_rowadr)
@@ -102,9 +104,9 @@ def factor(
                     for k in range(6):
                         if hessian[w, r][k] != real(0.0):
                             push += hessian[w, r][k] * _entry(J, w, first + k, b, sparse, J_rowadr)
-                if i >= j:
-                    L_out[w, i, j] = L_out[w, i, j] + push * _entry(J, w, r, a, sparse, J_rowadr)
-            sync()
+                L_out[w, i, j] = L_out[w, i, j] + push * _entry(J, w, r, a, sparse, J_rowadr)
+            if sparse == 1:  # else each thread has the same entries in all rows
+                sync()
     sync()
     for j in range(n):
         whole = L_out[w, j, j]
@@ -130,19 +132,19 @@ for _real in (wp.float32, wp.float64):
 
 @wp.func
 def substitute(L: wp.array3d(dtype=real), w: int, c: int, x: wp.array3d(dtype=real)):
-    """Solves L L' y = x[w, c] in place, by one thread."""
+    """Solves L L' y = x[w, :, c] in place, by one thread: those of other columns read what is beside it."""
     n = L.shape[1]
     for i in range(n):
-        total = x[w, c, i]
+        total = x[w, i, c]
         for k in range(i):
-            total -= L[w, i, k] * x[w, c, k]
-        x[w, c, i] = total / L[w, i, i]
+            total -= L[w, i, k] * x[w, k, c]
+        x[w, i, c] = total / L[w, i, i]
     for back in range(n):
         i = n - 1 - back
-        total = x[w, c, i]
+        total = x[w, i, c]
         for k in range(i + 1, n):
-            total -= L[w, k, i] * x[w, c, k]
-        x[w, c, i] = total / L[w, i, i]
+            total -= L[w, k, i] * x[w, k, c]
+        x[w, i, c] = total / L[w, i, i]
 
 
 @wp.func
@@ -168,7 +170,7 @@ def give(
     if going[w] == 0 or (held == 1 and not holds(model, c / 6, w)):
         return
     for i in range(L.shape[1]):
-        response_out[w, c, i] = jacobian[c / 6, w, i][c % 6]
+        response_out[w, i, c] = jacobian[c / 6, w, i][c % 6]
     substitute(L, w, c, response_out)
 
 
@@ -191,8 +193,8 @@ def move(
         m = vec6()
         # of two bodies whose steps differ the mean, so that it stays symmetric
         both = wp.sqrt(square[g, w] * square[c / 6, w])
-        for i in range(response.shape[2]):
-            m += (both * response[w, c, i]) * jacobian[g, w, i]
+        for i in range(response.shape[1]):
+            m += (both * response[w, i, c]) * jacobian[g, w, i]
         for b in range(6):
             compliance_out[groups * g + c / 6, w, b, c % 6] = m[b]
 
@@ -225,7 +227,7 @@ def drive(
     # Out:
     driven_out: wp.array3d(dtype=real),
 ):
-    """Accelerations by what all skins do against motions of the degrees of freedom [world, column, dof]; of
+    """Accelerations by what all skins do against motions of the degrees of freedom [world, dof, column]; of
     the wrenches on bodies that this skin holds."""
     w, c = wp.tid()
     if taking_part[w] == 0 or not holds(model, c / 6, w):
@@ -233,8 +235,8 @@ def drive(
     for i in range(stiffness.shape[1]):
         held = real(0.0)
         for j in range(stiffness.shape[1]):
-            held += stiffness[w, i, j] * response[w, c, j]
-        driven_out[w, c, i] = held
+            held += stiffness[w, i, j] * response[w, j, c]
+        driven_out[w, i, c] = held
     substitute(L, w, c, driven_out)
 
 
@@ -260,11 +262,11 @@ def add_powers(
             once = real(0.0)
             twice = real(0.0)
             for j in range(stiffness.shape[1]):
-                once += stiffness[w, i, j] * response[w, c, j]
-                twice += stiffness[w, i, j] * driven[w, c, j]
+                once += stiffness[w, i, j] * response[w, j, c]
+                twice += stiffness[w, i, j] * driven[w, j, c]
             for b in range(6):
-                second[b] = second[b] + once * response[w, 6 * g + b, i]
-                fourth[b] = fourth[b] + twice * driven[w, 6 * g + b, i]
+                second[b] = second[b] + once * response[w, i, 6 * g + b]
+                fourth[b] = fourth[b] + twice * driven[w, i, 6 * g + b]
     T = model.tangent0[g, w]
     power_out[w, c] = wp.vec2d((T * second)[c % 6], (T * fourth)[c % 6])
 
@@ -302,7 +304,7 @@ class Response:
         (groups, nworld, nv), self._jacobian, self._model = jacobian.shape, jacobian, model
         self._columns = nworld, 6 * groups
         with wp.ScopedDevice(jacobian.device):
-            self._found, self._driven = (wp.zeros((*self._columns, nv), dtype=real) for _ in range(2))
+            self._found, self._driven = (wp.zeros((nworld, nv, 6 * groups), dtype=real) for _ in range(2))
             self._power = wp.zeros(self._columns, dtype=wp.vec2d)
 
     def compliance(self, going: wp.array, L: wp.array, square: wp.array, out: wp.array) -> list[tuple]:
