@@ -743,6 +743,18 @@ def test_the_stages_of_a_step_are_one_step():
     biotac_mj.plugin.clear_errors()
 
 
+def test_runge_kutta_leaves_the_forces_of_mujocos_contacts():
+    """They act in a step together with the skin, as forces; mjData has them where contacts are read."""
+    beside = '<geom type="plane" size="1 1 .1" pos="0 0 -.1"/><body pos=".2 0 -.0901"><freejoint/>'
+    beside += '<geom name="beside" size=".01" mass="0.2"/></body>'
+    model, data, handle = scene(ball(0.1) + beside, 0.002, integrator="RK4", geoms=["ball"])
+    mujoco.mj_step(model, data, 200)
+    found = np.zeros(6)
+    mujoco.mj_contactForce(model, data, 0, found)
+    assert data.ncon == 1 and found[0] == pytest.approx(0.2 * G, rel=1e-3)
+    assert handle.read(data, "contact_force")[1] == pytest.approx(0.1 * G, rel=1e-3)
+
+
 STACK = ball(0.1) + (
     '<body name="top" pos="0 .001 .0379"><freejoint/>'
     '<geom name="top" size=".01" mass="0.3" friction="0.5"/></body>'

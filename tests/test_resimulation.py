@@ -179,7 +179,7 @@ def test_a_hand_pressed_plate_is_found_from_force_and_electrodes(monkeypatch):
     found, material, notes = fitted.fitted_touches(
         one, geometry, Material(), SkinOptions(), rate=50.0, block=4.0, progress=False
     )
-    assert len(found) == 4 and any("nobody measured either" in note for note in notes)
+    assert len(found) == 4 and any("neither was measured" in note for note in notes)
     assert material.youngs_modulus == pytest.approx(modulus, rel=0.1)
     outer = geometry.vert[np.unique(geometry.outer_face)]
     for touch in found:

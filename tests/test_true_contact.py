@@ -473,12 +473,23 @@ def settled_apex(height, tier, steps=120):
 
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_an_apex_inside_the_skin_comes_to_the_same_balance(tier):
-    above, counts = settled_apex(0.0088, "condensed")
-    heights, share = ((0.007, 0.0055), 0.05) if tier == "condensed" else ((0.007,), 0.15)
-    for height in heights:
+    above, counts = settled_apex(0.0088, tier)
+    for height in (0.007, 0.0055):
         inside, also = settled_apex(height, tier)
-        assert inside == pytest.approx(above, abs=1e-4)
-        np.testing.assert_allclose(also, counts, atol=share * np.abs(counts).max())
+        assert inside == pytest.approx(above, abs=5e-5)
+        np.testing.assert_allclose(also, counts, atol=0.05 * np.abs(counts).max())
+
+
+SHARPER = pytest.mark.xfail(strict=True, reason="E17 falls by 788 counts in the full tier, by 969 condensed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [pytest.param(0.15, marks=SHARPER), 0.25])
+def test_tiers_find_one_balance_of_an_apex(share):
+    """As far as the condensed tier knows one: an apex presses beyond where its error was measured."""
+    (height, counts), (also, others) = (settled_apex(0.0088, tier) for tier in ("condensed", "full"))
+    assert also == pytest.approx(height, abs=1e-4)
+    np.testing.assert_allclose(others, counts, atol=share * np.abs(counts).max())
 
 
 def test_in_a_batch_an_apex_comes_to_the_same_balance():

@@ -127,7 +127,7 @@ class Batch(Skins):
 
     def use_euler(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Makes greedy worlds' step that of backward Euler, after `restrain`. Launches only."""
-        self._launch(rounds.use_euler, self.nworld, [self.dt, 0.0, self._greedy], [self._of_step])
+        self._launch(rounds.use_euler, self.nworld, [self.dt, self._greedy], [self._of_step])
         self._find_drift(m, d)
 
     def add_forces(self, d: "mjw.Data") -> None:

@@ -111,6 +111,12 @@ class Instance:
         return self.model.opt.timestep
 
     @property
+    def lead(self) -> float:
+        """Time by which the step begins ahead of the positions [s]. Runge-Kutta's positions go by the mean
+        velocity, so those half a step ahead go by the one after a step, as with the other integrators."""
+        return 0.5 * self.model.opt.timestep * self.by_stages
+
+    @property
     def by_stages(self) -> bool:
         """Whether a step is Runge-Kutta's, of four stages."""
         return self.model.opt.integrator == _RK4
@@ -168,6 +174,7 @@ class Instance:
         """The arrays of a coupled step that begins: the linear model in force is that of the last step."""
         arrays, (head, models, *_) = self._arrays, self.parts
         arrays.record(self.horizon, 0.5 * self.by_stages)
+        self._begun = self._frame()
         for (last, now), part in zip(arrays.models, self.last_model()):
             last[:] = now[:] = part
         arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)
@@ -181,6 +188,19 @@ class Instance:
             with self.setup.skin.lock:
                 self.put = self.setup.skin.stepper.put(self._skin, placed[self.touching.group], *here)
         return arrays
+
+    def _frame(self):
+        core = self.touching.core
+        return self.data.xpos[core].copy(), self.data.xmat[core].reshape(3, 3).copy()
+
+    def seen(self, wrench: np.ndarray) -> np.ndarray:
+        """Wrenches (n, 6) in the BioTac frame with which the step began, in that of now."""
+        if not self.lead:
+            return wrench.copy()
+        (begun, before), (origin, frame) = self._begun, self._frame()
+        force, torque = wrench[:, :3] @ before.T, wrench[:, 3:] @ before.T
+        torque += np.cross(begun - origin, force)
+        return np.concatenate([force @ frame, torque @ frame], axis=1)
 
     @property
     def _skin(self):
@@ -327,10 +347,6 @@ class Instance:
             withheld, not those of the skin's last solve.
         """
         self._outcome = rounds, settled, withheld, energy, ends, acting
-
-    def acts(self, acting: np.ndarray) -> None:
-        """Keeps the wrenches (ngroup, 6) that the bodies get in one of Runge-Kutta's stages."""
-        self._outcome = *self._outcome[:-1], acting
 
     def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
         """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
@@ -481,14 +497,15 @@ class Instance:
         force, torque = from_ @ wrench[:3], from_ @ wrench[3:]
         return np.concatenate([force @ to, (torque + np.cross(offset, force)) @ to])
 
-    def end_stage(self, first: bool) -> None:
+    def end_stage(self, first: bool, held: bool) -> None:
         """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
-        and bodies get all four."""
+        and bodies get all four. held: what acted in the first acts in this one."""
         if self._error:
             return
-        data, core = self.data, self.touching.core
-        frame = data.xpos[core].copy(), data.xmat[core].reshape(3, 3).copy()
-        self._stages = [*(() if first else self._stages), (*self._acting(), *frame)]
+        if held:
+            self._stages.append(self._stages[0])
+            return
+        self._stages = [*(() if first else self._stages), (*self._acting(), *self._frame())]
 
     def _sum_up(self, settled):
         """Writes what acted over the stages of a step, in the frame of its start; whether all settled, and

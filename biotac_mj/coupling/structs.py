@@ -4,17 +4,19 @@
 A plugin's callbacks get bare addresses. The field layouts of the installed MuJoCo come from its own
 introspection tables, so that a new release that adds fields needs no change here."""
 
+import contextlib
 import ctypes
 import functools
 import math
 import pathlib
 import types
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, enums, structs
 
-__all__ = ["LIBRARY", "DataView", "ModelView", "c_structs"]
+__all__ = ["LIBRARY", "MINVAL", "DataView", "ModelView", "c_structs"]
 
 LIBRARY = ctypes.CDLL(
     str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
@@ -25,6 +27,8 @@ LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 for _stage in (
     "mj_kinematics",
+    "mj_comPos",
+    "mj_comVel",
     "mj_makeConstraint",
     "mj_island",
     "mj_referenceConstraint",
@@ -36,6 +40,7 @@ for _stage in (
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
+LIBRARY.mj_integratePos.argtypes = (*(ctypes.c_void_p,) * 3, ctypes.c_double)
 
 _SCALARS = {
     "mjtNum": ctypes.c_double,
@@ -71,6 +76,7 @@ _ROWS = (
 )
 _built = {}
 _TINY = np.finfo(float).tiny
+MINVAL = 1e-15  # mjMINVAL
 _PGS, _NEWTON = int(mujoco.mjtSolver.mjSOL_PGS), int(mujoco.mjtSolver.mjSOL_NEWTON)
 _NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 # iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
@@ -267,6 +273,16 @@ class DataView(_View):
         regularisation."""
         LIBRARY.mj_projectConstraint(self.model.address, self.address)
 
+    def weigh_constraints(self, weight: np.ndarray | float) -> None:
+        """Gives the rows weights (nefc,), one over their regularisation, or all the same."""
+        rows = self.rows()
+        rows.efc_D[:] = weight
+        rows.efc_R[:] = 1.0 / rows.efc_D
+        if self.struct.nisland:
+            rows.iefc_D[rows.map_efc2iefc], rows.iefc_R[rows.map_efc2iefc] = rows.efc_D, rows.efc_R
+        if self.is_dual:
+            self.project_constraints()
+
     def reference_constraints(self) -> None:
         """Computes the rows' reference accelerations from their present values."""
         LIBRARY.mj_referenceConstraint(self.model.address, self.address)
@@ -280,6 +296,31 @@ class DataView(_View):
     def find_poses(self) -> None:
         """Makes the poses of bodies, geoms and sites those of the positions of now."""
         LIBRARY.mj_kinematics(self.model.address, self.address)
+
+    def go_on(self, seconds: float) -> None:
+        """Moves the positions on at the present velocity, for `seconds`."""
+        where = self.qpos.ctypes.data, self.qvel.ctypes.data
+        if seconds:
+            LIBRARY.mj_integratePos(self.model.address, *where, seconds)
+
+    @contextlib.contextmanager
+    def ahead(self, seconds: float) -> Iterator[None]:
+        """Within this, bodies are where they go in `seconds` at the present velocity."""
+        if not seconds:
+            yield
+            return
+        before = self.qpos.copy()
+        self.go_on(seconds)
+        self._find_motion()
+        try:
+            yield
+        finally:
+            self.qpos[:] = before
+            self._find_motion()
+
+    def _find_motion(self):
+        for stage in (LIBRARY.mj_kinematics, LIBRARY.mj_comPos, LIBRARY.mj_comVel):
+            stage(self.model.address, self.address)
 
     def acceleration(self, again: bool = False, primal: bool = False) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint

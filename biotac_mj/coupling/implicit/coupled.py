@@ -5,7 +5,7 @@ import numpy as np
 
 from ...geometry.rigid_warp import LEVER
 from ...skin.bodies import BodyMotion
-from ..instance import STAGES, Instance
+from ..instance import Instance
 from ..structs import DataView
 
 __all__ = ["Coupled", "size"]
@@ -109,8 +109,9 @@ class Coupled:
     def _core_motion(self):
         if not self.instance.inertial:
             return ()
-        step, half = self.instance.horizon, 0.5 if self.instance.by_stages else 1.0
-        return self.instance.kinematics.core_motion(step, half * step**2, self.acceleration)
+        step = self.instance.horizon
+        with self.data.ahead(self.instance.lead):
+            return self.instance.kinematics.core_motion(step, step**2, self.acceleration)
 
     # --- in MuJoCo's dynamics ---
 
@@ -130,12 +131,6 @@ class Coupled:
         """Lets nothing act in this step; the model stays as the next one's first."""
         self.forced, self.withdrawn, self.arrays.push[:] = np.zeros_like(self.correction), True, 0.0
         self.touching, self.written, self.settled = np.zeros(0, int), False, False
-
-    def move_on(self) -> None:
-        """Takes the Jacobians of the bodies where one of Runge-Kutta's stages has them."""
-        self.jacobian, self.written = self.instance.kinematics.jacobians(), False
-        if not self.withdrawn:
-            self.forced = None
 
     def hold(self, acceleration: np.ndarray) -> None:
         """Lets what acts with accelerations (nv,) of MuJoCo's constraint solver act in place of the rows."""
@@ -161,26 +156,17 @@ class Coupled:
         """Tells the instance how the step went."""
         arrays, withheld = self.arrays, 1.0 - self.arrays.push.min(initial=1.0)
         left = arrays.conclude(self.result.converged)
-        share = STAGES[0] if self.instance.by_stages else 1.0
-        self._jacobian, self._acting = share * self.jacobian, share * arrays.acting
-        self.instance.concluded(rounds, self.settled, withheld, left, self.target, arrays.acting.copy())
+        acting = self.instance.seen(arrays.acting)
+        self.instance.concluded(rounds, self.settled, withheld, left, self.target, acting)
         self.instance.step_gamma, self.instance.frequency = arrays.gamma.copy(), arrays.frequency.copy()
-
-    def act(self, acceleration: np.ndarray, share: float) -> None:
-        """Notes what acts with accelerations (nv,) in one of Runge-Kutta's stages, which has this share in
-        the step."""
-        acting = self.acting_with(acceleration)
-        self._jacobian += share * self.jacobian
-        self._acting += share * acting
-        self.instance.acts(acting)
 
     def arrived(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when MuJoCo's poses are those of now. moved: (nv,) displacement of the degrees
         of freedom by their mean velocity in the step. near: [m] from where they were to go."""
         arrays = self.arrays
-        ends, travel = self.instance.kinematics.predict(0.0), self._jacobian @ moved
+        ends, travel = self.instance.kinematics.predict(0.0), self.jacobian @ moved
         error = size(travel - arrays.travel)
-        arrays.travel[:], arrays.acting[:] = travel, self._acting
+        arrays.travel[:] = travel
         self.instance.arrived(arrays.conclude(self.result.converged), ends, error < near)
 
 

@@ -17,14 +17,13 @@ import numpy as np
 import warp as wp
 
 from ...skin.types import real, vec6
-from ..structs import DataView, ModelView
+from ..structs import MINVAL, DataView, ModelView
 from ..touching import Touching
 from .kinematics import row
 from .rows import write_rows
 
 __all__ = ["Metric"]
 
-_MINVAL = 1e-15  # mjMINVAL
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
 _NEVER = int(mujoco.mjtSleepPolicy.mjSLEEP_NEVER)
 _NEEDED = {
@@ -158,7 +157,7 @@ class Metric:
     def release(self) -> None:
         """Leaves the rows without any stiffness."""
         if self.slot and self._filled:
-            self._fill(0.0, _MINVAL)
+            self._fill(0.0, MINVAL)
         self._filled, self._held = False, None
 
     def write(self, groups: np.ndarray) -> None:

@@ -190,9 +190,9 @@ def follow(r: Rounds, g: int, w: int, h: real, gain: vec6):
 
 
 @wp.func
-def _set_gamma(r: Rounds, g: int, w: int, step: real, ahead: real, gamma: real):
+def _set_gamma(r: Rounds, g: int, w: int, step: real, gamma: real):
     r.gamma[g, w] = gamma
-    r.horizon[g, w] = (gamma - real(0.5) + ahead) * step
+    r.horizon[g, w] = (gamma - real(0.5)) * step
     r.square[g, w] = _beta_of(gamma) * step * step
 
 
@@ -203,14 +203,14 @@ def choose_gamma(step: real, ahead: real, delay: real, solid: Solid, last: Model
     body must not go deep unseen, nor be pushed before it comes.
 
     Args:
-      ahead: by how many steps positions are ahead of those with the velocity after a step: half of one, where
-        they go by the mean velocity. delay: of the rubber's force, in steps.
+      ahead: by how many steps the step begins ahead of the positions, see `Instance.lead`. delay: of the
+        rubber's force, in steps.
     """
     g, w = wp.tid()
     gamma = real(EULER) - ahead
     if solid.inertial == 0 and wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0):
         gamma = _gamma_of(r.frequency[g, w] * step, delay)
-    _set_gamma(r, g, w, step, ahead, gamma)
+    _set_gamma(r, g, w, step, gamma)
 
 
 @wp.kernel
@@ -252,13 +252,13 @@ def begin_rounds(
 
 
 @wp.kernel
-def use_euler(step: real, ahead: real, greedy: wp.array(dtype=int), r: Rounds):
+def use_euler(step: real, greedy: wp.array(dtype=int), r: Rounds):
     """Makes the step that of backward Euler in greedy worlds, whose skins are to be solved again."""
     w = wp.tid()
     if greedy[w] == 1:
         r.settled[w] = 0
         for g in range(r.gamma.shape[0]):
-            _set_gamma(r, g, w, step, ahead, real(EULER))
+            _set_gamma(r, g, w, step, real(EULER))
 
 
 @wp.kernel

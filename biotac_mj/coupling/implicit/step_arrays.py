@@ -116,7 +116,7 @@ class StepArrays:
             (rounds.choose_gamma, (n, 1), [step, ahead, delay, self._solid, self._last, r]),
             *drift,
         )
-        self.use_euler = row((rounds.use_euler, 1, [step, ahead, *one, r]), *drift)
+        self.use_euler = row((rounds.use_euler, 1, [step, *one, r]), *drift)
         self.find_wrenches = row(forces)
         self.evaluate = row(
             k.bodies.accelerate(step, k.jacobian, self._qacc, r),

@@ -19,11 +19,11 @@ import numpy as np
 
 from ...geometry.rigid_warp import LEVER
 from ...threads import run_in_threads
-from ..instance import NO_PASSIVE, NO_SENSOR, STAGES, Instance
+from ..instance import NO_PASSIVE, NO_SENSOR, Instance
 from ..loads import Loads
 from ..solid import SOLVED
 from ..solid_contacts import SolidContacts
-from ..structs import DataView, ModelView
+from ..structs import MINVAL, DataView, ModelView
 from .coupled import Coupled
 from .group import SkinGroup
 from .integrator import Integrator
@@ -69,6 +69,7 @@ class World:
             t.number, t.springs = number, self._springs
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting = ()  # skins whose bodies are under way
+        self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
         self._loads = None
         self._solids = [SolidContacts(model, one.touching) for one in self.instances.values()]
         self._damped = (
@@ -95,7 +96,7 @@ class World:
         elif index == self.first:
             self._go_on()
         if instance.by_stages:
-            instance.end_stage(self._stage == 1)
+            instance.end_stage(self._stage == 1, self._stage > 1 and bool(self._acting))
 
     def _amend_contacts(self):
         amended = [one.amend(self.data) for one in self._solids] if self.data.ncon else []
@@ -137,7 +138,7 @@ class World:
             return
         if self._loads is None:
             self._loads = Loads(self.model, self.data, self.coupled)
-        acting = {skin.instance: skin.acting_with(self.data.qacc) for skin in self._acting}
+        acting = {one.instance: one.instance.seen(one.acting_with(self.data.qacc)) for one in self._acting}
         self._loads.write({t: acting[t] if t in acting else t.acting_wrench() for t in self.coupled})
 
     def _next_stage(self):
@@ -191,12 +192,14 @@ class World:
             own[:] = t.metric.first
 
     def _step(self):
-        self._acting = ()
+        self._acting, self._weights = (), None
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
-        skins = [Coupled(t, self.data) for t in self.coupled]
+        with self.data.ahead(self.coupled[0].lead):
+            skins = [Coupled(t, self.data) for t in self.coupled]
         try:
             self._newton(skins, outside)
+            self._pushes = self.data.qfrc_passive - outside
         except BaseException:
             self.data.qfrc_passive[:] = outside
             for skin in skins:
@@ -233,24 +236,27 @@ class World:
             skin.conclude(rounds)
 
     def _go_on(self):
-        """Lets the models that were found in the first of Runge-Kutta's stages answer to the accelerations of
-        this one. The models are linear, so their mean over the stages is their answer to the mean
-        acceleration, with which the step is made."""
+        """Lets the forces of the skins and of MuJoCo's constraints that the first of Runge-Kutta's stages
+        found act in this one: both were found for the whole step, and do not hold where a stage has the
+        bodies. All other forces are those of the stage."""
+        data = self.data
         self._take_rows()
         for t in self.coupled:
             t.metric.release()
-        self._now = self.data.qpos.copy()
-        if not self._acting:
-            return
-        for skin in self._acting:
-            skin.move_on()
-        self._group = SkinGroup(self._acting, self._springs)
-        outside = self.data.qfrc_passive.copy()
-        self._forces(self._acting, outside)
-        found = self.data.acceleration(primal=True)
-        for skin in self._acting:
-            skin.act(found, STAGES[self._stage - 1])
-        self._hold(self._acting, outside, found)
+        self._now = data.qpos.copy()
+        if self._acting:
+            if self._stage == 2:
+                self._held = data.qfrc_constraint.copy()
+            data.qfrc_passive += self._pushes + self._held
+            self._weights = data.rows().efc_D.copy()
+            data.weigh_constraints(MINVAL)
+
+    def _leave_constraint_forces(self):
+        """Leaves in mjData the constraint forces of the last of Runge-Kutta's stages, as MuJoCo does."""
+        self.data.weigh_constraints(self._weights)
+        self.data.qfrc_passive -= self._held
+        self.data.acceleration(again=True)
+        self._weights = None
 
     def _finish(self):
         """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
@@ -258,11 +264,15 @@ class World:
         skins, self._acting = self._acting, ()
         if not skins:
             return
+        if self._weights is not None:
+            self._leave_constraint_forces()
         moved = 0.5 * self.model.opt.timestep * (self._began_with + self.data.qvel)
+        after = self.data.qpos.copy()
+        self.data.go_on(skins[0].instance.lead)
         self.data.find_poses()
         for skin in skins:
             skin.arrived(moved, ASTRAY)
-        after, self.data.qpos[:] = self.data.qpos.copy(), self._now
+        self.data.qpos[:] = self._now
         self.data.find_poses()  # those that MuJoCo leaves after a step
         self.data.qpos[:] = after
 
