@@ -42,7 +42,7 @@ from biotac_mj.launches import recorded
 from biotac_mj.sensor.channels import impedance_from_counts
 from biotac_mj.sensor.film import kernels
 from biotac_mj.sensor.film.kernels import real, vec3
-from biotac_mj.sensor.film.systems import THREADS, Pattern, edges, make_pattern, solve_sheet
+from biotac_mj.sensor.film.systems import AHEAD, THREADS, Pattern, edges, make_pattern, solve_sheet
 from biotac_mj.sensor.presets import Sensor, read_sensor
 
 from ...short_repr import short_repr
@@ -400,7 +400,7 @@ class BatchFilm:
             self.local = wp.zeros((len(film._pos), nworld), dtype=real)
             self._given = wp.zeros((nworld, 3 * (len(film.face) + len(face))), dtype=real)
             self._over = wp.zeros((nworld, len(face)), dtype=int)
-            self._factor = wp.zeros((nworld, len(film._pattern["entry"]) - 1), dtype=real)
+            self._factor = wp.zeros((nworld, len(film._pattern["entry"]) - 1 + AHEAD), dtype=real)
             self._trial = wp.zeros_like(self.impedance)
         of_film = [self.middle, self.thickness, self.local]
         per_world = [*of_film, self._given, self._over, self._factor, self._trial]

@@ -20,11 +20,12 @@ from biotac_mj.sensor.film.kernels import (
     weights_over,
 )
 
-__all__ = ["THREADS", "Pattern", "edges", "make_pattern", "solve_sheet"]
+__all__ = ["AHEAD", "THREADS", "Pattern", "edges", "make_pattern", "solve_sheet"]
 
 wp.set_module_options({"enable_backward": False})
 
 THREADS = 512  # of the block that solves a world's film
+AHEAD = 3  # numbers behind a world's last entry that are read
 _LANES = 8  # that sum an entry on CUDA
 
 
@@ -148,12 +149,15 @@ def _fill(low, high, n):
 
 
 # An entry is summed by some lanes of a warp on CUDA, where a world is a block of threads, else by one thread.
+# The CPU takes four products at a time, of the last ones those that are kept: rows have `AHEAD` more numbers.
 # A pivot that is not positive leaves nan, which marks the film invalid.
 _ELIMINATE = """
 #if defined(__CUDA_ARCH__)
     const int lanes = LANES, thread = threadIdx.x, threads = blockDim.x;
 #else
     typedef double quad __attribute__((vector_size(32), aligned(8)));
+    typedef long long bits __attribute__((vector_size(32), aligned(8)));
+    static const long long kept[8] = {-1, -1, -1, -1, 0, 0, 0, 0};
     const int lanes = 1, thread = 0, threads = 1;
 #endif
     const double* summand = given.data + (long long)world * given.shape[1];
@@ -177,11 +181,14 @@ _ELIMINATE = """
                 for (int r = own.c[3]; r < next.c[3]; ++r) {
                     const auto at = run.data[r];
                     const double *a = value + at.c[0], *b = value + at.c[1];
-                    int k = part;
-#if !defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__)
+                    for (int k = part; k < at.c[2]; k += lanes) sum -= a[k] * b[k];
+#else
+                    int k = 0;
                     for (; k + 4 <= at.c[2]; k += 4) four -= *(const quad*)(a + k) * *(const quad*)(b + k);
+                    const quad rest = *(const quad*)(a + k) * *(const quad*)(b + k);
+                    four -= (quad)((bits)rest & *(const bits*)(kept + 4 - (at.c[2] - k)));
 #endif
-                    for (; k < at.c[2]; k += lanes) sum -= a[k] * b[k];
                 }
 #if !defined(__CUDA_ARCH__)
                 sum += (four[0] + four[1]) + (four[2] + four[3]);
