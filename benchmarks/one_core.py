@@ -14,9 +14,9 @@
 
 Each turn is a process of its own. A row is a phase of a case: median and slowest ms of processor time of
 `mj_step`, which part of it the kernels of the skins take and which the film (the rest is Python and MuJoCo),
-skin steps without a balance, and the mean force of each BioTac [N]. Of several turns the least of each time
-counts. --against DIR: the same of another checkout's package, in turns, and the ratio of this one's
-times to that one's."""
+solves of skins in a step (mean, most) and iterations of each, skin steps without a balance, and the mean
+force of each BioTac [N]. Of several turns the least of each time counts. --against DIR: the same of another
+checkout's package, in turns, and the ratio of this one's times to that one's."""
 
 import os
 
@@ -53,41 +53,58 @@ STRAIGHT = ("WRJ1", "WRJ2", "FFJ4", "MFJ4", "RFJ4", "LFJ4")
 
 
 class _Clock:
-    """Processor time of the calls of a method [ms]."""
+    """Processor time of the calls of a method [ms]; number of those that returned, and the iterations that
+    these say they took."""
 
     def __init__(self, owner: type, name: str):
         self.spent, method = 0.0, getattr(owner, name)
+        self.calls = self.iterations = 0
 
         def timed(*given, **named):
             begin = time.process_time()
             try:
-                return method(*given, **named)
+                found = method(*given, **named)
             finally:
                 self.spent += 1e3 * (time.process_time() - begin)
+            self.calls += 1
+            self.iterations += getattr(found, "iterations", 0)
+            return found
 
         setattr(owner, name, timed)
 
 
 @functools.cache
 def _clocks():
-    """Clocks of the skins' kernels and of the film. They must be there before a skin is made."""
+    """Clocks of the skins' kernels, of the film, and of solves in either tier. They must be there before a
+    skin is made."""
+    from biotac_mj.coupling.steppers.condensed import CondensedStepper
+    from biotac_mj.coupling.steppers.fem import FemStepper
     from biotac_mj.sensor.film.conduction import FilmConduction
     from biotac_mj.skin.program import Program
 
-    return _Clock(Program, "run"), _Clock(FilmConduction, "impedance")
+    of_solves = [_Clock(stepper, "solve_skin") for stepper in (CondensedStepper, FemStepper)]
+    return _Clock(Program, "run"), _Clock(FilmConduction, "impedance"), *of_solves
+
+
+def _counts():
+    """What the clocks say: time in kernels and film, solves, iterations of these."""
+    kernels, film, *of_solves = _clocks()
+    of_solves = [sum(clock.calls for clock in of_solves), sum(clock.iterations for clock in of_solves)]
+    return np.array([kernels.spent, film.spent, *of_solves])
 
 
 def _follow(model, handles, until, drive: Callable[[mujoco.MjData], None] = lambda data: None, data=None):
     """Steps until a time [s], `drive` before each: times at their ends [s], ms of processor time, of it in
-    the skins' kernels and in the film, skins without a balance, and forces (steps, BioTacs) [N]."""
+    the skins' kernels and in the film, solves, their iterations, skins without a balance, and forces (steps,
+    BioTacs) [N]."""
     data, rows = data or mujoco.MjData(model), []
     mujoco.mj_forward(model, data)
     while data.time < until:
         drive(data)
-        before, begin = [clock.spent for clock in _clocks()], time.process_time()
+        before, begin = _counts(), time.process_time()
         mujoco.mj_step(model, data)
         spent = 1e3 * (time.process_time() - begin)
-        parts = [clock.spent - was for clock, was in zip(_clocks(), before)]
+        parts = _counts() - before
         lost = sum(handle.read(data, "status")[0] == 0 for handle in handles)
         force = [np.linalg.norm(handle.read(data, "contact_force")[:3]) for handle in handles]
         rows.append([data.time, spent, *parts, lost, *force])
@@ -104,8 +121,11 @@ def _phase(rows, begin=0.0, end=np.inf):
         "ms_most": float(some[:, 1].max()),
         "solves": float(solves / whole),
         "film": float(film / whole),
-        "unsettled": int(some[:, 4].sum()),
-        "force_n": some[:, 5:].mean(0).round(4).tolist(),
+        "solves_mean": float(some[:, 4].mean()),
+        "solves_most": int(some[:, 4].max()),
+        "iterations": float(some[:, 5].sum() / max(some[:, 4].sum(), 1)),
+        "unsettled": int(some[:, 6].sum()),
+        "force_n": some[:, 7:].mean(0).round(4).tolist(),
     }
 
 
@@ -213,8 +233,9 @@ def table(found: dict) -> str:
     """What was measured, in Markdown."""
     other = any("against" in case for case in found["cases"].values())
     heads = ["case", "phase", "steps", "ms a step, median", "slowest", "solves %", "film %"]
-    heads += ["unsettled skin steps", "N of each"]
-    heads += ["median against", "slowest against", "unsettled against", "ratio of medians"] * other
+    heads += ["solves a step", "most", "iterations of each", "unsettled skin steps", "N of each"]
+    against = ["median", "slowest", "solves a step", "iterations of each", "unsettled"]
+    heads += [*(f"{name} against" for name in against), "ratio of medians"] * other
     lines = [f"{found['tier']}, {found['skin']}, {found['turns']} turns\n"]
     lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for case, turns in found["cases"].items():
@@ -225,12 +246,16 @@ def table(found: dict) -> str:
             cells = [case, phase, str(row["steps"]), f"{row['ms_median']:.2f}", f"{row['ms_most']:.1f}"]
             cells += [
                 *(f"{100 * row[part]:.0f}" for part in ("solves", "film")),
+                f"{row['solves_mean']:.2f}",
+                str(row["solves_most"]),
+                f"{row['iterations']:.1f}",
                 str(row["unsettled"]),
                 force,
             ]
             if phase in there:
                 that = there[phase]
-                cells += [f"{that['ms_median']:.2f}", f"{that['ms_most']:.1f}", str(that["unsettled"])]
+                cells += [f"{that['ms_median']:.2f}", f"{that['ms_most']:.1f}", f"{that['solves_mean']:.2f}"]
+                cells += [f"{that['iterations']:.1f}", str(that["unsettled"])]
                 cells += [f"{row['ms_median'] / that['ms_median']:.3f}"]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -949,6 +949,27 @@ def test_what_a_search_has_found_before_changes_nothing(coarse):
     assert {True, False} == set(depths) and min(found) == 0 and max(found) > 50
 
 
+def test_a_second_solve_begins_where_the_first_has_ended(coarse):
+    """A body that is dragged over the skin in one step goes on by 20 um in the second round: the balance is
+    that of a solve from where the step began, found in fewer iterations. The solver is shared with another
+    BioTac, which is solved in between."""
+    start, inward = touch(coarse.geometry)
+    skin, aside = CondensedSkin(coarse, sphere()), np.array([1.0, 0.0, 0.0])
+    before = walk(skin, start + np.outer(np.linspace(2e-4, 8e-4, 4), inward))[-1].memory
+    there = before.geom_pos + 3e-4 * aside + 1e-4 * inward
+    first = skin.solve(before, there, EYE)
+    walk(skin, [start + 3e-4 * inward])
+    further = there + 2e-5 * aside
+    near = skin.solve(before, further, EYE, near=first.memory)
+    plain = skin.solve(before, further, EYE)
+    assert near.converged and near.iterations < plain.iterations
+    force = np.linalg.norm(plain.wrench[0, :3])
+    np.testing.assert_allclose(near.wrench[0, :3], plain.wrench[0, :3], atol=1e-3 * force)
+    assert np.abs(near.vert_xpos - plain.vert_xpos).max() < 1e-6
+    # without `near` nothing is left of it
+    assert skin.solve(before, further, EYE).wrench.tobytes() == plain.wrench.tobytes()
+
+
 def test_what_a_skin_has_seen_before_changes_nothing(coarse):
     """Views of where faces cannot be near are kept, and geoms far away move unnoticed: along a walk with
     small and large steps, off the skin and on, each outcome is that of a skin that has seen nothing."""

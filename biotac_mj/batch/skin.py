@@ -261,6 +261,9 @@ class BatchSkin:
         wanted = self.data.worlds.wanted
         self._put_back.launch_wanted(wanted, self.reason)
         self._copy_contact(wanted, self._kept_contact, self._contact)
+        if self._condensed:
+            known = [wanted, self.reason, self.release.reset]
+            self._launch(kernels.begin_near, self.nworld, known, [self._condensed.previous.begins])
 
     def _copy_contact(self, on, source, target):
         """Copies the anchors, most of the memory, of those faces alone that have some."""

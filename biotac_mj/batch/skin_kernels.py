@@ -3,12 +3,13 @@
 import warp as wp
 
 from ..skin.contact.posed import Geoms
-from ..skin.newton.worlds import Worlds
+from ..skin.newton.worlds import CONVERGED, Worlds
 from ..skin.types import mat33, real, vec3, vec6
 
 __all__ = [
     "begin_at_rest",
     "begin_frames",
+    "begin_near",
     "copy_anchors",
     "find_bare",
     "forget_contacts",
@@ -41,6 +42,19 @@ def read_outputs(
         for i in range(6):
             v[i] = fraction[g] * wrench[g, w, i]
         wrench_out[g, w] = v
+
+
+@wp.kernel
+def begin_near(
+    wanted: wp.array(dtype=int),
+    reason: wp.array(dtype=int),
+    reset: wp.array(dtype=bool),
+    # Out:
+    begins_out: wp.array(dtype=int),
+):
+    """Lets solves of the wanted worlds begin where the previous one of the step has found a balance."""
+    w = wp.tid()
+    begins_out[w] = wp.where(wanted[w] == 1 and reason[w] == CONVERGED and not reset[w], 1, 0)
 
 
 @wp.kernel

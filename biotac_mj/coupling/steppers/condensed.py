@@ -23,8 +23,6 @@ class CondensedStepper(FemStepper):
 
     The state holds what a `Memory` does."""
 
-    gives_way, begins_near = True, False
-
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
         self._layout = layout_of(len(geoms))
@@ -56,6 +54,7 @@ class CondensedStepper(FemStepper):
         dt: float,
         core_pos: np.ndarray | None = None,
         core_mat: np.ndarray | None = None,
+        near: SkinResult | None = None,
         patient: bool = False,
         spent: float = 0.0,
         bodies: BodyMotion | None = None,
@@ -72,7 +71,8 @@ class CondensedStepper(FemStepper):
             if bodies is not None:  # where the bodies go without the skin
                 released = bodies.without(np.array([g.group for g in self._geoms], int), *released)
             memory = self._skin.outside(*released)  # as those of the full tier do
-        out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies)
+        begin = self._read(near.state) if near is not None and bodies is not None else None
+        out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies, begin)
         new = np.zeros_like(state)
         self._layout.write(out.memory, new)
         return SkinResult(

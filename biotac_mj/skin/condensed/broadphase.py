@@ -20,7 +20,7 @@ from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
 from .lanes import keep_rows
 from .states import Increment
-from .structs import BACK, Constants, Remembered, Scratch
+from .structs import BACK, Constants, Scratch
 
 __all__ = [
     "ROOT3",
@@ -122,7 +122,6 @@ def forget_faces(
     kept: wp.array2d(dtype=int),
     c: Constants,
     s: Scratch,
-    r: Remembered,
     touching: wp.array2d(dtype=int),
 ):
     """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
@@ -135,7 +134,7 @@ def forget_faces(
         for k in range(3):
             i = c.inner_number[c.inner_face[f][k]]
             if i >= 0:
-                if r.core_force[i, w] != real(0.0):
+                if s.core_force[w, i] != real(0.0):
                     loaded = 1
         s.near_core[w, f] = loaded
     sync()

@@ -24,6 +24,7 @@ from .linear import LinearSkin
 from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome
 from .refusals import refuse
 from .step import CondensedStep, Room
+from .structs import Remembered
 
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
@@ -66,6 +67,10 @@ class CondensedSkin:
         self._recall = Program("cpu", step.recall).run
         self._state = StateArrays(self._data, geoms, CONDENSED, **step.holders)
         self._nodes, self._views = {}, self._view()
+        previous, balance = step.previous, step.previous.balance
+        arrays = {name: getattr(balance, name) for name in Remembered.vars}
+        arrays |= {"pos": previous.pos, "mat": previous.mat, "begins": previous.begins}
+        self._previous = {name: a.numpy()[:, 0] if a.ndim == 2 else a.numpy() for name, a in arrays.items()}
         self._held = None  # contents of the state that the arrays hold
         g = geoms.struct
         free = [wp.zeros_like(g.pos), wp.zeros_like(g.mat)]
@@ -97,6 +102,7 @@ class CondensedSkin:
         geom_mat: np.ndarray,
         allowed: float = 1.0,
         bodies: BodyMotion | None = None,
+        near: Memory | None = None,
     ) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a pure function of its
         arguments.
@@ -110,6 +116,8 @@ class CondensedSkin:
           allowed: fraction of the limit by `patience`.
           bodies: compliance of the geoms' bodies; the outcome is then valid for the poses in its memory, to
             which its wrenches move the bodies. None: poses are prescribed.
+          near: a balance that was found from the same memory for poses not far from these, at which Newton's
+            method begins; with `bodies` alone.
 
         Raises:
           ValueError: NaN in a pose.
@@ -127,7 +135,7 @@ class CondensedSkin:
             v["origin"][:, 0], v["arm"][:, 0], v["spin"][:, 0] = bodies.pos, bodies.arm, bodies.spin
         self.proximity.pose(pos, mat)
         if bodies is not None or not self.proximity.deep(pos, mat):
-            out = self._follow(memory, pos, mat, effort, bodies)
+            out = self._follow(memory, pos, mat, effort, bodies, near)
         else:
             shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
             fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
@@ -137,7 +145,7 @@ class CondensedSkin:
         out.cost = allowed - effort[0] / self._first
         return out
 
-    def _follow(self, memory, pos, mat, effort, bodies=None):
+    def _follow(self, memory, pos, mat, effort, bodies=None, near=None):
         """Solves for poses that are not too deep. effort: [limit of the cost], from which it subtracts its
         cost."""
         far, let_go = np.inf, (pos, mat)
@@ -150,16 +158,18 @@ class CondensedSkin:
         if not len(memory.forces) or far > _FAR:
             if self.untouched(*let_go):  # the geoms do not touch the skin, or leave it
                 return self.at_rest(*let_go)
-        out = self._solve(memory, pos, mat, effort[0])
+        out = self._solve(memory, pos, mat, effort[0], near)
         effort[0] -= self._views["spent"][0]
         if not out.converged and self.untouched(*let_go):
             return self.at_rest(*let_go)
         return out
 
-    def _solve(self, memory, pos, mat, most):
+    def _solve(self, memory, pos, mat, most, near):
         """Solves from a state to poses, as far as possible."""
         v = self._views
         self._load(memory)
+        if near is not None:
+            self._begin_at(near)
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
         v["tier"][0] = -1  # without an equilibrium the error is not known
         self._run()
@@ -192,6 +202,16 @@ class CondensedSkin:
             v["pos_last"][:] = np.nan
         # what no candidate writes
         v["node_force"][:] = 0.0
+
+    def _begin_at(self, near):
+        """Lets the next solve begin at a balance."""
+        v, outer = self._previous, near.coordinate < 3 * len(self.linear.node)
+        v["force"][:] = v["core_force"][:] = 0.0
+        v["force"].reshape(-1)[near.coordinate[outer]] = near.force[outer]
+        v["core_force"][near.coordinate[~outer] - 3 * len(self.linear.node)] = near.force[~outer]
+        v["pressure"][0], v["bulge"][0] = near.pressure, near.bulge
+        v["solved"][0], v["after"][0] = near.solved, near.after
+        v["pos"][:], v["mat"][:], v["begins"][0] = near.geom_pos, near.geom_mat, 1
 
     def _read(self):
         memory = self._state.save(Memory)

@@ -39,6 +39,7 @@ class LoadStepping:
 
     holds: int  # whether the skin keeps its last state, since no equilibrium was found
     deep: int  # whether a geom is in the core
+    again: int  # whether the first try begins at `Previous`
     iterations: int
     at: real
     to: real  # trial load factor

@@ -18,7 +18,7 @@ from .refusals import refuse
 from .results import conclude, recall
 from .solve import block_of, phases, whole_step
 from .states import Increment, LoadStepping, Newton
-from .structs import NVECTOR, Remembered, Scratch
+from .structs import NVECTOR, Previous, Remembered, Scratch
 
 __all__ = ["CondensedStep", "Room", "kernels_for_cuda"]
 
@@ -67,6 +67,7 @@ class CondensedStep:
         contact.
       deep: (nworld,) int, 1: a geom is in the core.
       bodies: `Bodies`; the caller writes compliance, predicted wrenches and reference points before a launch.
+      previous: `Previous`; the caller lets a solve begin there.
       touch: `Contact` of the outer surface.
       tier: (nworld,) int, for the sensor `status`: 1, or -1 outside the range of measured errors.
 
@@ -96,7 +97,7 @@ class CondensedStep:
             self._scratch = _scratch(model, linear, nworld, geoms.count, room, groups)
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
         self.most, self.spent = self._scratch.most, self._scratch.spent
-        self.bodies = self._scratch.bodies
+        self.bodies, self.previous = self._scratch.bodies, self._scratch.previous
         self.most.fill_(float(model.options.max_work))
         self._going = wp.zeros(1, dtype=int, device=model.device)
         self._phases = phases(geoms.shapes) if model.device.is_cuda else None
@@ -220,6 +221,12 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.solve.phase = wp.zeros(nworld, dtype=int)
     for name, of in (("stepping", LoadStepping), ("increment", Increment), ("newton", Newton)):
         setattr(s.solve, name, wp.zeros(nworld, dtype=of))
+    s.previous = Previous()
+    sizes = {"outer_node": nouter, "inner_node": ninner, "world": nworld}
+    allocate("condensed", s.previous.balance, sizes, tier=CONDENSED)
+    s.previous.pos = wp.zeros((ngeom if groups else 0, nworld), dtype=vec3)
+    s.previous.mat = wp.zeros((ngeom if groups else 0, nworld), dtype=mat33)
+    s.previous.begins = wp.zeros(nworld, dtype=int)
     s.pos, s.from_pos, s.held_pos, s.sought_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(4))
     s.mat, s.from_mat, s.held_mat, s.sought_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(4))
     s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)

@@ -8,7 +8,7 @@ from ..block import sync
 from ..contact.faces import Contact, balanced_fraction, commit_face
 from ..contact.posed import Geoms
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
-from ..types import real, vec3
+from ..types import mat33, real, vec3
 from .balance import CUT, TOLERANCE, newton_from
 from .bodies import find_groups, place_bodies, pose_by_load, sum_forces
 from .broadphase import (
@@ -193,10 +193,45 @@ def begin_step(
             s.bodies.begun[h, w] = s.bodies.posed[h, w]
         sync()
     p.part = p.longest
+    if p.part == real(1.0):
+        p.again = s.previous.begins[w]
+    sync()
     if t == 0:
+        s.previous.begins[w] = 0
         s.solve.stepping[w] = _begin_increment(p, s.most[w])
         s.solve.increment[w] = Increment()
         s.solve.phase[w] = SEARCH
+
+
+@wp.func
+def _begin_at(
+    w: int,
+    t: int,
+    threads: int,
+    o: Increment,
+    r: Remembered,
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+    modulus: real,
+    c: Constants,
+    s: Scratch,
+    st: Worlds,
+):
+    """Begins an increment at a balance with geoms at these poses: its forces, pressure and linear skin, the
+    softening after it, and where geoms are held."""
+    for i in range(t, c.node.shape[0], threads):
+        s.force[w, i] = r.force[i, w]
+    for i in range(t, c.inner.shape[0], threads):
+        s.core_force[w, i] = r.core_force[i, w]
+    for g in range(t, pos.shape[0], threads):
+        s.held_pos[g, w] = pos[g, w]
+        s.held_mat[g, w] = mat[g, w]
+    sync()
+    o.solved = r.after[w]
+    o.bulge = r.bulge[w]
+    o.pressure = r.pressure[w]
+    o.linear = _linear_of(w, r.solved[w], r.bulge[w], modulus, c, st)
+    return o
 
 
 @wp.func
@@ -222,15 +257,14 @@ def search(
     looking = int(1)
     moved = real(0.0)
     if first == 1:
-        for i in range(t, c.node.shape[0], threads):
-            s.force[w, i] = r.force[i, w]
-        for i in range(t, c.inner.shape[0], threads):
-            s.core_force[w, i] = r.core_force[i, w]
-        forget_faces(w, t, threads, touch.kept, c, s, r, touch.touching)
+        if p.again == 1:
+            at = s.previous
+            o = _begin_at(w, t, threads, o, at.balance, at.pos, at.mat, p.modulus, c, s, st)
+        else:
+            o = _begin_at(w, t, threads, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
+        forget_faces(w, t, threads, touch.kept, c, s, touch.touching)
         sum_forces(w, t, threads, geoms, x, touch, c, s)
         place_bodies(w, t, threads, p.to, geoms, s)
-        o.solved = r.after[w]
-        o.bulge = r.bulge[w]
         moved = wp.pow(real(0.5), real(o.halved - 1)) * _largest_motion(w, geoms)
         for g in range(t, geoms.count, threads):
             s.sought_pos[g, w] = geoms.pos[g, w]
@@ -279,16 +313,13 @@ def search(
         find_groups(w, t, threads, o.nnode, geoms, x, touch, c, s)
         _load(w, t, threads, o.nnode, o.nin, c, s)
         foretold = int(0)
-        before = _linear_of(w, r.solved[w], r.bulge[w], p.modulus, c, st)
+        before = o.linear
         count, own = gather_load(w, t, threads, 3 * o.nnode + o.nin, F, c, s)
         l = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
         if first == 1 and count > 0 and p.holds == 0:
             foretold = 1
             if before.bulk_stiffness > real(0.0):  # what it was when the pressure was found
-                before.bulge = -r.pressure[w] / before.bulk_stiffness - before.scale * own
-            for g in range(t, geoms.count, threads):
-                s.held_pos[g, w] = geoms.pos_last[g, w]
-                s.held_mat[g, w] = geoms.mat_last[g, w]
+                before.bulge = -o.pressure / before.bulk_stiffness - before.scale * own
         if p.holds == 1 and l.bulk_stiffness > real(0.0):
             l.bulge = -r.pressure[w] / l.bulk_stiffness - l.scale * own
         if t == 0:
@@ -300,6 +331,33 @@ def search(
     if t == 0:
         s.solve.increment[w] = o
         s.solve.phase[w] = wp.where(looking == 1, NEWTON, BALANCED)
+
+
+@wp.func
+def _remember(
+    w: int,
+    t: int,
+    threads: int,
+    found: Increment,
+    geoms: Geoms,
+    c: Constants,
+    s: Scratch,
+    r: Remembered,
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+):
+    for i in range(t, c.node.shape[0], threads):
+        r.force[i, w] = s.force[w, i]
+    for i in range(t, c.inner.shape[0], threads):
+        r.core_force[i, w] = s.core_force[w, i]
+    for g in range(t, geoms.count, threads):
+        pos[g, w] = geoms.pos[g, w]
+        mat[g, w] = geoms.mat[g, w]
+    if t == 0:
+        r.bulge[w] = found.bulge
+        r.solved[w] = found.solved
+        r.after[w] = found.after
+        r.pressure[w] = found.pressure
 
 
 @wp.func
@@ -318,22 +376,14 @@ def _commit(
     rest_pressure: real,
 ):
     """Stores the state at the end of an increment, with the friction anchors."""
-    for i in range(t, c.node.shape[0], threads):
-        r.force[i, w] = s.force[w, i]
-    for i in range(t, c.inner.shape[0], threads):
-        r.core_force[i, w] = s.core_force[w, i]
+    _remember(w, t, threads, found, geoms, c, s, r, geoms.pos_last, geoms.mat_last)
+    if s.previous.pos.shape[0] > 0:
+        _remember(w, t, threads, found, geoms, c, s, s.previous.balance, s.previous.pos, s.previous.mat)
     for f in range(t, c.face.shape[0], threads):
         commit_face(f, w, touch)
     for i in range(t, x.shape[0], threads):
         touch.x_last[i, w] = x[i, w]
-    for g in range(t, geoms.count, threads):
-        geoms.pos_last[g, w] = geoms.pos[g, w]
-        geoms.mat_last[g, w] = geoms.mat[g, w]
     if t == 0:
-        r.bulge[w] = found.bulge
-        r.solved[w] = found.solved
-        r.after[w] = found.after
-        r.pressure[w] = found.pressure
         st.pressure[w] = found.pressure + rest_pressure
         st.last_pressure[w] = st.pressure[w]
     sync()
@@ -423,6 +473,7 @@ def _go_on(most: real, p: LoadStepping, o: Increment):
     arrived = o.ok  # whether what was found last is where the load goes on
     if p.holds == 1:
         return p, 0
+    p.again = 0
     p.spent += o.spent
     p.iterations += o.iterations
     p.error = o.error

@@ -8,7 +8,7 @@ from ..state import declared
 from ..types import mat33, real, vec3
 from .states import Solve
 
-__all__ = ["Constants", "Remembered", "Scratch"]
+__all__ = ["Constants", "Previous", "Remembered", "Scratch"]
 
 
 @wp.struct
@@ -77,7 +77,18 @@ class Constants:
 @wp.struct
 @declared("condensed")
 class Remembered:
-    """Between steps [item, world], see `state.VARIABLES`."""
+    """A balance of the skin [item, world], see `state.VARIABLES`: that of the last step is remembered."""
+
+
+@wp.struct
+class Previous:
+    """What the previous solve has found: the balance, with the geoms where they were then [geom, world]; no
+    geoms where bodies do not give way."""
+
+    balance: Remembered
+    pos: wp.array2d(dtype=vec3)
+    mat: wp.array2d(dtype=mat33)
+    begins: wp.array(dtype=int)  # [world] 1: the next solve is another one of the same step, and begins there
 
 
 # vectors over the coordinates of the candidates
@@ -129,6 +140,7 @@ class Scratch:
     sum: wp.array2d(dtype=float)
     held: wp.array2d(dtype=float)  # of the equations, how they are held against the liquid's pressure
     solve: Solve
+    previous: Previous
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
