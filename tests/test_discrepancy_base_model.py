@@ -13,7 +13,7 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories.base import pairs
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-from biotac_mj.discrepancy.trajectories.base.pairs import exchanged, hearing
+from biotac_mj.discrepancy.trajectories.base.pairs import cross_talk, exchanged
 from biotac_mj.discrepancy.trajectories.base.rests import rested
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
@@ -54,9 +54,9 @@ def test_exchanges_and_lead_pairs_are_found_only_where_present():
     assert exchanged(*fitted(changed(ring, n=8))).reads == ((2, 9), (9, 13), (13, 2))
     pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
     data = fitted(changed(heard(pairs), n=8))
-    assert exchanged(*data) is None and set(hearing(*data).hears.values()) == set(pairs)
+    assert exchanged(*data) is None and set(cross_talk(*data).hears.values()) == set(pairs)
     data = fitted(measured([], n=8))
-    assert exchanged(*data) is None and hearing(*data) is None
+    assert exchanged(*data) is None and cross_talk(*data) is None
 
 
 def test_a_ring_exchange_is_found_despite_a_contrary_contact(monkeypatch):

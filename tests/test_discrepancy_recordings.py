@@ -563,16 +563,16 @@ def test_summary_says_what_it_cannot_know():
     assert "no force: latency" in text and "not loaded: saturation" in text
 
 
-def test_an_effect_is_searched_or_said_to_be_untold():
-    """Of each entry of the catalogue a log tells by itself, or the report says what it would ask for."""
+def test_an_effect_is_searched_or_listed_as_not_identifiable():
+    """A log shows each entry of the catalogue, or the report lists the data that are required."""
     e, rng = unloaded()
     d = diagnose_recording(PlainRecording(noisy(e, rng)))
-    untold = {name for line in d.notes for name in line.partition(": ")[2].split(", ")}
-    assert not untold & {"stuck channel", "drift or jump of an electrode", "liquid lost over the session"}
+    missing = {name for line in d.notes for name in line.partition(": ")[2].split(", ")}
+    assert not missing & {"stuck channel", "drift or jump of an electrode", "liquid lost over the session"}
     for effect in (*entries("poses"), *LOGGED):
         effect = KINDS.get(effect.id, effect)
         has = {"rest", "sign", "time"}  # raw counts for a minute, and nothing else
-        assert (effect.name in untold) == bool(effect.asks - has), effect.id
+        assert (effect.name in missing) == bool(effect.asks - has), effect.id
 
 
 def test_what_no_bound_allows_has_no_name():

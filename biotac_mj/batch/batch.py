@@ -230,7 +230,8 @@ class Batch(Skins):
         self.accept(r.asked_pos, r.asked_mat)
 
     def solve_one_way(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Solves the skins that take part where the bodies go without acceleration."""
+        """Solves the skins that are awake, for the bodies' poses at the end of a step without
+        acceleration."""
 
         def solve():
             self.keep_models()

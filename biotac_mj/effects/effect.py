@@ -284,7 +284,8 @@ class Effect(abc.ABC):
         return other
 
     def solved(self, names: Sequence[str]) -> "Effect":
-        """The effect with parameters of these names: sensitivities of the skin solved for it."""
+        """The effect for fields that have these sensitivities of the skin: an effect may have a parameter for
+        each."""
         return self
 
     def joining(self, theta: dict) -> float | None:

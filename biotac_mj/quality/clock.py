@@ -94,8 +94,8 @@ def clock_faults(
 
 
 def _clock_jumps(missing, time, counts):
-    """Missing rows (n,) without gaps longer than the log across which the channels change no more than
-    between neighbouring rows: there the clock jumps."""
+    """Missing rows (n,) without jumps of the clock, and a fault for each jump. A gap that is longer than the
+    log is a jump if the channels change no more across it than between neighbouring rows."""
     step = np.abs(np.diff(counts, axis=0))
     usual = np.maximum(np.median(step, axis=0), 1.0)
     found = []

@@ -47,9 +47,9 @@ class Shaking:
         """`drive`, `gain`, `slip` and `area` of `sensor.vibration.Vibration` at the end of a step.
 
         A body's force acts on the samples that it touches, along itself; a height is a motion along it too,
-        and what it makes the tangent of the step. The speed of slip is that at which what holds the samples
-        in friction moves over the body, on average. Samples count by their forces: one that begins or ceases
-        to touch has none, and is not heard as a knock.
+        and the step's tangent gives its force. The speed of slip is the mean speed of the friction anchors
+        over the body. Samples are weighted by their forces: a sample that begins or ceases to touch has none,
+        so it causes no knock.
 
         Args:
           before: the skin's state. result: of the step. dt: its length [s].
@@ -64,7 +64,7 @@ class Shaking:
         face_area, nsample = self._stepper.sample_area
         sample, geom = rows[:, :2].T.astype(int)
         group, face = self._group[geom], sample // nsample
-        way, known = self._moved(self._stepper.contact_rows(before), rows, sample)
+        moved, known = self._moved(self._stepper.contact_rows(before), rows, sample)
         for g in np.bincount(group).nonzero()[0]:
             force, mine = -result.wrench[g, :3], (group == g).nonzero()[0]
             size, load = math.sqrt(force @ force), result.load[mine]
@@ -72,12 +72,12 @@ class Shaking:
                 continue
             along, weight = force / size, np.bincount(face[mine], load / load.sum())
             at = weight.nonzero()[0]
-            heard = (weight[at].astype(np.float32) @ self._faces.take(at, 0)).reshape(-1, 3) @ along
+            modal = (weight[at].astype(np.float32) @ self._faces.take(at, 0)).reshape(-1, 3) @ along
             area[g] = face_area[face[mine]].sum()
-            drive += size * heard[:-1]
-            gain[g] = (along @ result.tangent[g, :3, :3] @ along) * heard
+            drive += size * modal[:-1]
+            gain[g] = (along @ result.tangent[g, :3, :3] @ along) * modal
             also = known[mine] * load
-            mean = also @ way[mine] / (also.sum() or 1.0)
+            mean = also @ moved[mine] / (also.sum() or 1.0)
             slip[g] = math.sqrt(mean @ mean) / dt
         return drive, gain, slip, area
 

@@ -8,12 +8,12 @@ from .model import LEAST, WINDOW
 from .recording import FORCE_MOVED
 from .session import Session
 
-__all__ = ["untold"]
+__all__ = ["not_identifiable"]
 
 
-def untold(session: Session) -> list[str]:
-    """Lines, one for each thing that the recording lacks (`Effect.asks`): what would show there, or how, and
-    names of the effects that ask for it. An effect stands in the first of them."""
+def not_identifiable(session: Session) -> list[str]:
+    """A line for each kind of data that the recording lacks (`Effect.asks`), with the names of the effects
+    that require it. An effect is listed in the first of them."""
     known = {e.id: e for e in (*entries("poses"), *LOGGED, *entries("log"))}
     lacking, names = _lacking(session), {}
     for effect in known.values():
@@ -23,7 +23,7 @@ def untold(session: Session) -> list[str]:
 
 
 def _lacking(session):
-    """Key of `Effect.asks` -> in words, of what the recording lacks."""
+    """Keys of `Effect.asks` that the recording lacks, with a description each."""
     r, out = session.recording, {}
     if r.force is None:
         out["force"] = "no force"

@@ -8,7 +8,7 @@ from ...recordings.protocol import Protocol
 from ...recordings.recording import REST_LIKE
 from ..report.verdict import Estimate, Finding, Picture, Verdict
 from .amended import amended_sensor, running
-from .blind import untold
+from .blind import not_identifiable
 from .candidates import Candidate
 from .proof import views
 from .recording import PlainRecording
@@ -81,7 +81,7 @@ def concluded(
         where_note="electrodes that depart, from and to [s], RMS [counts]",
         remainder=left.text,
         unknown=left.significant,
-        notes=untold(session) + _order(r),
+        notes=not_identifiable(session) + _order(r),
         next_experiment=_next(session.ordered, protocol),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(session),

@@ -93,7 +93,7 @@ def _in_sensor(recording):
 def _contacts(time, pos, gap):
     """For every contact its rows (k,), the last one before it, those of it and the following ones near the
     skin; and a row of the approach without touch, or None."""
-    stride = np.linalg.norm(np.diff(pos, axis=0, prepend=pos[:1]), axis=1)
+    travel = np.linalg.norm(np.diff(pos, axis=0, prepend=pos[:1]), axis=1)
     touch = np.concatenate([[False], gap <= 0, [False]])
     change = np.diff(touch.astype(int))
     first, last = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
@@ -101,13 +101,13 @@ def _contacts(time, pos, gap):
     out = []
     for k, (a, b) in enumerate(zip(first, last)):
         end = first[k + 1] - 1 if k + 1 < len(first) else len(time)
-        near = (time[b:end] < time[b - 1] + _AFTER) & (gap[b:end] < _LEFT) & (stride[b:end] < _LEFT)
+        near = (time[b:end] < time[b - 1] + _AFTER) & (gap[b:end] < _LEFT) & (travel[b:end] < _LEFT)
         after = b + int(np.logical_and.accumulate(near).sum())
         rows = np.arange(a - 1, after)
-        way = np.arange(last[k - 1] if k else 0, a - 1)
+        approach = np.arange(last[k - 1] if k else 0, a - 1)
         if len(rows) >= 8:
-            late = time[a - 1] - time[way] < _WAIT * np.median(np.diff(time[rows]))
-            free = way[(gap[way] > _APART) & (gap[way] < _LEFT) & late]
+            late = time[a - 1] - time[approach] < _WAIT * np.median(np.diff(time[rows]))
+            free = approach[(gap[approach] > _APART) & (gap[approach] < _LEFT) & late]
             out.append((rows, int(free[-1]) if len(free) else None))
     return out
 

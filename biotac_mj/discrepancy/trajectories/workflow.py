@@ -13,7 +13,7 @@ from ...effects.sensor_file import SensorFile
 from ...geometry.design import check_nelectrode
 from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, of_electrodes
 from .base.findings import other_modulus
-from .base.pairs import exchanged, hearing
+from .base.pairs import cross_talk, exchanged
 from .base.rests import rested
 from .beliefs import Beliefs, believed
 from .fitting import Fit, fit_effects
@@ -168,7 +168,7 @@ def _wired(usable, comparison, fit, chosen):
         if effect.wiring:
             effect = exchanged(comparison, fit, chosen)
         elif effect.of_pairs:
-            effect = hearing(comparison, fit, chosen) or effect
+            effect = cross_talk(comparison, fit, chosen) or effect
         out += [effect] if effect is not None and not effect.of_rest else []
     return out
 

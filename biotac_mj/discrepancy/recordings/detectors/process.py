@@ -61,7 +61,7 @@ class Process:
         said, best = load @ np.linalg.solve(K, y), -np.inf
         for middle in (0.0, *np.quantile(said, _LOADS)):
             both = np.outer(said - middle, said - middle) * self._smooth
-            best = max(best, *(_likely(K + a * both, y) for a in _DRIFT))
+            best = max(best, *(_log_likelihood(K + a * both, y) for a in _DRIFT))
         return best - without
 
     def _of(self, i):
@@ -91,11 +91,11 @@ class Process:
             for slope in _LINEAR:
                 for memory in _MEMORY:
                     K = slope * linear + curved + memory * self._memory
-                    nats = _likely(K, y)
+                    nats = _log_likelihood(K, y)
                     if best is None or nats > best[0]:
                         best = nats, K, slope * linear + curved - base
         without, K, load = best
-        drift = [_likely(K + a * self._smooth, y) for a in _DRIFT]
+        drift = [_log_likelihood(K + a * self._smooth, y) for a in _DRIFT]
         return max(drift) - without, without, y, scale, _DRIFT[int(np.argmax(drift))], K, load
 
     def trend(self, i: int) -> Trend:
@@ -106,23 +106,23 @@ class Process:
         n = max(2, int((self._time <= self._model.time[self._model.inside][-1]).sum()))
         # how fast it changes the bins fitted say
         shapes = [a * self._smooth[:n, :n] ** q for q in _FASTER for a in (amount, 10 * amount)]
-        shape = max(shapes, key=lambda k: _likely(K[:n, :n] + k, y[:n]))
+        shape = max(shapes, key=lambda k: _log_likelihood(K[:n, :n] + k, y[:n]))
         values = scale * shape @ np.linalg.solve(K[:n, :n] + shape, y[:n])
         knots = np.linspace(self._time[0], self._time[n - 1], _KNOTS)
         values = np.interp(knots, self._time[:n], values)
         block = np.arange(len(y)) * BLOCKS // len(y)
-        gain = np.bincount(block, _foretold(both, y) - _foretold(K, y))
+        gain = np.bincount(block, _log_predictive(both, y) - _log_predictive(K, y))
         p = min(1.0, self._x.shape[1] * float(np.exp(-gain.sum())))  # Markov, of all electrodes tried
         return Trend("smooth", np.nan, knots, values - values.mean(), 0.0, gain, p)
 
 
-def _likely(K, y):
-    """Logarithm of the likelihood of y (n,) by a covariance (n, n) up to a factor, which fits best."""
-    return float(_foretold(K, y).sum())
+def _log_likelihood(K, y):
+    """Logarithm of the likelihood of y (n,) for a covariance K (n, n) times the factor that fits best."""
+    return float(_log_predictive(K, y).sum())
 
 
-def _foretold(K, y):
-    """(n,) logarithms of the likelihoods of each of y (n,) from those before."""
+def _log_predictive(K, y):
+    """(n,) logarithms of the predictive density of each value of y (n,), given those before."""
     L, failed = lapack.dpotrf(K.T, lower=1, clean=0)  # in Fortran's order, which takes half of the time
     if failed:
         raise np.linalg.LinAlgError("covariance is not positive definite")

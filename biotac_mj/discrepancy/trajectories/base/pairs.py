@@ -1,7 +1,8 @@
-"""Pairs of electrodes: which are read in each other's place, and which hear another one.
+"""Pairs of electrodes that are exchanged, or that have cross-talk.
 
-Found before anything is fitted. No small change leads from one wiring to another; and all pairs of leads
-together are three hundred, while what falls off with distance or goes by the order of sampling is no pair."""
+They are found before anything is fitted, since no small change leads from one wiring to another. There are
+three hundred pairs of leads; only neighbours, in place or in the order of sampling, are tried for
+cross-talk."""
 
 import typing
 
@@ -18,15 +19,15 @@ if typing.TYPE_CHECKING:
     from ..fitting import Fit
     from ..whitening import Comparison
 
-__all__ = ["exchanged", "hearing"]
+__all__ = ["cross_talk", "exchanged"]
 
 _SWAPPED = 3.0  # nats per trajectory that each electrode has to gain in another's place
 _SWAP_CHANCE = 0.01  # of all electrodes of a ring together
 
-_HEARD = 1.5  # nats per trajectory that an electrode has to gain by another one, beside a gain of its own
-_HEARD_CHANCE = 0.05
-_LEAST = 0.04  # share
-_MOST = 8  # pairs: where more electrodes follow others, it is the skin or the set-up that is another
+_GAIN = 1.5  # nats per trajectory by which another electrode has to explain more than a gain of its own
+_GAIN_CHANCE = 0.05
+_LEAST = 0.04  # fraction of the other electrode's change
+_MOST = 8  # pairs: more are a sign of another skin or set-up
 _ROUNDS = 3
 _NEAR = 5.0  # [mm], or sampled one after the other
 _RIDGE = 1e-3
@@ -51,7 +52,7 @@ def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Excha
 
 
 def _rings(reads):
-    """Lists of electrodes each of which shows the next one: who shows another's is shown by somebody."""
+    """Lists of electrodes, each of which reads the next one: the cycles of a permutation."""
     left, out = set(np.flatnonzero(reads != np.arange(len(reads))).tolist()), []
     while left:
         ring = [left.pop()]
@@ -72,12 +73,13 @@ def _in_place_of(comparison, i, predicted):
     return _evidence(square, len(measured))
 
 
-def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTalk | None:
+def cross_talk(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTalk | None:
     """Cross-talk with the pairs that the data show, or None where they show none.
 
-    A pair is taken up if its electrode's change in touch is told by its neighbour's beside its own, on
-    trajectories left out, and looked at again with all others in place: one that is loud moves what poses
-    are thought to be, and with them all electrodes. Whether the pairs are cross-talk is left to the fit."""
+    A pair is added if, on held-out trajectories, the neighbour's change in touch predicts the electrode's
+    residual better than its own change alone. It is tested again with all other pairs in the model, since a
+    strong pair shifts the estimated poses and thereby all electrodes. The fit decides whether the pairs are
+    cross-talk."""
     pairs, design = {}, comparison.sim.design
     n = design.nelectrode
     for _ in range(_ROUNDS):
@@ -85,38 +87,42 @@ def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTa
         residual = [white[i][:, :n] for i in chosen]
         change = [(comparison.measured[i] - raw[i])[:, :n] / comparison.sigmas[i][:n] for i in chosen]
         new = {
-            (i, j): share for i in range(n) for j, share in _heard(i, residual, change, set(pairs), design)
+            (i, j): fraction
+            for i in range(n)
+            for j, fraction in _best_source(i, residual, change, set(pairs), design)
         }
         if not new or len(pairs) + len(new) > _MOST:
             break
-        # side by side is mutual; what the other hears may look like a gain of its own where both answer alike
+        # neighbours couple in both directions; the reverse one looks like a gain where both respond alike
         pairs = {(j, i): 0.0 for i, j in new} | pairs | new
         effect = CrossTalk(list(pairs)).on(design)
         theta = effect.default() | dict(zip(effect.hears, pairs.values()))
         fit = fit_effects(comparison, [(effect, theta)], chosen, fit)
         pairs = {effect.hears[name]: fit.effects[0][1][name] for name in effect.hears}
-    pairs = [pair for pair, share in pairs.items() if share > _LEAST]
+    pairs = [pair for pair, fraction in pairs.items() if fraction > _LEAST]
     return CrossTalk(pairs).on(design) if pairs else None
 
 
-def _heard(i, residual, change, known, design):
-    """[(electrode that electrode i hears best, its share)], or []."""
+def _best_source(i, residual, change, known, design):
+    """[(electrode that explains electrode i best, the fraction of its change)], or []."""
     y = [r[:, i] for r in residual]
-    if np.mean([_evidence((b**2).mean(), len(b)) for b in y]) > -_HEARD:  # there is no more to gain
+    if np.mean([_evidence((b**2).mean(), len(b)) for b in y]) > -_GAIN:  # there is no more to gain
         return []
     own, _ = _predicted_by(y, [c[:, [i]] for c in change])
     tried = {
-        j: _predicted_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i, design) if (i, j) not in known
+        j: _predicted_by(y, [c[:, [i, j]] for c in change])
+        for j in _neighbours(i, design)
+        if (i, j) not in known
     }
-    tried = {j: (held - own, share) for j, (held, share) in tried.items() if share > _LEAST}
+    tried = {j: (held - own, fraction) for j, (held, fraction) in tried.items() if fraction > _LEAST}
     if not tried:
         return []
     j = max(tried, key=lambda k: tried[k][0].mean())
-    gain, share = tried[j]
-    return [(j, share)] if _supported(gain, _HEARD, _HEARD_CHANCE) else []
+    gain, fraction = tried[j]
+    return [(j, fraction)] if _supported(gain, _GAIN, _GAIN_CHANCE) else []
 
 
-def _beside(i, design):
+def _neighbours(i, design):
     at = electrode_positions(design)
     near = np.linalg.norm(at - at[i], axis=1) < _NEAR
     return [j for j in range(len(at)) if j != i and (near[j] or abs(i - j) == 1)]
