@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from blocks import four_nodes
 
+from biotac_mj.view import find_gl
+
 
 def load(repo, name):
     spec = importlib.util.spec_from_file_location(name, repo / "examples" / f"{name}.py")
@@ -81,3 +83,11 @@ def test_a_sensors_numbers_are_found(repo):
     truth, start = (np.array([row[k] for row in example.NUMBERS]) for k in (2, 3))
     assert (np.abs(found - truth) < 3 * error).all()
     assert (error < 0.2 * np.abs(start - truth)).all()
+
+
+@pytest.mark.slow
+def test_pictures_of_tasks_are_drawn_and_scored(repo, tmp_path, capsys):
+    pytest.importorskip("dm_control", reason="needs dm_control: pip install biotac_mj[control]")
+    written = load(repo, "task_pictures").main(["--tasks", "press", "--seconds", "0.3", "--out", str(tmp_path)])
+    assert "finger/press: mean reward 0." in capsys.readouterr().out
+    assert find_gl() is None or written["press"].stat().st_size > 10_000
