@@ -88,6 +88,7 @@ def test_a_sensors_numbers_are_found(repo):
 @pytest.mark.slow
 def test_pictures_of_tasks_are_drawn_and_scored(repo, tmp_path, capsys):
     pytest.importorskip("dm_control", reason="needs dm_control: pip install biotac_mj[control]")
-    written = load(repo, "task_pictures").main(["--tasks", "press", "--seconds", "0.3", "--out", str(tmp_path)])
+    asked = ["--tasks", "press", "--seconds", "0.3", "--out", str(tmp_path)]
+    written = load(repo, "task_pictures").main(asked)
     assert "finger/press: mean reward 0." in capsys.readouterr().out
     assert find_gl() is None or written["press"].stat().st_size > 10_000
