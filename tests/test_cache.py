@@ -24,6 +24,7 @@ from biotac_mj.geometry.skins import load_skin, skin_reference
 from biotac_mj.matching.states import PlateGrid, PlateStates, plate_states
 from biotac_mj.skin import Material, SkinModel, SkinOptions
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
+from biotac_mj.skin.condensed.linear import LinearSkin
 from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.fill import rest_state, rest_worlds
 from biotac_mj.skin.modes import skin_modes
@@ -56,6 +57,10 @@ def fill_worlds(geometry, modulus, extra):
 
 def compliance(geometry, outer, inner, direction):
     SurfaceCompliance(SkinModel(geometry), outer, inner, direction)
+
+
+def core(geometry):
+    LinearSkin(SkinModel(geometry))
 
 
 def vector(geometry, field, outer, inner):
@@ -116,6 +121,7 @@ KINDS = {
     "rest": (fill, {"amount": np.array([1e-8])}),
     "rests": (fill_worlds, {"modulus": np.ones((2, GEOMETRY.nelem)), "extra": np.array([0, 1e-8])}),
     "stiffness": (compliance, {**NODES, "direction": np.eye(3)[:1]}),
+    "core": (core, {}),
     "vector": (vector, {"field": np.ones((GEOMETRY.nvert, 3)), **NODES}),
     "modes": (modes, {"modulus": np.ones(GEOMETRY.nelem)}),
     "grid": (grid, {"vert": GEOMETRY.core_vert, "face": GEOMETRY.core_face}),

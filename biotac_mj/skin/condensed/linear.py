@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from ...cache import cached
 from ...geometry.tet_mesh import enclosed_volume
 from ..contact.meshes import grid_value, mesh_distance, mesh_field
 from ..contact.posed import Geoms
@@ -55,6 +56,46 @@ def _core_gaps(
         gap_out[f, i] = mesh_distance(core.grids, k, p)[3]
 
 
+def _meet_core(model, free, rest):
+    """Inner nodes that can touch the core and their directions away from it; gaps of the inner faces' samples
+    without contact, by the core's mesh and by its spline [m]; the slope of these by a motion of the skin, and
+    a bound of their curvature (nface,)."""
+    surface = model.core_surface
+    face = surface.face_np
+    inner = np.unique(face)
+    inner = inner[free[inner]]
+    gap = wp.zeros((len(face), len(model.sample)), dtype=real, device="cpu")
+    vert = wp.array(rest, dtype=vec3, device="cpu")
+
+    def gaps(shift, everywhere=0):
+        inputs = [surface.face, model.sample, model.core(1).struct, vert, vec3(*shift), everywhere]
+        wp.launch(_core_gaps, gap.shape, inputs, [gap], device="cpu")
+        return gap.numpy().copy()
+
+    probe = _PROBE * np.eye(3)
+    gradient = np.stack([(gaps(p) - gaps(-p)).mean(1) for p in probe], axis=1)
+    nodal = np.zeros((model.nvert, 3))
+    np.add.at(nodal, face, np.repeat(gradient[:, None], 3, 1))
+    away = nodal[inner] / np.linalg.norm(nodal[inner], axis=1, keepdims=True)
+    core_gap, spline_gap = gaps(np.zeros(3)), gaps(np.zeros(3), 1)
+    between = [(gaps(_STEP * axis, 1) - gaps(-_STEP * axis, 1)) / (2 * _STEP) for axis in np.eye(3)]
+    slope = np.stack(between, axis=2)
+    draw, off, near = np.random.default_rng(0), 0.0, np.zeros(gap.shape, bool)
+    farthest = max(_FARTHEST * spline_gap.max(), _LEAST)
+    for _ in range(_MOTIONS):
+        motion = draw.standard_normal(3)
+        length = draw.uniform(0.05, 1.0) * farthest
+        motion *= length / np.linalg.norm(motion)
+        found = gaps(motion, 1)
+        here = found < _STEP
+        if here.any():
+            off = max(off, ((spline_gap + slope @ motion - found)[here]).max() / length)
+            near |= here
+    # for samples that were never near, the motion itself is the only bound
+    bend = np.where(near.any(1), min(1.5 * off + 0.05, 2.0), 2.0)
+    return dict(inner=inner, away=away, gap=core_gap, spline_gap=spline_gap, slope=slope, bend=bend)
+
+
 class LinearSkin:
     """Contact nodes of a model, and the displacements by forces on them.
 
@@ -87,7 +128,10 @@ class LinearSkin:
         self.inner, self.away, self.core_gap = np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 1))
         self._spline_gap, self._slope, self._bend = self.core_gap, np.zeros((0, 1, 3)), np.zeros(0)
         if model.has_core:
-            self._meet_core(model, free, rest)
+            inputs = [g, rest, free, model.core_surface.face_np, model.sample.numpy()]
+            core = cached("core", inputs, lambda: _meet_core(model, free, rest))
+            self.inner, self.away, self.core_gap = core["inner"], core["away"], core["gap"]
+            self._spline_gap, self._slope, self._bend = core["spline_gap"], core["slope"], core["bend"]
         self.compliance = SurfaceCompliance(model, self.node, self.inner, self.away, cache)
         self._fill(model, rest)
 
@@ -104,41 +148,6 @@ class LinearSkin:
         out = np.full(self._nvert, -1)
         out[nodes] = np.arange(len(nodes))
         return out
-
-    def _meet_core(self, model, free, rest):
-        surface = model.core_surface
-        face = surface.face_np
-        self.inner = np.unique(face)
-        self.inner = self.inner[free[self.inner]]
-        gap = wp.zeros((len(face), len(model.sample)), dtype=real, device="cpu")
-        vert = wp.array(rest, dtype=vec3, device="cpu")
-
-        def gaps(shift, everywhere=0):
-            inputs = [surface.face, model.sample, model.core(1).struct, vert, vec3(*shift), everywhere]
-            wp.launch(_core_gaps, gap.shape, inputs, [gap], device="cpu")
-            return gap.numpy().copy()
-
-        probe = _PROBE * np.eye(3)
-        gradient = np.stack([(gaps(p) - gaps(-p)).mean(1) for p in probe], axis=1)
-        nodal = np.zeros((model.nvert, 3))
-        np.add.at(nodal, face, np.repeat(gradient[:, None], 3, 1))
-        self.away = nodal[self.inner] / np.linalg.norm(nodal[self.inner], axis=1, keepdims=True)
-        self.core_gap, self._spline_gap = gaps(np.zeros(3)), gaps(np.zeros(3), 1)
-        between = [(gaps(_STEP * axis, 1) - gaps(-_STEP * axis, 1)) / (2 * _STEP) for axis in np.eye(3)]
-        self._slope = np.stack(between, axis=2)
-        draw, off, near = np.random.default_rng(0), 0.0, np.zeros(gap.shape, bool)
-        farthest = max(_FARTHEST * self._spline_gap.max(), _LEAST)
-        for _ in range(_MOTIONS):
-            motion = draw.standard_normal(3)
-            length = draw.uniform(0.05, 1.0) * farthest
-            motion *= length / np.linalg.norm(motion)
-            found = gaps(motion, 1)
-            here = found < _STEP
-            if here.any():
-                off = max(off, ((self._spline_gap + self._slope @ motion - found)[here]).max() / length)
-                near |= here
-        # for samples that were never near, the motion itself is the only bound
-        self._bend = np.where(near.any(1), min(1.5 * off + 0.05, 2.0), 2.0)
 
     def _fill(self, model, rest):
         nfree, n = len(model.free), self.compliance.count
