@@ -49,31 +49,35 @@ def test_film_at_rest_before_the_first_solve(film):
     np.testing.assert_allclose(BatchFilm(film, 2).impedance.numpy()[1], film.impedance(film.geometry.vert))
 
 
-def test_the_elimination_is_that_of_a_dense_system(film):
-    """Resistances W' A^-1 W of the discs, from the same faces and weights."""
-    x = dented(film, 2)
-    batch = BatchFilm(film, 2)
-    batch.solve_film(as_warp(x), wp.ones(2, dtype=int))
-    n, nface, (disc, over) = len(film.node), len(film.face), film._pair
+@pytest.mark.parametrize("band", [True, False])
+def test_the_elimination_is_that_of_a_dense_system(film, band):
+    """Resistances W' A^-1 W of the discs, from the same faces and weights, twice."""
+    batch, due = BatchFilm(film, 2, band=band), wp.ones(2, dtype=int)
+    disc = batch._pattern.disc.numpy()
+    n, nface, (which, over) = len(film.node), len(film.face), film._pair
     i, j = edges(film.face)
-    for given, factor in zip(batch._given.numpy(), batch._factor.numpy()):
-        A, W = np.zeros((n, n)), np.zeros((n, len(film._pos)))
-        for row, column, sign in ((i, j, -1), (j, i, -1), (i, i, 1), (j, j, 1)):
-            np.add.at(A, (row, column), sign * given[: 3 * nface])
-        A[0, 0] *= 2
-        np.add.at(W, (film.face[over], disc[:, None]), given[3 * nface :].reshape(-1, 3))
-        np.testing.assert_allclose(W.sum(0), 1)
-        resistance = -factor[film._pattern["disc"]]
-        np.testing.assert_allclose(resistance, W.T @ np.linalg.solve(A, W), rtol=1e-10)
+    for seed in range(2):
+        batch.solve_film(as_warp(dented(film, 2, seed)), due)
+        for given, system in zip(batch._given.numpy().T, batch._system.numpy()):
+            A, W = np.zeros((n, n)), np.zeros((n, len(film._pos)))
+            for row, column, sign in ((i, j, -1), (j, i, -1), (i, i, 1), (j, j, 1)):
+                np.add.at(A, (row, column), sign * given[: 3 * nface])
+            A[0, 0] *= 2
+            np.add.at(W, (film.face[over], which[:, None]), given[3 * nface :].reshape(-1, 3))
+            np.testing.assert_allclose(W.sum(0), 1)
+            np.testing.assert_allclose(-system[disc], W.T @ np.linalg.solve(A, W), rtol=1e-10)
 
 
-def test_a_folded_film_is_not_valid_and_others_are(film):
-    x = dented(film, 4)
+def test_the_band_and_the_sparse_factor_are_the_same_film(film):
+    x, due = dented(film, 4), wp.ones(4, dtype=int)
     folded = x[2]
-    folded[film.node] = folded[film.node[::-1]]
-    batch = BatchFilm(film, 4)
-    batch.solve_film(as_warp(x), wp.ones(4, dtype=int))
-    assert batch.valid.numpy().tolist() == [1, 1, 0, 1]
+    folded[film.node] = folded[film.node[::-1]]  # no film: what each finds must be said by both
+    band, sparse = BatchFilm(film, 4, band=True), BatchFilm(film, 4, band=False)
+    for batch in (band, sparse):
+        batch.solve_film(as_warp(x), due)
+        assert batch.valid.numpy().tolist() == [1, 1, 0, 1]
+    assert np.abs(sparse.impedance.numpy()[0] / film.rest - 1).max() > 0.03
+    np.testing.assert_allclose(sparse.impedance.numpy(), band.impedance.numpy(), rtol=1e-11)
 
 
 @pytest.mark.parametrize("largest", [0.0, 1e-5, 1e-4, 1e-3, 5e-3])

@@ -71,27 +71,16 @@ def tube_film():
     return FilmConduction(tube(), conductivity=SIGMA, excitation=EXCITATION, sensor=None)
 
 
-@wp.kernel(enable_backward=False)
-def _edges(
-    face: wp.array(dtype=wp.vec3i),
-    middle: wp.array2d(dtype=wp.vec3d),
-    thickness: wp.array2d(dtype=wp.float64),
-    edge_out: wp.array(dtype=wp.vec3d),
-):
-    f = wp.tid()
-    edge_out[f] = kernels.face_conductance(face[f], 0, wp.float64(1.0), middle, thickness)
-
-
 def sheet_laplacian(point, face, conductance):
-    """P1 finite-element matrix (n, n) [S] of div(s grad u) on a surface, by the film's function; conductance:
+    """P1 finite-element matrix (n, n) [S] of div(s grad u) on a surface, by the film's kernel; conductance:
     (m,) s of each face [S]."""
     i, j = edges(face)
     with wp.ScopedDevice("cpu"):
-        edge = wp.zeros(len(face), dtype=wp.vec3d)
+        edge = wp.zeros((3 * len(face), 1), dtype=wp.float64)
         surface = wp.array(point[:, None], dtype=wp.vec3d, ndim=2), wp.ones((len(point), 1), dtype=wp.float64)
-        sheet = [wp.array(face, dtype=wp.vec3i), *surface]
-        wp.launch(_edges, len(face), sheet, [edge])
-    off = np.repeat(conductance, 3) * edge.numpy().ravel()
+        sheet = [wp.ones(1, dtype=int), wp.array(face, dtype=wp.vec3i), 1.0, *surface]
+        wp.launch(kernels.face_conductance, (len(face), 1), sheet, [edge])
+    off = np.repeat(conductance, 3) * edge.numpy()[:, 0]
     rows, columns = np.concatenate([i, j, i, j]), np.concatenate([j, i, i, j])
     return coo_matrix(
         (np.concatenate([-off, -off, off, off]), (rows, columns)), shape=(len(point),) * 2

@@ -13,10 +13,10 @@ between b and the electrode's radius a. A sheet is exact only if it is thinner t
 `spreading_resistance` is the additional resistance of a slab of thickness h.
 
 `FilmConduction` holds the constants of one skin and evaluates one deformed skin at a time; `BatchFilm`
-evaluates many on one device. Both launch two kernels: distances from the core's triangles (`kernels.py`), and
-the sheet's Laplacian with its Cholesky factor (`systems.py`). The solver is direct: conjugate gradients would
-need tens of iterations, since a film pressed to a twentieth of its thickness differs much from the one at
-rest."""
+evaluates many on one device. Both launch the kernels of `kernels.py`, distances from the core's triangles
+and the sheet Laplacian, and Cholesky's method in the form that suits the device (`systems.py`). The solver is
+direct: conjugate gradients would need tens of iterations, since a film pressed to a twentieth of its
+thickness differs much from the one at rest."""
 
 import functools
 import threading
@@ -42,7 +42,7 @@ from biotac_mj.launches import recorded
 from biotac_mj.sensor.channels import impedance_from_counts
 from biotac_mj.sensor.film import kernels
 from biotac_mj.sensor.film.kernels import real, vec3
-from biotac_mj.sensor.film.systems import AHEAD, THREADS, Pattern, edges, make_pattern, solve_sheet
+from biotac_mj.sensor.film.systems import THREADS, Pattern, edges, make_band, make_factor, solve_sheet
 from biotac_mj.sensor.presets import Sensor, read_sensor
 
 from ...short_repr import short_repr
@@ -189,8 +189,12 @@ class FilmConduction:
         )
 
     @functools.cached_property
-    def _pattern(self):
-        return make_pattern(self.face, len(self.node), self._pair, len(self._pos))
+    def _band(self):
+        return make_band(self.face, len(self.node), self._pair, len(self._pos))
+
+    @functools.cached_property
+    def _factor(self):
+        return make_factor(self.face, len(self.node), self._pair, len(self._pos))
 
     def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Geometry of the film under the skin.
@@ -348,6 +352,8 @@ class BatchFilm:
       film: `FilmConduction` that supplies the constants.
       nworld: number of worlds.
       device: Warp device.
+      band: whether the Laplacian is solved as a band of tiles, else by its sparse factor (CPU only); None:
+        only on CUDA.
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
@@ -359,11 +365,12 @@ class BatchFilm:
       nbytes: device memory of all worlds.
     """
 
-    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu"):
+    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
         self.design = film.design
         self._record = None  # list that collects launches instead of running them
-        n, (disc, face) = len(film.node), film._pair
+        band = self.device.is_cuda if band is None else band
+        (pattern, size), n, (disc, face) = film._band if band else film._factor, len(film.node), film._pair
         table_step, table = spreading_table()
         geometry = film.geometry
         with wp.ScopedDevice(self.device):
@@ -377,9 +384,11 @@ class BatchFilm:
             self._rest_thickness = wp.array(film._rest_thickness, dtype=real)
             self._face = wp.array(film.face, dtype=wp.vec3i)
             self._pattern = Pattern()
-            for name, variable in Pattern.vars.items():
-                given = film._pattern[name].astype(np.int32)
-                setattr(self._pattern, name, wp.array(given, dtype=variable.type.dtype))
+            for name, value in pattern.items():
+                if isinstance(value, np.ndarray):
+                    kind = Pattern.vars[name].type
+                    value = wp.array(value.astype(np.int32), dtype=kind.dtype, ndim=kind.ndim)
+                setattr(self._pattern, name, value)
             self._discs = kernels.Discs()
             self._discs.pos = wp.array(film._pos, dtype=vec3)
             self._discs.tangent = wp.array(film._tangent, dtype=vec3, ndim=2)
@@ -398,12 +407,12 @@ class BatchFilm:
             self.middle = wp.zeros((n, nworld), dtype=vec3)
             self.thickness = wp.zeros((n, nworld), dtype=real)
             self.local = wp.zeros((len(film._pos), nworld), dtype=real)
-            self._given = wp.zeros((nworld, 3 * (len(film.face) + len(face))), dtype=real)
-            self._over = wp.zeros((nworld, len(face)), dtype=int)
-            self._factor = wp.zeros((nworld, len(film._pattern["entry"]) - 1 + AHEAD), dtype=real)
+            self._given = wp.zeros((3 * (len(film.face) + len(face)), nworld), dtype=real)
+            self._over = wp.zeros((len(face), nworld), dtype=int)
+            self._system = wp.zeros((nworld, size), dtype=real)
             self._trial = wp.zeros_like(self.impedance)
         of_film = [self.middle, self.thickness, self.local]
-        per_world = [*of_film, self._given, self._over, self._factor, self._trial]
+        per_world = [*of_film, self._given, self._over, self._system, self._trial]
         self.nbytes = sum(array.capacity for array in per_world)
 
     def calibrate(self, x: wp.array) -> None:
@@ -455,9 +464,15 @@ class BatchFilm:
           ValueError: an array is on another device.
         """
         self.lay(x, due)
-        known = [due, self._face, self.film.conductivity, self._discs, self._network, self._pattern]
-        known += [self._cell_constant, self.middle, self.thickness]
-        found = [self._given, self._over, self.local, self._factor, self._trial, self.impedance, self.valid]
+        surface, given, discs = [self.middle, self.thickness], self._given, [due, self._discs, self._face]
+        conductivity, pairs = self.film.conductivity, self._over.shape
+        sheet = [due, self._face, conductivity, *surface]
+        self._launch(kernels.face_conductance, (len(self._face), self.nworld), sheet, [given])
+        self._launch(kernels.samples_over, pairs, [*discs, self.middle], [self._over])
+        weights = [*discs, self._over, *surface]
+        self._launch(kernels.find_weights, self.local.shape, weights, [given, self.local])
+        known = [due, conductivity, self._network, self._pattern, self._cell_constant, given, self.local]
+        found = [self._system, self._trial, self.impedance, self.valid]
         self._launch(solve_sheet, self.nworld, known, found, wp.launch_tiled, THREADS)
 
     def recorded(self, x: wp.array, due: wp.array) -> list[Callable[[], None]]:

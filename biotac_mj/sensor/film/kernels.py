@@ -1,5 +1,5 @@
-"""Film over the core, and functions of a world's thread for `systems.py`: sheet, discs, network. Arrays over
-worlds are [item, world], but those of the linear system [world, item]."""
+"""Kernels of `conduction.py`: film over the core, sheet, discs; and the network of their resistances. Arrays
+over worlds are [item, world], but those of the linear system [world, item]."""
 
 import warp as wp
 
@@ -13,8 +13,8 @@ __all__ = [
     "driving_point",
     "face_conductance",
     "film_surface",
+    "find_weights",
     "samples_over",
-    "weights_over",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -24,6 +24,7 @@ NSAMPLE = 24  # sample points of equal area on a disc
 _ON_EDGE = 1e-9
 real = wp.float64
 vec3 = wp.vec3d
+samples = wp.types.vector(NSAMPLE, int)
 grounded = wp.types.vector(MOST_EXCITATION, wp.float64)
 
 # `rough_thickness`, `sheet_scale` and `near_resistance` also run on tensors, for gradients
@@ -94,23 +95,32 @@ def film_surface(
     thickness_out[i, w] = thickness
 
 
-@wp.func
+@wp.kernel
 def face_conductance(
-    corner: wp.vec3i,
-    w: int,
+    # In:
+    due: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
     conductivity: real,
     middle: wp.array2d(dtype=vec3),
     thickness: wp.array2d(dtype=real),
+    # Out:
+    given_out: wp.array2d(dtype=real),
 ):
-    """Conductance of a face times cot / 2 of the angle opposite each edge."""
-    e0 = middle[corner[2], w] - middle[corner[1], w]
-    e1 = middle[corner[0], w] - middle[corner[2], w]
-    e2 = middle[corner[1], w] - middle[corner[0], w]
+    """Conductance times cot / 2 of the angle opposite each edge, [3 face + corner, world]."""
+    f, w = wp.tid()
+    if due[w] == 0:
+        return
+    t = face[f]
+    e0 = middle[t[2], w] - middle[t[1], w]
+    e1 = middle[t[0], w] - middle[t[2], w]
+    e2 = middle[t[1], w] - middle[t[0], w]
     area = wp.length(wp.cross(e0, e1))
     # keeps a degenerate face finite
     area = wp.max(area, real(1.0e-6) * (wp.length_sq(e0) + wp.length_sq(e1) + wp.length_sq(e2)))
-    total = thickness[corner[0], w] + thickness[corner[1], w] + thickness[corner[2], w]
-    return -sheet_scale(conductivity, total, area) * vec3(wp.dot(e1, e2), wp.dot(e2, e0), wp.dot(e0, e1))
+    scale = sheet_scale(conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area)
+    given_out[3 * f, w] = -scale * wp.dot(e1, e2)
+    given_out[3 * f + 1, w] = -scale * wp.dot(e2, e0)
+    given_out[3 * f + 2, w] = -scale * wp.dot(e0, e1)
 
 
 @wp.struct
@@ -156,11 +166,20 @@ def _barycentric(corner: wp.types.matrix((3, 2), wp.float64), p: wp.vec2d):
     return vec3(real(1.0) - u - v, u, v)
 
 
-@wp.func
+@wp.kernel
 def samples_over(
-    k: int, w: int, discs: Discs, face: wp.array(dtype=wp.vec3i), middle: wp.array2d(dtype=vec3)
+    # In:
+    due: wp.array(dtype=int),
+    discs: Discs,
+    face: wp.array(dtype=wp.vec3i),
+    middle: wp.array2d(dtype=vec3),
+    # Out:
+    over_out: wp.array2d(dtype=int),
 ):
-    """The samples over which a pair's face lies, as bits."""
+    """The samples over which the face of each pair lies, as bits [pair, world]."""
+    k, w = wp.tid()
+    if due[w] == 0:
+        return
     corner = _on_disc(k, w, discs, face, middle)
     low = wp.min(corner[0], wp.min(corner[1], corner[2]))
     high = wp.max(corner[0], wp.max(corner[1], corner[2]))
@@ -169,36 +188,50 @@ def samples_over(
         for i in range(NSAMPLE):
             if wp.min(_barycentric(corner, discs.sample[i])) >= real(-_ON_EDGE):
                 over |= 1 << i
-    return over
+    over_out[k, w] = over
 
 
-@wp.func
-def weights_over(
-    k: int,
-    w: int,
+@wp.kernel
+def find_weights(
+    # In:
+    due: wp.array(dtype=int),
     discs: Discs,
     face: wp.array(dtype=wp.vec3i),
-    middle: wp.array2d(dtype=vec3),
     over: wp.array2d(dtype=int),
+    middle: wp.array2d(dtype=vec3),
+    thickness: wp.array2d(dtype=real),
+    # Out:
+    given_out: wp.array2d(dtype=real),
+    local_out: wp.array2d(dtype=real),
 ):
-    """Weights of the corners of a pair's face in the mean over its disc. Faces over one sample share it."""
-    weights = vec3()
-    if over[w, k] != 0:
-        e = discs.pair_disc[k]
-        corner = _on_disc(k, w, discs, face, middle)
-        covered = int(0)
-        for n in range(discs.pair_start[e], discs.pair_start[e + 1]):
-            covered |= over[w, n]
-        ncovered = int(0)
+    """The mean over each disc as weights of its pairs' corners [3 (face + pair) + corner, world]: faces that
+    lie over one sample share it. Mean thickness [disc, world], zero without film."""
+    e, w = wp.tid()
+    if due[w] == 0:
+        return
+    hits = samples()
+    for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
+        mine = over[k, w]
         for i in range(NSAMPLE):
-            ncovered += (covered >> i) & 1
-        for i in range(NSAMPLE):
-            if ((over[w, k] >> i) & 1) == 1:
-                hits = int(0)
-                for n in range(discs.pair_start[e], discs.pair_start[e + 1]):
-                    hits += (over[w, n] >> i) & 1
-                weights += _barycentric(corner, discs.sample[i]) / real(hits * ncovered)
-    return weights
+            hits[i] += (mine >> i) & 1
+    covered = int(0)
+    for i in range(NSAMPLE):
+        covered += wp.min(hits[i], 1)
+    local = real(0.0)
+    for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
+        mine = over[k, w]
+        weights = vec3()
+        if mine != 0:  # where a corner is not finite the face is over no sample
+            corner = _on_disc(k, w, discs, face, middle)
+            for i in range(NSAMPLE):
+                if ((mine >> i) & 1) == 1:
+                    weights += _barycentric(corner, discs.sample[i]) / real(hits[i] * covered)
+            t = face[discs.pair_face[k]]
+            for c in range(3):
+                local += weights[c] * thickness[t[c], w]
+        for c in range(3):
+            given_out[3 * (face.shape[0] + k) + c, w] = weights[c]
+    local_out[e, w] = local
 
 
 @wp.struct
@@ -217,13 +250,13 @@ def driving_point(
     w: int,
     n: int,
     place: wp.array2d(dtype=int),
-    factor: wp.array2d(dtype=real),
+    system: wp.array2d(dtype=real),
     local: wp.array2d(dtype=real),
     network: Network,
     conductivity: real,
 ):
-    """Impedance of a sensing disc, of n, against the grounded ones. The sheet's resistances are - factor at
-    `place`."""
+    """Impedance of a sensing disc, of n, against the grounded ones; - system at `place`: the sheet's
+    resistances."""
     m = place.shape[0] - n
     # of the grounded electrodes among themselves; those that are not there stay apart
     among = wp.identity(n=MOST_EXCITATION, dtype=real)
@@ -231,15 +264,15 @@ def driving_point(
     into = grounded()
     for i in range(m):
         for j in range(m):
-            among[i, j] = -factor[w, place[n + i, n + j]]
+            among[i, j] = -system[w, place[n + i, n + j]]
         among[i, i] = among[i, i] + _near(local[n + i, w], network, conductivity)
         one[i] = real(1.0)
-        into[i] = -factor[w, place[n + i, e]]
+        into[i] = -system[w, place[n + i, e]]
     inverse = wp.inverse(among)
     equal = inverse * one  # currents of equal potentials
     # their common potential, at which they take the whole current
     potential = (wp.dot(equal, into) - real(1.0)) / wp.dot(equal, one)
-    z = _near(local[e, w], network, conductivity) - factor[w, place[e, e]]
+    z = _near(local[e, w], network, conductivity) - system[w, place[e, e]]
     return z - wp.dot(into, inverse * (into - potential * one)) - potential
 
 

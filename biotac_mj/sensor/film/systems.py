@@ -1,6 +1,7 @@
-"""The film's linear system: its Laplacian A with the discs' weights W as further rows, eliminated by
-Cholesky's method down to -W' A^-1 W. Direct, in double precision. The pattern and the order of elimination
-are those of the skin's mesh: all worlds share them."""
+"""The film's linear system, its Laplacian A with the discs' weights W as further rows: Cholesky's method
+leaves -W' A^-1 W. Direct, in double precision. CUDA has a band of tiles, a block of threads for each world.
+The CPU has a sparse factor, with a twentieth of the band's products; on CUDA it takes twice as long as the
+band, since its products wait for one another."""
 
 import functools
 
@@ -9,40 +10,29 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from biotac_mj.sensor.film.kernels import (
-    Discs,
-    Network,
-    driving_point,
-    face_conductance,
-    real,
-    samples_over,
-    vec3,
-    weights_over,
-)
+from biotac_mj.geometry.design import MOST_DISCS
+from biotac_mj.sensor.film.kernels import Network, driving_point, real
 
-__all__ = ["AHEAD", "THREADS", "Pattern", "edges", "make_pattern", "solve_sheet"]
+__all__ = ["THREADS", "Pattern", "edges", "make_band", "make_factor", "solve_sheet"]
 
 wp.set_module_options({"enable_backward": False})
 
-THREADS = 512  # of the block that solves a world's film
-AHEAD = 3  # numbers behind a world's last entry that are read
-_LANES = 8  # that sum an entry on CUDA
+TILE = MOST_DISCS  # rows of a tile, and columns of right-hand sides: the discs, padded
+THREADS = 128  # of a block that solves a band
+_AHEAD = 3  # numbers behind a world's last entry that are read
 
 
 @wp.struct
 class Pattern:
-    """Entries of the factor, column by column in the order of elimination. A world keeps them row by row, so
-    that what is multiplied lies side by side.
+    """Where a world's system has its entries, by numbers of `make_band` or `make_factor`."""
 
-    Columns of one level do not change each other. The last level has the discs' rows among themselves.
-    """
-
-    level: wp.array(dtype=int)  # first entry of each level
     # of each entry: its place, that of its column's diagonal (-1: is not eliminated), its first slot and run
     entry: wp.array(dtype=wp.vec4i)
     slot: wp.array(dtype=int)  # numbers that sum to the entry, but for the sign of those beside the diagonal
     run: wp.array(dtype=wp.vec3i)  # products to subtract: places of the first factors, and how many
     disc: wp.array2d(dtype=int)  # place of each entry of -W' A^-1 W
+    nblock: int  # tiles on the diagonal; 0: a sparse factor
+    reach: int  # and beside each
 
 
 def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,15 +40,9 @@ def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.roll(face, -1, axis=1).ravel(), np.roll(face, -2, axis=1).ravel()
 
 
-def make_pattern(face: np.ndarray, n: int, pair: tuple[np.ndarray, np.ndarray], ndisc: int) -> dict:
-    """Arrays of `Pattern`.
-
-    Args:
-      face: (m, 3) of nodes. n: nodes. pair: disc and face (k,) each of those that may lie over each other.
-      ndisc: number of discs.
-
-    Slots of edges are 3 face + corner, those of the discs' weights 3 (m + k) + corner.
-    """
+def _terms(face, n, pair):
+    """Row and column (k,) of each number that is summed to an entry, and its slot: of edges 3 face + corner,
+    of the discs' weights 3 (m + pair) + corner, in row n + disc."""
     i, j = edges(face)
     which, over = pair
     # an entry on the diagonal sums all edges at its node; once more at node 0, which fixes the free constant:
@@ -66,25 +50,63 @@ def make_pattern(face: np.ndarray, n: int, pair: tuple[np.ndarray, np.ndarray], 
     first, own = np.arange(len(i)), np.flatnonzero((i == 0) | (j == 0))
     row = np.concatenate([i, i, j, np.zeros(len(own), int), np.repeat(n + which, 3)])
     column = np.concatenate([j, i, j, np.zeros(len(own), int), face[over].ravel()])
-    slot = np.concatenate([first, first, first, own, len(i) + np.arange(3 * len(over))])
+    return row, column, np.concatenate([first, first, first, own, len(i) + np.arange(3 * len(over))])
 
+
+def make_band(face: np.ndarray, n: int, pair: tuple, ndisc: int) -> tuple[dict, int]:
+    """Fields of `Pattern`, and the size of a world's system: tiles of the band, of which the lower ones are
+    stored transposed under their column's diagonal; right-hand sides, one row per node and one column per
+    disc; the result. A system is zero but for the result before its entries are written, and afterwards.
+
+    Args:
+      face: (m, 3) of nodes in an order of small bandwidth. n: nodes. pair: disc and face (k,) each of those
+        that may lie over each other. ndisc: number of discs.
+    """
+    row, column, slot = _terms(face, n, pair)
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    keys, number = np.unique(low * (n + ndisc) + high, return_inverse=True)
+    low, high = keys // (n + ndisc), keys % (n + ndisc)
+    nblock, of_node = -(-n // TILE), high < n
+    reach = max(int((high // TILE - low // TILE)[of_node].max()), 1)
+    rhs, size = nblock * (reach + 1) * TILE * TILE, TILE * TILE
+    down = low // TILE * (reach + 1) + np.where(of_node, high // TILE - low // TILE, 0)
+    place = np.where(of_node, (down * TILE + low % TILE) * TILE + high % TILE, rhs + low * TILE + high - n)
+    sort, every = np.argsort(number, kind="stable"), np.arange(len(keys) + 1)
+    first = np.searchsorted(number[sort], every)
+    # Cholesky's factor of a diagonal tile also needs its lower triangle
+    within = np.flatnonzero(of_node & (high // TILE == low // TILE) & (low != high))
+    lower = (down * TILE + high % TILE) * TILE + low % TILE
+    length = np.diff(first)
+    takes = np.concatenate([np.arange(len(keys)), within])
+    padding = np.arange(n, nblock * TILE)
+    padding = (padding // TILE * (reach + 1) * TILE + padding % TILE) * TILE + padding % TILE
+    places = np.concatenate([place, lower[within], padding])
+    pivot = np.where(np.concatenate([low == high, np.zeros(len(within), bool), padding >= 0]), places, -1)
+    slots = np.concatenate([np.arange(first[e], first[e + 1]) for e in takes])
+    firsts = np.cumsum([0, *length[takes], *np.zeros(len(padding), int)])
+    entry = [np.append(places, 0), np.append(pivot, 0), firsts, np.zeros(len(firsts), int)]
+    result = rhs + nblock * size
+    return {
+        "entry": np.stack(entry, axis=1),
+        "slot": slot[sort][slots],
+        "run": np.zeros((0, 3), int),
+        "disc": result + TILE * np.arange(ndisc)[:, None] + np.arange(ndisc),
+        "nblock": nblock,
+        "reach": reach,
+    }, result + size
+
+
+def make_factor(face: np.ndarray, n: int, pair: tuple, ndisc: int) -> tuple[dict, int]:
+    """As `make_band`: the entries of the sparse factor, column by column in minimum-degree order. A world
+    keeps them row by row, so that what is multiplied lies side by side."""
+    row, column, slot = _terms(face, n, pair)
     place = np.arange(n + ndisc)
     place[_minimum_degree(row[row < n], column[row < n], n)] = np.arange(n)
     low, high = np.minimum(place[row], place[column]), np.maximum(place[row], place[column])
     a, b = np.tril_indices(ndisc)
     start, rows = _fill(np.concatenate([low, n + b]), np.concatenate([high, n + a]), n + ndisc)
-    columns = np.repeat(np.arange(n + ndisc), np.diff(start))
-
-    # a column's parent is the first row below its diagonal; leaves are of level 0
-    level = np.zeros(n + ndisc, int)
-    for k in range(n):
-        parent = rows[start[k] + 1]
-        level[parent] = max(level[parent], level[k] + 1)
-    level[n:] = level.max()
-
-    order = np.lexsort((rows, columns, level[columns]))
-    number = np.full((n + ndisc, n + ndisc), -1)
-    number[rows[order], columns[order]] = np.arange(len(rows))
+    columns, number = np.repeat(np.arange(n + ndisc), np.diff(start)), np.full((n + ndisc, n + ndisc), -1)
+    number[rows, columns] = np.arange(len(rows))
     at = np.empty(len(rows), int)
     at[np.lexsort((columns, rows))] = np.arange(len(rows))
     pivot = np.where(columns < n, at[start[columns]], -1)
@@ -108,14 +130,14 @@ def make_pattern(face: np.ndarray, n: int, pair: tuple[np.ndarray, np.ndarray], 
     owner = number[high, low]
     sort, every = np.argsort(owner, kind="stable"), np.arange(len(rows) + 1)
     firsts = np.searchsorted(owner[sort], every), np.searchsorted(changed[begins], every)
-    entry = [np.append(at[order], 0), np.append(pivot[order], 0), *firsts]
     return {
-        "level": np.append(np.searchsorted(level[columns[order]], np.arange(level.max() + 1)), len(rows)),
-        "entry": np.stack(entry, axis=1),
+        "entry": np.stack([np.append(at, 0), np.append(pivot, 0), *firsts], axis=1),
         "slot": slot[sort],
         "run": np.stack([left[begins], right[begins], length], axis=1),
-        "disc": at[order][np.maximum(number[n:, n:], number[n:, n:].T)],
-    }
+        "disc": at[np.maximum(number[n:, n:], number[n:, n:].T)],
+        "nblock": 0,
+        "reach": 0,
+    }, len(rows) + _AHEAD
 
 
 def _minimum_degree(row, column, n):
@@ -148,69 +170,47 @@ def _fill(low, high, n):
     return np.cumsum([0, *map(len, columns)]), np.concatenate(columns)
 
 
-# An entry is summed by some lanes of a warp on CUDA, where a world is a block of threads, else by one thread.
-# The CPU takes four products at a time, of the last ones those that are kept: rows have `AHEAD` more numbers.
-# A pivot that is not positive leaves nan, which marks the film invalid.
+# By one thread. Products are taken four at a time; of those behind a run none is kept. A pivot that is not
+# positive leaves nan, which marks the film invalid.
 _ELIMINATE = """
-#if defined(__CUDA_ARCH__)
-    const int lanes = LANES, thread = threadIdx.x, threads = blockDim.x;
-#else
+#if !defined(__CUDA_ARCH__)
     typedef double quad __attribute__((vector_size(32), aligned(8)));
     typedef long long bits __attribute__((vector_size(32), aligned(8)));
     static const long long kept[8] = {-1, -1, -1, -1, 0, 0, 0, 0};
-    const int lanes = 1, thread = 0, threads = 1;
-#endif
-    const double* summand = given.data + (long long)world * given.shape[1];
-    double* value = factor.data + (long long)world * factor.shape[1];
-    const int part = thread % lanes, together = threads / lanes;
-    for (int l = 0; l + 1 < level.shape[0]; ++l) {
-        const int begin = level.data[l], end = level.data[l + 1];
-        for (int first = begin; first < end; first += together) {
-            const int e = first + thread / lanes;
-            double sum = 0.0;
-            int place = 0, pivot = 0;
-            if (e < end) {
-                const auto own = entry.data[e], next = entry.data[e + 1];
-                place = own.c[0];
-                pivot = own.c[1];
-                for (int k = own.c[2] + part; k < next.c[2]; k += lanes) sum += summand[slot.data[k]];
-                if (place != pivot) sum = -sum;
-#if !defined(__CUDA_ARCH__)
-                quad four = {};
-#endif
-                for (int r = own.c[3]; r < next.c[3]; ++r) {
-                    const auto at = run.data[r];
-                    const double *a = value + at.c[0], *b = value + at.c[1];
-#if defined(__CUDA_ARCH__)
-                    for (int k = part; k < at.c[2]; k += lanes) sum -= a[k] * b[k];
-#else
-                    int k = 0;
-                    for (; k + 4 <= at.c[2]; k += 4) four -= *(const quad*)(a + k) * *(const quad*)(b + k);
-                    const quad rest = *(const quad*)(a + k) * *(const quad*)(b + k);
-                    four -= (quad)((bits)rest & *(const bits*)(kept + 4 - (at.c[2] - k)));
-#endif
-                }
-#if !defined(__CUDA_ARCH__)
-                sum += (four[0] + four[1]) + (four[2] + four[3]);
-#endif
-            }
-#if defined(__CUDA_ARCH__)
-            for (int far = lanes / 2; far > 0; far /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, far);
-#else
-            if (place != pivot && pivot >= 0) sum *= value[pivot];
-#endif
-            if (e < end && part == 0) value[place] = place == pivot ? 1.0 / sqrt(sum) : sum;
+    const double* summand = given.data + world;
+    const long long apart = given.shape[1];
+    double* value = system.data + (long long)world * system.shape[1];
+    for (int e = 0; e + 1 < entry.shape[0]; ++e) {
+        const auto own = entry.data[e], next = entry.data[e + 1];
+        const int place = own.c[0], pivot = own.c[1];
+        double sum = 0.0;
+        for (int k = own.c[2]; k < next.c[2]; ++k) sum += summand[slot.data[k] * apart];
+        if (place != pivot) sum = -sum;
+        quad four = {};
+        for (int r = own.c[3]; r < next.c[3]; ++r) {
+            const auto at = run.data[r];
+            const double *a = value + at.c[0], *b = value + at.c[1];
+            int k = 0;
+            for (; k + 4 <= at.c[2]; k += 4) four -= *(const quad*)(a + k) * *(const quad*)(b + k);
+            const quad rest = *(const quad*)(a + k) * *(const quad*)(b + k);
+            four -= (quad)((bits)rest & *(const bits*)(kept + 4 - (at.c[2] - k)));
         }
-#if defined(__CUDA_ARCH__)
-        __syncthreads();
-        for (int e = begin + thread; e < end; e += threads) {
-            const auto own = entry.data[e];
-            if (own.c[0] != own.c[1] && own.c[1] >= 0) value[own.c[0]] *= value[own.c[1]];
-        }
-        __syncthreads();
-#endif
+        sum += (four[0] + four[1]) + (four[2] + four[3]);
+        value[place] = place == pivot ? 1.0 / sqrt(sum) : pivot < 0 ? sum : sum * value[pivot];
     }
-""".replace("LANES", str(_LANES))
+#endif
+"""
+
+
+@wp.func_native(_ELIMINATE)
+def _eliminate(
+    world: int,
+    entry: wp.array(dtype=wp.vec4i),
+    slot: wp.array(dtype=int),
+    run: wp.array(dtype=wp.vec3i),
+    given: wp.array2d(dtype=real),
+    system: wp.array2d(dtype=real),
+): ...
 
 
 @wp.func_native("""
@@ -221,71 +221,194 @@ _ELIMINATE = """
 def _together(): ...
 
 
-@wp.func_native(_ELIMINATE)
-def _eliminate(
-    world: int,
-    level: wp.array(dtype=int),
-    entry: wp.array(dtype=wp.vec4i),
-    slot: wp.array(dtype=int),
-    run: wp.array(dtype=wp.vec3i),
-    given: wp.array2d(dtype=real),
-    factor: wp.array2d(dtype=real),
-): ...
+# For each tile along the diagonal: factor the tile, solve for the tiles right of it and its right-hand
+# sides, update the tiles further on, and leave zeros. One thread block per world on CUDA, one thread
+# elsewhere. Warp's own tiles do the same, but take CUDA over a minute to compile. A pivot that is not
+# positive leaves nan, which marks the film invalid. On CUDA one warp factors a tile, one row per lane in
+# registers: a block would wait at two barriers for each column. Products use tensor cores, which have
+# double precision from sm_80 on.
+_SOLVE_BAND = (
+    """
+#if defined(__CUDA_ARCH__)
+    #define SHARED __shared__
+    #define TOGETHER __syncthreads();
+    const int t = threadIdx.x, threads = THREADS;
+#else
+    #define SHARED
+    #define TOGETHER
+    const int t = 0, threads = 1;
+#endif
+    const int size = TILE * TILE, kept = 4;
+    // rows of tiles that are kept are so far apart that four of them lie in different banks
+    SHARED double factor[TILE * PITCH], inverse[TILE], tile[kept][TILE * PITCH];
+    double* base = system.data + (long long)world * system.shape[1];
+    double* rhs = base + (long long)nblock * (reach + 1) * size;
+    double* out = rhs + (long long)nblock * size;
+    for (int i = t; i < size; i += threads) out[i] = 0.0;
+    for (int k = 0; k < nblock; ++k) {
+        double* first = base + (long long)k * (reach + 1) * size;
+        const int beside = reach < nblock - 1 - k ? reach : nblock - 1 - k;
+        TOGETHER
+        // factor[c][r] is the factor's entry (r, c)
+#if defined(__CUDA_ARCH__)
+        if (t < TILE) {
+            double own[TILE];
+            #pragma unroll
+            for (int c = 0; c < TILE; ++c) own[c] = first[c * TILE + t];
+            #pragma unroll
+            for (int c = 0; c < TILE; ++c) {
+                const double pivot = 1.0 / sqrt(__shfl_sync(0xffffffffu, own[c], c));
+                const double entry = own[c] * pivot;
+                factor[c * PITCH + t] = entry;
+                if (t == c) inverse[c] = pivot;
+                __syncwarp();
+                #pragma unroll
+                for (int d = c + 1; d < TILE; ++d) own[d] -= entry * factor[c * PITCH + d];
+            }
+        }
+#else
+        for (int c = 0; c < TILE; ++c) {
+            const double pivot = 1.0 / sqrt(first[c * TILE + c]);
+            inverse[c] = pivot;
+            for (int r = c; r < TILE; ++r) factor[c * PITCH + r] = first[r * TILE + c] * pivot;
+            for (int d = c + 1; d < TILE; ++d) {
+                const double entry = factor[c * PITCH + d];
+                for (int r = d; r < TILE; ++r) first[r * TILE + d] -= factor[c * PITCH + r] * entry;
+            }
+        }
+#endif
+        TOGETHER
+        // a column of the right-hand sides, or of a tile beside, for each thread
+        for (int i = t; i < (beside + 1) * TILE; i += threads) {
+            const int which = i / TILE, c = i - which * TILE, apart = which < kept ? PITCH : TILE;
+            double* source = which ? first + (long long)which * size : rhs + (long long)k * size;
+            double* target = which < kept ? tile[which] : source;
+            double y[TILE];
+            #pragma unroll
+            for (int a = 0; a < TILE; ++a) y[a] = source[a * TILE + c];
+            #pragma unroll
+            for (int a = 0; a < TILE; ++a) {
+                y[a] *= inverse[a];
+                #pragma unroll
+                for (int b = a + 1; b < TILE; ++b) y[b] -= factor[a * PITCH + b] * y[a];
+                target[a * apart + c] = y[a];
+            }
+        }
+        TOGETHER
+        for (int i = 0; i <= beside; ++i)
+            for (int j = 0; j <= i; ++j) {
+                const double* left = i < kept ? tile[i] : first + (long long)i * size;
+                const double* right = j < kept ? tile[j] : first + (long long)j * size;
+                int left_apart = i < kept ? PITCH : TILE, right_apart = j < kept ? PITCH : TILE;
+                double* target = out;
+                if (i > 0) {
+                    target = rhs + (long long)(k + i) * size;
+                    if (j > 0) {
+                        target = base + ((long long)(k + j) * (reach + 1) + i - j) * size;
+                        const double* other = left;
+                        left = right;
+                        right = other;
+                        const int apart = left_apart;
+                        left_apart = right_apart;
+                        right_apart = apart;
+                    }
+                }
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+                // a quarter for each of four warps, by eight rows and columns: four lanes have a row of the
+                // first factor, and two neighbours in one of the result
+                const int lane = t & 31, far = lane / 4, near = lane & 3;
+                const int row = t / 64 * 16 + far, column = t / 32 % 2 * 16;
+                double sum[2][2][2] = {};
+                #pragma unroll
+                for (int a = near; a < TILE; a += 4)
+                    #pragma unroll
+                    for (int m = 0; m < 2; ++m)
+                        #pragma unroll
+                        for (int n = 0; n < 2; ++n) {
+                            const double x = left[a * left_apart + row + 8 * m];
+                            const double y = right[a * right_apart + column + far + 8 * n];
+                            asm("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 "
+                                "{%0, %1}, {%2}, {%3}, {%0, %1};"
+                                : "+d"(sum[m][n][0]), "+d"(sum[m][n][1]) : "d"(x), "d"(y));
+                        }
+                #pragma unroll
+                for (int m = 0; m < 2; ++m)
+                    #pragma unroll
+                    for (int n = 0; n < 2; ++n) {
+                        double* at = target + (row + 8 * m) * TILE + column + 8 * n + 2 * near;
+                        at[0] -= sum[m][n][0];
+                        at[1] -= sum[m][n][1];
+                    }
+#else
+                for (int part = t; part < size / 8; part += threads) {
+                    const int c = part & (TILE - 1), r = part / TILE * 8;
+                    double sum[8] = {};
+                    for (int a = 0; a < TILE; ++a) {
+                        const double y = right[a * right_apart + c];
+                        #pragma unroll
+                        for (int b = 0; b < 8; ++b) sum[b] += left[a * left_apart + r + b] * y;
+                    }
+                    #pragma unroll
+                    for (int b = 0; b < 8; ++b) target[(r + b) * TILE + c] -= sum[b];
+                }
+#endif
+            }
+        TOGETHER
+        for (int i = t; i < (beside + 1) * size; i += threads) first[i] = 0.0;
+        for (int i = t; i < size; i += threads) rhs[(long long)k * size + i] = 0.0;
+    }
+    TOGETHER
+    #undef SHARED
+    #undef TOGETHER
+""".replace("THREADS", str(THREADS))
+    .replace("TILE", str(TILE))
+    .replace("PITCH", str(TILE + 4))
+)
+
+
+@wp.func_native(_SOLVE_BAND)
+def _eliminate_band(world: int, nblock: int, reach: int, system: wp.array2d(dtype=real)): ...
 
 
 # launched with its own block size: in this module all kernels would be compiled for both sizes
-@wp.kernel(module="unique", enable_backward=False, launch_bounds=(THREADS, 2))
+@wp.kernel(module="unique", enable_backward=False, launch_bounds=(THREADS, 4))
 def solve_sheet(
     # In:
     due: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
     conductivity: real,
-    discs: Discs,
     network: Network,
     pattern: Pattern,
     cell_constant: wp.array2d(dtype=real),
-    middle: wp.array2d(dtype=vec3),
-    thickness: wp.array2d(dtype=real),
+    given: wp.array2d(dtype=real),
+    local: wp.array2d(dtype=real),
     # Out:
-    given_out: wp.array2d(dtype=real),
-    over_out: wp.array2d(dtype=int),
-    local_out: wp.array2d(dtype=real),
-    factor_out: wp.array2d(dtype=real),
+    system_out: wp.array2d(dtype=real),
     trial_out: wp.array2d(dtype=real),
     impedance_out: wp.array2d(dtype=real),
     valid_out: wp.array(dtype=int),
 ):
-    """Impedances of a film whose surface is known, [world, electrode], by a block of threads; if the film
-    cannot be solved, the last values stay."""
+    """Impedances [world, electrode], by a block of threads. If the film cannot be solved, the last values
+    stay."""
     w, t = wp.tid()
     if due[w] == 0:
         return
     threads = wp.block_dim()
-    nface = face.shape[0]
-    for f in range(t, nface, threads):
-        edge = face_conductance(face[f], w, conductivity, middle, thickness)
-        for c in range(3):
-            given_out[w, 3 * f + c] = edge[c]
-    for k in range(t, discs.pair_face.shape[0], threads):
-        over_out[w, k] = samples_over(k, w, discs, face, middle)
-    _together()
-    for k in range(t, discs.pair_face.shape[0], threads):
-        weights = weights_over(k, w, discs, face, middle, over_out)
-        for c in range(3):
-            given_out[w, 3 * (nface + k) + c] = weights[c]
-    _together()
-    for e in range(t, local_out.shape[0], threads):
-        local = real(0.0)  # of a disc that no film is over
-        for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
-            if over_out[w, k] != 0:  # where a corner is not finite the face is over no sample
-                corner = face[discs.pair_face[k]]
-                for c in range(3):
-                    local += given_out[w, 3 * (nface + k) + c] * thickness[corner[c], w]
-        local_out[e, w] = local
-    _eliminate(w, pattern.level, pattern.entry, pattern.slot, pattern.run, given_out, factor_out)
+    if pattern.nblock == 0:
+        _eliminate(w, pattern.entry, pattern.slot, pattern.run, given, system_out)
+    else:
+        for e in range(t, pattern.entry.shape[0] - 1, threads):
+            own = pattern.entry[e]
+            end = pattern.entry[e + 1][2]
+            total = real(0.0)
+            for k in range(own[2], end):
+                total += given[pattern.slot[k], w]
+            if own[2] == end:  # padding
+                total = real(1.0)
+            system_out[w, own[0]] = wp.where(own[0] == own[1], total, -total)
+        _eliminate_band(w, pattern.nblock, pattern.reach, system_out)
     for e in range(t, trial_out.shape[1], threads):
         trial_out[w, e] = cell_constant[w % cell_constant.shape[0], e] * driving_point(
-            e, w, trial_out.shape[1], pattern.disc, factor_out, local_out, network, conductivity
+            e, w, trial_out.shape[1], pattern.disc, system_out, local, network, conductivity
         )
     _together()
     if t == 0:
