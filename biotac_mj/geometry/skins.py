@@ -38,6 +38,8 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
 def _loaded(name_or_path):
     """The skin of `load_skin`, cached in the process: each `attach` loads it three times, and each
     `Handle.read` takes its design."""
+    if isinstance(name_or_path, str) and name_or_path in _SHIPPED:
+        return _read(name_or_path, None)
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(
             f"skin is {short_repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
@@ -48,9 +50,9 @@ def _loaded(name_or_path):
 
 
 @functools.lru_cache(maxsize=2 * len(_SHIPPED))
-def _read(path, state):
-    """The skin in a file; state: tells the file from later ones of this path."""
-    return SkinGeometry.load(path)
+def _read(name_or_path, state):
+    """A skin from its file; state: tells a stored one from later ones of this path."""
+    return SkinGeometry.load(_file(name_or_path))
 
 
 def _file(name_or_path):
