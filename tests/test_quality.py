@@ -673,3 +673,16 @@ def test_spikes_of_nearly_a_band_are_no_overflow():
         row = rng.choice(6000, 40, False)
         counts[row, rng.integers(0, 19, 40)] += rng.choice([-400, 500], 40)
         assert {f.id for f in check(Log(np.rint(counts), 1000.0)).faults} == {"spikes"}
+
+
+@pytest.mark.parametrize("begins, ends", [(0.5, 1.0), (0.0, 0.5), (0.3, 0.75)])
+def test_noise_may_begin_and_end_within_a_log(begins, ends):
+    counts, _, rng = pressed(11)
+    counts = noisy(counts, rng)
+    rows = slice(round(begins * len(counts)), round(ends * len(counts)))
+    counts[rows, 4] += np.rint(12 * rng.standard_normal(rows.stop - rows.start))
+    (fault,) = check(Log(counts)).faults
+    assert (fault.id, fault.channels) == ("noise", (4,))
+    length = len(counts) / RATE
+    assert fault.start == pytest.approx(begins * length, abs=length / 15)
+    assert fault.end == pytest.approx(ends * length, abs=length / 15)

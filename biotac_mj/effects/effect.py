@@ -191,8 +191,7 @@ class Effect(abc.ABC):
         running sensor can have}.
       asks: what a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of the counts;
         "time" in which touches are told from drift; "load"; "change", that it begins or ends there;
-        "throughout", that it does not; "poses", where nothing else will do; "search", where nothing searches
-        it.
+        "poses", where nothing else will do; "search", where nothing searches it.
       detector: class of evidence in logs, which sets a name's confidence
         (`discrepancy.recordings.confidence`).
     """

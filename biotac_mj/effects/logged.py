@@ -263,7 +263,7 @@ class Hum(Logged):
 
 
 class NoiseInLog(Noise, Logged):
-    fits, asks = _LOG, frozenset({"throughout"})
+    fits, asks = _LOG, frozenset()
     params = {"size": Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)}
     confusable = Noise.confusable | {"gain": "press next to the electrode: a gain makes touches larger, too"}
     apply = Logged.apply

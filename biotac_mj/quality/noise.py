@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 
 from ..sensor.channels import electrode_noise
 from .beside import last_measured
-from .evidence import BLOCKS, evidence
+from .evidence import BLOCKS, evidence, runs
 from .fault import Fault
 from .log import Log
 
@@ -19,6 +19,7 @@ _FEWEST = 20  # rows of a block that show its noise
 # logarithm of a channel's noise over the median one's, by itself and over the law, which it exceeds in this
 # fraction of the blocks: 0.51 at most in 51 recordings of eight sensors
 _TWICE, _MOSTLY = 0.69, 0.8
+_LASTS = 6  # blocks one after another: all signs of fewer are alike by chance more often than one in fifty
 
 
 def sound_noise(counts: np.ndarray) -> np.ndarray:
@@ -45,9 +46,10 @@ def running_median(x: np.ndarray, size: int, mode: str) -> np.ndarray:
 
 
 def noisy(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Finds channels that have more than twice the noise of the others from the first row to the last. Their
-    common noise is free: it differs between laboratories by a factor of ten."""
-    x = last_measured(log.counts, log.masked)[~log.repeated & ~log.masked.all(1)]
+    """Finds channels that have more than twice the noise of the others, throughout or for a part of the log.
+    Their common noise is free: it differs between laboratories by a factor of ten."""
+    rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
+    x = last_measured(log.counts, log.masked)[rows]
     sound = np.ones(log.channels, bool)
     sound[[k for f in faults if f.step or f.silent for k in f.channels]] = False
     if len(x) < _FEWEST * BLOCKS or sound.sum() < 4:
@@ -56,22 +58,38 @@ def noisy(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     level = np.log([noise_level(part) for part in np.array_split(x, BLOCKS)])
     beside = (r - np.median(r[:, sound], axis=1, keepdims=True) for r in (level, level - np.log(law)))
     more = np.minimum(*beside)
+    edges = np.linspace(0, len(x) - 1, BLOCKS + 1).astype(int)
     found = []
-    for k in np.flatnonzero(sound & (np.quantile(more, 1 - _MOSTLY, axis=0) > _TWICE)):
-        own, usual = np.exp(level[:, k]), np.exp(level[:, k] - more[:, k])
+    for k in np.flatnonzero(sound):
+        first, last = _noisy_blocks(more[:, k])
+        if first == last:
+            continue
+        some = slice(first, last)
+        own, usual = np.exp(level[some, k]), np.exp(level[some, k] - more[some, k])
         size = np.sqrt(np.maximum(own**2 - usual**2, 0.0))
-        rows, over = len(x) / BLOCKS, 2 * (more[:, k] - _TWICE)
+        number, over = len(x) / BLOCKS, 2 * (more[:, k] - _TWICE)
+        strength = np.sign(over) * number / 2 * (np.expm1(over) - over)
         found.append(
             Fault(
                 "noise",
                 (int(k),),
-                0.0,
-                (len(log) - 1) / log.rate,
+                rows[edges[first]] / log.rate,
+                rows[edges[last]] / log.rate,
                 f"{log.name([k])} has noise of {np.median(own):.1f} counts, usual are {np.median(usual):.1f}",
                 {"size": (float(np.median(size)), float(size.min()), float(size.max()))},
                 detector="loud",
                 ties=("gain",),
-                **evidence(np.sign(over) * rows / 2 * (np.expm1(over) - over)),
+                **evidence(strength[some]),
             )
         )
     return found
+
+
+def _noisy_blocks(more):
+    """First and one beyond the last block of a channel's noise, equal where it has none: nearly all blocks of
+    more (blocks,), or the longest run of them."""
+    if np.quantile(more, 1 - _MOSTLY) > _TWICE:
+        return 0, len(more)
+    start, length = runs(more > _TWICE)
+    k = int(np.argmax(length)) if len(length) else 0
+    return (start[k], start[k] + length[k]) if len(length) and length[k] >= _LASTS else (0, 0)

@@ -47,7 +47,6 @@ def _lacking(session):
     elif not session.loaded:
         out["load"] = "not loaded"
     out["change"] = "told only where it begins or ends here, not where it holds throughout or comes slowly"
-    out["throughout"] = "told only where it holds throughout, not where it begins or ends here"
     out["poses"] = "no poses of what touched, with which `diagnose` searches these"
     out["search"] = "not searched in any data"
     return out
