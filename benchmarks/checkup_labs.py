@@ -1,7 +1,7 @@
 r"""What a checkup finds in laboratories made of real recordings, with and without its protocol.
 
     python benchmarks/checkup_labs.py --data ../shared/data --authors ../shared/hidden_effects/authors \
-        --half blind --json out/checkup.json
+        --half blind --seed 1 --json out/checkup.json
 
 A laboratory is one sensor in one session: rows of an unloaded sensor (rest), then rows of one that is pressed
 by hand on a force plate, or five grasps of a gripper where the effect is a temperature. The segments of the
@@ -12,8 +12,8 @@ unloaded log before them, those of F1 another's of the same laboratory; the forc
 
 Effects are put in by the forms of authors' generators (`discrepancy_recordings.py`), each in all of the
 laboratory. practice: F1 and the seventeenth author. blind: F2 and grasps, the twelfth and thirteenth author,
-28 laboratories with one effect and 12 with none. again: the same with
-28 further pieces. Each is diagnosed as a plain log and with its protocol.
+28 laboratories with one effect, one of each kind before any twice, and 12 with none, drawn by --seed. Each is
+diagnosed as a plain log and with its protocol.
 """
 
 import argparse
@@ -30,7 +30,6 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from biotac_mj.recordings.protocol import Protocol, Segment
 from biotac_mj.shards import Task, run_tasks
 
-_SEED = 52
 _REST, _PRESSED = 40.0, 70.0  # [s] of a session
 _STILL = 0.35  # [N/s] below which the force stands still
 _FAST = 3.0  # [N/s] beyond which it changes fast
@@ -52,9 +51,9 @@ class Lab:
     piece: int = -1
 
 
-def plan(authors: Authors, half: str) -> list:
+def plan(authors: Authors, half: str, seed: int) -> list:
     """Laboratories of a half: one of each kind of effect, then further ones at random, and some with none."""
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(seed)
     names, sensors = (
         (("seventeenth",), ("F1",)) if half == "practice" else (("twelfth", "thirteenth"), ("F2",))
     )
@@ -73,9 +72,6 @@ def plan(authors: Authors, half: str) -> list:
         for thing in ("acrylic_211", "car_sponge_101", "steel_vase_702")
         for finger in "01"
     ]
-    if half == "again":
-        more, rng = more[28 - len(first) :], np.random.default_rng(_SEED + 1)
-        first = []
     labs = []
     for kind, name, i in [*first, *more][:count] + [("none", "", -1)] * 12:
         spec = authors.module(name).plan()[i] if name else None
@@ -103,7 +99,7 @@ def build(lab: Lab, authors: Authors):
         at_rest, pressed = sources.source(data, "U"), sources.source(data, lab.sensor)
         rows = slice(*np.searchsorted(at_rest.time, [lab.start[0], lab.start[0] + _REST]))
         touched = slice(*np.searchsorted(pressed.time, [lab.start[1], lab.start[1] + _PRESSED]))
-        count, rng = rows.stop - rows.start, np.random.default_rng([_SEED, int(lab.name[:3])])
+        count, rng = rows.stop - rows.start, np.random.default_rng(int(lab.name[:3]))
         x = np.rint(_joined([at_rest.x[rows], pressed.x[touched]], at_rest.rate))
         force = _joined([rng.normal(0, _PLATE, (count, 3)), pressed.force[touched]], at_rest.rate)
         count -= round(_FADE * at_rest.rate)
@@ -177,15 +173,15 @@ def _read_off(force, rate, begin):
 class Judge:
     """Work of `shards.run_tasks`: the records of a laboratory."""
 
-    def __init__(self, folder: str, data: str, half: str):
-        self.given = folder, data, half
+    def __init__(self, folder: str, data: str, half: str, seed: int):
+        self.given = folder, data, half, seed
 
     def __call__(self, values, folder, say):
         authors = Authors(*self.given[:2], [])
-        labs = plan(authors, self.given[2])
+        labs = plan(authors, *self.given[2:])
         for number in values:
             case, protocol = build(labs[number], authors)
-            record = {"half": labs[number].half, "key": [labs[number].name]}
+            record = {"half": labs[number].half, "seed": self.given[3], "key": [labs[number].name]}
             try:
                 recording = _recording(case)
                 record["plain"] = judge(case, recording, authors)
@@ -200,15 +196,16 @@ def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("--data", required=True, metavar="DIR", help="folder of recordings")
     args.add_argument("--authors", required=True, metavar="DIR", help="folder of the authors' modules")
-    args.add_argument("--half", default="practice", choices=("practice", "blind", "again"))
+    args.add_argument("--half", default="practice", choices=("practice", "blind"))
+    args.add_argument("--seed", type=int, default=52, help="of the laboratories that are drawn")
     args.add_argument("--jobs", type=int, default=os.cpu_count(), metavar="N", help="processes")
     args.add_argument("--json", required=True, metavar="OUT")
     options = args.parse_args(argv)
     authors = Authors(options.authors, options.data, [])
-    todo = [Task(number) for number in range(len(plan(authors, options.half)))]
+    todo = [Task(number) for number in range(len(plan(authors, options.half, options.seed)))]
     jobs = min(options.jobs, len(todo))
     processes = {f"process {k}": {"OMP_NUM_THREADS": "1"} for k in range(jobs)} if jobs > 1 else None
-    work, rows, code = Judge(options.authors, options.data, options.half), [], code_hash()
+    work, rows, code = Judge(options.authors, options.data, options.half, options.seed), [], code_hash()
     for row in run_tasks(work, todo, ".", "laboratories", "laboratory", processes=processes):
         rows.append(row)
         write_json(options.json, {"code": code, "labs": rows})

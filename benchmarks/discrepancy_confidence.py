@@ -36,6 +36,7 @@ FEATURES = {
     "order": {"nats": 1, "ratio": 1},
     "slip": {},
     "late": {"gain": 1, "size": 1},
+    "lag": {"share": 1},
 }
 _ROWS = ("rhythm", "sharp", "sharp1", "again")
 # of what is left: each may be what no name fits. Under a load levels are in recordings without an effect what

@@ -6,7 +6,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from biotac_mj import cli
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
+from biotac_mj.quality.check import sample_faults
+from biotac_mj.quality.log import Log
 from biotac_mj.quality.noise import sound_noise
+from biotac_mj.quality.still import at_rest
 from biotac_mj.recordings import Recording, read, write
 from biotac_mj.recordings.protocol import SCHEMA, STEPS, Protocol, Segment, read_protocol, write_protocol
 
@@ -61,6 +64,59 @@ def test_a_checkup_names_what_the_plain_log_does_not_tell():
 
 def test_a_checkup_names_nothing_of_a_sound_sensor():
     assert found(session()) == set()
+
+
+def resting(change=None, seed=0):
+    """(n, 19) counts of a log in which nothing touches."""
+    rng = np.random.default_rng(seed)
+    level = np.broadcast_to(np.linspace(2000, 3400, 19), (4000, 19))
+    x = level + sound_noise(level) * rng.standard_normal(level.shape)
+    return np.rint(x if change is None else change(x, sound_noise(level), rng))
+
+
+def struck(x, noise, rng):
+    x[rng.choice(np.arange(10, 3990), 8, replace=False)] += 3 * noise[0]
+    return x
+
+
+def one_struck(x, noise, rng):
+    x[rng.choice(np.arange(10, 3990, 10), 8, replace=False), 6] += 9 * noise[0, 6]
+    return x
+
+
+def shaking(x, noise, rng):
+    x[:, 2] += 1.5 * noise[0, 2] * gaussian_filter1d(rng.standard_normal(len(x)), 3) * np.sqrt(6 * np.pi**0.5)
+    return x
+
+
+@pytest.mark.parametrize(
+    "change, name, channels",
+    [(struck, "spikes", range(19)), (one_struck, "spikes", (6,)), (shaking, "noise", (2,))],
+)
+def test_at_rest_what_is_more_than_noise_is_found(change, name, channels):
+    """Of which the searches for any log find none: a load does as much."""
+    log = Log(resting(change))
+    assert not sample_faults(log).faults
+    assert [(f.id, f.channels) for f in at_rest(log)] == [(name, tuple(channels))]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_at_rest_noise_alone_has_no_fault(seed):
+    assert at_rest(Log(resting(seed=seed))) == []
+
+
+def test_a_checkup_finds_spikes_while_nothing_touches():
+    rng = np.random.default_rng(1)
+    rows = rng.choice(int(RATE * REST) - 20, 8, replace=False) + 10
+
+    def spiked(x, touched):
+        x[rows] += 15.0
+        return x
+
+    recording = PlainRecording(session(spiked), rate=RATE)
+    assert "spikes" not in {f.id for f in diagnose_recording(recording).findings}
+    (found,) = [f for f in diagnose_recording(recording, protocol=PROTOCOL).findings if f.id == "spikes"]
+    assert found.of_all and found.end < REST
 
 
 @pytest.mark.parametrize("live", [0, 1, 2])

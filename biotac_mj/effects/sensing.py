@@ -307,6 +307,7 @@ class Saturation(Effect):
 
 class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
+    fits, asks = frozenset({"poses", "log"}), frozenset({"load"})
     physics = "electrodes follow their input with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     equivalents, alike = ("latency",), True

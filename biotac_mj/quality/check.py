@@ -14,7 +14,7 @@ from .sample_hold import sample_and_hold
 from .spikes import off_rows, spikes
 from .stuck import dead, stuck_or_clipped
 
-__all__ = ["Checked", "check", "lost_rows", "sample_faults"]
+__all__ = ["Checked", "check", "less", "lost_rows", "sample_faults"]
 
 _LEAST = 200  # rows: sixteen blocks of twelve; fewer do not show the noise
 
@@ -31,7 +31,7 @@ class Checked(typing.NamedTuple):
 def check(log: Log, named: float = NAMED) -> Checked:
     """Finds all faults of a log. named: smallest confidence of a reported fault."""
     checked = sample_faults(log, named)
-    found = lost_rows(_less(checked.log, checked.faults), checked.faults)
+    found = lost_rows(less(checked.log, checked.faults), checked.faults)
     for fault in found:
         fault.confidence = confidence(fault)
     return Checked(
@@ -53,7 +53,7 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
     log, faults = put_back(log)
     weak = []
     for find in (off_rows, unmeasured, coarse, dead, sample_and_hold, hum, stuck_or_clipped, spikes, noisy):
-        for fault in find(_less(log, faults), faults):
+        for fault in find(less(log, faults), faults):
             fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)
     for fault in faults:  # before all that was found after it
@@ -68,7 +68,7 @@ def lost_rows(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) 
     return dropped(log) or jumping(log, faults, begun)
 
 
-def _less(log, faults):
+def less(log: Log, faults: Sequence[Fault]) -> Log:
     """The log with correctable faults corrected and invalid samples masked."""
     for fault in faults:
         log = log.without(fault.mask, None if fault.correct is None else fault.correct(log.counts, log.time))

@@ -6,14 +6,16 @@ import dataclasses
 import numpy as np
 import tqdm
 
-from ...quality.check import lost_rows, sample_faults
+from ...quality.check import less, lost_rows, sample_faults
 from ...quality.confidence import clear
+from ...quality.still import at_rest
 from ...recordings import Recording
 from ...recordings.protocol import Protocol
 from ..evidence import discoveries
 from .candidates import as_candidates, as_log
 from .confidence import NAMED, confidence
 from .detectors.jumps import jumped, jumped_alike
+from .detectors.lagging import lagging
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
 from .detectors.order import slipped
@@ -117,6 +119,8 @@ def _beside(session, checked, named):
         session.unnamed.append(offset)
     elif (finding := delayed(session)) is not None:
         _take(session, finding, named)
+    if (finding := lagging(session)) is not None:
+        _take(session, finding, named)
     for finding in session.findings:
         finding.confidence = _sure(session, finding)
     session.take_back(*(f for f in session.findings if f.confidence < named))
@@ -179,8 +183,14 @@ def _proved(session):
 def _checkup(session, protocol, named):
     """Findings of single stretches of a protocol that the whole log does not show."""
     r, known, found = session.recording, list(session.findings), []
-    for rows in stretches(r, protocol):
+    for touched, rows in stretches(r, protocol):
         some = diagnose_recording(r.part(rows), named=named).findings
+        if not touched:  # nothing but noise is there
+            faults = [f for f in some if f.of_log]
+            more = at_rest(less(as_log(r.part(rows)), faults), faults)
+            for fault in more:
+                fault.confidence = confidence(fault)
+            some += as_candidates([f for f in more if clear(f, named)])[0]
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
         found += [moved(f, rows, r) for f in some if not f.kind.silent and not _told(f, known)]
     enough = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]

@@ -11,9 +11,9 @@ from .recording import MIN_ROWS, PlainRecording
 __all__ = ["moved", "stretches"]
 
 
-def stretches(recording: PlainRecording, protocol: Protocol) -> list[slice]:
-    """Rows of the contiguous stretches in which something touched the sensor, or nothing did; none where all
-    of the recording is one, or where a stretch is too short to be diagnosed."""
+def stretches(recording: PlainRecording, protocol: Protocol) -> list[tuple[bool, slice]]:
+    """Whether something touched the sensor, and rows, of the contiguous stretches in which it did or did not;
+    none where all of the recording is one, or where a stretch is too short to be diagnosed."""
     time, found = _clock(recording), []
     for one in protocol.segments:
         touched = STEPS[one.kind].touched
@@ -24,7 +24,7 @@ def stretches(recording: PlainRecording, protocol: Protocol) -> list[slice]:
             found.append((touched, slice(first, last)))
     if len(found) < 2:
         return []
-    return [rows for _, rows in found if rows.stop - rows.start >= MIN_ROWS]
+    return [(touched, rows) for touched, rows in found if rows.stop - rows.start >= MIN_ROWS]
 
 
 def _clock(recording):

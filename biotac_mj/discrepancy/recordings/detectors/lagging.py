@@ -1,0 +1,82 @@
+"""An electrode that follows the load later than the others do: a filter, or a converter of its own.
+
+What the others say of an electrode within a touch is compared with what it reads; where it is late by a time,
+the difference is that time's share of the change that they say. Every electrode of a sound sensor is late by
+some milliseconds to either side of the others, which explains little of what it differs by."""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from ....quality.evidence import BLOCKS, sign_flip
+from ....sensor.channels import log_impedance
+from ..candidates import Candidate
+from ..conditional import Conditional
+from ..session import Session
+
+__all__ = ["lagging"]
+
+_BAND = (0.015, 0.25)  # [s] of smoothing between which touches move: noise is faster, drift slower
+_OWN = 1e-3  # of an electrode's variance that no other tells
+_LEAST = 0.05  # of what an electrode differs by: 0.13 at most in 35 pieces of sound sensors
+
+
+def lagging(session: Session) -> Candidate | None:
+    """The electrode whose lag explains most of what it differs by from what the others say."""
+    if not session.loaded:
+        return None
+    r = session.recording
+    used = np.flatnonzero(session.masked.mean(0) < 0.02)
+    fitted, aside = (_parts(session, rows, used) for rows in (session.fit, ~session.fit))
+    if len(used) < 7 or fitted is None:
+        return None
+    product, square, total = fitted
+    tau, share = _lag(product.sum(0), square.sum(0), total)
+    share = np.where(tau > 0, share, 0.0)
+    i = int(np.argmax(share))
+    if share[i] < _LEAST:
+        return None
+    each = product[:, i] / np.maximum(square[:, i], 1e-30)
+    error = float(each.std(ddof=1) / np.sqrt(len(each)))
+    found = Candidate(
+        "lowpass",
+        (int(used[i]),),
+        0.0,
+        float(r.time[-1]),
+        f"it is {1e3 * tau[i]:.0f} ms later than the others, which explains {share[i]:.0%} of what it lacks",
+        {"tau": (float(tau[i]), float(tau[i] - 2 * error), float(tau[i] + 2 * error))},
+        nats=float(-0.5 * BLOCKS * np.log1p(-share[i])),
+        p=sign_flip(product[:, i] * tau[i] - 0.5 * square[:, i] * tau[i] ** 2),
+        detector="lag",
+        ties=("latency",),
+        features={"share": float(np.log(share[i]))},
+    )
+    if aside is not None:
+        later, explained = _lag(aside[0].sum(0), aside[1].sum(0), aside[2])
+        found.verified = bool(later[i] > 0 and explained[i] > 0.5 * share[i])
+    return found
+
+
+def _lag(product, square, total):
+    """Lag [s] (c,) and the share (c,) that it explains of a sum of squares."""
+    return product / np.maximum(square, 1e-30), product**2 / np.maximum(square * total, 1e-30)
+
+
+def _parts(session, rows, used):
+    """By blocks of some rows (n,) and electrodes used (c,): products (blocks, c) of what each electrode lacks
+    with the change that the others say of it, squares of that change, and the sum (c,) of squares lacking;
+    None of too few rows."""
+    r = session.recording
+    rows = np.flatnonzero(rows & ~r.repeated & ~session.masked[:, used].any(1))
+    if len(rows) < BLOCKS * len(used) or r.rate * session.fresh * _BAND[0] < 1:
+        return None
+    z, rate = log_impedance(session.counts[np.ix_(rows, used)]), r.rate * session.fresh
+    fast, slow = (gaussian_filter1d(z, s * rate, axis=0) for s in _BAND)
+    y = fast - slow
+    moment = y.T @ y / len(y)
+    given = Conditional(moment, _OWN * np.diag(moment))
+    lacking = given.residual(y)
+    change = -np.gradient(y - lacking, axis=0) * rate
+    moved = np.cumsum((change**2).sum(1))  # blocks in which as much moves
+    first = np.searchsorted(moved, np.arange(BLOCKS) / BLOCKS * moved[-1])
+    product, square = (np.add.reduceat(v, first) for v in (lacking * change, change**2))
+    return product, square, (lacking**2).sum(0)
