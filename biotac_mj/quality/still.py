@@ -25,7 +25,7 @@ def at_rest(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Finds spikes and coloured noise of a log in which nothing touched the sensor."""
     rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
     sound = np.ones(log.channels, bool)
-    sound[[k for f in faults if f.silent or f.id == "hum" for k in f.channels]] = False
+    sound[[k for f in faults if f.silent or f.correct is not None for k in f.channels]] = False
     if len(rows) < 20 * BLOCKS or sound.sum() < 4 or any(f.step for f in faults):
         return []
     x = last_measured(log.counts, log.masked)[rows]
