@@ -16,8 +16,10 @@ from biotac_mj.geometry.design import Design, read_design
 from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 from biotac_mj.press import PressOptions, build_scene, plan_path, press, report
+from biotac_mj.press.approach import place_of
 from biotac_mj.press.indenter import make_indenter
 from biotac_mj.sensor.own_design import PadShape, new_design
+from biotac_mj.view import window
 
 DOMED = {"dome": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}
 DOME = PadShape(**DOMED, edge=2.4)
@@ -117,6 +119,42 @@ def test_a_block_lies_on_a_backing_of_its_shape(flat):
     backing = skin.core_vert if len(skin.core_face) else skin.nail_vert
     corners = np.unique(np.abs(backing[:, [0, 2]]).round(6), axis=0)
     np.testing.assert_allclose(corners, [[0, 0], [10.5e-3, 7.35e-3]], atol=1e-6)
+
+
+def test_all_of_a_block_s_front_may_touch_at_once(tmp_path):
+    """With cells of 1.2 mm, 1200 nodes of this front are more than a contact of the condensed tier has."""
+    new_design(tmp_path / "wide", PadShape(block=(22.0, 16.0, 4.0)))
+    spec = mujoco.MjSpec()
+    spec.option.gravity = np.zeros(3)
+    body = spec.worldbody.add_body(name="plate", mocap=True)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.015, 0.01, 0.015])
+    pad = biotac_mj.attach(
+        spec, body="world", design=str(tmp_path / "wide"), liquid=False, tier="condensed", coupling="one-way"
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for depth in (-1e-4, 0.0, 2e-5, 4e-5):
+        data.mocap_pos[0] = [0, -0.014 + depth, 0]
+        mujoco.mj_step(model, data)
+    assert pad.read(data, "status")[0] == 1
+    # between a column that is free at its sides and a layer that is held there
+    young, nu, strain = 1.55e6, 0.316, 4e-5 / 4e-3
+    layer = young * (1 - nu) / (1 + nu) / (1 - 2 * nu)
+    force = pad.read(data, "contact_force")[1] / (22e-3 * 16e-3 * strain)
+    assert young < force < layer
+
+
+def test_a_press_goes_to_the_middle_of_a_pad_unless_told(tmp_path):
+    cube = block((12, 6, 12), (3, 2, 3))
+    mesh = written(tmp_path / "aside.tet", cube.vert + [9, 0, 0], cube.elem)
+    new_design(tmp_path / "aside", PadShape(mesh=mesh))
+    skin, shape = biotac_mj.load_skin(tmp_path / "aside"), make_indenter("sphere_7mm")
+    options = PressOptions(design=tmp_path / "aside", liquid=False)
+    assert options.location is None
+    np.testing.assert_allclose(plan_path(skin, shape, options).start[0], 9e-3, atol=1e-6)
+    assert place_of(biotac_mj.load_skin("coarse")) == (-12e-3, 0.0)
+    spec, _ = window.build_scene(tmp_path / "aside", liquid=False)
+    assert spec.body("ball").pos[0] == pytest.approx(9e-3)
 
 
 def test_a_map_of_a_dome_has_one_scale():

@@ -107,3 +107,9 @@ def test_the_spectrum_of_pac_counts_no_sample_twice():
     one = Recording(time, electrodes=COUNTS, pac=pac)
     frequency, power, _ = pac_spectrum(one)
     assert frequency[power.argmax()] == 300 and power.max() > 1e3 * np.sort(power)[-4]
+
+
+def test_a_recording_of_a_pad_of_one_s_own_is_refused_by_name():
+    said = "own has 6 electrodes: a recording is one of a BioTac .19 .* or a BioTac SP .24"
+    with pytest.raises(ValueError, match=said):
+        Recording(0.01 * np.arange(3), electrodes=np.full((3, 6), 2000.0), name="own")

@@ -27,9 +27,8 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         "--location",
         type=place,
         nargs="+",
-        default=["-12mm"],
         metavar=("X", "ANGLE | Y Z"),
-        help=LOCATION_HELP,
+        help=f"{LOCATION_HELP} (default: -12mm on a BioTac, else the middle of the pad)",
     )
     for name, default, text in (
         ("direction", None, "of the press (default: inward normal of the skin there)"),
@@ -91,18 +90,20 @@ def _press(args):
     from ..press import PressOptions, press, render, report
     from ..press.record import write_readings, write_skin
 
-    if len(args.location) > 3:
+    location = args.location
+    if location and len(location) > 3:
         raise ValueError(
-            f"--location has {len(args.location)} numbers: give X, X and ANGLE, or X Y Z, as in -12mm 30deg"
+            f"--location has {len(location)} numbers: give X, X and ANGLE, or X Y Z, as in -12mm 30deg"
         )
-    location = args.location if len(args.location) > 1 else [*args.location, 0.0]
+    if location:
+        location = tuple(location) if len(location) > 1 else (*location, 0.0)
     same = (
         "indenter depth slide tier liquid timestep speed hold two_way friction seed device options sensor "
         "randomise thermal texture"
     )
     options = PressOptions(
         **{name: getattr(args, name) for name in same.split()},
-        location=tuple(location),
+        location=location,
         direction=args.direction and tuple(args.direction),
         slide_direction=tuple(args.slide_direction),
         # defaults are taken from the effects' file
@@ -387,7 +388,8 @@ def add_design(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--mesh", metavar="FILE", help=".msh, .tet or .vtu [m], its rim or back on y = 0")
     verb.add_argument("--core-mesh", metavar="FILE.obj", help="of the core [m]")
     verb.add_argument("--thickness", type=length, default="1.5mm", help="of a dome's shell")
-    verb.add_argument("--edge", type=length, default="1.2mm", help="of the tetrahedra")
+    text = "of the tetrahedra (default: 1.2mm, of a block so much that all its front may touch at once)"
+    verb.add_argument("--edge", type=length, help=text)
     text = "columns x y z [mm]: x to the fingertip, z out of the nail (default: no electrodes)"
     verb.add_argument("--electrodes", metavar="FILE", help=text)
     text = "columns x y z [mm] of the excitation electrodes, which --electrodes needs"
@@ -403,7 +405,8 @@ def _new_design(args):
         return tuple(1e3 * length for length in lengths or ())
 
     core = args.core_mesh or mm(args.core) or None
-    shape = PadShape(mm(args.dome), mm(args.block), args.mesh, core, 1e3 * args.thickness, 1e3 * args.edge)
+    edge = args.edge and 1e3 * args.edge
+    shape = PadShape(mm(args.dome), mm(args.block), args.mesh, core, 1e3 * args.thickness, edge)
     new_design(args.folder, shape, _places(args.electrodes), _places(args.excitation))
     args.design = args.folder
     _show_design(args)

@@ -44,7 +44,7 @@ class PressOptions:
     Attributes:
       indenter: see `indenter.make_indenter`.
       location: (x [m], angle around the finger [rad]) or (x, y, z) [m], moved to the nearest point of the
-        skin.
+        skin; None: see `approach.place_of`.
       direction: of the press (3,); None: the inward normal of the skin at the location.
       depth: travel from first contact [m].
       slide: travel along slide_direction after the press [m].
@@ -66,7 +66,7 @@ class PressOptions:
     """
 
     indenter: str = "sphere_7mm"
-    location: tuple = (-12e-3, 0.0)
+    location: tuple | None = None
     direction: tuple | None = None
     depth: float = 2.4e-3
     slide: float = 0.0
@@ -92,7 +92,8 @@ class PressOptions:
         keywords["options"] = read_dict(keywords.get("options"), "options")
         given["settings"] = Settings.of(settings, keywords, "PressOptions", _OF_PRESS, fields)
         given |= {name: read_quantity(name, given[name], kind) for name, kind in _KINDS.items()}
-        given["location"] = _location(given["location"])
+        if given["location"] is not None:
+            given["location"] = _location(given["location"])
         for name, value in given.items():
             object.__setattr__(self, name, value)
         self.settings.config()  # refuses impossible values
@@ -126,7 +127,7 @@ class PressOptions:
                 f"this press takes {steps:.3g} steps of {_said('timestep', self.timestep)}: {_MOST_STEPS} at "
                 "most; shorten hold, depth or slide, or raise speed or timestep"
             )
-        if len(self.location) not in (2, 3):
+        if self.location is not None and len(self.location) not in (2, 3):
             raise ValueError(
                 f"location {self.location} has {len(self.location)} numbers: "
                 "give x and an angle, or x, y and z"
@@ -137,7 +138,7 @@ class PressOptions:
                 raise ValueError(f"{name} is {value!r}: pass numbers")
             if value is not None and not np.isfinite(value).all():
                 raise ValueError(f"{name} {value} contains NaN or infinite numbers")
-        for i, value in enumerate(self.location):
+        for i, value in enumerate(self.location or ()):
             if len(self.location) == 2 and i == 1:
                 _refuse_larger("location's angle", value, _ROUND, "a finger is once round", "angle")
             else:
@@ -206,16 +207,17 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
       ValueError: no skin at the location, a location inside the core, an indenter that misses the skin, a
         direction out of the skin, or a slide along the direction.
     """
-    if len(options.location) == 2:
-        point, normal = approach.surface_point(geometry, *options.location)
+    location = approach.place_of(geometry) if options.location is None else options.location
+    if len(location) == 2:
+        point, normal = approach.surface_point(geometry, *location)
     else:
-        if approach.is_inside(geometry.core_vert, geometry.core_face, options.location):
-            place = ", ".join(f"{1e3 * v:g}" for v in options.location)
+        if approach.is_inside(geometry.core_vert, geometry.core_face, location):
+            place = ", ".join(f"{1e3 * v:g}" for v in location)
             raise ValueError(
                 f"location ({place}) mm lies inside the finger's rigid core: give a place on its skin, or x "
                 "and an angle around the finger"
             )
-        point, normal = approach.nearest_point(geometry, options.location)
+        point, normal = approach.nearest_point(geometry, location)
     direction = -normal if options.direction is None else np.asarray(options.direction, float)
     direction = direction / np.linalg.norm(direction)
     if direction @ normal >= 0:

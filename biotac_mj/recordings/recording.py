@@ -11,7 +11,7 @@ import numpy as np
 
 from ..fields import as_numbers, refuse_unknown
 from ..files import hdf5
-from ..geometry.design import BIOTAC, Design, design_of_channels
+from ..geometry.design import BIOTAC, Design, design_of_channels, designs
 from ..quality.clock import BUS_RATE, usual_step
 from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
@@ -140,6 +140,11 @@ class Recording:
     def _check_field(self, name):
         value, (width, units, _) = as_numbers(f"{self.name}: {name}", getattr(self, name)), FIELDS[name]
         setattr(self, name, value)
+        if name == "electrodes" and value.ndim == 2 and self.design is None:
+            raise ValueError(
+                f"{self.name} has {value.shape[1]} electrodes: a recording is one of a "
+                f"{' or a '.join(design.title for design in designs())}"
+            )
         if name in ("electrodes", "pac"):
             width = (self.design or BIOTAC).widths[name]
         shape = (len(self.time), width) if width else (len(self.time),)

@@ -27,6 +27,7 @@ __all__ = ["PadShape", "new_design", "pad_skin"]
 
 _BACKING = 1.0  # [mm] thickness of the plate that carries a pad
 _CELL = 1.2  # [mm] edge of the tetrahedra unless another is given
+_FLAT = 240  # nodes that may touch at once in the condensed tier, in up to 1024 worlds (docs/lab/limits.md)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +40,8 @@ class PadShape:
       block: size (along, across, depth) of solid rubber on a flat backing.
       mesh: .msh, .tet or .vtu [m] in the BioTac frame (tip at -x, pad at -y), its rim or back on the plane y
         = 0. With a core it is a shell over liquid, else solid.
-      edge: of the generated tetrahedra.
+      edge: of the generated tetrahedra; None: 1.2, of a block at least so much that all nodes of its front
+        may touch at once in the condensed tier.
 
     Raises:
       ValueError: not exactly one shape, or an invalid size.
@@ -50,7 +52,7 @@ class PadShape:
     mesh: str | pathlib.Path | None = None
     core: tuple | str | pathlib.Path | None = None
     thickness: float = 1.5
-    edge: float = _CELL
+    edge: float | None = None
 
     def __post_init__(self):
         if bool(self.dome) + bool(self.block) + (self.mesh is not None) != 1:
@@ -58,7 +60,7 @@ class PadShape:
         sizes = [*self.dome, *self.block, *(self.core if isinstance(self.core, tuple) else ())]
         if len(self.dome) not in (0, 3) or len(self.block) not in (0, 3) or min([*sizes, 1.0]) <= 0:
             raise ValueError(f"dome {self.dome} and block {self.block}: give three positive lengths [mm]")
-        if not (self.thickness > 0 and self.edge > 0):
+        if not (self.thickness > 0 and (self.edge is None or self.edge > 0)):
             raise ValueError(f"thickness {self.thickness} and edge {self.edge}: give positive lengths [mm]")
         if self.dome and self.core is None:
             raise ValueError(
@@ -91,11 +93,11 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
     curved = None
     if shape.dome:
         outer, inner = (np.array(_xyz(shape.dome)), 0.0), (np.array(_xyz(shape.dome)) - shape.thickness, 0.0)
-        mesh = dome_shell(outer, inner, max(4, round(1.6 * max(shape.dome) / shape.edge)))
+        mesh = dome_shell(outer, inner, max(4, round(1.6 * max(shape.dome) / (shape.edge or _CELL))))
         curved = {"outer": outer, "inner": inner}
     elif shape.block:
         size = np.array(_xyz(shape.block))
-        mesh = block(size, np.maximum(2, np.rint(size / shape.edge)).astype(int))
+        mesh = block(size, _cells(size, shape.edge))
     else:
         mesh = read_tet_mesh(shape.mesh)
         mesh = TetMesh(1e3 * mesh.vert, mesh.elem)
@@ -177,6 +179,16 @@ def new_design(
     skin.save(folder / "default.npz")
     write_json(folder / "design.json", json.loads(design.text))
     return design
+
+
+def _cells(size, edge):
+    """Cells (3,) of a block of a size (3,) [mm], see `PadShape.edge`."""
+    length = edge or _CELL
+    while True:
+        cells = np.maximum(2, np.rint(size / length)).astype(int)
+        if edge is not None or (2 * cells[0] + 1) * (2 * cells[2] + 1) <= _FLAT:
+            return cells
+        length *= 1.02
 
 
 def _outline(mesh):

@@ -10,7 +10,9 @@ import numpy as np
 
 from ..coupling.show import PAD_UP
 from ..geometry.design import SINGLES
+from ..geometry.skins import skin_reference
 from ..press import PressOptions, press
+from ..press.approach import place_of
 from ..press.record import write_skin
 from ..reading import Array, read_hdf5
 from ..sensor.channels import check_counts, check_force
@@ -148,7 +150,10 @@ def play_press(
       settings: of the press except depth and location, as for `PressOptions`.
     """
     with tempfile.TemporaryDirectory() as folder:
-        wanted = {"depth [mm]": 1.5, "along [mm]": -12.0, "around [deg]": 0.0}
+        geometry = skin_reference(settings.get("skin", "default"))[1]
+        along, ends = 1e3 * place_of(geometry)[0], 1e3 * geometry.vert[geometry.outer_face][..., 0]
+        low, high = np.ceil(max(ends.min() + 1, along - 10)), np.floor(min(ends.max() - 1, along + 10))
+        wanted = {"depth [mm]": 1.5, "along [mm]": along, "around [deg]": 0.0}
 
         def pressed():
             place = 1e-3 * wanted["along [mm]"], np.radians(wanted["around [deg]"])
@@ -163,12 +168,12 @@ def play_press(
         presses = {"press": pressed()}
         page = page or _served({"press": presses["press"].finger}, **server)
         made = dict(wanted)
-        for name, low, high, step in (
+        for name, least, most, step in (
             ("depth [mm]", 0.1, 2.4, 0.1),
-            ("along [mm]", -18.0, -2.0, 0.5),
+            ("along [mm]", low, high, 0.5),
             ("around [deg]", -60.0, 60.0, 5.0),
         ):
-            slider = page.server.gui.add_slider(name, low, high, step, wanted[name], order=0.4)
+            slider = page.server.gui.add_slider(name, least, most, step, wanted[name], order=0.4)
             slider.on_update(lambda event, name=name: wanted.update({name: event.target.value}))
 
         def again():

@@ -26,7 +26,6 @@ __all__ = ["build_hand", "build_scene", "view"]
 
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 _BALL = "biotac_ball"  # in a hand's model, which may have a ball of its own
-_PLACE = -10e-3, 0.0  # contact point on the pad: x [m] and angle around the finger
 _EYE = -0.3, -0.5, -0.8  # direction of the camera in the BioTac frame
 _SPRING, _PUSH = 50.0, 0.5  # stiffness [N/m] and force on the pad [N] of the ball at a hand's finger
 
@@ -48,7 +47,7 @@ def build_scene(
     from ..geometry import SkinGeometry, load_skin
 
     geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
-    top, _ = approach.surface_point(geometry, *_PLACE)
+    top, _ = approach.surface_point(geometry, *approach.place_of(geometry))
     spec = mujoco.MjSpec()
     spec.option.timestep = 4e-3
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -132,7 +131,8 @@ def _ball_before(spec, mount, geometry):
     model = spec.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    link, (place, _) = data.body(find_link(spec, mount.body).name), approach.surface_point(geometry, *_PLACE)
+    link = data.body(find_link(spec, mount.body).name)
+    place, _ = approach.surface_point(geometry, *approach.place_of(geometry))
     pos, quat = np.zeros(3), np.zeros(4)
     mujoco.mju_mulQuat(quat, link.xquat, mount.quat)
     mujoco.mju_rotVecQuat(pos, place - [0, _RADIUS + 2e-4, 0], quat)
