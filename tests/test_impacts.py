@@ -669,8 +669,8 @@ def test_a_light_stick_gains_nothing_from_open_pgs_rows():
 
 
 def thin_plate(number):
-    """A plate thrown at the finger under PGS, begun number * 0.1 nm higher: its largest kinetic energy
-    over that at the start, steps that push, and its height and speed at the end."""
+    """A plate thrown at the finger under PGS, begun number * 0.1 nm higher: its largest energy, without what
+    falling gives it, over that at the start, steps that push, and its height and speed at the end."""
     pos = " ".join(map(repr, [-0.00716, -0.00117, 0.02765 + 1e-10 * number]))
     spec = mujoco.MjSpec.from_string(
         f"""<mujoco><option timestep=".003" solver="PGS" iterations="3"/><worldbody>
@@ -684,11 +684,12 @@ def thin_plate(number):
     data = mujoco.MjData(model)
     data.qvel[:3] = 0.074, 0.1209, -1.9015
     mujoco.mj_forward(model, data)
-    start, most, pushed = kinetic(model, data), 0.0, 0
+    start, height, most, pushed = kinetic(model, data), data.qpos[2], 0.0, 0
     for _ in range(6):
         mujoco.mj_step(model, data)
         pushed += np.linalg.norm(handle.read(data, "contact_force")[:3]) > 0.05
-        most = max(most, kinetic(model, data))
+        fallen = 0.00076 * 9.81 * (height - data.qpos[2])
+        most = max(most, kinetic(model, data) - fallen)
     return most / start, pushed, data.qpos[2], data.qvel[2]
 
 
@@ -696,15 +697,12 @@ def thin_plate(number):
 def test_thin_plates_stay_out_of_the_core_with_open_pgs_rows():
     """0.8 g at 1.9 m/s, 6 mm a step: what PGS made of the rows led a round to where nothing touches, and the
     plate went through the skin without a force. Its solves are cut off, and where one ends hangs on 1e-10 m
-    of the plate's place, with MuJoCo's Newton solver as well: the median of five."""
-    energy, pushes, height, speed = np.median([thin_plate(number) for number in range(5)], axis=0)
-    assert energy < 1.05 and pushes >= 2 and height > 6.5e-3 and speed > -0.3
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="from the first of five places it gains 10 %")
-def test_no_thin_plate_gains_energy_with_open_pgs_rows():
-    assert max(thin_plate(number)[0] for number in range(5)) < 1.05
+    of the plate's place, with MuJoCo's Newton solver as well: none of five gains energy, and the median of
+    the rest."""
+    plates = np.array([thin_plate(number) for number in range(5)])
+    assert plates[:, 0].max() < 1.05
+    pushes, height, speed = np.median(plates[:, 1:], axis=0)
+    assert pushes >= 2 and height > 6.5e-3 and speed > -0.3
 
 
 @pytest.mark.parametrize("mass", [0.01, 0.1])
