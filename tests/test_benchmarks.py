@@ -601,6 +601,18 @@ def test_worlds_of_the_hand_are_timed_by_decision(repo, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
+def test_a_rod_of_the_batch_goes_as_in_mj_step(repo, tmp_path):
+    pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
+    file = tmp_path / "out.json"
+    done = _run_here(repo, "lost_rods.py", "--json", file, "--worlds", 2, "--device", "cpu", "--decisions", 6)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = json.loads(file.read_text())["rows"]
+    assert row["lost"] is None and row["mj_step"] is None
+    assert min(row["force_n"]) > 0.1 and row["apart_mm"] < 0.01
+
+
+@pytest.mark.slow
 def test_steps_of_one_core_are_timed_beside_another_checkout(repo, tmp_path):
     """A ball of 100 g at rest weighs 0.981 N in both."""
     file = tmp_path / "out.json"
