@@ -160,9 +160,9 @@ def _barycentric(corner: wp.types.matrix((3, 2), wp.float64), p: wp.vec2d):
     e1 = corner[1] - corner[0]
     e2 = corner[2] - corner[0]
     d = p - corner[0]
-    area = e1[0] * e2[1] - e1[1] * e2[0]
-    u = (d[0] * e2[1] - d[1] * e2[0]) / area
-    v = (e1[0] * d[1] - e1[1] * d[0]) / area
+    scale = real(1.0) / (e1[0] * e2[1] - e1[1] * e2[0])
+    u = scale * (d[0] * e2[1] - d[1] * e2[0])
+    v = scale * (e1[0] * d[1] - e1[1] * d[0])
     return vec3(real(1.0) - u - v, u, v)
 
 
@@ -212,8 +212,9 @@ def find_weights(
     hits = samples()
     for k in range(discs.pair_start[e], discs.pair_start[e + 1]):
         mine = over[k, w]
-        for i in range(NSAMPLE):
-            hits[i] += (mine >> i) & 1
+        if mine != 0:
+            for i in range(NSAMPLE):
+                hits[i] += (mine >> i) & 1
     covered = int(0)
     for i in range(NSAMPLE):
         covered += wp.min(hits[i], 1)
