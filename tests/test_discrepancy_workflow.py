@@ -3,6 +3,7 @@ that costs nothing."""
 
 import ast
 import dataclasses
+import functools
 import json
 import pathlib
 import types
@@ -29,6 +30,11 @@ ROOT = pathlib.Path(__file__).parents[1]
 WEIGHT = np.random.default_rng(0).uniform(-0.15, 0.6, 19)
 
 
+@functools.cache
+def skin_and_film(skin):
+    return Simulator(skin=skin).skin_and_film(0.0, 0.0)
+
+
 class Springs(Simulator):
     """A sensor whose skin is F = 600 d + 2e5 d^2 [N] and whose electrodes follow depth and place: the
     workflow without finite elements."""
@@ -53,6 +59,10 @@ class Springs(Simulator):
             if progress:
                 progress()
         return out
+
+    def skin_and_film(self, log_friction, bubble):
+        """One for all: no field depends on them, and a search makes some twenty films."""
+        return skin_and_film(self.skin)
 
 
 def plans(n=14, seed=0, unload=True):
