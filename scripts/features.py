@@ -58,7 +58,8 @@ DESIGN_ROWS = {
     "effects of a running sensor, `randomise`": ("yes", "yes", "yes"),
     'sensors as measured; `"random"`': ("eight; yes", "three; yes", "one, what the film conducts; no"),
     "`import`, `show`, `diagnose` of logs": ("yes", "yes", "no: logs are told by 19 or 24 electrodes"),
-    "calibrate, compare (forces alone)": ("yes", "yes", "yes"),
+    "calibrate (forces alone)": ("yes", "yes", "yes"),
+    "compare": ("yes", "no: the paper's configurations are of a BioTac", "no, likewise"),
     "data sets (`generate`, LeRobot), `estimate`": ("yes", "yes", "yes, where it has electrodes"),
     "`data import`, `resimulate`": ("yes", "yes", "no: recordings are told by 19 or 24 electrodes"),
     "models and states of MuJoCo (`data export --form mujoco`)": (

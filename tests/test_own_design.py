@@ -1,5 +1,6 @@
 """Pads of one's own: `biotac design new`, and what they give in a simulation."""
 
+import json
 import warnings
 
 import mujoco
@@ -296,3 +297,17 @@ def test_a_synthetic_sensor_of_a_pad_rests_at_the_pad_s_counts(tmp_path):
     design = new_design(tmp_path / "dome", DOME, SIX, GROUND)
     variation = SensorVariation.draw(0, design)
     assert list(variation.sensor.rest) == design.sensors["ideal"]["rest"] and variation.mixing.shape == (6, 6)
+
+
+def test_calibrate_s_own_data_are_of_the_design_of_its_skin(flat, tmp_path, capsys):
+    """The path and the synthetic forces were those of a BioTac, whatever the skin."""
+    out = str(tmp_path / "out")
+    said = ["lab", "calibrate", "--synthetic", "--truth", "default", "--fit", "E", "--noise", "0", "--quiet"]
+    settings = ["--no-liquid", "--no-truth-liquid", "--skin", str(flat), "--out", out]
+    assert main([*said, *settings, "--material", '{"youngs_modulus": 1e6}']) == 0
+    found = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    assert found["parameters"] == ["youngs_modulus"] and found["value"] == pytest.approx([1.55e6], rel=0.015)
+    assert main([*said, *settings, "--truth-skin", "coarse"]) == 2
+    assert "is of pad flat (0 electrodes), --truth-skin coarse of BioTac" in capsys.readouterr().err
+    assert main(["lab", "compare", "--skin", "biotac_sp/coarse", "--count", "1"]) == 2
+    assert "the configurations compared are the paper's of a BioTac" in capsys.readouterr().err

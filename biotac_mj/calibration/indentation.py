@@ -86,7 +86,7 @@ class Indentation:
 
 def plan_indentation(
     indenter: str = "sphere_7mm",
-    location: tuple = (-0.010, 0.3),
+    location: tuple | None = None,
     depth: float = 1.2e-3,
     slide: float = 1.2e-3,
     slide_direction: tuple | np.ndarray = (1, 0, 0),
@@ -99,7 +99,8 @@ def plan_indentation(
 
     Args:
       indenter: as in `biotac press --indenter`.
-      location: x [m] and angle about the finger [rad], or a point (3,) [m].
+      location: x [m] and angle about the finger [rad], or a point (3,) [m]; None: beside the midline of a
+        finger, or the middle of a pad.
       depth, slide: travel along `direction`, then along `slide_direction` [m].
       direction: (3,); None is the skin's inward normal.
       samples: rows along the path, without the one before first touch.
@@ -109,9 +110,12 @@ def plan_indentation(
       ValueError: see `press.plan_path`.
     """
     from ..geometry import load_skin
+    from ..press.approach import place_of
     from ..press.indenter import make_indenter
     from ..press.path import PressOptions, plan_path
 
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    location = place_of(geometry, (-0.010, 0.3)) if location is None else location
     largest_step = (depth + slide) / samples
     options = PressOptions(
         indenter=indenter,
@@ -124,7 +128,6 @@ def plan_indentation(
         timestep=1.0,
         hold=0.0,
     )
-    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
     path = plan_path(geometry, make_indenter(indenter), options)
     tip = np.array([path.position(*travel) for travel in zip(path.depth, path.slid)])
     time = 0.02 * np.arange(len(tip))

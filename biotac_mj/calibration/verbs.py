@@ -7,7 +7,8 @@ from collections.abc import Callable
 import tqdm
 
 from ..files import check_output
-from ..geometry.skins import load_skin
+from ..geometry.design import BIOTAC
+from ..geometry.skins import design_of, load_skin, mesh_of_same_design
 from ..skin.rubber.material import material
 from ..skin.settings import plain, read_dict, read_material, read_settings
 from .comparison import PAPER, Comparison, comparison_table, evaluate, plan_indentations, references
@@ -17,6 +18,7 @@ from .indentation import Indentation, plan_shear, read_indentation, write_indent
 from .kept import Kept
 from .reference import STAND_IN, stand_in
 from .refinement import refined
+from .refinement import skin as named_skin
 from .report import calibration_table, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
@@ -24,7 +26,7 @@ __all__ = ["calibrate_verb", "compare_verb"]
 # arguments for the synthetic skin only, and their defaults
 _TRUTH = {
     "truth": "rubber",
-    "truth_skin": "default",
+    "truth_skin": None,
     "noise": 0.01,
     "truth_liquid": None,
 }
@@ -69,7 +71,15 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     body = _body(args.configuration, args.skin, args.liquid, args.options)
     if args.synthetic:
         check_output(out, "synthetic.csv")
-        plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction)
+        args.truth_skin = args.truth_skin or str(mesh_of_same_design(args.skin, "default"))
+        design, truly = design_of(args.skin), named_skin(args.truth_skin).design
+        if truly != design:
+            raise ValueError(
+                f"--skin {args.skin} is of {design.title}, --truth-skin {args.truth_skin} of {truly.title}: "
+                "take meshes of one of them"
+            )
+        met = mesh_of_same_design(args.skin, "coarse")
+        plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction, skin=met)
         data = stand_in(
             plan,
             args.truth,
@@ -117,6 +127,11 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     """
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
+    if design_of(args.skin) != BIOTAC:
+        raise ValueError(
+            f"--skin {args.skin} is of {design_of(args.skin).title}: the configurations compared are the "
+            "paper's of a BioTac; take a skin of it, or `biotac lab calibrate`"
+        )
     _complete(args, {"reference_material": "rubber"}, not args.data, "leave it out, or --data")
     chosen = [
         _body(

@@ -34,7 +34,8 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--truth-skin",
-        help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight (default: default)",
+        help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight (default: the "
+        "default one of --skin's design)",
     )
     verb.add_argument(
         "--truth-liquid",

@@ -12,13 +12,21 @@ import zlib
 import numpy as np
 
 from biotac_mj.geometry.assets import asset_path
-from biotac_mj.geometry.design import BIOTAC, DESIGNS, Design, read_design
+from biotac_mj.geometry.design import BIOTAC, DESIGNS, Design, designs, read_design
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 from ..cache import cache_folder, digest
 from ..short_repr import short_repr
 
-__all__ = ["SKINS", "design_of", "load_skin", "shipped_skin", "skin_of_design", "skin_reference"]
+__all__ = [
+    "SKINS",
+    "design_of",
+    "load_skin",
+    "mesh_of_same_design",
+    "shipped_skin",
+    "skin_of_design",
+    "skin_reference",
+]
 
 SKINS = ("coarse", "default", "fine")  # of every shipped design
 _SHIPPED = (*SKINS, *(f"{design}/{name}" for design in DESIGNS[1:] for name in SKINS))
@@ -72,6 +80,15 @@ def design_of(skin: pathlib.Path | str | SkinGeometry) -> Design:
 def shipped_skin(design: Design, mesh: str = "default") -> str:
     """Name of a shipped design's skin, for `load_skin`."""
     return mesh if design == BIOTAC else f"{design.name}/{mesh}"
+
+
+def mesh_of_same_design(skin: pathlib.Path | str | SkinGeometry, mesh: str) -> pathlib.Path | str:
+    """A mesh of a skin's design by its name, for `load_skin`; the skin itself where the design is not shipped
+    and has one mesh."""
+    design = design_of(skin)
+    if design in designs():
+        return shipped_skin(design, mesh)
+    return skin_reference(skin)[0] if isinstance(skin, SkinGeometry) else skin
 
 
 def skin_of_design(

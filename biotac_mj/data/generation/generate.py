@@ -14,9 +14,8 @@ from ...effects.sensors import take_sensor
 from ...fields import as_whole, check_types, either
 from ...files import write_json
 from ...geometry import load_skin
-from ...geometry.design import designs
 from ...geometry.indenters import INDENTERS
-from ...geometry.skins import design_of, shipped_skin
+from ...geometry.skins import design_of, mesh_of_same_design
 from ...sensor.film import read_film
 from ...sensor.materials import check_choices, read_thermal
 from ...sensor.signals import read_signal
@@ -112,8 +111,7 @@ class GenerateOptions:
         if self.sensor is None:
             object.__setattr__(self, "sensor", design.sensor)
         if self.measured_skin is None:
-            finest = shipped_skin(design, "fine") if design in designs() else self.skin
-            object.__setattr__(self, "measured_skin", finest)
+            object.__setattr__(self, "measured_skin", mesh_of_same_design(self.skin, "fine"))
         take_sensor({"sensor": self.sensor, "randomise": self.randomise}, design=design)
         if read_signal(self.signal)[0] != "physics" and "film" in (self.options or {}):
             raise ValueError("a network replaces the film: leave film out of options")

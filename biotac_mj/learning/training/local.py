@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ...geometry.design import designs
-from ...geometry.skins import shipped_skin, skin_reference
+from ...geometry.skins import mesh_of_same_design
 from ...sensor.channels import FULL_SCALE
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead
@@ -84,10 +83,7 @@ class Features:
         """Points at which the paper's networks read the skin, and the set there."""
         from ..networks.points import SkinPoints
 
-        design = self.arrays.geometry.design
-        own = (
-            shipped_skin(design, "coarse") if design in designs() else skin_reference(self.arrays.geometry)[0]
-        )
+        own = mesh_of_same_design(self.arrays.geometry, "coarse")
         points = SkinPoints.choose(self.config.mesh_points, self.config.mesh_factors, own)
         return points, self.arrays.at_points(points)
 
