@@ -15,9 +15,9 @@ from biotac_mj.cli import main
 from biotac_mj.data.generation.synthetic_sensor import SensorVariation
 from biotac_mj.geometry.design import Design, read_design
 from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
+from biotac_mj.geometry.skins import place_of
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 from biotac_mj.press import PressOptions, build_scene, plan_path, press, report
-from biotac_mj.press.approach import place_of
 from biotac_mj.press.indenter import make_indenter
 from biotac_mj.sensor.own_design import PadShape, new_design
 from biotac_mj.view import window

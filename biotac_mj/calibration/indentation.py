@@ -109,8 +109,7 @@ def plan_indentation(
     Raises:
       ValueError: see `press.plan_path`.
     """
-    from ..geometry import load_skin
-    from ..press.approach import place_of
+    from ..geometry.skins import load_skin, place_of
     from ..press.indenter import make_indenter
     from ..press.path import PressOptions, plan_path
 

@@ -23,6 +23,7 @@ __all__ = [
     "design_of",
     "load_skin",
     "mesh_of_same_design",
+    "place_of",
     "shipped_skin",
     "skin_of_design",
     "skin_reference",
@@ -112,6 +113,15 @@ def skin_of_design(
             f"the skin is one of {design_of(mesh).title} and the design {wanted.title}: leave one of them out"
         )
     return mesh
+
+
+def place_of(geometry: SkinGeometry, of_finger: tuple[float, float] = (-12e-3, 0.0)) -> tuple[float, float]:
+    """Location, x [m] and angle about the finger [rad], of a press whose place is not given: `of_finger` on a
+    finger with a cylindrical core, such as a BioTac; the middle of a pad on a flat backing."""
+    if geometry.design.radius is not None:
+        return of_finger
+    x = geometry.vert[geometry.outer_face][..., 0]
+    return float(x.min() + x.max()) / 2, 0.0
 
 
 def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGeometry]:

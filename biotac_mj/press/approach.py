@@ -26,15 +26,6 @@ def normal_at(geometry: SkinGeometry, point: np.ndarray) -> np.ndarray:
     return normal / np.linalg.norm(normal)
 
 
-def place_of(geometry: SkinGeometry, of_finger: tuple[float, float] = (-12e-3, 0.0)) -> tuple[float, float]:
-    """Location, as of `surface_point`, of a press whose place is not given: `of_finger` on a finger with a
-    cylindrical core, such as a BioTac; the middle of a pad on a flat backing."""
-    if geometry.design.radius is not None:
-        return of_finger
-    x = geometry.vert[geometry.outer_face][..., 0]
-    return float(x.min() + x.max()) / 2, 0.0
-
-
 def surface_point(geometry: SkinGeometry, x: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """The point of the outer surface at a position along and around the finger.
 

@@ -12,6 +12,7 @@ from ..coupling.settings import Settings
 from ..fields import check_types, either
 from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skins import place_of
 from ..short_repr import short_repr
 from ..skin.settings import read_dict
 from ..units import SI, UNITS, question, read_quantity
@@ -44,7 +45,7 @@ class PressOptions:
     Attributes:
       indenter: see `indenter.make_indenter`.
       location: (x [m], angle around the finger [rad]) or (x, y, z) [m], moved to the nearest point of the
-        skin; None: see `approach.place_of`.
+        skin; None: see `geometry.skins.place_of`.
       direction: of the press (3,); None: the inward normal of the skin at the location.
       depth: travel from first contact [m].
       slide: travel along slide_direction after the press [m].
@@ -207,7 +208,7 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
       ValueError: no skin at the location, a location inside the core, an indenter that misses the skin, a
         direction out of the skin, or a slide along the direction.
     """
-    location = approach.place_of(geometry) if options.location is None else options.location
+    location = place_of(geometry) if options.location is None else options.location
     if len(location) == 2:
         point, normal = approach.surface_point(geometry, *location)
     else:

@@ -10,9 +10,8 @@ import numpy as np
 
 from ..coupling.show import PAD_UP
 from ..geometry.design import SINGLES
-from ..geometry.skins import skin_reference
+from ..geometry.skins import place_of, skin_reference
 from ..press import PressOptions, press
-from ..press.approach import place_of
 from ..press.record import write_skin
 from ..reading import Array, read_hdf5
 from ..sensor.channels import check_counts, check_force

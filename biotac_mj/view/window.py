@@ -17,6 +17,7 @@ from ..coupling.show import OBJECT, PAD_UP
 from ..files import picture_kind, replacing
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skins import place_of
 from ..press import approach
 from ..press.scene import see_through
 from ..reading import reading
@@ -47,7 +48,7 @@ def build_scene(
     from ..geometry import SkinGeometry, load_skin
 
     geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
-    top, _ = approach.surface_point(geometry, *approach.place_of(geometry))
+    top, _ = approach.surface_point(geometry, *place_of(geometry))
     spec = mujoco.MjSpec()
     spec.option.timestep = 4e-3
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -132,7 +133,7 @@ def _ball_before(spec, mount, geometry):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     link = data.body(find_link(spec, mount.body).name)
-    place, _ = approach.surface_point(geometry, *approach.place_of(geometry))
+    place, _ = approach.surface_point(geometry, *place_of(geometry))
     pos, quat = np.zeros(3), np.zeros(4)
     mujoco.mju_mulQuat(quat, link.xquat, mount.quat)
     mujoco.mju_rotVecQuat(pos, place - [0, _RADIUS + 2e-4, 0], quat)
