@@ -5,6 +5,7 @@
                                    [--indenters sphere_7mm,cube_14mm] [--markdown]
     python benchmarks/condensed.py --json out/condensed_time.json --time [--indenters sphere_7mm,cube_14mm]
     python benchmarks/condensed.py --json out/condensed_fit.json --fit [--materials default]
+    python benchmarks/condensed.py --json out/condensed_field.json --field [--skins coarse]
     python benchmarks/condensed.py --json out/condensed_worlds.json --worlds 1,128,1024,4096 --device cuda:0
                                    [--skins coarse,default]
 
@@ -18,6 +19,11 @@ time of a step of the skin alone (no readings).
 --fit finds the constants of `skin/condensed/correction.py` for the law of the material: least squares of the
 logarithms of force and (weight 0.3) pressure against the full FEM over all presses, small errors squared and
 large ones nearly linear.
+
+--field: displacements of the inner surface, electrodes and PDC of the condensed tier over those of the full
+FEM, on the same skin. bulge and pressed: slope, by least squares, of the displacements away from the core and
+towards it, of nodes with more than a twentieth of the largest and more than 0.05 mm; in brackets what is
+left of them, of their RMS, in %.
 
 --worlds: a sphere of 7 mm goes 0.96 mm into the pad in steps of 0.04 mm, the same in all worlds, default
 material with liquid, by the skin alone. Milliseconds a step (mean without the first, and largest), and of the
@@ -51,11 +57,23 @@ from biotac_mj.press import PressOptions, press
 from biotac_mj.skin import PRESETS
 from biotac_mj.skin.condensed import correction
 
-__all__ = ["compare", "fit", "main", "run", "time_steps"]
+__all__ = ["compare", "compare_fields", "fields", "fit", "main", "run", "time_steps"]
 
 DEPTHS = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.2, 2.4)  # [mm]
 INDENTERS = ("sphere_7mm", "cube_14mm", "cylinder_short_7mm")
 LOCATIONS = ((-12e-3, 0.0), (-8e-3, 0.6))
+_ROD, _PLATE = "geom:capsule:10mm,60mm", "geom:box:50mm,5mm,50mm"
+FIELD_DEPTHS = (0.6, 1.0, 1.4)  # [mm]
+FIELD_PRESSES = (
+    ("sphere_7mm", -12e-3, 0.0),
+    ("sphere_7mm", -8e-3, 0.6),
+    ("cube_14mm", -12e-3, 0.0),
+    (_PLATE, -4e-3, 0.0),
+    (_ROD, -6e-3, 0.2),
+    (_ROD, -12e-3, 0.0),
+    (_ROD, -18e-3, 0.0),  # as a thumb holds it
+    (_ROD, -18e-3, 0.5),
+)
 
 
 def run(
@@ -132,6 +150,65 @@ def compare(full, condensed) -> list[dict]:
             }
         )
     return rows
+
+
+def compare_fields(full, condensed, pressures, depths=FIELD_DEPTHS) -> list[dict]:
+    """One row per depth of two records of the same press, with the pressures of both [Pa]: ratios of force
+    and pressure, slopes of the condensed tier over the full one and what is left, of the RMS."""
+    geometry = full.geometry
+    node = np.unique(geometry.inner_face)
+    core = CoreSurface(geometry.core_vert, geometry.core_face)
+    node = node[core.closest(np.asarray(full.vert_xpos[0, node], float))[0] > 2e-5]  # others are held
+    rest = np.asarray(full.vert_xpos[0, node], float)
+    away = rest - core.closest(rest)[1]
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    rows = []
+    for depth in depths:
+        step = int(np.abs(full.depth - 1e-3 * depth).argmin())
+        records = full, condensed
+        moved = [np.einsum("ij,ij->i", r.vert_xpos[step, node] - rest, away) for r in records]
+        counts = [r.electrode_change[step] for r in records]
+        force = [float(np.linalg.norm(r.force[step])) for r in records]
+        bulged, pressed = moved[0] > 0.05 * moved[0].max(), moved[0] < -5e-5
+        row = {"depth_mm": depth, "force": force[1] / force[0]}
+        row["pressure"] = float(pressures[1][step - 1] / pressures[0][step - 1])
+        for name, one, other in (
+            ("bulge", moved[0][bulged], moved[1][bulged]),
+            ("pressed", moved[0][pressed], moved[1][pressed]),
+            ("electrodes", *counts),
+        ):
+            slope = float(one @ other / (one @ one))
+            left = np.linalg.norm(other - slope * one) / np.linalg.norm(one)
+            row |= {name: slope, f"{name}_left": float(left)}
+        rows.append(row)
+    return rows
+
+
+def fields(skin: str, material: str) -> list[dict]:
+    """Rows of `compare_fields` of FIELD_PRESSES, which are printed as a table."""
+    print("| indenter, x mm, angle | mm | force | PDC | bulge | pressed | electrodes |\n" + "|---" * 7 + "|")
+    out = []
+    for indenter, *location in FIELD_PRESSES:
+        pair = [
+            run(tier, skin, indenter, location, material, 1e-3 * FIELD_DEPTHS[-1], _FIT_STEP)
+            for tier in ("full", "condensed")
+        ]
+        pressures = [[r.pressure for r in results] for _, results, _ in pair]
+        for row in compare_fields(pair[0][0], pair[1][0], pressures):
+            out.append({"skin": skin, "material": material, "indenter": indenter, "location": location} | row)
+            slopes = [
+                f"{row[n]:.2f} ({100 * row[f'{n}_left']:.0f})" for n in ("bulge", "pressed", "electrodes")
+            ]
+            place = f"{indenter}, {1e3 * location[0]:.0f}, {location[1]:.1f}"
+            cells = [
+                place,
+                f"{row['depth_mm']:.1f}",
+                f"{row['force']:.2f}",
+                f"{row['pressure']:.2f}",
+                *slopes,
+            ]
+            print(f"| {' | '.join(cells)} |", flush=True)
+    return out
 
 
 def fit(skin: str, material: str, indenters, depth: float):
@@ -308,6 +385,7 @@ def main(arguments=None) -> int:
     parser.add_argument(
         "--fit", action="store_true", help="fit the correction of the first skin and each material instead"
     )
+    parser.add_argument("--field", action="store_true", help="compare displacements and electrodes instead")
     parser.add_argument("--worlds", help="comma-separated: time presses of so many worlds at once instead")
     parser.add_argument("--device", default="cuda:0", help="of Warp, with --worlds")
     options = parser.parse_args(arguments)
@@ -335,6 +413,10 @@ def main(arguments=None) -> int:
         for row in out:
             print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else v for v in row.values()) + " |")
         write_json(options.json, {"times": out})
+        return 0
+    if options.field:
+        rows = [row for pair in itertools.product(skins, materials) for row in fields(*pair)]
+        write_json(options.json, {"fields": rows})
         return 0
     if options.fit:
         write_json(

@@ -8,6 +8,7 @@ import pathlib
 import runpy
 import subprocess
 import sys
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 import scipy.stats
 
 import biotac_mj
+from biotac_mj.geometry.skins import load_skin
 
 
 def _run(repo, script, *arguments):
@@ -626,3 +628,26 @@ def test_steps_of_one_core_are_timed_beside_another_checkout(repo, tmp_path):
     assert "| ball | at rest | 20" in done.stdout and "ratio of medians" in done.stdout
     with pytest.raises(FileNotFoundError, match="has no biotac_mj/__init__.py: give the root of a checkout"):
         _run_here(repo, "one_core.py", "--json", file, "--cases", "ball", "--against", tmp_path)
+
+
+def test_fields_of_two_tiers_are_compared_node_by_node(repo, monkeypatch):
+    """A press whose inner surface and electrodes move a tenth further is off by a tenth, and by no more."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import condensed
+
+    geometry = load_skin("coarse")
+    moved = 2e-4 * np.sin(300 * geometry.vert[:, :1]) * geometry.vert / 7e-3
+
+    def record(factor):
+        return SimpleNamespace(
+            geometry=geometry,
+            depth=np.array([0.0, 1e-3]),
+            vert_xpos=np.stack([geometry.vert, geometry.vert + factor * moved]),
+            electrode_change=factor * np.array([np.zeros(19), np.arange(19.0)]),
+            force=np.array([np.zeros(3), [0.0, 0.0, factor]]),
+        )
+
+    (row,) = condensed.compare_fields(record(1.0), record(1.1), [[100.0], [120.0]], [1.0])
+    assert row["pressure"] == pytest.approx(1.2) and row["force"] == pytest.approx(1.1)
+    for name in ("bulge", "pressed", "electrodes"):
+        assert row[name] == pytest.approx(1.1) and row[f"{name}_left"] < 1e-6
