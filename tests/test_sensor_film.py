@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix
 
 from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.geometry.skins import load_skin
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance
 from biotac_mj.sensor.film import FilmConduction, kernels, spreading_resistance, spreading_table
 from biotac_mj.sensor.film.systems import edges
@@ -293,3 +294,16 @@ def test_core_distance_against_all_triangles():
         expected = scaled.nearest.signed_distance(point * 1e3) * -1e-3
         np.testing.assert_allclose(distance, expected, atol=2e-6)
         np.testing.assert_allclose(np.linalg.norm(point - foot, axis=1), np.abs(distance), atol=1e-12)
+
+
+@pytest.mark.parametrize("sensor", ["", None])
+def test_another_residual_film_is_that_of_a_film_made_with_it(sensor):
+    skin = load_skin("coarse")
+    own = FilmConduction(skin, sensor=sensor)
+    made, other = FilmConduction(skin, residual_film=1.5e-4, sensor=sensor), own.with_residual_film(1.5e-4)
+    pressed = skin.vert + [0.0, 3e-4, 0.0]
+    np.testing.assert_array_equal(other.impedance(pressed), made.impedance(pressed))
+    np.testing.assert_array_equal(other.rest, made.rest)
+    assert own.residual_film == 50e-6 and not np.allclose(own.impedance(pressed), made.impedance(pressed))
+    with pytest.raises(ValueError, match="residual_film is 0.0: pass a positive number"):
+        own.with_residual_film(0.0)

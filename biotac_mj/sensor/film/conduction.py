@@ -18,6 +18,7 @@ and the sheet Laplacian, and Cholesky's method in the form that suits the device
 direct: conjugate gradients would need tens of iterations, since a film pressed to a twentieth of its
 thickness differs much from the one at rest."""
 
+import copy
 import functools
 import threading
 from collections.abc import Callable
@@ -136,13 +137,27 @@ class FilmConduction:
         self._normal = np.concatenate([geometry.electrode_normal, self.core.normal[triangle]])
         self._set_mesh()
         self._set_discs()
-        self.cell_constant = self.rest = np.ones(design.nelectrode)
+        self._wanted = None if sensor is None else impedance_from_counts(sensor.rest)
+        self._set_rest()
+
+    def _set_rest(self):
+        """Sets the cell constants to give the skin at rest the impedances of the sensor; to one without."""
+        self.cell_constant = self.rest = np.ones(self.design.nelectrode)
         self._set_single()
-        self.rest = self.impedance(geometry.vert)
-        if sensor is not None:
-            self.cell_constant = impedance_from_counts(sensor.rest) / self.rest
+        self.rest = self.impedance(self.geometry.vert)
+        if self._wanted is not None:
+            self.cell_constant = self._wanted / self.rest
             self.rest = self.cell_constant * self.rest
             self._set_single()
+
+    def with_residual_film(self, thickness: float) -> "FilmConduction":
+        """The same film with another thickness where the skin touches the core [m]."""
+        _check_numbers({"residual_film": thickness}, self.geometry)
+        other = copy.copy(self)
+        other.residual_film = thickness
+        other._set_mesh()
+        other._set_rest()
+        return other
 
     def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
         """Impedance of E1, E2, ...

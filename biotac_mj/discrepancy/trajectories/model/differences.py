@@ -142,9 +142,9 @@ def _films(sim, trajectories, base, tick):
     model, own = sim.skin_and_film(0.0, 0.0)
     given = read_dict(sim.options, "options").get("film") or {}
     thick = [float(by * own.residual_film) for by in np.exp(_FILM)]
-    settings = [sim.options | {"film": {**given, "residual_film": one}} for one in (*thick, thick)]
-    films = [sim.but({0.0: model}, options=one).skin_and_film(0.0, 0.0)[1] for one in settings[:-1]]
-    several = sim.but({0.0: model, "film": SeveralFilms(films)}, options=settings[-1])
+    films = SeveralFilms([own.with_residual_film(one) for one in thick])
+    options = sim.options | {"film": {**given, "residual_film": thick}}
+    several = sim.but({0.0: model, "film": films}, options=options)
     changes = []
     for solved, here in zip(several.solve(trajectories, progress=tick), base):
         n, electrodes = here["log_z"].shape
