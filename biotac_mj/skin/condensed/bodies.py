@@ -237,18 +237,18 @@ def sum_forces(
     """Makes the wrenches `posed` those of the forces on all outer nodes that a solve begins with."""
     b = s.bodies
     groups = b.compliance.shape[0]
+    for i in range(t, wp.where(groups > 0, c.node.shape[0], 0), threads):
+        mine = int(-1)
+        if wp.length_sq(s.force[w, i]) > real(0.0):
+            mine = wp.where(groups > 1, _group_of(w, i, geoms, touch, c), 0)
+        s.place[w, i] = mine  # which has no other use before the candidates are known
     for h in range(groups):
         force = vec3()
         torque = vec3()
-        for i in range(t, c.node.shape[0], threads):
-            f = s.force[w, i]
-            if wp.length_sq(f) > real(0.0):
-                mine = int(0)
-                if groups > 1:
-                    mine = _group_of(w, i, geoms, touch, c)
-                if mine == h:
-                    force += f
-                    torque += wp.cross(x[c.node[i], w], f)
+        for i in range(t, c.node.shape[0], threads):  # as above: each thread reads what it wrote
+            if s.place[w, i] == h:
+                force += s.force[w, i]
+                torque += wp.cross(x[c.node[i], w], s.force[w, i])
         force = block_sum(force)
         torque = block_sum(torque)
         if t == 0:

@@ -110,6 +110,16 @@ def correct(
 
 
 @wp.func
+def _touches(w: int, group: int, geoms: Geoms, touched_by: wp.array2d(dtype=int)):
+    """Whether a geom of the group touches: most groups do not."""
+    touches = int(0)
+    for g in range(geoms.count):
+        if geoms.group[g] == group and touched_by[g, w] == 1:
+            touches = 1
+    return touches
+
+
+@wp.func
 def find_wrenches(
     w: int,
     t: int,
@@ -130,7 +140,18 @@ def find_wrenches(
         touched_by[g, w] = 0
     sync()
     nsample = c.sample.shape[0]
+    for k in range(t, nface, threads):
+        f = s.face[w, k]
+        for i in range(wp.where(touch.touching[f, w] == 1, nsample, 0)):
+            g = touch.trial_geom[f * nsample + i, w]
+            if g >= 0:
+                touched_by[g, w] = 1
+    sync()
     for group in range(wrench.shape[0]):
+        if _touches(w, group, geoms, touched_by) == 0:
+            for a in range(t, 6, threads):
+                wrench[group, w, a] = real(0.0)
+            continue
         force = vec3()
         torque = vec3()
         for k in range(t, nface, threads):
@@ -151,7 +172,6 @@ def find_wrenches(
                         other -= moment
                         mine = geoms.group[g]
                         if mine == group:
-                            touched_by[g, w] = 1
                             force += touch.sample_force[f * nsample + i, w]
                             torque += moment
                 if mine == group:
@@ -207,6 +227,7 @@ def find_tangents(
     touch: Contact,
     c: Constants,
     s: Scratch,
+    touched_by: wp.array2d(dtype=int),
     tangent: wp.array2d(dtype=mat66),
 ):
     """Stiffness against rigid motions of each group of geoms about the origin, with springs D lumped at the
@@ -225,7 +246,7 @@ def find_tangents(
     room = wp.where(outer + inner <= s.touched.shape[1] and equations * wide <= s.matrix.shape[1], 1, 0)
     for group in range(tangent.shape[0]):
         most = real(0.0)
-        if room == 1:
+        if room == 1 and _touches(w, group, geoms, touched_by) == 1:
             for k in range(t, outer, threads):
                 fraction = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
                 s.vector[w, DU, k] = fraction  # no longer needed
@@ -296,7 +317,9 @@ def conclude(
     o = s.solve.increment[w]
     find_wrenches(w, t, threads, o.nface, o.nnode, geoms, x, touch, c, s, touched_by_out, wrench_out)
     if tangent_out.shape[0] > 0:
-        find_tangents(w, t, threads, o.nnode, o.nin, o.linear, geoms, x, touch, c, s, tangent_out)
+        find_tangents(
+            w, t, threads, o.nnode, o.nin, o.linear, geoms, x, touch, c, s, touched_by_out, tangent_out
+        )
 
 
 @wp.kernel

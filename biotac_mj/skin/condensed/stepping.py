@@ -184,14 +184,6 @@ def begin_step(
     p.longest = real(1.0)
     if p.length > _PART:
         p.longest = wp.max(_PART / p.length, _SHORTEST)
-    if s.bodies.begun.shape[0] > 0:
-        for i in range(t, c.node.shape[0], threads):
-            s.force[w, i] = r.force[i, w]
-        sync()
-        sum_forces(w, t, threads, geoms, x, touch, c, s)
-        for h in range(t, s.bodies.begun.shape[0], threads):
-            s.bodies.begun[h, w] = s.bodies.posed[h, w]
-        sync()
     p.part = p.longest
     if p.part == real(1.0):
         p.again = s.previous.begins[w]
@@ -264,6 +256,10 @@ def search(
             o = _begin_at(w, t, threads, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
         forget_faces(w, t, threads, touch.kept, c, s, touch.touching)
         sum_forces(w, t, threads, geoms, x, touch, c, s)
+        if p.at == real(0.0):  # where the step begins
+            for h in range(t, s.bodies.begun.shape[0], threads):
+                s.bodies.begun[h, w] = s.bodies.posed[h, w]
+            sync()
         place_bodies(w, t, threads, p.to, geoms, s)
         moved = wp.pow(real(0.5), real(o.halved - 1)) * _largest_motion(w, geoms)
         for g in range(t, geoms.count, threads):
