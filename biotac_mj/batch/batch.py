@@ -17,6 +17,7 @@ from ..coupling.implicit.rules import LOSS_FREQUENCY
 from ..coupling.loads import core_geom
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
+from ..coupling.touches import find_touches
 from ..coupling.touching import Touching
 from . import kernels, solid
 from .implicit import dynamics, integrator
@@ -332,18 +333,16 @@ class Batch(Skins):
 
     def find_touches(self) -> None:
         """Parts what acts among the geoms."""
-        from . import loads  # here, as mujoco_warp is: `make` does without
-
         skin, outer, model = self.skin, self.skin.data.outer, self.skin.model
         samples = [len(model.sample), model.outer.face, self._group, outer.kept, outer.anchor_geom]
         samples += [outer.sample_force, skin.x, self._acting]
-        self._launch(loads.find_touches, self.groups, samples, [*self._touches])
+        self._launch(find_touches, self.groups, samples, [*self._touches])
 
     def list_touches(self, m: "mjw.Model", d: "mjw.Data", row: int, listed: list) -> None:
         """Adds its touches to the contacts, with rows from `row` on, and clears its own rows."""
         from mujoco_warp import ConeType
 
-        from . import loads
+        from . import loads  # here, as mujoco_warp is: `make` does without
 
         pos, normal, _, wrench = self._touches
         pyramidal = m.opt.cone == ConeType.PYRAMIDAL

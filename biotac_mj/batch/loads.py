@@ -24,7 +24,6 @@ _FORCE, _TORQUE, _TOUCH, _CONTACT = (
     int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH", "CONTACT")
 )
 _CONSTRAINT, _PYRAMID = wp.constant(int(ContactType.CONSTRAINT)), wp.constant(PYRAMID)
-_TINY = wp.constant(wp.float64(1e-12))  # [N]
 
 
 @wp.kernel
@@ -40,77 +39,6 @@ def clear_rows(
     if first >= 0:
         for i in range(6):
             force[w, first + i] = 0.0
-
-
-@wp.kernel
-def find_touches(
-    # In:
-    nsample: int,
-    face: wp.array(dtype=wp.vec3i),
-    group: wp.array(dtype=int),
-    kept: wp.array2d(dtype=int),
-    geom: wp.array2d(dtype=int),
-    force: wp.array2d(dtype=vec3),
-    x: wp.array2d(dtype=vec3),
-    acting: wp.array2d(dtype=vec6),
-    # Out:
-    pos_out: wp.array2d(dtype=vec3),
-    normal_out: wp.array2d(dtype=vec3),
-    share_out: wp.array2d(dtype=real),
-    wrench_out: wp.array2d(dtype=vec6),
-):
-    """Contact of each geom (`Instance.touches`): centre of pressure, mean normal out of the skin there,
-    fraction of the body's wrench, force and torque about the centre."""
-    g, w = wp.tid()
-    first = int(-1)
-    for k in range(group.shape[0]):
-        if group[k] == g:
-            if first < 0:
-                first = k
-            pos_out[k, w] = vec3()
-            normal_out[k, w] = vec3()
-            share_out[k, w] = real(0.0)
-            wrench_out[k, w] = vec6()
-    total = real(0.0)
-    for f in range(kept.shape[0]):
-        if kept[f, w] == 1:
-            t = face[f]
-            a = x[t[0], w]
-            b = x[t[1], w]
-            c = x[t[2], w]
-            n = wp.normalize(wp.cross(b - a, c - a))
-            for s in range(nsample):
-                k = geom[f * nsample + s, w]
-                if k >= 0:
-                    if group[k] == g:
-                        push = wp.max(-wp.dot(force[f * nsample + s, w], n), real(0.0))
-                        total += push
-                        share_out[k, w] += push
-                        pos_out[k, w] += push / real(3.0) * (a + b + c)
-                        normal_out[k, w] += push * n
-    pushed = wp.spatial_top(acting[g, w])
-    square = wp.dot(pushed, pushed)
-    if first < 0 or square < _TINY * _TINY:
-        return
-    if total < _TINY:
-        pos_out[first, w] = wp.cross(pushed, wp.spatial_bottom(acting[g, w])) / square
-        normal_out[first, w] = pushed
-        share_out[first, w] = real(1.0)
-        total = real(1.0)
-    centre = vec3()
-    for k in range(group.shape[0]):
-        if group[k] == g and share_out[k, w] > real(0.0):
-            centre += pos_out[k, w] / total
-            pos_out[k, w] = pos_out[k, w] / share_out[k, w]
-            normal_out[k, w] = wp.normalize(normal_out[k, w])
-            share_out[k, w] = share_out[k, w] / total
-    turn = wp.spatial_bottom(acting[g, w]) - wp.cross(centre, pushed)
-    for k in range(group.shape[0]):
-        if group[k] == g:
-            share = share_out[k, w]
-            for i in range(3):
-                wrench_out[k, w][i] = share * pushed[i]
-                wrench_out[k, w][i + 3] = share * turn[i]
 
 
 @wp.kernel

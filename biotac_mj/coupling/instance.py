@@ -12,7 +12,6 @@ import warnings
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import cross
 from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.kinematics import Kinematics
@@ -23,6 +22,7 @@ from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, 
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
+from .touches import Touches
 
 __all__ = [
     "NO_CONTACT",
@@ -39,7 +39,6 @@ NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
-_TINY = np.finfo(float).tiny
 _RK4, _DISCRETE = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("RK4", "DISCRETE"))
 NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
@@ -440,47 +439,26 @@ class Instance:
         acting = self._outcome[5]
         return self._result.wrench if acting is None else acting
 
-    def touches(self, wrench: np.ndarray, by_place: bool) -> list:
-        """Distributes wrenches (ngroup, 6) on the touching bodies to their geoms: [(number of the geom, (4,
-        3) of centre of pressure [m], normal out of the skin there, force, torque about the centre)].
+    @functools.cached_property
+    def _touches(self):
+        geometry = self.setup.skin.geometry
+        return Touches(self.touching.group, geometry.outer_face, geometry.nvert, self.setup.ngroup)
 
-        A body's wrench is shared by its geoms as the skin pushes on them. Where no push is known, or not
-        asked for, the first gets all, on the axis of the wrench."""
-        out, known = [], self._pushes() if by_place else None
-        for k in wrench.any(axis=1).nonzero()[0].tolist():
-            force, torque = wrench[k, :3], wrench[k, 3:]
-            geoms = (self.touching.group == k).nonzero()[0]
-            pushed = geoms[known[0][geoms] > 0.0] if known else ()
-            if len(pushed):
-                load, moment, outward = (of_geoms[pushed] for of_geoms in known)
-                part, pos, normal = load / load.sum(), moment / load[:, None], outward
-            else:
-                axis = cross(wrench[k : k + 1, :3], wrench[k : k + 1, 3:]) / max(force @ force, _TINY)
-                pushed, part, pos, normal = geoms[:1], np.ones(1), axis, force[None]
-            turn = torque - cross((part @ pos)[None], force[None])[0]
-            for g, a, x, n in zip(pushed.tolist(), part.tolist(), pos, normal):
-                n = n / math.sqrt(max(n @ n, _TINY))
-                out.append((g, np.array([x, n, a * force, a * turn])))
-        return out
-
-    def _pushes(self):
-        """Normal force of the skin on each geom: its size (ngeom,) [N], size times place and size times
-        normal (ngeom, 3); zeros if unknown."""
-        skin, ngeom = self.setup.skin, len(self.touching.geoms)
-        load, moment, outward = np.zeros(ngeom), np.zeros((ngeom, 3)), np.zeros((ngeom, 3))
-        known = self._result is not None and self._result.state is not None
-        if not known or not hasattr(skin.stepper, "touched_faces"):
-            return load, moment, outward
-        with skin.lock:
-            face, geom, push = skin.stepper.touched_faces(self._result.state)
-            x = skin.stepper.vert_xpos(self._result.state)
-        corner = x[skin.geometry.outer_face[face]]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        normal /= np.linalg.norm(normal, axis=1)[:, None]
-        np.add.at(load, geom, push)
-        np.add.at(moment, geom, push[:, None] * corner.mean(axis=1))
-        np.add.at(outward, geom, push[:, None] * normal)
-        return load, moment, outward
+    def touches(self, wrench: np.ndarray, by_place: bool) -> list[tuple[int, np.ndarray]]:
+        """Wrenches (ngroup, 6) on the touching bodies as contacts of their geoms, see `Touches.find`.
+        by_place: at the places where the skin pushes; else on the axis of the wrench."""
+        found, skin, result = self._touches, self.setup.skin, self._result
+        found.wrench[:], found.kept[:] = wrench, 0
+        known = by_place and result is not None and result.state is not None
+        if known and hasattr(skin.stepper, "touched_faces"):
+            with skin.lock:
+                face, geom, push = skin.stepper.touched_faces(result.state)
+                found.x[:] = skin.stepper.vert_xpos(result.state)
+            corner = found.x[skin.geometry.outer_face[face]]
+            normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+            normal /= np.linalg.norm(normal, axis=1)[:, None]
+            found.kept[face], found.geom[face], found.force[face] = 1, geom, -push[:, None] * normal
+        return found.find()
 
     def _push_on(self, other, group):
         """(6,) of this skin on another BioTac, its touching body `group`, in the frame of that one."""
