@@ -531,6 +531,7 @@ def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
     )
 
 
+@functools.cache
 def spreading_table() -> tuple[float, np.ndarray]:
     """Step in r / (1 + r), r = h / a, and values of `spreading_resistance`; the kernels interpolate in this
     table."""
