@@ -26,6 +26,7 @@ _STANDS = 8.0  # [counts] most jitter of a constant channel
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
 _ALIVE = 1.2  # [counts] of noise, four times that of rounding
+_STAYS_PUT = 0.8  # of the samples between the first and the last constant one
 _MOVED = 6.0  # times its noise, that a channel with a limit moves by
 _OFTEN = 2.0  # times what noise repeats a value, that a channel stays at its limit
 
@@ -117,7 +118,9 @@ def _limits(log, rows):
 def _limited(log, k, side):
     """Fault of channel k with a limit at one side of what it reads."""
     start, length = runs(log.read[:, k] == side * (side * log.read[:, k]).max())
-    return _constant_fault(log, k, side, log.read[start, k], start, length)
+    found = _constant_fault(log, k, side, log.read[start, k], start, length)
+    on = np.flatnonzero(found.mask[:, k])
+    return _with_ties(found, len(start), found.mask[on[0] : on[-1] + 1, k].mean() > _STAYS_PUT)
 
 
 def _long_constant(log, x):
@@ -201,7 +204,7 @@ def _constant_faults(log, k, still, sure):
     if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
         if still[inner].mean() > _FILTERED:
             return []
-    stays = still[on[0] : on[-1] + 1].mean() > 0.8  # a limit is left when the load decreases
+    stays = still[on[0] : on[-1] + 1].mean() > _STAYS_PUT  # a limit is left when the load decreases
     low, high = _at_ends(values, ends)
     for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
         if side < 0 and not log.signed:  # its baseline
@@ -218,12 +221,17 @@ def _constant_faults(log, k, still, sure):
         if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
             if any(at.all() for at in (low, high, *_at_ends(values, ever))):
                 one.ties = ("saturate",)  # a single stay at a limit
-        if mine.sum() > 8 and not stays:  # it moves in between: it does not respond there
-            one.ties = ("gain",) if side else ("gain", "saturate")
-        if one.detector == "rail":  # a response of the wrong sign also drives levels to the converter's end
-            one.ties = (*one.ties, "flip")
-        found.append(one)
+        found.append(_with_ties(one, mine.sum(), stays))
     return found
+
+
+def _with_ties(fault, number, stays):
+    """A fault of a channel that is constant so often, or most of the time, and what it may be instead."""
+    if number > 8 and not stays:  # it moves in between: it does not respond there
+        fault.ties = ("gain",) if fault.beyond else ("gain", "saturate")
+    if fault.detector == "rail":  # a response of the wrong sign also drives levels to the converter's end
+        fault.ties = (*fault.ties, "flip")
+    return fault
 
 
 def _moving_range(moving):
