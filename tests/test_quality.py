@@ -154,6 +154,17 @@ def test_values_far_beyond_an_electrodes_range_are_no_limit():
         assert {f.id for f in (*checked.faults, *checked.weak)} == {name}
 
 
+def test_codes_that_a_converter_prefers_are_no_limit():
+    """Nor is the rest of a log that tells how far, and not which way."""
+    rng = np.random.default_rng(0)
+    x = noisy(np.full((4500, 19), 2700.0), rng)
+    x[:, 6] = np.array([2965, 2976, 2991, 2998])[rng.integers(0, 4, len(x))]
+    assert not stuck_or_clipped(Log(x))
+    folded, _, _ = touched()
+    folded = -np.maximum(np.abs(folded - folded[:1]) - 20, 0)
+    assert not [f for f in stuck_or_clipped(Log(folded, converter=False)) if f.beyond > 0]
+
+
 def test_each_of_several_electrodes_may_be_limited():
     """Five at ends of their own; of five that stand still for a while within what they read none is."""
     e, _, rng = pressed(5)
