@@ -9,7 +9,9 @@ from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.geometry.design import read_design
 from biotac_mj.recordings import Recording, load, load_one
 from biotac_mj.recordings import write as write_recordings
+from biotac_mj.recordings.formats.streams import join
 from biotac_mj.recordings.inspection import findings
+from biotac_mj.recordings.live import streams_of_lines
 from biotac_mj.recordings.picture import pac_spectrum
 from biotac_mj.sensor.presets import sensors_of
 
@@ -107,6 +109,12 @@ def test_the_spectrum_of_pac_counts_no_sample_twice():
     one = Recording(time, electrodes=COUNTS, pac=pac)
     frequency, power, _ = pac_spectrum(one)
     assert frequency[power.argmax()] == 300 and power.max() > 1e3 * np.sort(power)[-4]
+
+
+def test_lines_of_a_serial_port_of_an_sp_need_no_names():
+    lines = [b",".join(b"%d" % (2000 + k) for k in range(24)) + b"\n"] * 5
+    (one,) = join(streams_of_lines("port", lines, 0.01 * np.arange(5), None))
+    assert one.design == read_design("biotac_sp") and (one.electrodes == 2000 + np.arange(24)).all()
 
 
 def test_a_recording_of_a_pad_of_one_s_own_is_refused_by_name():

@@ -33,7 +33,7 @@ def for_jax(function: Callable, *shapes: Sequence[int]) -> Callable:
     import jax
 
     if not shapes:
-        raise ValueError("no shapes: give that of each tensor which the function gives, as (19,)")
+        raise ValueError("no shapes: give that of each tensor which the function gives, as (3,)")
     shapes = [tuple(shape) for shape in shapes]
     # graphs of the last calls, so that a backward pass need not repeat the forward pass
     kept, lock = collections.OrderedDict(), threading.Lock()

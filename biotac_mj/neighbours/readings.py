@@ -16,7 +16,7 @@ class BioTacData:
     """Readings in n worlds, in counts of the real sensor.
 
     Attributes:
-      electrodes: (n, 19), pac: (n, 22), pdc, tac, tdc: (n, 1) [counts].
+      electrodes: (n, nelectrode), pac: (n, 22), pdc, tac, tdc: (n, 1) [counts].
       contact_force: (n, 6) force [N] and torque [N m] on the BioTac, in its frame.
       status: (n, 8), see `biotac_mj.Handle.read`.
     """

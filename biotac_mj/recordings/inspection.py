@@ -87,7 +87,7 @@ def doubts(recording: Recording) -> list[str]:
 
 def check_clock(recording: Recording, counts: np.ndarray | None) -> tuple[np.ndarray | None, list[Fault]]:
     """(n,) number of rows missing before each by the file's clock, None if unknown, and faults of that clock.
-    counts: (n, 19) of the electrodes, or None."""
+    counts: (n, nelectrode) of the electrodes, or None."""
     if recording.rate_source != CLOCKED:
         return None, []
     changed = any(note.startswith(CLOCK_FAULT) or "were left out" in note for note in recording.notes)

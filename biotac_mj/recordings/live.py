@@ -5,7 +5,7 @@ import pathlib
 import time as clock
 from collections.abc import Iterable
 
-from ..sensor.channels import ELECTRODES
+from ..geometry.design import BIOTAC, design_of_channels
 from .formats.columns import parse_table
 from .formats.messages import Topic
 from .formats.streams import join, make_streams
@@ -98,8 +98,8 @@ def record_serial(
     """A recording from a serial port that sends lines, each a row of numbers.
 
     Args:
-      columns: their names (`names`); None: from the first line, else e1..e19. Rows without a time column get
-        their time of arrival.
+      columns: their names (`names`); None: from the first line, else e1, e2, ... of the
+        design with as many. Rows without a time column get their time of arrival.
 
     Raises:
       ValueError: pyserial is not installed, the port cannot be opened, or no complete line arrived.
@@ -139,7 +139,7 @@ def streams_of_lines(
     """
     source = pathlib.Path(pathlib.Path(port).name)
     table = parse_table(source, b"".join(lines))
-    names = columns or table.names or list(ELECTRODES)
+    names = columns or table.names or list((design_of_channels(table.width) or BIOTAC).electrodes)
     if table.width != len(names):
         raise ValueError(
             f"{port} sends {table.width} numbers a line, {len(names)} were expected "

@@ -23,13 +23,13 @@ def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
     """Estimates constants of a sensor.
 
     Args:
-      counts: (n, 19) of the electrodes, raw. rate: rows per second [Hz]. force: (n, 3) on them [N], or None:
-        no contact.
+      counts: (n, nelectrode) of the electrodes, raw. rate: rows per second [Hz]. force: (n, 3) on them [N],
+        or None: no contact.
 
     Returns:
-      rest: (19,) counts without force at the start; loaded: whether it was always touched; noise: (19,) RMS
-        [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and warm_share (19,), the
-        fraction of it for each electrode.
+      rest: (nelectrode,) counts without force at the start; loaded: whether it was always touched; noise:
+        (nelectrode,) RMS [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and
+        warm_share (nelectrode,), the fraction of it for each electrode.
     """
     time, log_z = np.arange(len(counts)) / rate, log_impedance(counts)
     load, light = np.zeros((len(counts), 0)), np.ones(len(counts), bool)

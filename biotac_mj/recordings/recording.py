@@ -77,8 +77,8 @@ class Recording:
 
     Attributes:
       time: (n,) increasing [s].
-      electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), of a BioTac SP (n, 31), tdc (n,), tac
-        (n,): in `units`, default raw counts.
+      electrodes (n, nelectrode), pdc (n,), pac (n, 22), of a BioTac SP (n, 31), tdc
+        (n,), tac (n,): in `units`, default raw counts.
       force, torque: (n, 3) [N], [N m].
       contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
       name: unique in its file. object: what touched, "" if unknown.

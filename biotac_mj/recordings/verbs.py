@@ -61,7 +61,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         "--columns",
         nargs="+",
         metavar="NAME",
-        help="of --serial's lines, as time e1 ... e19 pdc (default: a header line, or e1..e19)",
+        help="of --serial's lines, as time e1 e2 pdc (default: a header line, or all electrodes in order)",
     )
     v.add_argument(
         "--seconds",

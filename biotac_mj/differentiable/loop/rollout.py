@@ -55,8 +55,8 @@ class Rolled:
     readings: dict
 
     def electrodes(self, name: str = "biotac_", step: int = -1) -> torch.Tensor:
-        """(..., 19) counts of a BioTac's electrodes after a step, without noise, rounding and time-dependent
-        effects.
+        """(..., nelectrode) counts of a BioTac's electrodes after a step, without noise, rounding and
+        time-dependent effects.
 
         Raises:
           ValueError: its readings have no film.

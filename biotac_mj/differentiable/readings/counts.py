@@ -25,7 +25,7 @@ def electrode_counts(
     """Counts of the electrodes.
 
     Args:
-      impedance: (..., 19) of the film [ohm]. rest: (19,) of the film at rest [ohm].
+      impedance: (..., nelectrode) of the film [ohm]. rest: (nelectrode,) of the film at rest [ohm].
       sensor: for rest counts, mixing, power and saturation; None: `Sensor()`.
     """
     sensor = Sensor() if sensor is None else sensor

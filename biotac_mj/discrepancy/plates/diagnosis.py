@@ -38,8 +38,9 @@ class Sensor:
     """One recording with the base model.
 
     Attributes:
-      recording; rows: of the first 70 %; locked: the held-out ones; judged; noise: (19,) [counts]; cells: see
-        `press_cells`; worst: electrodes that lead, from 0; slope, error: (19,) see `missing`.
+      recording; rows: of the first 70 %; locked: the held-out ones; judged; noise: (nelectrode,) [counts];
+        cells: see `press_cells`; worst: electrodes that lead, from 0; slope, error: (nelectrode,) see
+        `missing`.
     """
 
     recording: PlainRecording
@@ -108,7 +109,7 @@ class Tested:
 
 
 def _rms(sensor, *errors):
-    """RMS of errors (n, 19) at the electrodes that lead and at all."""
+    """RMS of errors (n, nelectrode) at the electrodes that lead and at all."""
     return {
         "worst": tuple(float(np.sqrt((e[:, sensor.worst] ** 2).mean())) for e in errors),
         "all": tuple(float(np.sqrt((e**2).mean())) for e in errors),

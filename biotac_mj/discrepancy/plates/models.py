@@ -101,9 +101,9 @@ class Judged:
     """A model on both halves of n rows, each by constants that the other half gave.
 
     Attributes:
-      constants: of the first and of the second half. state: (n, 4). error: (n, 19) modelled less measured
-        [counts]. own: (n, 19) error by the half's own constants. change: (n, 19) modelled change of the
-        counts from rest.
+      constants: of the first and of the second half. state: (n, 4). error: (n, nelectrode) modelled less
+        measured [counts]. own: (n, nelectrode) error by the half's own constants. change: (n, nelectrode)
+        modelled change of the counts from rest.
     """
 
     constants: tuple[Constants, Constants]
@@ -114,8 +114,8 @@ class Judged:
 
     @property
     def uncertainty(self) -> np.ndarray:
-        """(n, 19) standard deviation of a prediction: the constants of both halves, compared on the same
-        rows."""
+        """(n, nelectrode) standard deviation of a prediction: the constants of both halves, compared on the
+        same rows."""
         return np.abs(self.error - self.own) / np.sqrt(2)
 
     def square(self) -> np.ndarray:
@@ -124,7 +124,7 @@ class Judged:
 
     def gain(self, smaller: "Judged", noise: np.ndarray) -> np.ndarray:
         """(blocks,) [nats] by which it makes each block likelier than a smaller model does, errors of rows of
-        one block alike; noise: (19,) of the electrodes [counts]."""
+        one block alike; noise: (nelectrode,) of the electrodes [counts]."""
         return log_ratio(smaller.square(), self.square(), len(noise), np.mean(noise**2))
 
 

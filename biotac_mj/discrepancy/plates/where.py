@@ -35,7 +35,7 @@ def press_cells(rows: Rows, judged: Judged, noise: np.ndarray) -> list[dict]:
     these first, the largest error first.
 
     Args:
-      noise: (19,) of the electrodes [counts].
+      noise: (nelectrode,) of the electrodes [counts].
     """
     expected, square = np.hypot(noise, judged.uncertainty) ** 2, judged.error**2
     conditions, channels = _conditions(rows, judged), electrode_names(range(square.shape[1]))
@@ -69,8 +69,8 @@ def leading(judged: Judged) -> list[int]:
 
 
 def missing(judged: Judged) -> tuple[np.ndarray, np.ndarray]:
-    """Fraction by which the electrodes' changes are too small (19,), and its standard error over blocks: the
-    slope of the residual over the modelled change."""
+    """Fraction by which the electrodes' changes are too small (nelectrode,), and its standard error over
+    blocks: the slope of the residual over the modelled change."""
     parts = [
         (-(judged.error[b] * judged.change[b]).sum(0), (judged.change[b] ** 2).sum(0))
         for b in blocks(len(judged.error))

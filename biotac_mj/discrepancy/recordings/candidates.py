@@ -37,7 +37,8 @@ class Candidate(Fault):
         event, and held-out rows say nothing more of it.
       beside_load: whether an electrode was compared with the others while a load moves them.
       delay: [s] by which the electrodes follow the force later.
-      trend: of levels over time, or None; share: (19,) of it that each electrode has, None of a single one.
+      trend: of levels over time, or None; share: (nelectrode,) of it that each electrode has, None of a
+        single one.
       gap: on the held-out rows, None where nothing there measures it; verified: whether they confirm it,
         None where they cannot; written: whether it is in the amended sensor, with which the held-out rows are
         no further off.
@@ -79,8 +80,8 @@ def as_log(
     masked: np.ndarray | None = None,
     rows: np.ndarray | slice = slice(None),
 ) -> Log:
-    """Rows of a recording as a log; counts (n, 19) and samples masked (n, 19) of the whole recording: others
-    than its own."""
+    """Rows of a recording as a log; counts (n, nelectrode) and samples masked (n, nelectrode) of the whole
+    recording: others than its own."""
     counts = recording.electrodes if counts is None else counts
     return Log(
         counts[rows],

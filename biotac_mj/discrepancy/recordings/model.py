@@ -1,4 +1,4 @@
-"""The joint model of 19 electrodes: rest + load on few dimensions + what develops over time + noise.
+"""The joint model of all electrodes: rest + load on few dimensions + what develops over time + noise.
 
 Electrodes and the products of their principal components are one Gaussian (`conditional.py`) whose covariance
 is taken from changes *within* cells of a few seconds, so that nothing slow enters it. The true direction p of
@@ -33,8 +33,8 @@ class Model:
     """Bins of a recording and the Gaussian of the rows that are fitted. m bins, c usable electrodes.
 
     Args:
-      counts: (n, 19); good: (n, 19) bool, samples that are measurements; fit: (n,) bool, contiguous from row
-        0; rate: [Hz]; fresh: share of the rows that are no repetition.
+      counts: (n, nelectrode); good: (n, nelectrode) bool, samples that are measurements; fit: (n,) bool,
+        contiguous from row 0; rate: [Hz]; fresh: share of the rows that are no repetition.
 
     Attributes:
       used (c,) electrode numbers; time (m,) [s]; value (m, c) ln Z about the mean of the rows fitted;

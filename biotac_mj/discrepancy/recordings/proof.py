@@ -184,8 +184,8 @@ def _blocks(*sessions):
 
 
 def _errors(s):
-    """(n, 19) errors [counts] of the held-out part, nan where nothing was measured: of bins, what each
-    electrode reads beside the others; unloaded, of rows, about the level of the rows fitted."""
+    """(n, nelectrode) errors [counts] of the held-out part, nan where nothing was measured: of bins, what
+    each electrode reads beside the others; unloaded, of rows, about the level of the rows fitted."""
     if s.loaded:
         m, aside = _aside(s)
         out = np.full((aside.sum(), s.counts.shape[1]), np.nan)

@@ -171,9 +171,9 @@ def _spectrum(x, size, least):
 
 
 def _touched(x):
-    """(n - 1,) whether a touch begins or ends between two rows of x (n, 19): at least three electrodes move
-    there, and before it or after it nearly all stand still. Electrodes that stand still on both sides, at
-    different values, were touched within few rows."""
+    """(n - 1,) whether a touch begins or ends between two rows of x (n, nelectrode): at least three
+    electrodes move there, and before it or after it nearly all stand still. Electrodes that stand still on
+    both sides, at different values, were touched within few rows."""
     half = _STILL // 2
     near = np.concatenate([[0], np.cumsum(_still(x))])
     i, n = np.arange(len(x) - 1), len(x)

@@ -13,9 +13,9 @@ class Session:
     """The recording less what was found.
 
     Attributes:
-      recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
-      findings; weak: those that are too little to be named, or contradicted; unnamed: sentences on what is
-      there and has no name.
+      recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, nelectrode); masked
+      (n, nelectrode) bool; findings; weak: those that are too little to be named, or contradicted; unnamed:
+      sentences on what is there and has no name.
     """
 
     def __init__(self, recording: PlainRecording, fit: np.ndarray, findings: tuple | list = ()):
@@ -72,8 +72,8 @@ class Session:
         return self.model().dimensions >= 2
 
     def filled(self) -> np.ndarray:
-        """(n, 19) counts without the effects; samples that are no measurement as the other electrodes say
-        them."""
+        """(n, nelectrode) counts without the effects; samples that are no measurement as the other
+        electrodes say them."""
         from ...sensor.channels import counts_from_log_impedance
 
         if not self.masked.any():

@@ -112,7 +112,7 @@ def overview(
     """All electrodes over time, and the force.
 
     Args:
-      time: (n,) [s]. views: title -> (n, 19) counts. force: (n, 3) [N] or None. aside: see `Panel`.
+      time: (n,) [s]. views: title -> (n, nelectrode) counts. force: (n, 3) [N] or None. aside: see `Panel`.
     """
     width = max(1, len(time) // 1500)
     m = len(time) // width

@@ -133,9 +133,9 @@ def _around(size, row, column):
 
 
 def _stays(x, without=(), rows=slice(None)):
-    """(rows, 19) by how much the mean of the rows after each row of x (n, 19) lies above that of the rows
-    before it, less what the same of the other electrodes, some left out, says of it: the load may have moved
-    meanwhile."""
+    """(rows, nelectrode) by how much the mean of the rows after each row of x (n, nelectrode) lies above
+    that of the rows before it, less what the same of the other electrodes, some left out, says of it: the
+    load may have moved meanwhile."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
     at = np.arange(len(x))
     a, b = np.maximum(at - _STAYS, 0), np.minimum(at + 1 + _STAYS, len(x))

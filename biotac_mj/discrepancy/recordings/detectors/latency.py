@@ -49,8 +49,8 @@ class ForceView:
     """Cross-validated prediction of force from electrodes on some contiguous rows.
 
     Args:
-      counts: (n, 19); force: (n, 3) as the sensor said [N]; rows: (n,) bool, contiguous; usable: electrodes
-        to use; rate: [Hz].
+      counts: (n, nelectrode); force: (n, 3) as the sensor said [N]; rows: (n,) bool, contiguous; usable:
+        electrodes to use; rate: [Hz].
     """
 
     def __init__(

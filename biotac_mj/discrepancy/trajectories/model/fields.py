@@ -34,7 +34,7 @@ class Fields:
     with it})], see `Simulator.bend`: of a share s of these parameters they miss s^2 of it, and s of the
     changes by what lies beside that share. All that were solved are kept, since several fits hold on to
     theirs. remembered: ids of effects of the rubber -> [(their parameters, what their reduced form misses
-    of rubber that does so itself [(n, 23) per trajectory])], see `in_skin.remember`."""
+    of rubber that does so itself [(n, nelectrode + 4) per trajectory])], see `in_skin.remember`."""
 
     base: list
     slopes: dict
@@ -67,7 +67,7 @@ class Fields:
         return Fields([self.quick[i] for i in which], slopes, some, deeper=deeper, film=film)
 
     def shifted(self, i: int, offset: np.ndarray) -> np.ndarray:
-        """(n, 23) what an offset (n, 3) of the poses changes of trajectory i [m]."""
+        """(n, nelectrode + 4) what an offset (n, 3) of the poses changes of trajectory i [m]."""
         heading, change = self.trajectories[i].heading, 0.0
         if self.deeper is not None:
             along = offset @ heading
@@ -78,7 +78,7 @@ class Fields:
         return change
 
     def shifting(self, i: int, offset: np.ndarray) -> list[np.ndarray]:
-        """(n, 23) per metre along x, y and z, about an offset (3,) of trajectory i [m]."""
+        """(n, nelectrode + 4) per metre along x, y and z, about an offset (3,) of trajectory i [m]."""
         slopes = [self.stacked[name][i] for name in "xyz"]
         if self.deeper is None:
             return slopes
@@ -103,8 +103,8 @@ class Fields:
         return out
 
     def recalled(self, effect: Effect, theta: dict, i: int) -> np.ndarray | None:
-        """(n, 23) that the effect's reduced form misses in trajectory i, where the skin was solved with it;
-        it grows with the effect's first parameter, its share."""
+        """(n, nelectrode + 4) that the effect's reduced form misses in trajectory i, where the skin was
+        solved with it; it grows with the effect's first parameter, its share."""
         if effect.id not in self.remembered:
             return None
         there, missed = min(self.remembered[effect.id], key=lambda one: unlike(effect, theta, one[0]))
@@ -118,7 +118,8 @@ class Curve:
     nothing, and a film matters only where the skin lies on the core."""
 
     def __init__(self, at: np.ndarray, changes: list[np.ndarray]):
-        """at: (m,) that were solved, rising, one of them 0. changes: per trajectory (m, n, 23)."""
+        """at: (m,) that were solved, rising, one of them 0. changes: per trajectory
+        (m, n, nelectrode + 4)."""
         self.solved, self.changes = at, changes
         self._cubics = [CubicHermiteSpline(at, one, _tangents(at, one)) for one in changes]
         self._last = {}  # trajectory -> the values that were asked for last, and the change
@@ -127,7 +128,7 @@ class Curve:
         return Curve(self.solved, [self.changes[i] for i in which])
 
     def at(self, i: int, value: np.ndarray | float) -> np.ndarray:
-        """(n, 23) change of trajectory i by values (n,), or one of all rows."""
+        """(n, nelectrode + 4) change of trajectory i by values (n,), or one of all rows."""
         before, known = self._last.get(i, (np.nan, None))
         if np.array_equal(before, value):
             return known
@@ -140,13 +141,13 @@ class Curve:
         return change
 
     def slope(self, i: int, value: np.ndarray | float) -> np.ndarray:
-        """(n, 23) of the change at values (n,), or one of all rows."""
+        """(n, nelectrode + 4) of the change at values (n,), or one of all rows."""
         (a, b, c, _), x = self._cubic(i, np.clip(value, self.solved[0], self.solved[-1]))
         return (3 * a * x + 2 * b) * x + c
 
     def _cubic(self, i, value):
-        """Coefficients (4, n, 23) of each row's cubic at its own value, and how far that is from where the
-        cubic begins (n, 1)."""
+        """Coefficients (4, n, nelectrode + 4) of each row's cubic at its own value, and how far that is from
+        where the cubic begins (n, 1)."""
         cubics = self._cubics[i]
         row = np.arange(cubics.c.shape[2])
         value = np.broadcast_to(value, row.shape)
@@ -155,7 +156,8 @@ class Curve:
 
 
 def _tangents(at, changes):
-    """(m, n, 23) slopes of changes at (m,): parabolas', within three times that to either side."""
+    """(m, n, nelectrode + 4) slopes of changes at (m,): parabolas', within three times that to either
+    side."""
     wide = np.diff(at)[:, None, None]
     secant = np.diff(changes, axis=0) / wide
     out = np.empty_like(changes)
@@ -200,12 +202,12 @@ def nearest(solved: list, now: dict) -> tuple:
 
 
 def stack(one: dict) -> np.ndarray:
-    """(n, 23) force, pressure and ln Z of a solution."""
+    """(n, nelectrode + 4) force, pressure and ln Z of a solution."""
     return np.column_stack([one["force"], one["pressure"], one["log_z"]])
 
 
 def unstack(values: np.ndarray) -> dict:
-    """A solution of (n, 23) force, pressure and ln Z."""
+    """A solution of (n, nelectrode + 4) force, pressure and ln Z."""
     return {"force": values[:, :3], "pressure": values[:, 3], "log_z": values[:, 4:]}
 
 

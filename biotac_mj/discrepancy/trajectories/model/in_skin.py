@@ -51,8 +51,8 @@ def solve_with_memory(
         session began.
 
     Returns:
-      per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19),
-        converged (n,).
+      per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n,
+        nelectrode), converged (n,).
     """
     from ....data.generation.simulate import Scene, _walk, clock
     from ....skin import SkinData, step
