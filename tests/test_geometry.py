@@ -361,7 +361,7 @@ def test_indenter_shape(name):
     else:
         expected = VOLUMES[name]
     assert solid.volume == pytest.approx(expected, rel=0.01)  # chords of the tessellation
-    ((stored, triangles),) = read_obj(asset_path(shape.mesh_asset))
+    ((stored, triangles),) = read_obj(asset_path(f"indenters/{name}.obj"))
     assert enclosed_volume(stored, triangles) == pytest.approx(solid.volume * 1e-9, rel=1e-6)
 
 

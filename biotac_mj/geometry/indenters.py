@@ -30,7 +30,6 @@ class Indenter:
         spheres.
       pos: centre of the geom in the indenter frame [m].
       quat: its orientation there (w, x, y, z).
-      mesh_asset: name for `asset_path`, of the shape with its rounded edges in the indenter frame [m].
     """
 
     name: str
@@ -39,10 +38,6 @@ class Indenter:
     rounding: float
     pos: tuple
     quat: tuple = _UPRIGHT
-
-    @property
-    def mesh_asset(self) -> str:
-        return f"indenters/{self.name}.obj"
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """The shape with its rounded edges as a closed mesh: vert (n, 3) [m], indenter frame, face (m, 3),

@@ -25,7 +25,6 @@ __all__ = [
     "REST_COUNTS",
     "REST_TEMPERATURE",
     "TAC_REST",
-    "WIDTHS",
     "counts_from_impedance",
     "counts_from_log_impedance",
     "counts_from_pac",
@@ -50,7 +49,6 @@ __all__ = [
 # The BioTac's; other designs have their own (`geometry.design`).
 NELECTRODE, NPAC = BIOTAC.nelectrode, BIOTAC.npac  # sensing electrodes; PAC's samples of a frame
 ELECTRODES, CHANNELS = BIOTAC.electrodes, BIOTAC.channels
-WIDTHS = BIOTAC.widths
 FULL_SCALE = 4095.0
 # [C] of the heated core by the manual's formula: 47 to 50 in four sensors (TDC 1890 to 2103 counts), mean
 # 48.4 in two

@@ -346,9 +346,7 @@ class Simulator:
             if nuisance.log_film and fields.film is not None:
                 between = between + fields.film.at(i, nuisance.log_film)
             if np.ndim(between):
-                run.force = run.force + modulus * between[:, :3]
-                run.pressure = run.pressure + modulus * between[:, 3]
-                run.log_z = run.log_z + between[:, 4:]
+                _add(run, modulus, between)
             if nuisance.footprint:
                 run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint, self.design)
         for i, run in enumerate(runs):
@@ -359,9 +357,7 @@ class Simulator:
                     effect.apply(run, theta)
                     missed = fields.recalled(effect, theta, i)
                     if missed is not None:
-                        run.force = run.force + modulus * missed[:, :3]
-                        run.pressure = run.pressure + modulus * missed[:, 3]
-                        run.log_z = run.log_z + missed[:, 4:]
+                        _add(run, modulus, missed)
             if np.ndim(run.turn) and run.turn.any():  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
@@ -463,9 +459,7 @@ class Simulator:
                 if i in curve:
                     change = change + share * curve[i]
             if np.ndim(change):
-                run.force = run.force + modulus * change[:, :3]
-                run.pressure = run.pressure + modulus * change[:, 3]
-                run.log_z = run.log_z + change[:, 4:]
+                _add(run, modulus, change)
 
     # --- YAML  ---
 
@@ -490,6 +484,13 @@ def _turned(t, turn):
     from scipy.spatial.transform import Rotation
 
     return dataclasses.replace(t, mat=Rotation.from_rotvec(turn).as_matrix() @ t.mat)
+
+
+def _add(run, modulus, change):
+    """Adds changes (n, 4 + nelectrode) of force and pressure, per unit of the modulus, and ln Z."""
+    run.force = run.force + modulus * change[:, :3]
+    run.pressure = run.pressure + modulus * change[:, 3]
+    run.log_z = run.log_z + change[:, 4:]
 
 
 def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
