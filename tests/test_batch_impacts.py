@@ -137,7 +137,8 @@ def test_a_thrown_box_is_lent_nothing():
     assert np.any([world.force[0].any() for world in seen])  # touch at once
     for world, lent in zip(seen, store.T):
         assert world.growth < 0.05 and world.touched > 1
-        assert 0 < lent.max() < 1.05 * world.kinetic
+        lost = world.energy[0] - world.energy[1:]  # by the body, in whose fall is as much as in its speed
+        assert 0 < lent.max() and (lent < lost + 0.1 * world.kinetic).all()
 
 
 def rolling(mass, friction, timestep):
