@@ -28,7 +28,7 @@ LAYERS = {
     "geometry": "cache short_repr files reading quiet triangles",
     "skin": "cache short_repr lazy geometry fields files reading threads quiet launches",
     "quiet": "",
-    "sensor": "short_repr lazy fields files geometry threads quiet launches",
+    "sensor": "cache short_repr lazy fields files geometry threads quiet launches",
     "effects": "short_repr lazy skin sensor geometry fields files reading",
     "coupling": "cache short_repr lazy skin sensor effects geometry fields launches threads learning.serve",
     "plugin": "coupling",

@@ -32,6 +32,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from scipy.special import j1
 
+from biotac_mj.cache import cached
 from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
 from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.design import BIOTAC, Design
@@ -209,7 +210,16 @@ class FilmConduction:
 
     @functools.cached_property
     def _factor(self):
-        return make_factor(self.face, len(self.node), self._pair, len(self._pos))
+        sizes = len(self.node), len(self._pos)
+
+        def make():
+            pattern, size = make_factor(self.face, sizes[0], self._pair, sizes[1])
+            return pattern | {"size": size}
+
+        pattern = cached("film", [self.face, *self._pair, *sizes], make, ("sensor",))
+        pattern = {name: value if np.ndim(value) else int(value) for name, value in pattern.items()}
+        size = pattern.pop("size")
+        return pattern, size
 
     def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Geometry of the film under the skin.
