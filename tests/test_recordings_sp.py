@@ -1,9 +1,11 @@
 """Logs of the BioTac SP are read as such, whatever form they have."""
 
 import gzip
+import re
 
 import numpy as np
 import pytest
+from recorded import synthetic, write_btd
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.geometry.design import read_design
@@ -121,3 +123,13 @@ def test_a_recording_of_a_pad_of_one_s_own_is_refused_by_name():
     said = "own has 6 electrodes: a recording is one of a BioTac .19 .* or a BioTac SP .24"
     with pytest.raises(ValueError, match=said):
         Recording(0.01 * np.arange(3), electrodes=np.full((3, 6), 2000.0), name="own")
+
+
+def test_a_native_log_of_an_sp_is_told_by_its_serial_number(tmp_path):
+    """Public logs of SPs have 19 of their electrodes, and count of rows alone makes a BioTac of them."""
+    write_btd(tmp_path / "log.btd", synthetic(60))
+    said = "serial number is that of a BioTac SP .24 electrodes., of which this log has 19"
+    assert not any(re.search(said, note) for note in load_one(tmp_path / "log.btd")[0].notes)
+    text = (tmp_path / "log.btd").read_bytes().replace(b"SYNTHETIC01", b"BTSP050400018017")
+    (tmp_path / "sp.btd").write_bytes(text)
+    assert any(re.search(said, note) for note in load_one(tmp_path / "sp.btd")[0].notes)
