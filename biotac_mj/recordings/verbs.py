@@ -158,10 +158,7 @@ def _record(args):
     from .recording import write
 
     timeline = f"{os.path.splitext(args.out)[0]}_timeline.yaml" if args.protocol else None
-    if timeline:
-        recordings = _prompted(args, timeline)
-    else:
-        recordings = _recorded(args, args.seconds or 10.0)
+    recordings = _prompted(args, timeline) if timeline else _recorded(args, args.seconds or 10.0)
     write(args.out, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
