@@ -6,6 +6,7 @@ import pytest
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.evidence import further_off
 from biotac_mj.discrepancy.recordings.detectors.latency import clock_offset
+from biotac_mj.discrepancy.recordings.proof import blocks
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.samples import make_samples
 
@@ -70,6 +71,18 @@ def test_what_makes_held_out_rows_worse_is_not_written(sample):
     for finding in diagnosis.findings:
         assert finding.written or finding.id in " ".join(diagnosis.amended)
     assert "warm_up" not in diagnosis.sensor().base["sensor"]
+
+
+@pytest.mark.parametrize("first", (0, 1))
+def test_errors_are_compared_where_a_finding_is_all_the_load(sample, first):
+    """Without it the sensor is at rest, or with it."""
+    counts, _ = sample
+    still = np.rint(counts[0] + np.random.default_rng(0).standard_normal(counts.shape))
+    fit = np.arange(len(counts)) < 0.6 * len(counts)
+    sessions = [Session(PlainRecording(x, rate=100.0), fit) for x in (counts, still)]
+    assert [one.loaded for one in sessions] == [True, False]
+    before, after = blocks(sessions[first], sessions[1 - first])
+    assert before.shape == after.shape and (np.argmax([before.mean(), after.mean()]) == first)
 
 
 def test_more_than_chance_is_further_off():

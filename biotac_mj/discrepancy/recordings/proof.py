@@ -13,7 +13,7 @@ from .detectors.latency import force_view
 from .recording import FORCE_MOVED
 from .session import Session
 
-__all__ = ["prove", "views"]
+__all__ = ["blocks", "prove", "views"]
 
 _BLOCKS = 8  # of the held-out rows, whose errors are compared
 
@@ -38,7 +38,7 @@ def prove(session: Session, finding: Candidate) -> None:
     else:
         without = session.without(finding)
         gap = _counts(session, without, finding)
-        finding.written = not further_off(*_blocks(without, session))
+        finding.written = not further_off(*blocks(without, session))
     finding.gap = gap
     if gap is not None and finding.verified is None:
         finding.verified = gap.after < gap.before
@@ -133,7 +133,7 @@ def views(session: Session) -> dict[str, Gap]:
     session = session.without(*(f for f in session.findings if not f.written))
     out = {}
     sample = noise_level(session.recording.electrodes[session.fit])
-    each = [_errors(s) for s in (bare, session)]
+    each = [_errors(s, session.loaded) for s in (bare, session)]
     if session.loaded:
         out["each electrode from the others"] = _view(
             "what each electrode reads beside the others", each, sample / np.sqrt(session.model().width)
@@ -173,9 +173,9 @@ def _by_channel(errors):
     return np.where(known.any(0), np.sqrt(square), np.nan)
 
 
-def _blocks(*sessions):
+def blocks(*sessions: Session) -> list[np.ndarray]:
     """Mean squares (blocks, 1) of the errors of held-out rows in each session, of what is known in all."""
-    errors = [_errors(s) for s in sessions]
+    errors = [_errors(s, sessions[-1].loaded) for s in sessions]
     known = np.logical_and.reduce([np.isfinite(e) for e in errors])
     return [
         np.array([[part.mean()] for part in np.array_split(np.where(known, e**2, 0), _BLOCKS)])
@@ -183,10 +183,10 @@ def _blocks(*sessions):
     ]
 
 
-def _errors(s):
+def _errors(s, loaded):
     """(n, nelectrode) errors [counts] of the held-out part, nan where nothing was measured: of bins, what
     each electrode reads beside the others; unloaded, of rows, about the level of the rows fitted."""
-    if s.loaded:
+    if loaded:
         m, aside = _aside(s)
         out = np.full((aside.sum(), s.counts.shape[1]), np.nan)
         out[:, m.used] = m.alone()[aside] * m.slope
