@@ -283,6 +283,26 @@ class DataView(_View):
         if self.is_dual:
             self.project_constraints()
 
+    def trees_of_rows(self) -> np.ndarray:
+        """(nefc, ntree) whether a constraint row acts on a kinematic tree."""
+        rows = self.rows()
+        if self.model.is_sparse:
+            number, column = np.repeat(np.arange(len(rows.efc_D)), rows.efc_J_rownnz), rows.efc_J_colind
+        else:
+            number, column = rows.efc_J.reshape(-1, self.model.nv).nonzero()
+        out = np.zeros((len(rows.efc_D), self.model.ntree), bool)
+        out[number, self.model.dof_treeid[column]] = True
+        return out
+
+    def linked_trees(self, trees: np.ndarray) -> np.ndarray:
+        """(ntree,) `trees` (ntree,) and the kinematic trees that rows with a weight link to them."""
+        links = self.trees_of_rows()[self.rows().efc_D > 2.0 * MINVAL]
+        while True:
+            more = trees | links[links[:, trees].any(axis=1)].any(axis=0)
+            if (more == trees).all():
+                return trees
+            trees = more
+
     def reference_constraints(self) -> None:
         """Computes the rows' reference accelerations from their present values."""
         LIBRARY.mj_referenceConstraint(self.model.address, self.address)

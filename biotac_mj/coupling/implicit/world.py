@@ -224,6 +224,8 @@ class World:
             self._hold(skins, outside, self._found)
             self._group.find_frequencies()
             self._acting, self._now, self._began_with = skins, self.data.qpos.copy(), self.data.qvel.copy()
+            if skins[0].instance.by_stages:
+                self._held_trees = self._touched_trees(skins)
         else:
             rounds = 1
             self._group.evaluate(np.zeros(self.model.nv))
@@ -235,10 +237,17 @@ class World:
         for skin in skins:
             skin.conclude(rounds)
 
+    def _touched_trees(self, skins):
+        """(ntree,) kinematic trees that skins touch, and those that constraints link to them."""
+        tree, trees = self.model.dof_treeid, np.zeros(self.model.ntree, bool)
+        for skin in skins:
+            trees[tree[skin.jacobian[skin.touching].any(axis=(0, 1))]] = True
+        return self.data.linked_trees(trees)
+
     def _go_on(self):
-        """Lets the forces of the skins and of MuJoCo's constraints that the first of Runge-Kutta's stages
-        found act in this one: both were found for the whole step, and do not hold where a stage has the
-        bodies. All other forces are those of the stage."""
+        """Lets the forces of the skins, and of MuJoCo's constraints on trees that they touch, that the first
+        of Runge-Kutta's stages found act in this one: both were found for the whole step, and do not hold
+        where a stage has the bodies. All other forces are those of the stage."""
         data = self.data
         self._take_rows()
         for t in self.coupled:
@@ -246,10 +255,12 @@ class World:
         self._now = data.qpos.copy()
         if self._acting:
             if self._stage == 2:
-                self._held = data.qfrc_constraint.copy()
+                held = self._held_trees[self.model.dof_treeid]
+                self._held = np.where(held, data.qfrc_constraint, 0.0)
             data.qfrc_passive += self._pushes + self._held
             self._weights = data.rows().efc_D.copy()
-            data.weigh_constraints(MINVAL)
+            held = data.trees_of_rows()[:, self._held_trees].any(axis=1)
+            data.weigh_constraints(np.where(held, MINVAL, self._weights))
 
     def _leave_constraint_forces(self):
         """Leaves in mjData the constraint forces of the last of Runge-Kutta's stages, as MuJoCo does."""
