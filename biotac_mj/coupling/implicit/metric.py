@@ -51,8 +51,8 @@ class Metric:
         if len(needed) > len(slots):
             raise ValueError(
                 f"{len(needed)} bodies can touch the BioTac {model.name('body', self.core)!r} but it has "
-                f"room for {len(slots)}: give slots={len(needed)} to attach or tasks.BioTac, attach it after "
-                "adding the objects, or name the geoms that may touch with geoms=[...]"
+                f"room for {len(slots)}: give slots={len(needed)} to attach or tasks.BioTac, attach it to a "
+                "spec that has the objects, or name the geoms that may touch with geoms=[...]"
             )
         self.root = roots
         self._layout, self._filled, self._held = None, False, None
