@@ -103,6 +103,13 @@ def test_pac_has_the_frame_of_an_sp(tmp_path, given):
     np.testing.assert_array_equal(load_one(tmp_path / "log.h5")[0].pac, one.pac)
 
 
+def test_more_pac_than_a_frame_has_is_said(tmp_path):
+    header = [*(f"e{k + 1}" for k in range(19)), *(f"pac{k + 1}" for k in range(31))]
+    rows = np.c_[COUNTS[:, :19], RNG.integers(2000, 2100, (200, 31))]
+    one, _ = load_one(write(tmp_path / "log.csv", header, rows))
+    assert any("PAC has 31 samples of a frame, the last 22 are kept" in note for note in one.notes)
+
+
 def test_the_spectrum_of_pac_counts_no_sample_twice():
     """Rows 10 ms apart, frames of 14 ms: a tone of 300 Hz is one line."""
     time = 0.01 * np.arange(1, 201)

@@ -428,8 +428,11 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
 def _frame_of_pac(source, value, npac):
     """((n, npac), notes) of PAC (n, k): drivers keep some samples of a frame; the last is the latest."""
     given = value.shape[1]
-    if given >= npac:
-        return value[:, -npac:], []
+    if given > npac:
+        kept = f"the last {npac} are kept: another sensor has more"
+        return value[:, -npac:], [f"{source}: PAC has {given} samples of a frame, {kept}"]
+    if given == npac:
+        return value, []
     missing = np.full((len(value), npac - given), np.nan)
     return np.hstack([missing, value]), [f"{source}: PAC has {given} of {npac} samples of a frame"]
 
