@@ -27,7 +27,7 @@ __all__ = [
 
 OWN = 1 << 30  # bit of contype and conaffinity that BioTacs alone have
 SOLID = 1 | OWN  # contype and conaffinity of core, nail and clamp: MuJoCo's default, and other BioTacs'
-TO_COME = 64  # bodies that a BioTac makes room for beyond those it sees: a place costs 60 kB and no time
+TO_COME = 64  # bodies that a BioTac makes room for beyond those it sees: a place costs 60 kB, 0.2 us a step
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
