@@ -35,7 +35,8 @@ from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.geometry import load_skin
-from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 from biotac_mj.sensor.channels import (
     NPAC,
     PAC_COLOUR,

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 from biotac_mj.sensor.presets import Sensor
 
 REST = channels.impedance_from_counts(channels.REST_COUNTS["1"])

@@ -16,7 +16,7 @@ from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.fem import FemStepper
-from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC
+from biotac_mj.sensor.acquisition_kernels import SAMPLED, SAMPLED_PDC
 from biotac_mj.sensor.heat import BODIES, MADE, Heat
 from biotac_mj.sensor.materials import material_of
 from biotac_mj.sensor.presets import SENSORS

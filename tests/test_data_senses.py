@@ -13,7 +13,8 @@ from biotac_mj.data.generation.generate import GenerateOptions, generate
 from biotac_mj.data.generation.readings import in_order
 from biotac_mj.data.lerobot import export_lerobot
 from biotac_mj.press import PressOptions, press
-from biotac_mj.sensor.acquisition import SLOT_RATE, Acquisition
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE
 from biotac_mj.sensor.channels import CHANNELS, NELECTRODE
 from biotac_mj.sensor.presets import SENSORS
 

@@ -31,7 +31,8 @@ from biotac_mj.recordings import Recording, load_one, write
 from biotac_mj.recordings.formats.bags import write_bag
 from biotac_mj.recordings.simulated import of_simulation
 from biotac_mj.resimulation.resimulate import ResimulateOptions, resimulate
-from biotac_mj.sensor.acquisition import SLOT_RATE, Acquisition
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE
 from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
 from biotac_mj.sensor.presets import sensors_of
 

@@ -34,7 +34,8 @@ from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains,
 from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
-from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC, BatchAcquisition  # noqa: E402
+from biotac_mj.sensor.acquisition import BatchAcquisition  # noqa: E402
+from biotac_mj.sensor.acquisition_kernels import SAMPLED, SAMPLED_PDC  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
 from biotac_mj.sensor.own_design import PadShape, new_design  # noqa: E402
 

@@ -10,7 +10,8 @@ from grids import first
 import biotac_mj
 from biotac_mj.press import approach
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 
 RATE = SLOT_RATE / 2  # [Hz] of PAC
 REST = channels.impedance_from_counts(np.full(19, 3000.0))

@@ -6,7 +6,8 @@ import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.acquisition import NSTATE, SAMPLED, SAMPLED_PDC, Acquisition, BatchAcquisition
+from biotac_mj.sensor.acquisition import Acquisition, BatchAcquisition
+from biotac_mj.sensor.acquisition_kernels import NSTATE, SAMPLED, SAMPLED_PDC
 from biotac_mj.sensor.film import BatchFilm, FilmConduction
 from biotac_mj.sensor.film.systems import edges
 

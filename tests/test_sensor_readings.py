@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.acquisition import SLOT_RATE
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE
 from biotac_mj.sensor.film import FilmConduction, NoFilmError
 from biotac_mj.sensor.readings import PhysicsReadings
 

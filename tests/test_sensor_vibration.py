@@ -11,7 +11,7 @@ from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.geometry import load_skin
-from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 from biotac_mj.sensor.vibration import LOSS_FACTOR, Modes, Texture, Vibration, read_texture, sections
 
 MODE = Modes(np.array([2 * np.pi * 300.0]), np.array([5.0]))

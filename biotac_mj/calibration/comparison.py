@@ -3,7 +3,7 @@ reference."""
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -94,7 +94,9 @@ def plan_indentations(
     return plans
 
 
-def references(plans, progress=None, **options) -> list[Indentation]:
+def references(
+    plans: Sequence[Indentation], progress: Callable | None = None, **options: object
+) -> list[Indentation]:
     """Reference solutions; see `stand_in`."""
     answers = []
     for plan in plans:

@@ -49,7 +49,7 @@ def calibration_table(result: Calibration) -> str:
     return "\n".join(lines)
 
 
-def plain(value):
+def plain(value: object) -> object:
     """The value as JSON types."""
     if dataclasses.is_dataclass(value):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}

@@ -6,8 +6,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import node_normals
 from .schema import nodes_of
 
-__all__ = ["contact_labels"]
-
 _TOUCH = 1e-6  # [N]: less is no contact
 
 

@@ -13,8 +13,6 @@ from .schema import Interaction
 from .splits import assign
 from .store import shard_path, write_shard
 
-__all__ = ["Measured", "import_recordings", "interactions", "measured"]
-
 _GAP = 0.5  # [s] without a sample ends an interaction
 
 

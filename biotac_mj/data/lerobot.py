@@ -15,8 +15,6 @@ from ..files import refuse_existing, replacing
 from ..geometry.design import SINGLES
 from .schema import SPLITS
 
-__all__ = ["VERSION", "export_lerobot", "interactions_to_export"]
-
 VERSION = "v3.0"
 _FILE_MB = 100  # of one data file, lerobot's default
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")

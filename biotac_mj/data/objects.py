@@ -15,8 +15,6 @@ from ..press.indenter import Indenter, make_indenter
 from ..skin.contact.meshes import DistanceGrid, bake_distance_grid
 from ..triangles import trimesh
 
-__all__ = ["OBJECTS", "grid_of", "make_object"]
-
 _EDGE = 0.5e-3  # [m] rounding of pegs and of the table's edges
 _LENGTH = 12e-3  # [m] of a peg
 _TABLE = 20e-3  # [m] half width of the block for the table: larger than the finger on all sides

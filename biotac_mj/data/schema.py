@@ -8,18 +8,6 @@ import numpy as np
 from ..geometry.design import BIOTAC, Design
 from ..geometry.skin_geometry import SkinGeometry
 
-__all__ = [
-    "COLUMNS",
-    "DISPLACEMENT_SCALE",
-    "KINDS",
-    "MAY_LACK",
-    "SCHEMA",
-    "SPLITS",
-    "Interaction",
-    "channel_sizes",
-    "nodes_of",
-]
-
 SCHEMA = "biotac_mj.data/1"
 KINDS = ("press", "slide", "twist", "tap", "recorded", "resimulated")
 SPLITS = ("train", "validation", "test")

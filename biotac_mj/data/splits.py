@@ -8,8 +8,6 @@ import numpy as np
 
 from .schema import SPLITS
 
-__all__ = ["FRACTIONS", "Split", "assign", "least_count", "split_by_interaction", "split_by_object"]
-
 FRACTIONS = (0.72, 0.18, 0.10)  # train, validation, test: Narang et al., ICRA 2021
 
 

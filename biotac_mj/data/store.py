@@ -27,8 +27,6 @@ from .schema import (
     nodes_of,
 )
 
-__all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
-
 _GEOMETRY = tuple(name for name in STORED if name != "name")
 _TABLE = (
     "id",

@@ -20,8 +20,6 @@ from ..sensor.channels import CHANNELS, NELECTRODE, NPAC
 from .lerobot import interactions_to_export
 from .objects import make_object
 
-__all__ = ["STATE", "export_mujoco"]
-
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _FOLDER = pathlib.Path(__file__).parents[1]
 _MESHES = "core", "nail", "clamp"

@@ -3,8 +3,6 @@
 import argparse
 import dataclasses
 
-__all__ = ["export_verb", "generate_verb", "import_verb"]
-
 
 def generate_verb(args: argparse.Namespace) -> None:
     """`biotac data generate`; raises ValueError or FileNotFoundError for invalid input."""

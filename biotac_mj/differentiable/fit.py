@@ -17,8 +17,6 @@ from .record import Record, follow
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, push_forward
 
-__all__ = ["Forces", "calibrate", "forces_of"]
-
 _PRECISION = 1e-4  # of derivatives, which only set the direction
 
 

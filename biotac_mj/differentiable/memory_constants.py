@@ -4,8 +4,6 @@ import numpy as np
 
 from ..skin import Material, SkinData
 
-__all__ = ["constants_of", "relaxed", "split_constants", "write_constants"]
-
 
 def constants_of(material: Material) -> np.ndarray:
     """(c,) concatenated: fraction and time [s] of each Prony term, three of Mullins, fraction and strain of

@@ -21,8 +21,6 @@ from .skin import NUMBERS, Skin
 from .sweep import Inputs, Outputs, pull_back, push_forward
 from .tensors import real_tensor, skew
 
-__all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
-
 # parameters of `press`; default: the skin's own
 PARAMETERS = ("youngs_modulus", "poissons_ratio", "fill_volume", "bulk_modulus", "contact_stiffness")
 

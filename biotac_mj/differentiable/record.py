@@ -16,8 +16,6 @@ from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, SkinWorlds
 from .touching import Anchors, at_sharp_edges, find_touching, rows, touching_samples
 
-__all__ = ["Changes", "Record", "Trajectory", "advance", "follow", "hold_pressure", "restore"]
-
 _NOTHING = 1e-15  # of the largest energy density of the rubber
 _WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds` in a step
 

@@ -21,8 +21,6 @@ from ..skin.types import DOUBLE, real, vec3
 from .linear.factors import Factors
 from .memory_constants import constants_of
 
-__all__ = ["NUMBERS", "TOLERANCE", "Skin", "SkinWorlds", "refuse_beyond"]
-
 # tolerance of a step: the gradient is that of an equilibrium, so the residual is its error
 TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
 FINEST = 1e-9  # least precision of linear solves, below which a step's own rounding matters

@@ -13,8 +13,6 @@ from .linear.step import LinearStep
 from .record import Record, Trajectory
 from .skin import NUMBERS, SkinWorlds
 
-__all__ = ["Inputs", "Outputs", "no_memory", "pull_back", "pull_pressure", "push_forward"]
-
 
 @dataclasses.dataclass
 class Outputs:

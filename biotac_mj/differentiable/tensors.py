@@ -8,8 +8,6 @@ import torch
 
 from ..short_repr import short_repr
 
-__all__ = ["TORCH", "add_rows", "real_tensor", "skew"]
-
 # numpy names in `sensor.formulas`
 TORCH = types.SimpleNamespace(
     float64=float, pi=math.pi, exp=torch.exp, log=torch.log, where=torch.where, pow=torch.pow

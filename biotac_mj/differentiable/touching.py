@@ -14,8 +14,6 @@ from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
 
-__all__ = ["Anchors", "Touching", "at_sharp_edges", "find_touching", "rows", "touching_samples"]
-
 _NEARER = 0.25  # of a sample's spacing, distance to another side of a geom: finds 90 degrees, no tessellation
 
 

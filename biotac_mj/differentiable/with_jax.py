@@ -8,8 +8,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-__all__ = ["for_jax"]
-
 _KEPT = 4  # number of last calls whose graphs are kept for a backward pass
 
 

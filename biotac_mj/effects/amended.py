@@ -21,8 +21,6 @@ from .in_skin import memory_of, moduli
 from .sensor_file import SensorFile, read_sensor_file
 from .sensors import with_effects
 
-__all__ = ["Effects", "Model", "amend", "amend_settings", "take_effects"]
-
 Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as in `attach`
 
 _AIR = 101325.0  # [Pa]

@@ -35,8 +35,6 @@ from .sensing import (
 )
 from .setup import DepthZero, Misalignment, Mount, Radius, Rocking, RockingTorque
 
-__all__ = ["CATALOGUE", "by_id", "entries", "name_of"]
-
 _SENSOR = (
     Relaxation(),
     PowerCreep(),

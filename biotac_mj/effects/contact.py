@@ -9,13 +9,6 @@ import numpy as np
 from .effect import Effect, Param, Run, Whole
 from .in_skin import Inside
 
-__all__ = [
-    "TACKY",
-    "Friction",
-    "FrictionLoad",
-    "Adhesion",
-]
-
 _PARTING = 3.0  # ratio of the works of separation and adhesion, as in `Adhesion`
 # under a 7 mm sphere on the coarse skin the nodes' pressure [Pa] is the second times force^the first, so that
 # force^-n is pressure^(-n / the first), and at 1 N mu is the material's (measured by

@@ -18,8 +18,6 @@ if typing.TYPE_CHECKING:
     from ..sensor.presets import Sensor
     from .in_skin import Inside
 
-__all__ = ["STAGES", "Effect", "Param", "Run", "Whole", "shifted", "memory", "stop"]
-
 # In the order in which they act. B and S change the object's position or size, so the skin is solved again.
 STAGES = {
     "S": "set-up",

@@ -9,8 +9,6 @@ from ..sensor.channels import FULL_SCALE
 from ..sensor.presets import Sensor
 from .effect import Effect, Param, Run
 
-__all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
-
 SESSION = 100.0  # [s] after which a drift has the size of its parameter
 _WHOLE = 0.25  # largest deviation of an exchange's fraction from one
 

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike
 from ..sensor.film import FilmConduction
 from ..skin import SkinData, SkinModel
 
-__all__ = ["RoughFilm", "SeveralFilms", "SunkFilm", "drain", "remaining_liquid"]
-
 _MOST = 0.8  # largest lost fraction of the liquid, as in `sensing.FluidLoss`
 _DRAINED_PER_STEP = 0.02  # fraction of the liquid lost in one step of the skin
 _THINNEST = 0.3  # fraction of the film at rest that remains under a sunk skin

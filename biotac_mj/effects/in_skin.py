@@ -14,8 +14,6 @@ if typing.TYPE_CHECKING:
     from ..skin import Material
     from ..skin.model import SkinOptions
 
-__all__ = ["Inside", "friction_branch", "memory_of", "moduli", "stiffening"]
-
 
 # measured by benchmarks/discrepancy_in_skin_maps.py on presses of the coarse skin (docs/lab/memory.md):
 # apparent c2 of the force over the stiffening c2 / c1 of the rubber,

@@ -15,8 +15,6 @@ from .effect import Effect, Param, Run
 from .electrodes import Noise
 from .sensing import FluidLoss, Saturation, WarmUp
 
-__all__ = ["LOGGED", "SHARED", "Logged", "SharedLevel"]
-
 _COUNTS = Param("counts", -FULL_SCALE, FULL_SCALE, "12-bit range")
 _TIME = Param("s", 0, 1e6, "the record")
 _LOG = frozenset({"log"})

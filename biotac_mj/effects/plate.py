@@ -16,8 +16,6 @@ from ..skin import Material, SkinOptions
 from ..skin.rubber.material import CALIBRATED_FILL, PRESETS
 from .effect import Effect, Param, Run
 
-__all__ = ["PLATE", "RADIUS", "PlateEffect", "bonded", "moved"]
-
 RADIUS = PRESETS["calibrated"].electrode_radius  # [m] of the base model's electrodes
 _FADE = 2e-3  # [m] distance from fixed nodes over which a shift of the wall fades
 _TIP = -14e-3, -10e-3  # [m] range over which a shift of the tip's wall fades

@@ -14,20 +14,6 @@ from ..sensor.presets import Sensor
 from .effect import Effect, Param, Run, Whole, memory, stop
 from .in_skin import Inside, friction_branch, stiffening
 
-__all__ = [
-    "Relaxation",
-    "PowerCreep",
-    "Hysteresis",
-    "LoadHysteresis",
-    "Mullins",
-    "Damage",
-    "Stiffening",
-    "Inhomogeneity",
-    "Spots",
-    "modulus_of",
-    "Modulus",
-]
-
 _SPOT = 4.0  # [mm] decay length of a spot's stiffness
 # Fraction of the film's change that is as delayed as the load: slowly yielding rubber lets liquid pass as
 # slowly. Inside the finite elements the film follows from the skin.

@@ -12,24 +12,6 @@ from ..sensor.presets import MOST_LATENCY, Sensor
 from .effect import Effect, Param, Run, Whole, memory, shifted
 from .in_skin import Inside
 
-__all__ = [
-    "FluidLoss",
-    "Thermal",
-    "WarmUp",
-    "Asperities",
-    "Bubble",
-    "Gain",
-    "DeadTaxels",
-    "CrossTalk",
-    "Saturation",
-    "LowPass",
-    "Latency",
-    "Drift",
-    "PressureGain",
-    "ForceZero",
-]
-
-
 _LOG_MODULUS = 0.1  # scatter between batches of rubber
 _FILM = 0.5e-3  # [m] mean thickness of liquid between skin and core
 

@@ -15,8 +15,6 @@ from ..short_repr import short_repr
 from .catalogue import by_id
 from .effect import STAGES
 
-__all__ = ["SCHEMA", "SensorFile", "read_sensor_file", "write_sensor_file"]
-
 SCHEMA = "biotac_mj.sensor/1"
 _KEYS = {
     "schema": str,

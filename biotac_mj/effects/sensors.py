@@ -15,8 +15,6 @@ from .effect import Effect
 from .rubber import Relaxation
 from .sensing import CrossTalk, DeadTaxels, Drift, FluidLoss, Gain, PressureGain, WarmUp
 
-__all__ = ["RANDOM", "draw_effects", "read_randomise", "take_sensor", "with_effects"]
-
 RANDOM = {
     effect.id: effect
     for effect in (

@@ -6,15 +6,6 @@ import numpy as np
 
 from .effect import Effect, Param, Run
 
-__all__ = [
-    "Radius",
-    "Misalignment",
-    "DepthZero",
-    "Mount",
-    "Rocking",
-    "RockingTorque",
-]
-
 
 class Radius(Effect):
     """One parameter for each spherical tool among the trajectories, else one for all."""

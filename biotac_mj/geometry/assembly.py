@@ -11,8 +11,6 @@ from biotac_mj.geometry.solid import check_size
 from biotac_mj.geometry.surface import face_areas
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_cells, enclosed_volume
 
-__all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
-
 EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # an absent rigid body
 FIXED_WITHIN = 1e-5  # nodes within this distance of a rigid body are fixed [m] (Narang et al., ICRA 2021)
 

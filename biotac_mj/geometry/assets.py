@@ -3,8 +3,6 @@
 import importlib.resources
 import pathlib
 
-__all__ = ["asset_path"]
-
 
 def asset_path(name: str) -> pathlib.Path:
     """Path of a shipped asset, for example "skins/default.npz", "core.obj" or "indenters/ring_7mm.obj".

@@ -7,8 +7,6 @@ from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
 
-__all__ = ["skin_numbers"]
-
 
 def skin_numbers(skin: SkinGeometry) -> dict:
     """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the

@@ -18,20 +18,6 @@ import warp as wp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-__all__ = [
-    "FACE",
-    "SLACK",
-    "Lists",
-    "TriangleLists",
-    "closest_on_face",
-    "closest_on_triangle",
-    "list_nearest",
-    "nearest_listed",
-    "pack_lists",
-    "pseudonormals",
-    "ray_distances",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 real, vec3 = wp.float64, wp.vec3d

@@ -19,8 +19,6 @@ from .closest import (
 
 quiet_warp()
 
-__all__ = ["Core", "CoreSurface", "NearestTriangles", "nearest_listed_on_core", "nearest_on_core"]
-
 wp.set_module_options({"enable_backward": False})
 
 _FARTHEST = 1.0e4  # [mm] largest distance of a query point from the core

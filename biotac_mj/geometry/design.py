@@ -13,18 +13,6 @@ from ..reading import read_json
 from ..short_repr import short_repr
 from .assets import asset_path
 
-__all__ = [
-    "BIOTAC",
-    "DESIGNS",
-    "MOST_DISCS",
-    "SINGLES",
-    "Design",
-    "check_nelectrode",
-    "design_of_channels",
-    "designs",
-    "read_design",
-]
-
 DESIGNS = ("biotac", "biotac_sp")  # shipped with the package
 MOST_DISCS = 32  # electrodes and excitation; more were never simulated
 MOST_EXCITATION = 4

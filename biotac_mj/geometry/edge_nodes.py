@@ -7,8 +7,6 @@ import numpy as np
 
 from biotac_mj.geometry.skin_geometry import PARTS, SkinGeometry
 
-__all__ = ["EDGES", "with_edge_nodes"]
-
 # of the nodes 4..9, in the order of CalculiX's C3D10
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 
@@ -73,7 +71,7 @@ def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> 
     )
 
 
-def shape_gradients(points) -> np.ndarray:
+def shape_gradients(points: np.ndarray) -> np.ndarray:
     """(npoint, 10, 3) derivatives of the ten shape functions by the barycentric coordinates 1..3 at
     barycentric points (npoint, 4)."""
     by_all = np.zeros((len(points), 10, 4))

@@ -4,8 +4,6 @@ import numpy as np
 
 from .design import BIOTAC, Design
 
-__all__ = ["electrode_positions"]
-
 
 def electrode_positions(design: Design = BIOTAC) -> np.ndarray:
     """(nelectrode, 3) [mm], in the design's published frame: that of Lin et al. 2013 for the BioTac."""

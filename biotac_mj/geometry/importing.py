@@ -13,8 +13,6 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, connected_cells, enclosed_volume
 from biotac_mj.reading import read_text, reading
 
-__all__ = ["import_mesh", "read_obj", "read_tet_mesh"]
-
 _MESHES = (".tet", ".msh", ".vtu")
 
 

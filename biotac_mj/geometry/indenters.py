@@ -8,8 +8,6 @@ import dataclasses
 
 import numpy as np
 
-__all__ = ["INDENTERS", "Indenter", "indenter"]
-
 _EDGE = 0.001  # rounding of cylinders, cube and ring [m]; the meshes have it within their tessellation
 _RING = (0.0035, 0.007)  # inner and outer radius [m]
 _RING_HEIGHT = 0.007  # [m], down to where the paper's ring joins its mount

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 
 from .tet_mesh import TetMesh
 
-__all__ = ["block", "column_tetrahedra", "dome_core", "dome_shell", "ellipsoid_cap", "on_ellipsoid", "plate"]
-
 
 def _disc(rings):
     """Points (n, 2) of the unit disc on `rings` rings, 6 k on ring k, and triangles (m, 3),

@@ -6,23 +6,6 @@ import typing
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = [
-    "UPRIGHT",
-    "Z_TO_Y",
-    "across",
-    "cross",
-    "displace",
-    "displacement",
-    "matrix",
-    "matrix_entries",
-    "quaternion",
-    "quaternion_from_y",
-    "rigid_motions",
-    "rotation",
-    "skew",
-    "unit",
-]
-
 UPRIGHT = np.array([1.0, 0, 0, 0])
 Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])  # turns the z axis of a geom to the pressing direction
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])  # positions of a cross product's factors

@@ -4,15 +4,6 @@ A small motion has the translation of the point at the origin first, then the ro
 
 import warp as wp
 
-__all__ = [
-    "displace_at_once",
-    "is_finite",
-    "motion",
-    "motion_at_once",
-    "rotation",
-    "size_of",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 real = wp.float64

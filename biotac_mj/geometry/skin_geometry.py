@@ -12,8 +12,6 @@ from .design import BIOTAC, Design, read_design
 from .solid import check_place, check_size, no_solid
 from .tet_mesh import TetMesh, check_closed, enclosed_volume, indices, triangle_numbers
 
-__all__ = ["PARTS", "STORED", "SkinGeometry"]
-
 # the eight four-node tetrahedra of a ten-node one: four at the corners, four around the octahedron's diagonal
 # 4-9
 PARTS = np.array(

@@ -18,17 +18,6 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 from ..cache import cache_folder, digest
 from ..short_repr import short_repr
 
-__all__ = [
-    "SKINS",
-    "design_of",
-    "load_skin",
-    "mesh_of_same_design",
-    "place_of",
-    "shipped_skin",
-    "skin_of_design",
-    "skin_reference",
-]
-
 SKINS = ("coarse", "default", "fine")  # of every shipped design
 _SHIPPED = (*SKINS, *(f"{design}/{name}" for design in DESIGNS[1:] for name in SKINS))
 

@@ -6,20 +6,6 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = [
-    "bounds_solid",
-    "check_place",
-    "check_size",
-    "close_rim",
-    "convex_hull",
-    "face_outwards",
-    "fills_hull",
-    "ground",
-    "no_solid",
-    "spread_points",
-    "winding",
-]
-
 
 def check_size(size: float, what: str = "skin", least: float = 5e-3, most: float = 0.1) -> None:
     """Raises ValueError unless the largest dimension [m] of a body is from `least` to `most`, by default that

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["face_areas", "node_areas", "node_normals"]
-
 
 def face_areas(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
     """(nface, 3) vector areas [m^2]: outward normals of faces (nface, 3) as long as the faces are large; vert

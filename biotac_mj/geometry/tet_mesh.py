@@ -5,8 +5,6 @@ import functools
 
 import numpy as np
 
-__all__ = ["TetMesh", "indices"]
-
 # Faces of a tetrahedron with positive volume, ordered so that their normals point out of it; face i is
 # opposite to vertex i.
 _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])

@@ -22,8 +22,6 @@ if typing.TYPE_CHECKING:
 
     from ..geometry.skin_geometry import SkinGeometry
 
-__all__ = ["Estimate", "contact_patch", "draw_skin", "estimate"]
-
 _UNTOUCHED = 0.05  # [N]
 # thresholds of a drift note: number of rows, correlation with TDC, and counts above noise and a light touch
 _ROWS, _CORRELATED, _FEW_COUNTS = 20, 0.9, 20

@@ -19,8 +19,6 @@ if typing.TYPE_CHECKING:
     from .training.arrays import Arrays
     from .training.config import LearningConfig
 
-__all__ = ["ForwardModel", "PointsModel"]
-
 
 class _Served(nn.Module):
     """Base of models that read a deformed skin of `nvert` nodes in place of the film."""

@@ -5,15 +5,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t, wilcoxon
 
-__all__ = [
-    "check_changes",
-    "conformal_width",
-    "interaction_errors",
-    "is_better",
-    "paired_test",
-    "quartiles",
-]
-
 
 def interaction_errors(
     predicted: ArrayLike, truth: ArrayLike, owner: ArrayLike

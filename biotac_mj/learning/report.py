@@ -11,8 +11,6 @@ from ..reading import Array, check_arrays, read_json, read_npz
 from ..sensor.channels import electrode_noise
 from .protocol import conformal_width, interaction_errors, paired_test, quartiles
 
-__all__ = ["PAPER", "draw_errors", "evaluate_models", "predictions_of", "report_of", "table"]
-
 # Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
 PAPER = {
     "trajectory": {"latent_projection": 0.010, "pointnet": 0.012},

@@ -16,8 +16,6 @@ if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
     from .predictor import ForwardModel
 
-__all__ = ["LearnedBatchFilm", "NetworkFilm"]
-
 
 class NetworkFilm:
     """Electrodes from a network, in the place of `sensor.film.FilmConduction`.

@@ -11,8 +11,6 @@ from ..files import check_output_file
 from ..reading import read_json
 from ..recordings.verbs import add_load_arguments, add_which
 
-__all__ = ["add_verbs"]
-
 
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
     """Adds them to argparse's subparsers; verb(verbs, name, run, text) makes one."""

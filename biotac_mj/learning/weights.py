@@ -24,25 +24,6 @@ if typing.TYPE_CHECKING:
     from .training.inverse import InverseHead
     from .training.paper import LatentProjection, PointNet
 
-__all__ = [
-    "FORMAT",
-    "SHIPPED",
-    "amend",
-    "check_forward",
-    "describe",
-    "find_weights",
-    "is_inverse",
-    "load_forward",
-    "load_inverse",
-    "mesh_key",
-    "read_tensors",
-    "save_forward",
-    "save_inverse",
-    "save_points_model",
-    "shipped",
-    "write_tensors",
-]
-
 _DAMAGED = "it is damaged: train again, or copy it again"
 FORMAT = "biotac_mj.learning.weights/1"
 SHIPPED = ("forward", "inverse", "latent_projection")

@@ -5,7 +5,7 @@ import pathlib
 import numpy as np
 
 from ..files import check_output_file, picture_kind, save_figure
-from ..sensor.acquisition import SLOT_RATE
+from ..sensor.acquisition_kernels import SLOT_RATE
 from ..sensor.colors import change_map, line_color
 from .recording import Recording, check_recording
 

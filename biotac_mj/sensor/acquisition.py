@@ -23,38 +23,12 @@ from numpy.typing import ArrayLike
 
 from biotac_mj.sensor import acquisition_kernels as kernels
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.acquisition_kernels import (
-    NSTATE,
-    OWN,
-    PAC,
-    SAMPLED,
-    SAMPLED_PDC,
-    SAMPLED_TAC,
-    SAMPLED_TDC,
-    SLOT_RATE,
-    SLOTS_PER_FRAME,
-    place_of,
-    real,
-)
+from biotac_mj.sensor.acquisition_kernels import place_of, real
 from biotac_mj.sensor.presets import SENSORS, Sensor
 
 from ..geometry.design import BIOTAC, Design
 from ..launches import recorded
 from ..short_repr import short_repr
-
-__all__ = [
-    "Acquisition",
-    "BatchAcquisition",
-    "SAMPLED",
-    "SAMPLED_PDC",
-    "SAMPLED_TAC",
-    "SAMPLED_TDC",
-    "NSTATE",
-    "OWN",
-    "PAC",
-    "SLOTS_PER_FRAME",
-    "SLOT_RATE",
-]
 
 
 class Acquisition:

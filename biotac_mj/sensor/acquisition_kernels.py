@@ -16,12 +16,6 @@ from biotac_mj.sensor.presets import MOST_LATENCY, numbers_of
 
 quiet_warp()
 
-__all__ = [
-    "SAMPLED", "SAMPLED_PDC", "SAMPLED_TAC", "SAMPLED_TDC", "NSTATE", "OWN", "PAC", "Place",
-    "SLOTS_PER_FRAME", "SLOT_RATE", "draw_normal", "find_due", "place_of", "real", "reset_states",
-    "sample_slots", "slots_until",
-]  # fmt: skip
-
 wp.set_module_options({"enable_backward": False})
 
 SLOT_RATE = 4400.0  # [Hz]

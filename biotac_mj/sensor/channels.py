@@ -12,40 +12,6 @@ from numpy.typing import ArrayLike
 
 from ..geometry.design import BIOTAC
 
-__all__ = [
-    "CHANNELS",
-    "ELECTRODES",
-    "FULL_SCALE",
-    "NELECTRODE",
-    "NPAC",
-    "PAC_COLOUR",
-    "PAC_NOISE",
-    "PAC_REST",
-    "PDC_REST",
-    "REST_COUNTS",
-    "REST_TEMPERATURE",
-    "TAC_REST",
-    "counts_from_impedance",
-    "counts_from_log_impedance",
-    "counts_from_pac",
-    "counts_from_pressure",
-    "counts_from_temperature",
-    "electrode_noise",
-    "heating_exponent",
-    "heating_from_counts",
-    "impedance_from_counts",
-    "log_impedance",
-    "pac_from_counts",
-    "pressure_from_counts",
-    "saturated",
-    "temperature_exponent",
-    "temperature_from_counts",
-    "thermistor_counts",
-    "check_counts",
-    "check_force",
-    "check_temperature",
-]
-
 # The BioTac's; other designs have their own (`geometry.design`).
 NELECTRODE, NPAC = BIOTAC.nelectrode, BIOTAC.npac  # sensing electrodes; PAC's samples of a frame
 ELECTRODES, CHANNELS = BIOTAC.electrodes, BIOTAC.channels

@@ -7,8 +7,6 @@ import numpy as np
 if typing.TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
-__all__ = ["FULL_CHANGE", "change_map", "electrode_colors", "line_color"]
-
 FULL_CHANGE = 300.0  # change of an electrode at full colour [counts]
 _NEUTRAL, _LESS, _MORE = np.array([0.85, 0.85, 0.85]), np.array([0.8, 0.15, 0.1]), np.array([0.1, 0.3, 0.85])
 

@@ -11,8 +11,6 @@ from typing import TypeVar
 
 import warp as wp
 
-__all__ = ["Number", "for_kernels", "with_globals", "with_names"]
-
 Number = TypeVar("Number")  # float64 in a kernel, an array or a tensor; the same for all arguments
 
 

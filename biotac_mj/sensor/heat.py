@@ -28,21 +28,6 @@ import warp as wp
 
 from biotac_mj.sensor.materials import Material
 
-__all__ = [
-    "CORE",
-    "GIVEN",
-    "ABOVE",
-    "LIQUID",
-    "LOST",
-    "MADE",
-    "THERMISTOR",
-    "Heat",
-    "HeatParameters",
-    "begin_heat",
-    "half_space",
-    "state_size",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 NCELL = 8  # finite volumes through the skin

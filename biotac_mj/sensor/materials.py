@@ -14,18 +14,6 @@ from biotac_mj.sensor.channels import check_temperature
 
 from ..short_repr import short_repr
 
-__all__ = [
-    "MATERIALS",
-    "ROOM",
-    "SKIN",
-    "Material",
-    "check_choices",
-    "check_geoms",
-    "material_named",
-    "material_of",
-    "read_thermal",
-]
-
 ROOM, SKIN = 23.0, 33.0  # [C] of objects in a room, of a living hand
 # Limits of `read_thermal`: from below gases (air has 5.5 and 0.026) to above diamond (6e4 and 2300)
 _EFFUSIVITY, _CONDUCTIVITY_RANGE = (1.0, 1e5), (1e-3, 1e4)

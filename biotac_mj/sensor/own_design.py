@@ -23,8 +23,6 @@ from .channels import counts_from_impedance
 from .film import FilmConduction
 from .film.conduction import ELECTRODE_RADIUS
 
-__all__ = ["PadShape", "new_design", "pad_skin"]
-
 _BACKING = 1.0  # [mm] thickness of the plate that carries a pad
 _CELL = 1.2  # [mm] edge of the tetrahedra unless another is given
 _FLAT = 240  # nodes that may touch at once in the condensed tier, in up to 1024 worlds (docs/lab/limits.md)

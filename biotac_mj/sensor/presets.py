@@ -31,21 +31,6 @@ from biotac_mj.sensor.channels import (
 from ..geometry.design import BIOTAC, Design
 from ..short_repr import short_repr
 
-__all__ = [
-    "MEASURED",
-    "MOST_LATENCY",
-    "NAMES",
-    "PER_DEGREE",
-    "SENSORS",
-    "Sensor",
-    "draw_sensor",
-    "generator",
-    "numbers_of",
-    "read_sensor",
-    "sensor_names",
-    "sensors_of",
-]
-
 # [1/C] of ln Z: all electrodes change by -6.4 to -7.8 % per degree of the liquid in five sensors
 PER_DEGREE = 0.071
 MOST_LATENCY = 0.11  # [s] eleven frames

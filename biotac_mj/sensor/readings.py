@@ -15,8 +15,6 @@ from biotac_mj.sensor.materials import Material
 from biotac_mj.sensor.presets import Sensor, read_sensor
 from biotac_mj.sensor.vibration import Texture, Vibration
 
-__all__ = ["PhysicsReadings", "check_settings"]
-
 _SETTINGS = {
     "noise": bool,
     "sensor": str | dict,

@@ -4,8 +4,6 @@ import os
 
 from ..short_repr import short_repr
 
-__all__ = ["SIGNALS", "read_signal"]
-
 SIGNALS = ("physics", "latent_projection", "learned")
 _WEIGHTS = ".safetensors"
 

@@ -30,17 +30,6 @@ from biotac_mj.sensor.materials import material_named
 
 from ..short_repr import short_repr
 
-__all__ = [
-    "LOSS_FACTOR",
-    "ROUGHNESS",
-    "Modes",
-    "Texture",
-    "Vibration",
-    "read_texture",
-    "sections",
-    "state_size",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 real = wp.float64

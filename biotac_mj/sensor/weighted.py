@@ -11,8 +11,6 @@ from ..geometry.closest import ray_distances
 from ..geometry.design import BIOTAC
 from ..geometry.skin_geometry import SkinGeometry
 
-__all__ = ["WeightedElectrodes"]
-
 # [N/count] of the shipped BioTac, fitted to synthetic presses: benchmarks/weighted_electrodes.py
 _SCALE = (7.9e-4, 1.85e-3, 8.8e-4)
 

@@ -13,8 +13,6 @@ from ..short_repr import short_repr
 from .biotac import ESTIMATED, PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
 
-__all__ = ["AWAY", "TouchTask", "arena"]
-
 AWAY = (0.0, 0.0, -1.0)  # [m] position of unused mocap objects
 CONTROL_TIMESTEP = 0.01  # [s] one frame of the sensor
 _OBSERVE = {"tactile": TACTILE, "estimated": ESTIMATED, "privileged": TACTILE + PRIVILEGED, "none": ()}

@@ -21,8 +21,6 @@ from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from ..short_repr import short_repr
 
-__all__ = ["ESTIMATED", "PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
-
 TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # readings of the real sensor
 ESTIMATED = ("contact_estimate",)  # drivers' estimate from these by a formula
 PRIVILEGED = ("contact_force", "contact_patch", "skin")  # available in simulation only

@@ -23,8 +23,6 @@ from .biotac import BioTac
 from .scripted import SCRIPTED, make_controller
 from .touch import Estimator, fitted_on
 
-__all__ = ["main", "record", "record_explore"]
-
 _SEED = 100000
 _CODE = ("geometry", "skin", "sensor", "coupling", "tasks")  # folders whose code the recordings depend on
 _HOLD = 40  # duration of a random error in frames

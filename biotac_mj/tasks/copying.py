@@ -14,8 +14,6 @@ from dm_control.mujoco import wrapper
 from .. import plugin
 from ..sensor.presets import Sensor
 
-__all__ = ["Copyable", "give_state", "take_state"]
-
 _COUNTERS = ("_reset_next_step", "_mjcf_never_compiled", "_fixed_random_state", "_time_limit")
 _HOOKS = tuple(f"_{name}" for name in composer.HOOK_NAMES)
 _OF_OBSERVABLE = ("enabled", "update_interval", "buffer_size", "delay", "rate", "lag")

@@ -19,8 +19,6 @@ from ..view.offscreen import Offscreen, find_gl
 from . import copying, suite
 from .biotac import TACTILE
 
-__all__ = ["BioTacEnv", "IDS", "register"]
-
 IDS = {
     f"BioTac/{''.join(w.capitalize() for w in task.split('_'))}-v0": (domain, task)
     for domain, task in suite.tasks()

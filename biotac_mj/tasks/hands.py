@@ -21,8 +21,6 @@ from .mounts import TIP, Mount, read_mounts
 if typing.TYPE_CHECKING:
     from ..coupling.handle import Handle
 
-__all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms", "known_hand"]
-
 _MASKS = "contype", "conaffinity"
 _CORE_MASS = 4e-3  # of the BioTac [kg], subtracted from the link that carries it
 

@@ -16,8 +16,6 @@ from ..view.offscreen import SHOWN, Offscreen, find_gl, show_bodies, stage
 from .hands import attach_to_hand, find_link, fixed_geoms
 from .mounts import CLAMP, TIP, Mount, write_mounts
 
-__all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view", "stands_off"]
-
 _SIZES = 2e-3, 1.0  # [m] range of a fingertip link's length: others are in different units
 _OBLIQUE = np.cos(np.radians(20))  # to all axes of its frame, above which a link's own axis is used
 _SLENDER = 1.4  # least ratio of moments for an own axis: fingertips of known hands have 1.7 to 3

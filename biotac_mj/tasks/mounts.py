@@ -11,8 +11,6 @@ from ..geometry.rigid import quaternion, unit
 from ..reading import read_yaml, reading
 from ..short_repr import short_repr
 
-__all__ = ["CLAMP", "TIP", "Mount", "read_mounts", "write_mounts"]
-
 TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
 CLAMP = 7.65e-3  # from the origin to the back end of `assets/clamp.obj` [m]
 _REMEDY = "give a file that `biotac hand mount` wrote"

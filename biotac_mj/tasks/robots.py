@@ -5,8 +5,6 @@ from dm_control import composer, mjcf
 
 from ..geometry.rigid import quaternion
 
-__all__ = ["Gantry", "Gripper"]
-
 _MASS = 0.15  # of a carriage [kg]
 _STIFFNESS = 3000.0  # of a servo [N/m]: 1 N moves it by 0.3 mm
 _YAW_INERTIA, _YAW_STIFFNESS = 1e-4, 20.0  # [kg m^2], [N m/rad]

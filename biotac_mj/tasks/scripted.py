@@ -16,8 +16,6 @@ from .touch import Touch, check_fitted_on, load_calibration, load_estimator
 if typing.TYPE_CHECKING:
     from dm_control import composer
 
-__all__ = ["SCRIPTED", "make_controller"]
-
 _FRICTION = Config().friction  # of the skin, known to the gripper
 
 

@@ -15,8 +15,6 @@ if typing.TYPE_CHECKING:
 
     from .base import TouchTask
 
-__all__ = ["DOMAINS", "environment", "load", "tasks"]
-
 DOMAINS = ("finger", "gripper")
 
 

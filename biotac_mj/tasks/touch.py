@@ -17,16 +17,6 @@ from ..sensor.channels import FULL_SCALE
 if typing.TYPE_CHECKING:
     from ..coupling.config import Config
 
-__all__ = [
-    "CalibrationWarning",
-    "Estimator",
-    "Touch",
-    "check_fitted_on",
-    "fitted_on",
-    "load_calibration",
-    "load_estimator",
-]
-
 _TARE = 5  # frames averaged before any contact
 _PDC_SCALE, _LOG_SCALE = 100.0, 0.1  # scale features to order one
 _SMOOTHING = 0.5  # weight of the newest frame

@@ -42,13 +42,13 @@ class Scene:
             frame.position, frame.wxyz = data.xpos[body].copy(), data.xquat[body].copy()
 
 
-def geom_color(model, g):
+def geom_color(model: mujoco.MjModel, g: int) -> np.ndarray:
     """RGBA (4,) of a geom, from its material if it has one."""
     material = int(model.geom_matid[g])
     return model.mat_rgba[material] if material >= 0 else model.geom_rgba[g]
 
 
-def geom_mesh(model, g):
+def geom_mesh(model: mujoco.MjModel, g: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices (n, 3) [m] and triangles (m, 3) of a geom in its frame; None without a finite surface."""
     from ..triangles import trimesh
 

@@ -12,8 +12,6 @@ from ...skin.geoms import GeomSet
 from ...skin.types import real, vec3
 from ..objects import grid_of, make_object
 
-__all__ = ["Placed", "first_touch", "surface_samples"]
-
 wp.set_module_options({"enable_backward": False})
 
 _FAR = 2e-3  # [m] range of a mesh's distance grid

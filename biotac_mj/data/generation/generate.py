@@ -26,8 +26,6 @@ from ..store import TactileSet, shard_path
 from .plan import KINDS
 from .vary import check_vary
 
-__all__ = ["Batch", "GenerateOptions", "GenerateReport", "batches", "generate", "made_already"]
-
 _MOST_STEPS = 2000  # a batch is in memory with all its nodes
 
 

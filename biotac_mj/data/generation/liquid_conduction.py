@@ -22,8 +22,6 @@ from ...geometry.surface import face_areas, node_normals
 from ...geometry.tet_mesh import connected_cells
 from ...sensor.film import excitation_places
 
-__all__ = ["LiquidConduction"]
-
 _RINGS = (
     (0.25e-3, 6),
     (0.5e-3, 12),

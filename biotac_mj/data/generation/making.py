@@ -21,8 +21,6 @@ from ..store import write_shard
 from .plan import plan_motions
 from .vary import draw_sense, draw_worlds, refuse_impossible
 
-__all__ = ["MakeShards", "Maker", "make_shards"]
-
 _STAGES = ("start", "plan", "skin", "measured skin", "waiting for readings")
 _LOOKAHEAD = 4  # most batches in memory that wait for their readings
 

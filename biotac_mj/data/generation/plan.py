@@ -13,8 +13,6 @@ from ...press.approach import normal_at
 from ..objects import OBJECTS, make_object
 from .clearance import Placed, first_touch, surface_samples
 
-__all__ = ["Motion", "plan_motions", "sensing_faces"]
-
 KINDS = ("press", "slide", "twist", "tap")
 _PROBABILITY = (0.4, 0.3, 0.15, 0.15)
 _TILT = np.radians(25.0)  # largest angle between the press and the skin's inward normal

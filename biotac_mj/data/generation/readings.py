@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from ...geometry.design import BIOTAC, SINGLES, Design
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.acquisition import SLOT_RATE, Acquisition
+from ...sensor.acquisition import Acquisition
+from ...sensor.acquisition_kernels import SLOT_RATE
 from ...sensor.film import FilmConduction
 from ...sensor.materials import Material
 from ...sensor.presets import SENSORS, Sensor, read_sensor
@@ -22,20 +23,6 @@ from ...sensor.signals import read_signal
 from ...sensor.vibration import Modes, Texture, Vibration
 from ...shards import end_with_parent
 from ..schema import DISPLACEMENT_SCALE
-
-__all__ = [
-    "THREADS",
-    "Readings",
-    "Sense",
-    "Touch",
-    "in_order",
-    "prepare_worker",
-    "read_in_worker",
-    "read_motion",
-    "readings_pool",
-    "sample",
-]
-
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

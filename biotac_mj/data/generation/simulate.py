@@ -19,8 +19,6 @@ from ..schema import DISPLACEMENT_SCALE, nodes_of
 from .clearance import Placed
 from .readings import Readings, Touch
 
-__all__ = ["Fields", "Scene", "clock", "describe", "simulate"]
-
 wp.set_module_options({"enable_backward": False})
 
 _LARGEST_STEP = 1.0e-4  # [m] longest displacement in a step of the skin: twice that converges worse at edges

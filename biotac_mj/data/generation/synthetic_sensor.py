@@ -26,8 +26,6 @@ from ..schema import DISPLACEMENT_SCALE
 from .liquid_conduction import LiquidConduction
 from .readings import sample
 
-__all__ = ["SensorVariation", "SyntheticSensor", "start_worker", "measure_in_worker", "relax"]
-
 _CLEARING = 12.0  # [s] between the starts of successive contacts of a session: chosen
 _TARE = 50  # frames of 10 ms before the contact, whose mean is row 0, like a sensor's tare
 _WAVES = 64  # number of waves in a random field

@@ -13,8 +13,6 @@ from ...skin.per_world import NAMES
 from ...skin.rubber.material import Material
 from .readings import Sense
 
-__all__ = ["check_vary", "draw_sense", "draw_worlds", "refuse_impossible"]
-
 _NUMBERS = ("youngs_modulus", "poissons_ratio", "friction", "stiffening")
 _FACTORS = ("prony", "hysteresis")
 _WORLDS = tuple(name for name in NAMES if name != "modulus")

@@ -13,8 +13,6 @@ import numpy as np
 from ...geometry.skin_geometry import SkinGeometry
 from .presses import Presses
 
-__all__ = ["AWAY", "FORCE", "PLACE", "TILT", "Belief", "Posterior", "Touch", "believe", "learn", "likelihood"]
-
 # Standard deviations over sensors, and of the residual of a press: maximum likelihood for 80 presses of 4
 # synthetic sensors (docs/lab/differentiable.md, A contact from electrodes), unless another source is given
 _GAIN = 0.42  # of each electrode

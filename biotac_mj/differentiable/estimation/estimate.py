@@ -23,8 +23,6 @@ from .belief import FORCE, PLACE, Belief, Posterior, Touch, believe, learn
 from .fitting import fit, noise_of
 from .presses import Presses
 
-__all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "touch_of"]
-
 # Ratio of half widths of 95 % intervals to standard deviations, of ln of the force and of the centre: FITTED
 # to the coverage of 110 presses of 11 synthetic sensors. A normal distribution's 2 is too small: some presses
 # have large model errors

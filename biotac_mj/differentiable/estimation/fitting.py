@@ -19,8 +19,6 @@ from ..sweep import Inputs, push_forward
 from .belief import TILT
 from .presses import Presses, frame_of, outcome_of, slopes_of_film
 
-__all__ = ["Fit", "fit", "noise_of"]
-
 _STARTS, _SPACING = 3, 2e-3  # starting positions from the table, and their least distance [m]
 _ITERATIONS, _LONGEST = 20, 0.5  # per start; longest move of an iteration [mm]
 _CONVERGED = 0.1  # least gain of ln of the likelihood per iteration: well inside the interval

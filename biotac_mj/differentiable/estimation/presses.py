@@ -29,8 +29,6 @@ from ..record import Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward
 
-__all__ = ["Capsule", "Presses", "capsule_of", "deepest", "frame_of", "outcome_of", "slopes_of_film"]
-
 _TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that approximates a clamped finger
 _ROUND = np.radians([85, 64, 43, 21])  # angles on an end
 _FRACTIONS = np.linspace(0, 1, 8)  # of the deepest press

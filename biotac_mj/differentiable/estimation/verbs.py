@@ -20,8 +20,6 @@ from ...skin.settings import read_dict, read_settings
 from .belief import Touch
 from .estimate import Estimate, Estimator, change_of, pressure_change, touch_of
 
-__all__ = ["estimate_verb"]
-
 _VECTORS = "centre", "centre_error", "force"
 _ADDED = "sensor", "randomise", "effects", "signal", "friction", "thermal"  # keywords of a press
 _TOUCHING = 0.1  # [N] least force of a labelled touch

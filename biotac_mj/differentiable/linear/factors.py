@@ -4,8 +4,6 @@ import numpy as np
 
 from ...skin.model import SkinModel
 
-__all__ = ["Factors"]
-
 # excess products at which a new factor, which costs 75 products and saves two to four per step, is worthwhile
 _FACTOR = 150
 _FEW = 16

@@ -12,8 +12,6 @@ from ..skin import SkinWorlds
 from ..tensors import add_rows
 from .factors import Factors
 
-__all__ = ["FaceBlocks", "FactorInverse", "StepInverse", "solve_by_gmres"]
-
 _CANCELLED = 0.1  # fraction of a vector's length below which it is orthogonalised again, against rounding
 _MOST = 400  # products of a solve
 # reduction of a residual by a single-precision inverse before it is recomputed; size of the basis then,

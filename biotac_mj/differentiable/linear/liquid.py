@@ -20,8 +20,6 @@ from ..tensors import add_rows
 from .inverse import FaceBlocks
 from .samples import LinearSurface
 
-__all__ = ["LinearLiquid", "VolumeSlopes", "differentiate_push", "differentiate_volume"]
-
 _NUMBERS = 9
 _adjoint = wp.kernel(wet_faces.func, module=f"{__name__}.adjoint", enable_backward=True)
 

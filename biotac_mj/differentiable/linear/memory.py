@@ -19,8 +19,6 @@ from ..memory_constants import split_constants
 from ..record import Record
 from ..skin import SkinWorlds
 
-__all__ = ["LinearMemory", "Memory"]
-
 _KINK = 1e-9  # relative distance from slip of friction elements, or from the largest energy, taken as a kink
 _SHORT = 1e-4  # step over relaxation time below which a Prony weight is a series, see `memory.prony_weight`
 

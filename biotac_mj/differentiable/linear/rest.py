@@ -15,8 +15,6 @@ import torch
 
 from ..skin import SkinWorlds
 
-__all__ = ["areas_at", "cavity_at", "pull_rest", "push_rest"]
-
 
 def pull_rest(skin: SkinWorlds, x: np.ndarray, balance: np.ndarray) -> np.ndarray:
     """(nvert, 3) derivatives of balance . f by rest positions, f the forces of the rubber.

@@ -19,8 +19,6 @@ from ..tensors import add_rows, skew
 from ..touching import Touching, rows
 from .inverse import FaceBlocks
 
-__all__ = ["LinearSurface", "SampleJacobians", "SampleSlopes", "differentiate_samples", "slopes_of_samples"]
-
 _OUTPUTS = 6  # force, anchor
 
 

@@ -23,8 +23,6 @@ from .memory import LinearMemory, Memory
 from .rest import pull_rest, push_rest
 from .samples import LinearSurface
 
-__all__ = ["GIVEN", "LinearStep"]
-
 # inputs of a step, besides rest positions and memory of the rubber: nodes at its start (nvert, nworld, 3);
 # anchors of all samples then (nsample nworld, 3); poses of the geoms at its end and start (ngeom, nworld, 6),
 # a translation and a rotation vector about the geom's own origin, in the BioTac frame; frictions (ngeom,

@@ -14,8 +14,6 @@ from ...coupling.instance import Instance
 from ...coupling.structs import DataView, ModelView, c_structs
 from ...geometry.rigid import displacement
 
-__all__ = ["Bodies", "Start"]
-
 _EPS = 1e-6  # central difference: rounding and curvature errors are then both about 1e-10
 _SOLVED = 1e-13, 200  # least tolerance and iterations of MuJoCo's solver, whose residual enters differences
 

@@ -16,8 +16,6 @@ from ..tensors import real_tensor
 from .bodies import Bodies, Start
 from .skins import Cotangent, LoopSkin
 
-__all__ = ["Rolled", "rollout"]
-
 AGREE = 1e-8  # [m] between bodies and skins, see `rollout`
 _STATE, _DRIVEN = ("qpos", "qvel", "act"), ("ctrl", "qfrc_applied", "mocap_pos", "mocap_quat")
 _RANK = 1e-10  # of the largest: wrenches that move no body in contact with a skin

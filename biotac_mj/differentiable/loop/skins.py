@@ -20,8 +20,6 @@ from ..record import Record, advance, hold_pressure
 from ..skin import Skin
 from ..sweep import no_memory, pull_pressure
 
-__all__ = ["Cotangent", "SavedStep", "LoopSkin", "Pulled"]
-
 
 @dataclasses.dataclass(frozen=True)
 class SavedStep:

@@ -11,8 +11,6 @@ from ...sensor.formulas import with_names
 from ...sensor.presets import Sensor
 from ..tensors import TORCH
 
-__all__ = ["electrode_counts", "pdc_counts", "tac_counts", "tdc_counts"]
-
 _thermistor_counts, _temperature_exponent, _heating_exponent, _saturated = (
     with_names(getattr(channels, name), TORCH)
     for name in ("thermistor_counts", "temperature_exponent", "heating_exponent", "saturated")

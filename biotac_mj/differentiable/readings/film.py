@@ -12,8 +12,6 @@ from ...sensor.film import FilmConduction, NoFilmError, kernels, spreading_table
 from ...sensor.formulas import with_globals
 from ..tensors import real_tensor
 
-__all__ = ["impedance"]
-
 _INSIDE = 1e-9  # barycentric coordinate below which a point is on a triangle's edge
 # Warp's names in the film's formulas
 _WARP = types.SimpleNamespace(pi=np.pi, log=torch.log, pow=torch.pow, min=lambda a, most: a.clamp(max=most))

@@ -18,8 +18,6 @@ from ...sensor.formulas import with_globals
 from ...sensor.heat import HeatParameters
 from ..tensors import real_tensor
 
-__all__ = ["temperatures"]
-
 _UNITS = {
     "area": "square metres, 0 or more",
     "force": "newtons, 0 or more",

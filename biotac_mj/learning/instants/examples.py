@@ -9,8 +9,6 @@ from ...geometry.design import SINGLES
 from ...recordings import Recording
 from ...sensor.channels import log_impedance
 
-__all__ = ["Examples", "blocks", "from_recording", "from_set"]
-
 _BLOCKS = 56  # trajectories of a recording: its rows are correlated in time (docs/lab/learning.md)
 
 

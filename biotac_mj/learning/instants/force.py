@@ -15,8 +15,6 @@ from ...sensor.channels import log_impedance
 from .linear import held_out_errors, of_strengths
 from .terms import KINDS, Terms
 
-__all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force"]
-
 _WARM_UP = 2.5  # time constant, in lengths of the training rows
 _BLOCKS, _FOLDS = 40, 5  # rows are correlated in time
 _RIDGE = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["best_ridge", "held_out_errors", "of_strengths", "principal_components", "ridge", "ridges"]
-
 # scikit-learn is imported only for fitting: it takes two seconds, and saved models do not need it
 
 

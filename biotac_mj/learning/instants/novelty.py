@@ -10,8 +10,6 @@ from ...sensor.channels import FULL_SCALE
 from .force import causal_average
 from .linear import principal_components, ridge
 
-__all__ = ["NoveltyDetector", "StuckDetector", "compressed"]
-
 _NEIGHBOURS, _SIMILAR = 5, 10  # nearest neighbours for the distance, and for the expected PDC
 _MOST = 8000  # most reference rows
 # scale above which a change counts by its ratio instead of its size: ln Z, and counts of PDC (chosen on

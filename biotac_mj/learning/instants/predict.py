@@ -14,8 +14,6 @@ from ..training.experiment import division_of
 from ..weights import amend, describe, load_forward
 from .reader import TARGETS, UNITS, Prediction, Reader, check_intervals
 
-__all__ = ["SUFFIXES", "predict", "save_forward_model", "write_prediction"]
-
 SUFFIXES = (".csv", ".h5", ".hdf5")
 _LEVEL = 0.9
 _KIND = "ensemble"  # of models saved by `biotac learn train`

@@ -17,17 +17,6 @@ from .linear import best_ridge, principal_components
 from .novelty import NoveltyDetector, StuckDetector, compressed
 from .terms import KINDS, Terms
 
-__all__ = [
-    "TARGETS",
-    "UNITS",
-    "Prediction",
-    "Reader",
-    "check_intervals",
-    "fit_reader",
-    "judge",
-    "judge_in_time",
-]
-
 TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": ()}  # names of columns
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _LEVEL = 0.9  # of the intervals

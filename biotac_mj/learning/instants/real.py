@@ -14,8 +14,6 @@ from .examples import blocks
 from .force import TRIALS, fit_force
 from .linear import principal_components, ridge
 
-__all__ = ["evaluate_recording"]
-
 _CODE = 8
 _BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # fewest and most steps
 _KL = 1e-4

@@ -6,8 +6,6 @@ import numpy as np
 
 from .linear import principal_components
 
-__all__ = ["KINDS", "Terms"]
-
 _WAVES = 200  # random Fourier features: more changed nothing on two recordings
 # arguments of `Terms.fit`; predictions are the mean over these, since none is reliable on new data
 KINDS = [

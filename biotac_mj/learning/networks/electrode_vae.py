@@ -8,8 +8,6 @@ from torch import nn
 
 from .vae import VAE
 
-__all__ = ["ElectrodeVAE", "mlp"]
-
 
 def mlp(widths: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
     """Fully connected layers with ELU between them (not after the last); dropout after each hidden layer."""

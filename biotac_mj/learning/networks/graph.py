@@ -9,8 +9,6 @@ import torch
 from scipy.sparse import spmatrix
 from torch import nn
 
-__all__ = ["ChebConv", "SparseMatrix", "sparse_product"]
-
 
 class _Product(torch.autograd.Function):
     """matrix (n, m) @ x (m, c) with a given transpose, so that the gradient is a sparse product too."""

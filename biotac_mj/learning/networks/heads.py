@@ -6,8 +6,6 @@ from torch import nn
 
 from .electrode_vae import mlp
 
-__all__ = ["FromRest", "LocalHead", "steady"]
-
 
 class FromRest(nn.Module):
     """A network's output minus that for zero input, the skin at rest.

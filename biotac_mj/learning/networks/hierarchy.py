@@ -14,8 +14,6 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, identity
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-__all__ = ["Level", "build_hierarchy", "edges_of", "scaled_laplacian"]
-
 _NEIGHBOURS = 8
 
 

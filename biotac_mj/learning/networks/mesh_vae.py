@@ -13,8 +13,6 @@ from .vae import VAE
 if typing.TYPE_CHECKING:
     from .hierarchy import Level
 
-__all__ = ["MeshVAE"]
-
 
 class MeshVAE(VAE):
     """Code of a displacement field.

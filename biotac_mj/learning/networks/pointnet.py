@@ -10,8 +10,6 @@ from torch import nn
 
 from .electrode_vae import mlp
 
-__all__ = ["PointNet", "farthest_points"]
-
 _POINTS, _NEIGHBOURS = (128, 32, 8), 16  # of the levels; in each group
 
 

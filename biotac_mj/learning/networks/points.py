@@ -17,8 +17,6 @@ from .hierarchy import Level, build_hierarchy
 if typing.TYPE_CHECKING:
     from ...geometry.skin_geometry import SkinGeometry
 
-__all__ = ["SAME_SHAPE", "SkinPoints", "shape_values"]
-
 SAME_SHAPE = (
     0.5e-3  # [m] half the thickness of the skin: at a larger distance the points belong to another skin
 )

@@ -3,8 +3,6 @@
 import torch
 from torch import nn
 
-__all__ = ["VAE"]
-
 
 class VAE(nn.Module):
     """A subclass has `encode`, mean and log variance (n, latent) each of x (n, ...), and `decode`, back from

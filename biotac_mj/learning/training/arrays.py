@@ -15,8 +15,6 @@ if typing.TYPE_CHECKING:
     from ...data import TactileSet
     from ..networks.points import SkinPoints
 
-__all__ = ["Arrays", "check_columns", "join", "load_arrays", "spread_rows"]
-
 
 @dataclasses.dataclass
 class Arrays:

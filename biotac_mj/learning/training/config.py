@@ -6,8 +6,6 @@ import numpy as np
 
 from ...fields import check_types
 
-__all__ = ["LearningConfig"]
-
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 

@@ -30,8 +30,6 @@ from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_i
 from .local import Features, film_with_gains, train_head
 from .paper import network_change, network_target, train_latent_projection, train_pointnet
 
-__all__ = ["division_of", "train_all", "train_split"]
-
 _HEAD, _INVERSE = "local_taught", "pod_inverse_taught"  # names of our models in reports
 
 

@@ -14,8 +14,6 @@ from ..networks.points import SAME_SHAPE, shape_values
 if typing.TYPE_CHECKING:
     from ...geometry.skin_geometry import SkinGeometry
 
-__all__ = ["FilmFeatures", "Pod", "mirror_matrix", "mirror_order", "orthogonal_modes"]
-
 _RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
 _FILM = 50e-6  # [m] residual film where the skin touches the core, as in sensor.film
 

@@ -15,8 +15,6 @@ from ..weights import load_forward
 from .arrays import load_arrays
 from .local import counts_change
 
-__all__ = ["evaluate_new_sensor", "fit_gains", "fit_mixing"]
-
 _PENALTIES = np.geomspace(1e-4, 1e2, 13)  # of a mixing, relative to the mean square of its inputs
 
 

@@ -17,8 +17,6 @@ from torch.optim.lr_scheduler import LambdaLR, OneCycleLR
 
 from ...files import replacing
 
-__all__ = ["Checkpoints", "TrainingOptions", "fast_products", "root_mean_square", "train"]
-
 _CHECKS = 12  # validations in a training
 _WARM = 5  # warm-up steps before the capture
 _BETWEEN = 5.0  # [s] between two checkpoints: one takes as long as three small steps

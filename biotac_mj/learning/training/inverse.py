@@ -20,17 +20,6 @@ if typing.TYPE_CHECKING:
     from .config import LearningConfig
     from .features import Pod
 
-__all__ = [
-    "InverseHead",
-    "contact_centre",
-    "field_errors",
-    "inverse_errors",
-    "log_change_of",
-    "patch_of_push",
-    "patch_overlap",
-    "train_inverse",
-]
-
 PATCH = 0.15  # fraction of the largest nodal force above which a node is in the patch
 
 

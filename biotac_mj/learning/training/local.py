@@ -21,8 +21,6 @@ if typing.TYPE_CHECKING:
     from .config import LearningConfig
     from .features import Pod
 
-__all__ = ["MODES", "Features", "counts_change", "film_with_gains", "train_head"]
-
 MODES = 32  # components of the mesh that a head reads
 
 

@@ -21,15 +21,6 @@ if typing.TYPE_CHECKING:
     from .arrays import Arrays
     from .config import LearningConfig
 
-__all__ = [
-    "LatentProjection",
-    "make_pointnet",
-    "network_change",
-    "network_target",
-    "train_latent_projection",
-    "train_pointnet",
-]
-
 
 class LatentProjection(nn.Module):
     """Displacements -> code of 128 -> code of 8 -> electrodes, and back.

@@ -49,18 +49,6 @@ from biotac_mj.sensor.presets import Sensor, read_sensor
 
 from ...short_repr import short_repr
 
-__all__ = [
-    "CONDUCTIVITY",
-    "EXCITATION",
-    "BatchFilm",
-    "FilmConduction",
-    "NoFilmError",
-    "excitation_places",
-    "read_film",
-    "spreading_resistance",
-    "spreading_table",
-]
-
 # X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED, since not published
 # for this sensor: the two pairs, symmetric about z = 0, that best explain the published rest counts
 # (scripts/fit_excitation.py on the paper's mesh: ln Z correlates 0.978, RMS 0.054).

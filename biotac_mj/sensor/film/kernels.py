@@ -6,17 +6,6 @@ import warp as wp
 from biotac_mj.geometry.core_surface import Core, NearestTriangles, nearest_listed_on_core
 from biotac_mj.geometry.design import MOST_EXCITATION
 
-__all__ = [
-    "NSAMPLE",
-    "Discs",
-    "Network",
-    "driving_point",
-    "face_conductance",
-    "film_surface",
-    "find_weights",
-    "samples_over",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 NSAMPLE = 24  # sample points of equal area on a disc

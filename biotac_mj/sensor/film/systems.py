@@ -13,8 +13,6 @@ from scipy.sparse.linalg import splu
 from biotac_mj.geometry.design import MOST_DISCS
 from biotac_mj.sensor.film.kernels import Network, driving_point, real
 
-__all__ = ["THREADS", "Pattern", "edges", "make_band", "make_factor", "solve_sheet"]
-
 wp.set_module_options({"enable_backward": False})
 
 TILE = MOST_DISCS  # rows of a tile, and columns of right-hand sides: the discs, padded

@@ -27,22 +27,6 @@ from ..contact.posed import Geoms, LoadPath
 from ..types import Precision, mat33, real, vec3, vec6
 from .worlds import Worlds, total_of
 
-__all__ = [
-    "BodyContact",
-    "add_slope",
-    "mark_unknown_wrenches",
-    "begin_pending",
-    "begin_bodies",
-    "bodies_kernels",
-    "end_pending",
-    "measure_stiffness",
-    "find_pending",
-    "move_bodies",
-    "body_motion",
-    "begin_iteration",
-    "copy_flags",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -9,8 +9,6 @@ from ..types import real, vec6
 from .line_search import MAX_TRIES
 from .worlds import NEGLIGIBLE_RESIDUAL, VISCOUS_AFTER, Worlds, set_viscosity
 
-__all__ = ["check_convergence", "choose_viscosity"]
-
 wp.set_module_options({"enable_backward": False})
 
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))

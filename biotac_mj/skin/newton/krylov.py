@@ -13,8 +13,6 @@ from .line_search import begin_line_search
 from .nodes import LiquidForces, NodeSlots, SurfaceForces
 from .worlds import Worlds, total_of, totals_of
 
-__all__ = ["Inertia", "begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -5,8 +5,6 @@ import warp as wp
 from ..types import real
 from .worlds import Worlds, totals_of
 
-__all__ = ["MAX_TRIES", "begin_line_search", "choose_length"]
-
 wp.set_module_options({"enable_backward": False})
 
 MAX_TRIES = wp.constant(12)  # evaluations of a line search

@@ -20,17 +20,6 @@ from .worlds import (
     set_viscosity,
 )
 
-__all__ = [
-    "end_try",
-    "end_path",
-    "choose_increment",
-    "lag_friction",
-    "place_geoms",
-    "end_geoms",
-    "partial_turn",
-    "start_increment",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 _FIRST_INCREMENT = wp.constant(wp.float64(0.25))  # load increment after a first try that failed

@@ -13,20 +13,6 @@ from ..block import sum_of_lanes
 from ..types import Precision, mat33, real, vec3, vec6
 from .worlds import Worlds
 
-__all__ = [
-    "LiquidForces",
-    "NodeSlots",
-    "SurfaceForces",
-    "assemble_force",
-    "begin_nodes",
-    "end_core",
-    "end_nodes",
-    "predict_free_flight",
-    "correct_pressure",
-    "nodes_kernels",
-    "set_where",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -8,28 +8,6 @@ from ..contact.posed import Geoms, LoadPath
 from ..contact.touch import CURRENT
 from ..types import real, vec3
 
-__all__ = [
-    "NEGLIGIBLE_RESIDUAL",
-    "BLOCK",
-    "CONVERGED",
-    "INSIDE_CORE",
-    "CUT_BACK_BEFORE",
-    "LAST_CUT_BACK",
-    "NOT_CONVERGED",
-    "NOT_FINITE",
-    "NO_CUTBACK",
-    "VISCOUS_AFTER",
-    "Worlds",
-    "all_on",
-    "begin_try",
-    "begin_worlds",
-    "end_worlds",
-    "modulus_of",
-    "set_viscosity",
-    "total_of",
-    "totals_of",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 # reason of a world's last step

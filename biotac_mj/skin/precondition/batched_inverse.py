@@ -8,8 +8,6 @@ import warp as wp
 if typing.TYPE_CHECKING:
     from ..program import Launcher
 
-__all__ = ["THREADS", "invert", "invert_kernel"]
-
 wp.set_module_options({"enable_backward": False})
 
 THREADS = 512  # of a block: one for each row

@@ -28,8 +28,6 @@ import warp as wp
 from .nested_dissection import cut
 from .right_hand_sides import LOW
 
-__all__ = ["DissectedInverse"]
-
 wp.set_module_options({"enable_backward": False})
 
 _ALIGN = 64  # rows are padded to tiles of the tensor cores; other sizes run at a third of the speed

@@ -8,8 +8,6 @@ import warp as wp
 from ..program import Launcher
 from .block_inverse import DissectedInverse
 
-__all__ = ["Product"]
-
 wp.set_module_options({"enable_backward": False})
 
 _COLUMNS = 8  # worlds are padded to tiles of the tensor cores

@@ -17,8 +17,6 @@ import warp as wp
 from ...geometry.rigid import rigid_motions
 from ..types import mat33, real, vec3
 
-__all__ = ["assemble", "body_tangent", "row_tangents", "group_rows", "sum_rows"]
-
 wp.set_module_options({"enable_backward": False})
 
 _BLOCK = np.array(

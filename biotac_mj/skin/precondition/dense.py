@@ -24,8 +24,6 @@ if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
     from ..newton.bodies import BodyContact
 
-__all__ = ["FEW", "LANES_FEW", "THREADS_FEW", "DensePreconditioner"]
-
 FEW = 16  # up to this number of worlds do not fill the device: work is split more finely
 THREADS_FEW = 64  # block size with few worlds: small, so that more multiprocessors take part
 LANES_FEW = 8  # threads that sum one node with few worlds: a single thread would wait for each read

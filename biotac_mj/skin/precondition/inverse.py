@@ -14,8 +14,6 @@ from . import right_hand_sides, woodbury
 from .block_products import Product
 from .pushed_forward import PushForwardMatrices, pushes_forward
 
-__all__ = ["Inverse"]
-
 
 class Inverse:
     """Applies the block inverse (`block_inverse`) to the right-hand sides of all worlds.

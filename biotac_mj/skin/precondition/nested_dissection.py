@@ -10,8 +10,6 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-__all__ = ["cut", "dissect"]
-
 _LEAF = 25  # nodes that are not divided further
 _CUTS = (0.42, 0.5, 0.58)  # fractions of the nodes on one side that are tried
 

@@ -21,8 +21,6 @@ from ..types import DOUBLE, SINGLE, Precision, mat33, real, vec3
 if typing.TYPE_CHECKING:
     from ..rubber.tetrahedra import Tetrahedra
 
-__all__ = ["PushForward", "PushForwardMatrices", "pushes_forward"]
-
 wp.set_module_options({"enable_backward": False})
 
 _LEAST_DETERMINANT = 0.1  # of a node's deformation gradient; below it M is the identity

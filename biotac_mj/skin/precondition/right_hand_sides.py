@@ -9,25 +9,6 @@ import warp as wp
 from ..newton.worlds import Worlds, total_of
 from ..types import real, single, vec3
 
-__all__ = [
-    "LOW",
-    "InverseEntries",
-    "NodeMap",
-    "RAISE",
-    "STIFF",
-    "TINY",
-    "entry",
-    "load_difference",
-    "load_gradient",
-    "load_residual",
-    "measure_norm",
-    "measure_volume_change",
-    "liquid_scale",
-    "read_along",
-    "read_answer",
-    "gather_displacements",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 # [N/m] stiffness along the scaled gradient of the liquid: like that of contact, so that single precision

@@ -33,8 +33,6 @@ if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
     from ..newton.bodies import BodyContact
 
-__all__ = ["SparsePreconditioner"]
-
 _DENSE = 300  # coordinates below which a dense matrix of springs is faster than a sparse one
 _FACTOR = 60  # cost of a factor in products of the tangent
 _SYSTEM = 110_000  # entries of a Woodbury system that cost as much as a product

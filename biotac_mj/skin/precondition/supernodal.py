@@ -21,8 +21,6 @@ from scipy.linalg import lapack
 from ...launches import recorded
 from .nested_dissection import dissect
 
-__all__ = ["Elimination", "SupernodalFactor", "elimination_of"]
-
 wp.set_module_options({"enable_backward": False})
 
 _LANES = 8  # numbers of a SIMD multiplication, to which rows of panels are padded with zeros

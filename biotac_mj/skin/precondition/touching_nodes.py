@@ -7,8 +7,6 @@ from ..newton.worlds import Worlds, total_of
 from ..types import real
 from .right_hand_sides import TINY
 
-__all__ = ["list_touching_nodes", "number_touching_nodes"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -12,16 +12,6 @@ from ..newton.worlds import Worlds, total_of
 from ..types import narrow, real, vec3, vec6
 from .right_hand_sides import STIFF, InverseEntries, entry, liquid_scale
 
-__all__ = [
-    "add_bodies",
-    "multiply_springs",
-    "fill_compliance",
-    "contact_forces",
-    "fill_stiffness",
-    "fill_system",
-    "sum_liquid",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

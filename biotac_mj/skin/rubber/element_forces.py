@@ -13,8 +13,6 @@ from .points import Rubber
 if typing.TYPE_CHECKING:
     from .tetrahedra import Tetrahedra
 
-__all__ = ["ElementForces", "module_for_cuda"]
-
 _THREADS = 256  # of a block
 
 

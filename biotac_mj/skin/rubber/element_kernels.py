@@ -14,8 +14,6 @@ from ..types import Precision, mat33, real, vec3
 from .element_points import Kind, material_functions
 from .points import Mesh, Rubber, deformation_of
 
-__all__ = ["element_kernels"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -22,8 +22,6 @@ from .law import (
 )
 from .points import Mesh, Rubber, point_functions
 
-__all__ = ["Kind", "material_functions"]
-
 wp.set_module_options({"enable_backward": False})
 
 # det F below which the line search rejects a step of rubber with friction elements, whose strain is isochoric

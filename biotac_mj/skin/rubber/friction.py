@@ -15,8 +15,6 @@ import warp as wp
 
 from ..types import mat33, real
 
-__all__ = ["deviator", "push_forward", "push_forward_change", "strain", "strain_change"]
-
 wp.set_module_options({"enable_backward": False})
 
 

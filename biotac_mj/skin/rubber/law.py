@@ -22,23 +22,6 @@ import warp as wp
 
 from ..types import double, mat33, narrow, real, single, vec3, widen
 
-__all__ = [
-    "COMPRESSED",
-    "LAWS",
-    "barrier",
-    "dilatation",
-    "dilatation_gradient",
-    "dilatation_hessian",
-    "energy_density",
-    "polar",
-    "polar_single",
-    "polar_upright",
-    "barrier_derivative",
-    "barrier_stress",
-    "stress",
-    "stress_derivative",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 COMPRESSED = wp.constant(wp.float64(0.2))  # J0

@@ -6,8 +6,6 @@ import math
 from ...fields import check_types
 from .law import LAWS
 
-__all__ = ["CALIBRATED_FILL", "ELEMENTS", "PRESETS", "Material", "material"]
-
 ELEMENTS = ("linear", "quadratic")
 
 _SOFTEST, _HARDEST = 100.0, 1e15  # [Pa]: softer than any gel, harder than any solid

@@ -16,8 +16,6 @@ from .law import polar
 from .material import Material
 from .points import Mesh, Rubber, deformation_of, point_functions
 
-__all__ = ["RubberMemory", "rubber_of_worlds"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -33,8 +33,6 @@ from .friction import deviator, push_forward, push_forward_change, sticking_frac
 from .law import energy_density, stress, stress_derivative
 from .stiffening import added_derivative, added_energy, added_stress
 
-__all__ = ["Mesh", "Rubber", "deformation_of", "point_functions"]
-
 wp.set_module_options({"enable_backward": False})
 
 

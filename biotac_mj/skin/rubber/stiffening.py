@@ -15,8 +15,6 @@ import warp as wp
 from ..types import mat33, real
 from .law import energy_density, stress, stress_derivative
 
-__all__ = ["added_derivative", "added_energy", "added_stress"]
-
 wp.set_module_options({"enable_backward": False})
 
 

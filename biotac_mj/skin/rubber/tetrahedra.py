@@ -27,8 +27,6 @@ from ..types import mat33, real, vec3
 from .law import LAWS
 from .points import Mesh
 
-__all__ = ["CONTRACTION", "POINTWISE", "Tetrahedra", "incidence"]
-
 POINTWISE = 5.0  # of mu; docs/lab/elements.md has the error of other values
 CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/lab/elements.md has the error
 _LEAST_STRETCH = 0.2  # of `deformed`

@@ -10,8 +10,6 @@ import warp as wp
 from ...batch import Batch
 from ...batch.rows import Rows
 
-__all__ = ["Bank"]
-
 # of mujoco_warp's Data: what a step depends on, and the last sensor data
 _FIELDS = ("time", "qpos", "qvel", "act", "ctrl", "qacc", "qacc_warmstart", "qfrc_applied", "xfrc_applied")
 _FIELDS += ("mocap_pos", "mocap_quat", "xpos", "xmat", "sensordata")

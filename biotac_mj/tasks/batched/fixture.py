@@ -8,8 +8,6 @@ import warp as wp
 
 from .task import BatchTask, TaskSettings
 
-__all__ = ["HeldSettings", "HeldTask"]
-
 
 @wp.struct
 class _Fixture:

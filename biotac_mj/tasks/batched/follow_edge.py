@@ -9,8 +9,6 @@ import warp as wp
 from .machine import carriage, new_spec, servo
 from .task import BatchTask, TaskSettings
 
-__all__ = ["FollowEdge", "Settings"]
-
 _PAD = 8.2e-3  # from the BioTac's axis to its pad [m]
 _POINT = -9e-3  # x of the pad's point that is to stay on the rim, BioTac frame [m]
 _ROUNDING = 1e-3  # of the rim [m]

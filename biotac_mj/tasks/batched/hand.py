@@ -9,8 +9,6 @@ from scipy.optimize import least_squares
 
 from ..hands import attach_to_hand
 
-__all__ = ["FINGERS", "JOINTS", "Pinch", "Rod", "build", "find_pinch"]
-
 FINGERS = ("ff", "mf", "th")
 JOINTS = tuple(f"{f}J{i}" for f in ("FF", "MF") for i in (4, 3, 2, 1)) + tuple(
     f"THJ{i}" for i in (5, 4, 3, 2, 1)

@@ -9,8 +9,6 @@ import warp as wp
 from .fixture import HeldSettings, HeldTask
 from .machine import carriage, new_spec, servo
 
-__all__ = ["InsertPeg", "Settings"]
-
 _PAD = 8.2e-3  # from the BioTac's axis to its pad [m]
 _POINT = 12e-3  # from the BioTac's origin to where the pads meet the peg, toward the tip [m]
 _RADIUS, _HALF, _ABOVE = 5e-3, 20e-3, 10e-3  # of the peg; from its middle up to where it is held [m]

@@ -11,8 +11,6 @@ if typing.TYPE_CHECKING:
     import gymnasium
     import rsl_rl.env
 
-__all__ = ["gymnasium_env", "rsl_rl_env", "skrl_env"]
-
 
 def rsl_rl_env(env: BatchTask) -> "rsl_rl.env.VecEnv":
     """An `rsl_rl.env.VecEnv`: observations are a TensorDict with the environment's groups, of which

@@ -3,8 +3,6 @@
 import mujoco
 import numpy as np
 
-__all__ = ["carriage", "new_spec", "servo"]
-
 _MASS, _INERTIA = 0.15, 1e-4  # of a carriage [kg], [kg m^2]
 
 

@@ -11,8 +11,6 @@ from . import TASKS, make
 from .policy import load_policy
 from .task import BatchTask
 
-__all__ = ["HELD_OUT", "acting", "agree", "env_of", "find_policy", "interval", "play", "seen_by"]
-
 HELD_OUT = 54321  # seed of beginnings that no policy learns from
 
 

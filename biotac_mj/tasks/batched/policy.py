@@ -11,8 +11,6 @@ from safetensors.torch import save_file
 from ...files import replacing
 from ...reading import reading
 
-__all__ = ["Network", "Policy", "load_policy", "read_card", "save_policy"]
-
 _HIDDEN = (256, 128)  # units
 _LEAST = 0.1  # deviation of actions in learning
 _CLIP = 10.0  # deviations from the mean beyond which an observation is cut

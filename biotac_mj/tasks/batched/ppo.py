@@ -8,8 +8,6 @@ import torch
 
 from .policy import Network, Policy
 
-__all__ = ["Learner", "Lessons", "Numbers"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Numbers:

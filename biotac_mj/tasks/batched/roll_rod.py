@@ -13,8 +13,6 @@ import warp as wp
 from .fixture import HeldSettings, HeldTask
 from .hand import _PAD, Rod, build, find_pinch
 
-__all__ = ["RollRod", "Settings"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Settings(HeldSettings):

@@ -16,8 +16,6 @@ from ...view.offscreen import stage
 from .bank import Bank
 from .touch import Touch, as_deviations, check_observe
 
-__all__ = ["BatchTask", "TaskSettings"]
-
 _FELT = 0.02  # force of a finger that holds something, at least [N]
 
 

@@ -16,8 +16,6 @@ from ...short_repr import short_repr
 if typing.TYPE_CHECKING:
     from ...batch import Batch
 
-__all__ = ["OBSERVE", "Touch", "as_deviations", "check_observe"]
-
 OBSERVE = ("none", "binary", "force", "electrodes", "electrodes+pac", "learned")
 _CHANNELS = ("electrodes", "pdc", "pac")
 _COUNTS = 100.0  # unit of changes

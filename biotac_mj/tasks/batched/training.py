@@ -27,8 +27,6 @@ from .policy import save_policy
 from .ppo import Learner, Lessons, Numbers
 from .task import BatchTask
 
-__all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
-
 # effects of the sensors in learning, in addition to the spread of real ones (`sensor="random"`)
 RANDOMISED = ("gain", "pdc_gain", "warmup", "drift")
 # of electrodes, PDC and PAC of coarse skins in the condensed tier, against the full one and the default skin

@@ -8,8 +8,6 @@ from dm_control.utils import rewards
 from ..base import AWAY, TouchTask
 from ..robots import Gantry
 
-__all__ = ["FollowEdge"]
-
 _PAD = 8.2e-3  # [m]
 _REFERENCE = -9e-3  # x of the pad's point that should stay on the edge, BioTac frame [m]
 _RADII = (0.03, 0.045, 0.07)  # [m]

@@ -13,8 +13,6 @@ from ...short_repr import short_repr
 from ..base import AWAY, TouchTask
 from ..robots import Gantry
 
-__all__ = ["Explore"]
-
 _PAD = 8.2e-3  # [m]
 CENTER = -9e-3  # x of the middle of the pad, BioTac frame [m]
 _OFF, _TURN = 1e-3, 0.2  # largest offset [m] and rotation [rad] of the object

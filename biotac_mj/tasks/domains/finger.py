@@ -9,8 +9,6 @@ from ..suite import environment
 if typing.TYPE_CHECKING:
     from dm_control import composer
 
-__all__ = ["SUITE", "explore", "follow_edge", "press", "roll_ball"]
-
 SUITE = containers.TaggedTasks()
 
 

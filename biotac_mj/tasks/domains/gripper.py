@@ -9,8 +9,6 @@ from ..suite import environment
 if typing.TYPE_CHECKING:
     from dm_control import composer
 
-__all__ = ["SUITE", "hold", "lift"]
-
 SUITE = containers.TaggedTasks()
 
 

@@ -8,8 +8,6 @@ from ...coupling.config import Config
 from ..base import AWAY, TouchTask
 from ..robots import Gripper
 
-__all__ = ["Hold", "Lift"]
-
 FRICTION = Config().friction  # of the skin, the larger of the pair
 _HALF = np.array([9e-3, 8e-3, 14e-3])  # of the object [m]
 _PADS = -0.010  # z of the pads' middle below the gripper's origin [m]

@@ -8,8 +8,6 @@ from dm_control.utils import rewards
 from ..base import AWAY, TouchTask
 from ..robots import Gantry
 
-__all__ = ["Press"]
-
 _PAD = 8.2e-3  # of the pad below the BioTac's axis [m]
 _FORCES = (0.5, 3.0)  # [N]
 _TILT = 0.08  # [rad]

@@ -8,8 +8,6 @@ from ...coupling.config import OWN
 from ..base import AWAY, TouchTask
 from ..robots import Gantry
 
-__all__ = ["RollBall"]
-
 _PAD = 8.2e-3  # [m]
 _CENTER = -9e-3  # x of the middle of the pad, BioTac frame [m]
 _START = np.array([2e-3, 1e-3])  # initial distance of the ball from the pad's middle [m]
