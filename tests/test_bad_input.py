@@ -498,7 +498,7 @@ def files_of_sensors():
     yield change(
         "sensor: '1'",
         "sensor: {rest: [1]}",
-        "rest of a sensor is [1], of 1 electrodes, and the design is BioTac (19 electrodes): pass 19",
+        "rest of a sensor has 1 electrodes, and the skin is of BioTac (19 electrodes)",
     )
     yield change("material: default", "material: jelly", "unknown material 'jelly'")
     yield change("material: default", "material: {frction: 1}", "did you mean 'friction'?")
@@ -591,7 +591,7 @@ def settings():
         ("--sensor f9", "sensor is 'f9': pass one of '1'"),
         (
             '--sensor {"rest":[1]}',
-            "rest of a sensor is [1], of 1 electrodes, and the design is BioTac (19 electrodes): pass 19",
+            "rest of a sensor has 1 electrodes, and the skin is of BioTac (19 electrodes)",
         ),
         ('--sensor {"colour":1}', "a sensor has no 'colour': choose from like, rest"),
         ("--sensor {rest", "is no JSON"),

@@ -34,7 +34,7 @@ from biotac_mj.resimulation.resimulate import ResimulateOptions, resimulate
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.acquisition_kernels import SLOT_RATE
 from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
-from biotac_mj.sensor.presets import sensors_of
+from biotac_mj.sensor.presets import read_sensor, sensors_of
 
 SP = read_design("biotac_sp")
 
@@ -147,10 +147,14 @@ def test_an_sp_s_electrodes_are_renewed_every_14_ms():
 
 def test_a_design_and_what_is_not_of_it_are_refused_by_name():
     spec = mujoco.MjSpec()
-    with pytest.raises(ValueError, match="sensor of a BioTac SP .24 electrodes. is '1': pass one of 'sp_ff'"):
+    with pytest.raises(ValueError, match="sensor '1' has 19 electrodes, and the skin is of BioTac SP .24"):
         attach(spec, body="world", design="biotac_sp", skin="coarse", sensor="1")
-    with pytest.raises(ValueError, match="rest of a sensor is .*, of 19 electrodes, and the design is"):
+    with pytest.raises(ValueError, match="rest of a sensor has 19 electrodes, and the skin is of BioTac SP"):
         attach(spec, body="world", design="biotac_sp", skin="coarse", sensor={"rest": [3000.0] * 19})
+    theirs = sensors_of(SP)["sp_mf"]
+    for sensor in ("sp_mf", theirs, {"like": "sp_mf"}, {"noise": list(theirs.noise)}):
+        with pytest.raises(ValueError, match="has 24 electrodes, and the skin is of BioTac .19 .* BioTac SP"):
+            read_sensor(sensor)
     with pytest.raises(ValueError, match="the skin is one of BioTac SP .* and the design BioTac"):
         attach(spec, body="world", design="biotac", skin="biotac_sp/coarse")
     with pytest.raises(FileNotFoundError, match="no design at other: pass one of biotac, biotac_sp"):

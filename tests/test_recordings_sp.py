@@ -132,6 +132,25 @@ def test_a_recording_of_a_pad_of_one_s_own_is_refused_by_name():
         Recording(0.01 * np.arange(3), electrodes=np.full((3, 6), 2000.0), name="own")
 
 
+def named(path, prefix, count):
+    header = ",".join(f"{prefix}e{i + 1}" for i in range(count))
+    np.savetxt(path, np.full((9, count), 2e3), "%d", ",", header=header, comments="")
+    return path
+
+
+@pytest.mark.parametrize("prefix", ["biotac_sp_", "left/BioTacSP/", "BTSP-1 "])
+def test_names_tell_an_sp_before_the_count_does(prefix, tmp_path):
+    assert load_one(named(tmp_path / "log.csv", prefix, 24))[0].design == SP
+    with pytest.raises(ValueError, match="19 electrodes called .*, and a BioTac SP .24 .* has more"):
+        load_one(named(tmp_path / "log.csv", prefix, 19))
+
+
+@pytest.mark.parametrize("prefix", ["biotac_", "bt_spare_", "grasp/bt_"])
+def test_other_names_leave_it_to_the_count(prefix, tmp_path):
+    for count in (19, 24):
+        assert load_one(named(tmp_path / "log.csv", prefix, count))[0].design.nelectrode == count
+
+
 def test_a_native_log_of_an_sp_is_told_by_its_serial_number(tmp_path):
     """Public logs of SPs have 19 of their electrodes, and count of rows alone makes a BioTac of them."""
     write_btd(tmp_path / "log.btd", synthetic(60))

@@ -84,7 +84,7 @@ def test_what_cannot_be_is_refused():
         read_sensor("f9")
     with pytest.raises(ValueError, match="a sensor has no 'colour': choose from like, rest"):
         read_sensor({"colour": 1})
-    with pytest.raises(ValueError, match="rest of a sensor is"):
+    with pytest.raises(ValueError, match="rest of a sensor has 2 electrodes, and the skin is of BioTac"):
         read_sensor({"rest": [1, 2]})
     for wrong, said in (
         ({"pdc_noise": -1.0}, "pdc_noise of a sensor is -1.0: give 0 or more"),

@@ -69,7 +69,7 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         "--sensor",
         type=choice,
         metavar="NAME",
-        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random or JSON",
+        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, JSON or a file of it",
     )
     verb.add_argument(
         "--signal",
@@ -105,11 +105,18 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
 
 
 def choice(text: str) -> str | dict:
-    """A name, or JSON of a dict."""
+    """A name, JSON of a dict, or a file of it (.json)."""
     import json
 
     if text.endswith((".yaml", ".yml")):
         raise argparse.ArgumentTypeError(f"{text!r} is a sensor file: give it as --effects {text}")
+    if text.endswith(".json"):
+        from ..reading import read_json
+
+        try:
+            return read_json(text, "sensor or material", "give a name, JSON, or a file of it")
+        except (FileNotFoundError, ValueError) as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
     if not text.startswith("{"):
         return text
     try:

@@ -6,6 +6,7 @@ import functools
 import json
 import os
 import pathlib
+import re
 
 import numpy as np
 
@@ -212,8 +213,20 @@ def design_of_channels(nelectrode: int) -> Design | None:
     return next((d for d in designs() if d.nelectrode == nelectrode), None)
 
 
+def design_named(*texts: str) -> Design | None:
+    """The shipped design that a log's names tell, or None: of columns, topics or sensors (biotac_sp_e1), and
+    serial numbers (BTSP...). "BioTac" by itself names the family."""
+    for design in designs():
+        family, _, own = design.name.partition("_")
+        mark = re.compile(rf"(?:{family}|bt)[^a-z0-9]*{own}(?![a-z])")
+        if own and any(mark.search(text.lower()) for text in texts):
+            return design
+    return None
+
+
 def check_nelectrode(design: Design, nelectrode: int, whose: str) -> None:
-    """Raises ValueError if a recording has another number of electrodes than the skin's design."""
+    """Raises ValueError if a recording, or a sensor, has another number of electrodes than the skin's
+    design."""
     if nelectrode != design.nelectrode:
         other = design_of_channels(nelectrode)
         remedy = "take the skin of its own design" if other is None else f"take a skin of {other.title}"

@@ -28,7 +28,7 @@ from biotac_mj.sensor.channels import (
     temperature_from_counts,
 )
 
-from ..geometry.design import BIOTAC, Design
+from ..geometry.design import BIOTAC, Design, check_nelectrode, designs
 from ..short_repr import short_repr
 
 # [1/C] of ln Z: all electrodes change by -6.4 to -7.8 % per degree of the liquid in five sensors
@@ -202,6 +202,7 @@ class Sensor:
         return np.concatenate([np.ravel(values.get(name, getattr(self, name, 0))) for name in _ORDER])
 
 
+_OF_ELECTRODES = ("rest", "noise", "mixing", "warm_share", "drift")  # fields, one number or row for each
 _PER_ELECTRODE = ("scale", "base", "noise", "warm_share", "drift")
 _ORDER = (
     *_PER_ELECTRODE, "mixing", "mixed", "pdc_rest", "pdc_gain", "pdc_noise", "pac_rest", "pac_noise",
@@ -289,13 +290,18 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
         unknown = [name for name in fields if name not in known]
         if unknown:
             raise ValueError(f"a sensor has no {unknown[0]!r}: choose from like, {', '.join(known)}")
-        _refuse_others(fields.get("rest", like.rest), design)
+        for name, value in fields.items():
+            if name in _OF_ELECTRODES and np.ndim(value):
+                check_nelectrode(design, len(value), f"{name} of a sensor")
         return dataclasses.replace(like, **fields)
     if isinstance(value, Sensor):
-        _refuse_others(value.rest, design)
+        check_nelectrode(design, value.nelectrode, "a sensor")
         return value
     names = sensor_names(design)
     if not isinstance(value, str) or value not in names:
+        for other in designs():
+            if isinstance(value, str) and value in other.sensors:
+                check_nelectrode(design, other.nelectrode, f"sensor {value!r}")
         of = "" if design.name == BIOTAC.name else f" of a {design.title}"
         raise ValueError(
             f"sensor{of} is {short_repr(value)}: pass one of {', '.join(map(repr, names))}, or a dict of "
@@ -304,13 +310,3 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
     if value == "random":
         return draw_sensor(generator(seed, 0x5E), design)
     return sensors_of(design)[value]
-
-
-def _refuse_others(rest, design):
-    """Raises ValueError if rest counts have another number of electrodes than the design."""
-    if np.size(rest) != design.nelectrode:
-        raise ValueError(
-            f"rest of a sensor is {short_repr(rest)}, of {np.size(rest)} electrodes, and the design is "
-            f"{design.title}: pass {design.nelectrode}, or one of "
-            f"{', '.join(map(repr, sensor_names(design)))}"
-        )

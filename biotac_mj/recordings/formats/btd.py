@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 
-from ...geometry.design import design_of_channels, designs, read_design
+from ...geometry.design import design_named, design_of_channels, designs
 from ...quality.clock import BUS_RATE
 from .streams import Stream
 
@@ -20,7 +20,6 @@ __all__ = ["is_btd", "read_btd"]
 # channels' numbers in the log
 _PAC, _PDC, _TAC, _TDC, _E1 = 0, 1, 2, 3, 17
 _BEGIN = b"Begin File"
-_OF_SP = "BTSP"  # in serial numbers
 
 
 def is_btd(content: bytes) -> bool:
@@ -80,10 +79,10 @@ def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> lis
         for key in ("Serial Number", "Date")
         if header.get(key)
     ]
-    sp = read_design("biotac_sp")
-    if _OF_SP in header.get("Serial Number", "") and n < sp.nelectrode:
+    named = design_named(header.get("Serial Number", ""))
+    if named is not None and n < named.nelectrode:
         notes.append(
-            f"{path.name}: the serial number is that of a {sp.title}, of which this log has {n}: they are "
+            f"{path.name}: the serial number is that of a {named.title}, of which this log has {n}: they are "
             f"read as those of a {design_of_channels(n).title}, and lie elsewhere"
         )
     lost = table[starts[-1], 2] - table[starts[0], 2] + 1 - len(starts)

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from ...geometry.design import BIOTAC, designs
+from ...geometry.design import BIOTAC, design_named, designs
 from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
 from ..recording import CHANNELS, FIELDS, Recording, designed
 from .names import is_stamp, is_time, place_of, unit_of
@@ -108,6 +108,12 @@ def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] |
         whole = {}
         for field, pieces in fields.items():
             value, said = _whole(source, field, pieces)
+            named = design_named(sensor) if field == "electrodes" else None
+            if named is not None and value.shape[1] != named.nelectrode:
+                raise ValueError(
+                    f"{source} has {value.shape[1]} electrodes called {sensor}, and a {named.title} has more: "
+                    f"give all of its columns, or rename these if they are of a {designed(value).title}"
+                )
             notes += said
             if value is not None and np.isfinite(value).any():
                 whole[field] = value
