@@ -69,7 +69,8 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         "--sensor",
         type=choice,
         metavar="NAME",
-        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, JSON or a file of it",
+        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, JSON, "
+        "or a file of it",
     )
     verb.add_argument(
         "--signal",

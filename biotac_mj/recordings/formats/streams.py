@@ -111,8 +111,8 @@ def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] |
             named = design_named(sensor) if field == "electrodes" else None
             if named is not None and value.shape[1] != named.nelectrode:
                 raise ValueError(
-                    f"{source} has {value.shape[1]} electrodes called {sensor}, and a {named.title} has more: "
-                    f"give all of its columns, or rename these if they are of a {designed(value).title}"
+                    f"{source} has {value.shape[1]} electrodes called {sensor}, and a {named.title} has "
+                    f"more: give all of its columns, or rename these if they are of a {designed(value).title}"
                 )
             notes += said
             if value is not None and np.isfinite(value).any():
