@@ -61,39 +61,6 @@ if typing.TYPE_CHECKING:
 
 __version__ = "0.3.0"
 
-_HOME = {
-    "Handle": ".coupling.handle",
-    "ReadingsOptions": ".coupling.sensing.options",
-    "SkinData": ".skin",
-    "SkinGeometry": ".geometry",
-    "SkinModel": ".skin",
-    "attach": ".coupling.attachment",
-    "attach_to_hand": ".tasks.hands",
-    "handles": ".coupling.handle",
-    "import_mesh": ".geometry",
-    "load_skin": ".geometry",
-    "step": ".skin",
-    # packages
-    "batch": None,
-    "calibration": None,
-    "coupling": None,
-    "data": None,
-    "differentiable": None,
-    "discrepancy": None,
-    "effects": None,
-    "geometry": None,
-    "learning": None,
-    "mjx": None,
-    "neighbours": None,
-    "press": None,
-    "recordings": None,
-    "resimulation": None,
-    "sensor": None,
-    "skin": None,
-    "tasks": None,
-    "view": None,
-}
-
 __all__ = [
     "Handle",
     "ReadingsOptions",
@@ -109,4 +76,4 @@ __all__ = [
     "plugin",
     "step",
 ]
-__getattr__, __dir__ = lazy(__name__, {**_HOME, "plugin": None})
+__getattr__, __dir__ = lazy(__name__)

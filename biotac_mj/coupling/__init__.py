@@ -21,23 +21,4 @@ if typing.TYPE_CHECKING:
     from .stepper import register_readings as register_readings
     from .stepper import register_stepper as register_stepper
 
-_HOME = {
-    "Config": ".config",
-    "ContactSettings": ".settings",
-    "Geom": ".stepper",
-    "Handle": ".handle",
-    "Readings": ".stepper",
-    "SensorSettings": ".settings",
-    "SettingKeywords": ".settings",
-    "Settings": ".settings",
-    "SkinResult": ".stepper",
-    "SkinSettings": ".settings",
-    "SkinStepper": ".stepper",
-    "attach": ".attachment",
-    "handles": ".handle",
-    "register_readings": ".stepper",
-    "register_stepper": ".stepper",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

@@ -24,26 +24,4 @@ if typing.TYPE_CHECKING:
     from .store import write_shard as write_shard
     from .trajectories import export_mujoco as export_mujoco
 
-_HOME = {
-    "COLUMNS": ".schema",
-    "FRACTIONS": ".splits",
-    "GenerateOptions": ".generation.generate",
-    "GenerateReport": ".generation.generate",
-    "Interaction": ".schema",
-    "KINDS": ".schema",
-    "SCHEMA": ".schema",
-    "SPLITS": ".schema",
-    "Split": ".splits",
-    "TactileSet": ".store",
-    "export_lerobot": ".lerobot",
-    "export_mujoco": ".trajectories",
-    "generate": ".generation.generate",
-    "nodes_of": ".schema",
-    "shard_path": ".store",
-    "split_by_interaction": ".splits",
-    "split_by_object": ".splits",
-    "write_shard": ".store",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

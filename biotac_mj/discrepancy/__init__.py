@@ -22,23 +22,4 @@ if typing.TYPE_CHECKING:
     from .trajectories.workflow import TrajectoryDiagnosis as TrajectoryDiagnosis
     from .trajectories.workflow import diagnose as diagnose
 
-_HOME = {
-    "CATALOGUE": "..effects.catalogue",
-    "Effect": "..effects.effect",
-    "Finding": ".report.verdict",
-    "Param": "..effects.effect",
-    "PlainRecording": ".recordings.recording",
-    "Simulator": ".trajectories.model.simulator",
-    "Trajectory": ".trajectories.trajectory",
-    "TrajectoryDiagnosis": ".trajectories.workflow",
-    "Verdict": ".report.verdict",
-    "diagnose": ".trajectories.workflow",
-    "diagnose_recording": ".recordings.search",
-    "load_simulator": ".trajectories.model.sensor_file",
-    "read_recording": ".recordings.recording",
-    "read_trajectories": ".trajectories.trajectory",
-    "write_trajectories": ".trajectories.trajectory",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

@@ -8,7 +8,4 @@ if typing.TYPE_CHECKING:
     from .effect import Effect as Effect
     from .effect import Param as Param
 
-_HOME = {"Effect": ".effect", "Param": ".effect"}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

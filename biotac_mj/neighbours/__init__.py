@@ -11,7 +11,4 @@ if typing.TYPE_CHECKING:
     from . import mjlab as mjlab
     from . import ros as ros
 
-_HOME = {"isaaclab": None, "mjlab": None, "ros": None}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

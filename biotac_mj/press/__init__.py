@@ -19,20 +19,4 @@ if typing.TYPE_CHECKING:
     from .scene import build_scene as build_scene
     from .scene import see_through as see_through
 
-_HOME = {
-    "Path": ".path",
-    "PressOptions": ".path",
-    "PressRecord": ".record",
-    "PressResult": ".pressing",
-    "build_scene": ".scene",
-    "plan_path": ".path",
-    "press": ".pressing",
-    "render": ".pressing",
-    "see_through": ".scene",
-    "write_picture": ".report",
-    "write_readings": ".record",
-    "write_skin": ".record",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

@@ -20,22 +20,4 @@ if typing.TYPE_CHECKING:
     from .recording import write as write
     from .simulated import of_simulation as of_simulation
 
-_HOME = {
-    "FIELDS": ".recording",
-    "Loaded": ".importers",
-    "SCHEMA": ".recording",
-    "Recording": ".recording",
-    "draw": ".picture",
-    "faults": ".inspection",
-    "findings": ".inspection",
-    "load": ".importers",
-    "load_one": ".importers",
-    "of_simulation": ".simulated",
-    "read": ".recording",
-    "warnings": ".inspection",
-    "write": ".recording",
-    "write_bag": ".formats.bags",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

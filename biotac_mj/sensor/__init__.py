@@ -11,8 +11,4 @@ if typing.TYPE_CHECKING:
     from .readings import PhysicsReadings as PhysicsReadings
     from .weighted import WeightedElectrodes as WeightedElectrodes
 
-_HOME = {"FilmConduction": ".film", "PhysicsReadings": ".readings", "Sensor": ".presets"}
-_HOME["WeightedElectrodes"] = ".weighted"
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

@@ -23,23 +23,8 @@ if typing.TYPE_CHECKING:
     from .suite import load as load
     from .suite import tasks as tasks
 
-_HOME = {
-    "BioTac": ".biotac",
-    "Copyable": ".copying",
-    "Mount": ".hands",
-    "ESTIMATED": ".biotac",
-    "PRIVILEGED": ".biotac",
-    "TACTILE": ".biotac",
-    "attach_to_hand": ".hands",
-    "load": ".suite",
-    "make_controller": ".scripted",
-    "register": ".environments",
-    "tasks": ".suite",
-}
 _EXTRA = {"dm_control": "control", "gymnasium": "gymnasium"}
-
-__all__ = list(_HOME)
-_get, __dir__ = lazy(__name__, _HOME)
+_get, __dir__ = lazy(__name__)
 
 
 def __getattr__(name):

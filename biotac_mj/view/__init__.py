@@ -11,13 +11,4 @@ if typing.TYPE_CHECKING:
     from .window import build_scene as build_scene
     from .window import view as view
 
-_HOME = {
-    "Offscreen": ".offscreen",
-    "build_hand": ".window",
-    "build_scene": ".window",
-    "find_gl": ".offscreen",
-    "view": ".window",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)

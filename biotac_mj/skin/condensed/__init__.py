@@ -17,21 +17,11 @@ import typing
 
 from ...lazy import lazy
 
-if typing.TYPE_CHECKING:
+if typing.TYPE_CHECKING:  # loaded when they are first used: the full tier takes `refusals` alone
     from .linear import LinearSkin as LinearSkin
     from .memory import Memory as Memory
     from .memory import Outcome as Outcome
     from .skin import CondensedSkin as CondensedSkin
     from .step import CondensedStep as CondensedStep
 
-# loaded when they are first used: the full tier takes `refusals` alone
-_HOME = {
-    "CondensedSkin": ".skin",
-    "CondensedStep": ".step",
-    "LinearSkin": ".linear",
-    "Memory": ".memory",
-    "Outcome": ".memory",
-}
-
-__all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__)
