@@ -22,7 +22,6 @@ from ..coupling.touching import Touching
 from . import kernels, solid
 from .implicit import dynamics, integrator
 from .implicit.factor import Cones, Factor
-from .release import Clearance
 from .senses import Senses
 from .skin import BatchSkin
 from .skins import Skins
@@ -82,7 +81,6 @@ class Batch(Skins):
         pairs = SolidPairs(view, touching)
         self.solid_contacts = SolidContacts(pairs, self.nworld, self.device)
         self._delay = loss / (2 * math.pi * LOSS_FREQUENCY * self.dt)
-        self._clearance = Clearance(skin.model, self.nworld)
         self._qacc = None  # with which the bodies go
         self._response = self._factor = None
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
@@ -180,14 +178,11 @@ class Batch(Skins):
 
     def _put_bodies(self, m):
         """Lets bodies that were placed begin without contact; finds which were placed in the skin."""
-        r, skin, clearance = self._of_step, self.skin, self._clearance
-        laws, geoms = skin.data.laws.struct, skin.geoms.struct
+        r, skin, at, laws = self._of_step, self.skin, self.rest.clearance, self.skin.data.laws.struct
         self.place_geoms(r.here_pos, r.here_mat, m.geom_pos, m.geom_quat)
-        clearance.found.fill_(wp.vec2d(math.inf, math.inf))
-        wp.copy(clearance.close, r.inside)
-        skin.put_bodies(r.placed, self.began, self.rest.awake, clearance.close)
-        clearance.measure(geoms, laws, skin.data.rest_vert)
-        self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
+        skin.put_bodies(r.placed, self.began, self.rest.awake, r.inside)
+        at.find(r.inside, skin.geoms.struct, laws, skin.data.rest_vert)
+        self._launch(rounds.look_inside, self.nworld, [laws, at.found], [r])
 
     def look_ahead(self, m: "mjw.Model", taking_part: Marks) -> None:
         """Marks worlds that this skin cannot leave alone, after `evaluate`."""
@@ -220,8 +215,8 @@ class Batch(Skins):
         self._launch(rounds.tell_bodies, self.groups, inputs, [bodies, r])
         self._launch(rounds.uncoupled_poses, self.groups, [wanted, bodies], [r])
         self.place_geoms(r.free_pos, r.free_mat, *on_bodies)
-        skin.release.begin()
-        self._launch(rounds.ask, self.groups, [wanted, skin.release.gone], [r])
+        self.rest.begin_solve()
+        self._launch(rounds.ask, self.groups, [wanted, self.rest.gone], [r])
         self.place_geoms(r.asked_pos, r.asked_mat, *on_bodies)
         skin.begin_solve()
 

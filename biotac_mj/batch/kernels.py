@@ -17,7 +17,6 @@ __all__ = [
     "accept_models",
     "body_forces",
     "core_pose",
-    "count_failures",
     "geom_poses",
     "reset_models",
     "write_force",
@@ -127,24 +126,6 @@ def accept_models(
         model.tangent0[g, w] = hold_by_rows(tangent[g, w])
     model.pos0[g, w] = p
     model.mat0[g, w] = R
-
-
-@wp.kernel
-def count_failures(
-    # In:
-    reason: wp.array(dtype=int),
-    settled: wp.array(dtype=int),
-    # In and out:
-    failed: wp.array(dtype=int),
-    began: wp.array(dtype=int),
-):
-    """Ends a step: counts those that found no balance, of skin or of skin and bodies."""
-    w = wp.tid()
-    if reason[w] == NOT_FINITE:
-        return
-    began[w] = 1
-    if reason[w] != CONVERGED or settled[w] == 0:
-        failed[w] += 1
 
 
 @wp.kernel

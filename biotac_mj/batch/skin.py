@@ -23,7 +23,7 @@ from ..skin.step import launch_step, prepare_step
 from ..skin.transfer import Transfer
 from . import skin_kernels as kernels
 from .memory import arrays_of
-from .release import Release, rest_worlds
+from .rest import Rest
 
 __all__ = ["BatchSkin", "solve_group"]
 
@@ -52,7 +52,7 @@ class BatchSkin:
         BioTac frames are, core_pos, core_mat (nworld,) when the step begins and data.frame_pos,
         data.frame_mat when it ends.
       fresh: (nworld,) int, 1 where no step was made since the reset: such a skin begins at rest on its core.
-      release: `release.Release`, which skins are put to rest instead of solved.
+      rest: `rest.Rest`, which skins sleep, and which come to rest instead of being solved.
       x: (nvert, nworld) nodes [m].
       motion: (ngeom, nworld) of the geoms in the last step [m].
       fraction: (ngroup,) of what it does to each group that this skin answers for, see `Touching`.
@@ -121,9 +121,9 @@ class BatchSkin:
             self._every = wp.ones(nworld, dtype=int)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
-        self.release = Release(model, self.data, self.geoms)
+        self.rest = Rest(self)
         tier, of_tier = (CONDENSED, self._condensed.holders) if self._condensed else (FULL, {})
-        holders = {"batch": self, "release": self.release, **of_tier}
+        holders = {"batch": self, "rest": self.rest, **of_tier}
         self.state = StateArrays(self.data, self.geoms, tier, **holders)
         self.state.prepare()
         self._kept = []
@@ -141,7 +141,8 @@ class BatchSkin:
 
     def solve_skins(self) -> None:
         """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
-        may be captured in a CUDA graph. After `release.begin`, before `come_to_rest`.
+        may be captured in a CUDA graph. After `rest.begin_solve`, before
+        `rest.come_to_rest`.
 
         A world without a balance there comes as far as it can (`data.worlds.load_factor`); one whose poses
         are not finite stays as it was. One that nothing touches any more comes to rest, and so does one that
@@ -184,7 +185,7 @@ class BatchSkin:
         self._touched.zero_()
         left = [outer.anchor_geom, self._touched]
         self._launch(kernels.forget_contacts, faces, [where, nsample, geoms], left)
-        if self.release.possible:
+        if self.rest.possible:
             self._launch(kernels.find_bare, self.nworld, [where, self._touched, began], [self._bare])
             self.state.reset_skin(self._bare)
         self._come_from_outside(where)
@@ -214,23 +215,7 @@ class BatchSkin:
             if self.geoms.shapes == SKINS:
                 known = [self.fraction, self._path]
                 self._launch(kernels.scale_tangents, self.tangent.shape, known, [self.tangent])
-        self.release.end()
-
-    def come_to_rest(self) -> None:
-        """Resets the skins that have no contact, and those of worlds that were reset. Call it after
-        `solve_skins`. Launches only."""
-        if self.release.possible:
-            wp.capture_if(self.release.any, self._put_to_rest)
-
-    def _put_to_rest(self):
-        d, release = self.data, self.release
-        self.state.reset_skin(release.reset)
-        self._launch(
-            rest_worlds,
-            self.nworld,
-            [release.gone, release.reset],
-            [d.worlds, self.geoms.struct, self.motion, *self.outcome],
-        )
+        self.rest.end_solve()
 
     def prepare_keep(self) -> None:
         """Allocates the arrays of `keep`."""
@@ -262,7 +247,7 @@ class BatchSkin:
         self._put_back.launch_wanted(wanted, self.reason)
         self._copy_contact(wanted, self._kept_contact, self._contact)
         if self._condensed:
-            known = [wanted, self.reason, self.release.reset]
+            known = [wanted, self.reason, self.rest.resets]
             self._launch(kernels.begin_near, self.nworld, known, [self._condensed.previous.begins])
 
     def _copy_contact(self, on, source, target):

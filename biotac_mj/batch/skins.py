@@ -17,7 +17,6 @@ from ..skin.program import compile_ahead, finish_compiling
 from ..skin.state import GUESS, MEMORY, OUTCOME
 from . import kernels
 from .ahead import launched_by
-from .rest import Rest
 from .senses import Senses
 from .skin import BatchSkin
 
@@ -38,7 +37,7 @@ class Skins:
       failed: (nworld,) wp.array int, steps that found no balance since the reset.
       model: `Model`, linear models in force: of the skin ON each touching body in the BioTac frame.
       began: (nworld,) wp.array int, whether a step was made since the reset.
-      rest: `rest.Rest`, which skins take part in the step.
+      rest: `rest.Rest` of the skin, which skins take part in the step.
     """
 
     def __init__(
@@ -71,7 +70,7 @@ class Skins:
             self._valid = senses.film.valid if senses else wp.ones(self.nworld, dtype=int)
             self._no_state = wp.zeros((self.nworld, self._place.nstate), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
-        self.rest = Rest(skin)
+        self.rest = skin.rest
         if self.device.is_cuda:
             finish_compiling(compile_ahead(self.device, launched_by(self.reset)))
         self.reset()
@@ -119,8 +118,7 @@ class Skins:
         same."""
         models = [getattr(self.model, name) for name in Model.vars]
         last = [*self.skin.state.of_role(MEMORY, GUESS, OUTCOME), *models, self.failed, self.began]
-        last += [*self.rest.lasting, self.skin.release.undeformed]
-        return last, self.senses.lasting if self.senses else []
+        return [*last, *self.rest.lasting], self.senses.lasting if self.senses else []
 
     @property
     def nbytes(self) -> int:
@@ -144,10 +142,7 @@ class Skins:
 
     def end_step(self) -> None:
         """After the last one. Launches only."""
-        self.rest.end_step(self.model, self._settled, self._rounds)
-        how = [self.skin.reason, self._settled]
-        self._launch(kernels.count_failures, self.nworld, how, [self.failed, self.began])
-        self.skin.release.count(self.rest.awake)
+        self.rest.end_step(self.model, self._settled, self._rounds, self.failed, self.began)
 
     def solve_at(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
         """Solves the skins of the wanted worlds for touching bodies at pos, mat [group, world] in the BioTac
@@ -157,14 +152,14 @@ class Skins:
           geom_pos, geom_quat: mujoco_warp's arrays (1 or nworld, ngeom) of the geoms on their bodies.
         """
         self.place_geoms(pos, mat, geom_pos, geom_quat)
-        self.skin.release.begin()
+        self.rest.begin_solve()
         self.skin.solve_skins()
         self.accept(pos, mat)
 
     def accept(self, pos: wp.array, mat: wp.array) -> None:
         """Takes the models of skins that were solved for bodies there. Launches only."""
         skin, st = self.skin, self.skin.data.worlds
-        skin.come_to_rest()
+        self.rest.come_to_rest()
         where = [pos, mat, skin.geoms.struct]
         solved = [st.wanted, st.reason, st.load_factor, self.began, skin.wrench, skin.tangent]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
