@@ -16,12 +16,12 @@ from gymnasium.utils import EzPickle
 from ..fields import as_whole
 from ..short_repr import short_repr
 from ..view.offscreen import Offscreen, find_gl
-from . import copying, suite
+from . import copying, load, tasks
 from .biotac import TACTILE
 
 IDS = {
     f"BioTac/{''.join(w.capitalize() for w in task.split('_'))}-v0": (domain, task)
-    for domain, task in suite.tasks()
+    for domain, task in tasks()
 }
 _MADE_ANEW = ("suite", "_screen", "action_space", "observation_space", "_ezpickle_args", "_ezpickle_kwargs")
 
@@ -59,7 +59,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
         EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
         self.render_mode, self._screen = render_mode, None
         self._size = as_whole("width", width, 1), as_whole("height", height, 1)
-        self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
+        self.suite = load(domain, task, task_kwargs={"observe": observe, **settings})
         if render_mode is not None:
             self._screen = self._make_screen()
         action = self.suite.action_spec()  # all of them in [-1, 1]

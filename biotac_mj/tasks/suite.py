@@ -1,49 +1,25 @@
 """`load(domain, task)` as in `dm_control.suite`, for the tasks of this package."""
 
-import functools
-import importlib
 import inspect
-import typing
 
+import dm_env
 import numpy as np
+from dm_control import composer
 
 from ..fields import as_real, as_whole, refuse_unknown
 from ..short_repr import short_repr
+from . import copying
+from .base import TouchTask
+from .domains.edge import FollowEdge
+from .domains.explore import Explore
+from .domains.hold import Hold, Lift
+from .domains.press import Press
+from .domains.roll import RollBall
 
-if typing.TYPE_CHECKING:
-    from dm_control import composer
-
-    from .base import TouchTask
-
-DOMAINS = ("finger", "gripper")
-
-
-@functools.cache
-def _environment_class():
-    from dm_control import composer
-
-    from . import copying
-
-    class Environment(copying.Copyable, composer.Environment):
-        arguments: dict  # of `environment`, for copies
-
-        def step(self, action):
-            shape = self.action_spec().shape
-            try:
-                good = np.shape(action) == shape and np.isfinite(action).all()
-            except (TypeError, ValueError):
-                good = False
-            if not good:
-                raise ValueError(
-                    f"the action is {short_repr(action)}: give {shape[0]} finite numbers in [-1, 1] "
-                    f"({', '.join(self.action_spec().name.split())})"
-                )
-            return super().step(np.asarray(action, float))
-
-        def __reduce__(self):
-            return functools.partial(environment, **self.arguments), (), copying.take_state(self)
-
-    return Environment
+_TASKS = {
+    "finger": {"press": Press, "follow_edge": FollowEdge, "roll_ball": RollBall, "explore": Explore},
+    "gripper": {"hold": Hold, "lift": Lift},
+}
 
 
 def _settings(task):
@@ -60,14 +36,8 @@ def _settings(task):
     return names
 
 
-def environment(
-    task: "type[TouchTask]",
-    environment_kwargs: dict | None = None,
-    random: "int | np.random.RandomState | None" = None,
-    time_limit: float | None = None,
-    **settings: object,
-) -> "composer.Environment":
-    """A composer.Environment of a TouchTask class. A pickle or copy continues from the same state.
+class Environment(copying.Copyable, composer.Environment):
+    """The environment of a TouchTask class. A pickle or copy continues from the same state.
 
     Args:
       task: the class; settings: its arguments.
@@ -78,35 +48,55 @@ def environment(
     Raises:
       ValueError: an invalid setting, or one that the task does not have.
     """
-    refuse_unknown(settings, (*_settings(task), "random", "time_limit"), f"task_kwargs of {task.__name__}")
-    if time_limit is not None:
-        as_real("time_limit", time_limit, 0.0)
-    if random is not None and not isinstance(random, np.random.RandomState):
-        random = as_whole("random", random, 0, 2**32 - 1)
-    _dict("biotac", settings.get("biotac"))
-    more = _check_environment(environment_kwargs)
-    made = task(**settings)
-    # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
-    # forces that act in it
-    options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
-    # sums of time steps may be too small by rounding
-    limit = (made.seconds if time_limit is None else time_limit) - 1e-6
-    env = _environment_class()(made, time_limit=limit, random_state=random, **options | more)
-    env.arguments = dict(
-        task=task, environment_kwargs=environment_kwargs, random=random, time_limit=time_limit, **settings
-    )
-    state = env.random_state.get_state()
-    # the first episode compiles and draws noise that later ones do not: done here, so that a seed determines
-    # an episode
-    env.reset()
-    env.random_state.set_state(state)
-    return env
+
+    def __init__(
+        self,
+        task: type[TouchTask],
+        environment_kwargs: dict | None = None,
+        random: int | np.random.RandomState | None = None,
+        time_limit: float | None = None,
+        **settings: object,
+    ):
+        refuse_unknown(
+            settings, (*_settings(task), "random", "time_limit"), f"task_kwargs of {task.__name__}"
+        )
+        if time_limit is not None:
+            as_real("time_limit", time_limit, 0.0)
+        if random is not None and not isinstance(random, np.random.RandomState):
+            random = as_whole("random", random, 0, 2**32 - 1)
+        _dict("biotac", settings.get("biotac"))
+        more = _check_environment(environment_kwargs)
+        made = task(**settings)
+        # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
+        # forces that act in it
+        options = dict(
+            recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False
+        )
+        # sums of time steps may be too small by rounding
+        limit = (made.seconds if time_limit is None else time_limit) - 1e-6
+        super().__init__(made, time_limit=limit, random_state=random, **options | more)
+        state = self.random_state.get_state()
+        # the first episode compiles and draws noise that later ones do not: done here, so that a seed
+        # determines an episode
+        self.reset()
+        self.random_state.set_state(state)
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        shape = self.action_spec().shape
+        try:
+            good = np.shape(action) == shape and np.isfinite(action).all()
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise ValueError(
+                f"the action is {short_repr(action)}: give {shape[0]} finite numbers in [-1, 1] "
+                f"({', '.join(self.action_spec().name.split())})"
+            )
+        return super().step(np.asarray(action, float))
 
 
 def _check_environment(given):
     """Further arguments of `composer.Environment`, with checked names and types."""
-    from dm_control import composer
-
     given = _dict("environment_kwargs", given)
     known = inspect.signature(composer.Environment.__init__).parameters
     own = ("self", "task", "time_limit", "random_state")  # of task_kwargs
@@ -128,25 +118,14 @@ def _dict(name, value):
     return value or {}
 
 
-def _domain(name):
-    if not isinstance(name, str) or name not in DOMAINS:
-        raise ValueError(f"no domain {short_repr(name)}: choose one of {', '.join(DOMAINS)}")
-    try:
-        return importlib.import_module(f".domains.{name}", __package__)
-    except ModuleNotFoundError as error:
-        if not (error.name or "").startswith("dm_control"):
-            raise
-        raise ModuleNotFoundError(f"{error}: pip install 'biotac-mj[control]'", name=error.name) from error
-
-
 def tasks() -> list[tuple[str, str]]:
     """All (domain, task) pairs."""
-    return [(domain, task) for domain in DOMAINS for task in _domain(domain).SUITE]
+    return [(domain, task) for domain, known in _TASKS.items() for task in known]
 
 
 def load(
     domain_name: str, task_name: str, task_kwargs: dict | None = None, environment_kwargs: dict | None = None
-) -> "composer.Environment":
+) -> Environment:
     """An environment: `load("finger", "press", task_kwargs={"random": 0})`.
 
     Args:
@@ -158,12 +137,14 @@ def load(
     Raises:
       ValueError: no such domain or task, or a setting that the task does not have.
     """
-    suite = _domain(domain_name).SUITE
-    if not isinstance(task_name, str) or task_name not in suite:
+    if not isinstance(domain_name, str) or domain_name not in _TASKS:
+        raise ValueError(f"no domain {short_repr(domain_name)}: choose one of {', '.join(_TASKS)}")
+    known = _TASKS[domain_name]
+    if not isinstance(task_name, str) or task_name not in known:
         raise ValueError(
-            f"domain {domain_name!r} has no task {short_repr(task_name)}: choose one of {', '.join(suite)}"
+            f"domain {domain_name!r} has no task {short_repr(task_name)}: choose one of {', '.join(known)}"
         )
     settings = _dict("task_kwargs", task_kwargs)
     if "environment_kwargs" in settings or "task" in settings:
         raise ValueError("task_kwargs has environment_kwargs, or task: give them as arguments of their own")
-    return suite[task_name](environment_kwargs=environment_kwargs, **settings)
+    return Environment(known[task_name], environment_kwargs, **settings)

@@ -1,1 +1,1 @@
-"""The tasks, one module each, on one finger (`finger`) or two fingertips (`gripper`)."""
+"""The tasks of one finger and of two fingertips."""
