@@ -39,8 +39,7 @@ AT_TIP = [0.0, 0.8]
 
 @pytest.fixture(scope="module")
 def answers():
-    """A synthetic base model with two changes, of the tip's answers and of E17 to E19, and one without
-    drag."""
+    """A synthetic base model with two changes, of the tip's answers and of E17 to E19."""
     states, log_z = made_up_states(drag=(1.0,))
     at_tip = np.isin(np.arange(19), TIP)
     here = Response(states, log_z)
@@ -48,11 +47,7 @@ def answers():
         "friction": (here, Response(states, log_z * np.where(np.arange(19) > 15, 0.6, 1.0))),
         "fill": (here, Response(states, log_z * np.where(at_tip, 1.8, 1.0))),
     }
-    straight = dataclasses.replace(states.grid, drag=())
-    return (
-        here.with_changes(*(pairs[m.id] for m in TRIED)),
-        Response(states.on(straight), log_z[:, :, :1]),
-    )
+    return here.with_changes(*(pairs[m.id] for m in TRIED))
 
 
 def synthetic(answers, amount, seed, memory=0.0):
@@ -71,7 +66,7 @@ def synthetic(answers, amount, seed, memory=0.0):
     rest = log_impedance(REST_COUNTS["2"]) + rng.normal(0, 0.02, 19)
     const = Constants(rest, np.ones(19), np.array([-0.1, np.log(0.3)]), MODULUS, memory, np.array(amount))
     load = (pressing + memory * (past - pressing)) / MODULUS
-    value, _ = answers[0].at_load(load, const.amount)(state, False)
+    value, _ = answers.at_load(load, const.amount)(state, False)
     counts = counts_from_log_impedance(const.log_z(value[:, :19], time)) + rng.normal(0, 3, (n, 19))
     force = np.column_stack([value[:, 19:] * MODULUS, pressing]) @ np.linalg.inv(SIGNS)
     return PlainRecording(counts, force, rate=100.0, name=f"synthetic {seed}"), past
@@ -84,7 +79,7 @@ def of_both(answers):
         patch.setattr(models, "_ROWS", 50)
         patch.setattr(models, "_MEMORY", ())
         recordings = [synthetic(answers, AT_TIP, seed)[0] for seed in (1, 2)]
-        return diagnose_presses(recordings, *answers, TRIED, quiet=True)
+        return diagnose_presses(recordings, answers, TRIED, quiet=True)
 
 
 def test_what_two_sensors_share_is_the_base_models(of_both):
@@ -94,7 +89,6 @@ def test_what_two_sensors_share_is_the_base_models(of_both):
         assert set(sensor.worst) & set(TIP), "it finds the tip by itself"
         assert np.allclose(tested.value, 0.8 * CALIBRATED_FILL, atol=0.25 * CALIBRATED_FILL)
         assert tested.locked["worst"][1] < 0.6 * tested.locked["worst"][0]
-    assert all(by_id["drag"].significant), "drag, which it has, is missed where it is left out"
 
 
 def test_what_is_written_runs(of_both, answers, tmp_path):
@@ -130,7 +124,7 @@ def test_what_one_sensor_has_alone_is_the_sensors(answers, monkeypatch):
     monkeypatch.setattr(models, "_ROWS", 150)
     monkeypatch.setattr(models, "_MEMORY", ())
     recordings = [synthetic(answers, AT_TIP, 1)[0], synthetic(answers, [0.0, 0.0], 2)[0]]
-    found = diagnose_presses(recordings, *answers, TRIED, quiet=True)
+    found = diagnose_presses(recordings, answers, TRIED, quiet=True)
     finding = next(f for f in found.models if f.id == "fill")
     assert finding.significant == (True, False) and finding.whose == "sensor synthetic 1"
     assert found.named == []
@@ -141,7 +135,7 @@ def test_what_one_sensor_has_alone_is_the_sensors(answers, monkeypatch):
 def test_a_load_that_is_remembered(answers):
     recording, past = synthetic(answers, [0.0, 0.0], 3, memory=0.4)
     rows, _ = press_rows(recording)
-    plain = answers[0].amended(np.zeros(2))
+    plain = answers.amended(np.zeros(2))
     at = np.rint(rows.time * len(past)).astype(int)
     rows = Rows(rows.counts, rows.force, rows.time, past[at])
     const, _ = fit_constants(plain, rows[::2], Setup(gains=0.0, memory=0.3))
@@ -202,8 +196,8 @@ def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
 
     folder = pathlib.Path(os.environ["BIOTAC_RECORDINGS"])
     recordings = [read_recording(*(folder / name for name in pair)) for pair in the_tip.PRESSES]
-    base, straight, _ = tables.base_response(load_skin("coarse"), quiet=True)
-    found = diagnose_presses(recordings, base, straight, (), quiet=True)
+    base, _ = tables.base_response(load_skin("coarse"), quiet=True)
+    found = diagnose_presses(recordings, base, (), quiet=True)
     for sensor in found.sensors:
         assert {6, 7, 8} <= set(sensor.worst) and all(sensor.slope[[6, 7, 8]] > 0)
     assert found.alike[0] > 0.5 and found.alike[1] < 0.05
@@ -214,13 +208,12 @@ def test_one_recording_cannot_tell_whose_it_is(answers, monkeypatch, tmp_path, c
     """From the verb on, with synthetic tables in place of the skin's."""
     monkeypatch.setattr(models, "_ROWS", 60)
     monkeypatch.setattr(models, "_MEMORY", ())
-    base, straight = answers[0].amended(np.zeros(2)), answers[1]
-    monkeypatch.setattr(tables, "base_response", lambda *_: (base, straight, None))
+    monkeypatch.setattr(tables, "base_response", lambda *_: (answers, None))
     monkeypatch.setattr(tables, "with_effects", lambda base, *_: base)
     recording = synthetic(answers, AT_TIP, 5)[0]
-    found = diagnose_with_states([recording], tmp_path, True, ())
-    drag = next(f for f in found.models if f.id == "drag")
-    assert drag.significant == (True,) and drag.whose == "unknown"
+    found = diagnose_with_states([recording], tmp_path, True, TRIED)
+    fill = next(f for f in found.models if f.id == "fill")
+    assert fill.significant == (True,) and fill.whose == "unknown"
     assert found.alike is None and "verdict:" in capsys.readouterr().out
     with pytest.raises(ValueError, match="no force"):
-        diagnose_with_states([dataclasses.replace(recording, force=None)], tmp_path, True, ())
+        diagnose_with_states([dataclasses.replace(recording, force=None)], tmp_path, True, TRIED)

@@ -124,7 +124,7 @@ def test_every_tag_of_the_page_is_closed():
 
 
 def test_the_schema_takes_what_is_written(tmp_path):
-    figure = plots.channels([plots.Bars("a", "counts", ["e1"], [2.0], [1.0], 0.5)])
+    figure = plots.channels([Gap("counts", 2.0, 1.0, 0.5, "a", ("e1",), (2.0,), (1.0,))])
     drawn = Drawn(**vars(everywhere(HOSTILE)), figure=figure)
     paths = write_report(drawn, tmp_path)
     assert [p.name for p in paths] == ["report.html", "verdict.json", "channels.png"]

@@ -138,9 +138,9 @@ def diagnose_with_states(
     for one in recordings:
         check_nelectrode(design, one.electrodes.shape[1], one.name)
     geometry = load_skin(shipped_skin(design, "coarse"))  # states of the default's take ten times as long
-    base, straight, states = tables.base_response(geometry, quiet)
+    base, states = tables.base_response(geometry, quiet)
     response = tables.with_effects(base, states, geometry, effects, quiet)
-    found = diagnose_presses(recordings, response, straight, effects, quiet)
+    found = diagnose_presses(recordings, response, effects, quiet)
     first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
     _reported(found.beside(first), folder)
     return found

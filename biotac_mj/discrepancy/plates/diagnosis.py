@@ -18,7 +18,7 @@ from ...quality.noise import noise_level
 from ...skin import Material
 from ...skin.rubber.material import PRESETS
 from ...skin.settings import plain
-from ..evidence import RATE, asked, discoveries, further_off, sign_flip
+from ..evidence import RATE, asked, discoveries, sign_flip
 from ..recordings.diagnosis import RecordingDiagnosis
 from ..recordings.recording import PlainRecording
 from ..report import plots
@@ -29,7 +29,6 @@ from .where import leading, missing, press_cells
 __all__ = ["PlateDiagnosis", "Sensor", "Tested", "Tried", "diagnose_presses"]
 
 _TIMES = 4000  # permutations of the electrodes
-_KINDS = {"has": " (in the model)", "lacks": "", "fits": " (a fit, no reason)"}
 _BLOCKS = "blocks of time that took no part in the fit"
 
 
@@ -86,13 +85,11 @@ class Tested:
 
     @classmethod
     def of(cls, sensor: Sensor, model: Model) -> "Tested":
-        begin = None if model.kind == "has" else sensor.judged
-        new = judge(model.response, model.of(sensor.recording, sensor.rows), model.setup, begin)
-        small, large = (new, sensor.judged) if model.kind == "has" else (sensor.judged, new)
-        gain = large.gain(small, sensor.noise)
-        value = tuple(model.value(c) for c in new.constants) if model.value else ()
-        modulus = float(np.mean([c.modulus for c in new.constants]))
-        return cls(gain, _rms(sensor, small.error, large.error), value, modulus)
+        small, rows = sensor.judged, model.of(sensor.recording, sensor.rows)
+        large = judge(model.response, rows, model.setup, small)
+        value = tuple(model.value(c) for c in large.constants)
+        modulus = float(np.mean([c.modulus for c in large.constants]))
+        return cls(large.gain(small, sensor.noise), _rms(sensor, small.error, large.error), value, modulus)
 
     @property
     def nats(self) -> float:
@@ -147,7 +144,7 @@ class Tried:
     def further_off(self) -> bool:
         """Whether it is further off than the base model from what a sensor held out."""
         rms = [t.locked["all"] for t in self.tested if t.locked]
-        return any(further_off([[before**2]], [[after**2]], np.zeros(1)) for before, after in rms)
+        return any(after > before for before, after in rms)
 
     @property
     def attached(self) -> list[dict] | None:
@@ -205,14 +202,13 @@ class PlateDiagnosis(Verdict):
 
     def pictures(self) -> list[Picture]:
         """Error by electrode, what each electrode's change lacks, what each model takes away."""
-        tried = [f for f in self.models if f.model.kind != "has"]
         figure = plots.plates(
             [s.name for s in self.sensors],
             [_listed(s.worst) for s in self.sensors],
             [np.sqrt((s.judged.error**2).mean(0)) for s in self.sensors],
             [(s.slope, s.error) for s in self.sensors],
-            [f"{f.name}{' *' if f in self.named else ''}" for f in tried],
-            [[f.tested[i].closed() for f in tried] for i in range(len(self.sensors))],
+            [f"{f.name}{' *' if f in self.named else ''}" for f in self.models],
+            [[f.tested[i].closed() for f in self.models] for i in range(len(self.sensors))],
         )
         own = Picture("simulated", "tried", figure)
         return [*self.first.pictures(), own] if self.first else [own]
@@ -237,7 +233,6 @@ class PlateDiagnosis(Verdict):
 def diagnose_presses(
     recordings: list[PlainRecording],
     response: Response,
-    straight: Response,
     effects: tuple[PlateEffect, ...] = PLATE,
     quiet: bool = False,
 ) -> PlateDiagnosis:
@@ -245,12 +240,11 @@ def diagnose_presses(
 
     Args:
       response: the base model's, with a change for each of `effects`, in their order.
-      straight: the base model's without drag.
 
     Raises:
       ValueError: a recording without force, or with too few loaded rows.
     """
-    some, sensors = list(models(response, straight, effects)), []
+    some, sensors = list(models(response, effects)), []
     base = response.amended(np.zeros(len(response.changes)))
     tested = {id(model): [] for model in some}
     total = len(recordings) * (1 + len(some))
@@ -263,7 +257,7 @@ def diagnose_presses(
                 bar.update()
     tried = _tried(some, [tuple(tested[id(model)]) for model in some], sensors)
     named = _named(tried)
-    proved = {id(f): _proved(f, sensors, base) for f in tried if f in named or f.model.kind == "fits"}
+    proved = {id(f): _proved(f, sensors, base) for f in named}
     tried, named = ([proved.get(id(f), f) for f in fs] for fs in (tried, named))
     return _concluded(sensors, tried, named, _alike(sensors))
 
@@ -274,7 +268,7 @@ def _tried(some, tested, sensors):
     for model, parts, by_chance in zip(some, tested, enough):
         significant = tuple(bool(b and t.nats > asked(len(some))) for b, t in zip(by_chance, parts))
         # an amount to one side on one sensor and to the other on the other is not the base model's
-        side = {np.sign(t.value[0] - model.effect.base) for t in parts} if model.kind == "lacks" else {1}
+        side = {np.sign(t.value[0] - model.effect.base) for t in parts}
         if not any(significant):
             whose = "nobody"
         elif len(sensors) == 1:
@@ -289,7 +283,7 @@ def _tried(some, tested, sensors):
 
 def _named(tried):
     """The model with most evidence in every sensor, and those that no sensor distinguishes from it."""
-    good = [f for f in tried if f.model.kind == "lacks" and f.whose in ("base model", "unknown")]
+    good = [f for f in tried if f.whose in ("base model", "unknown")]
 
     def tied(other):
         return all(sign_flip(b.gain - o.gain) > RATE for b, o in zip(good[0].tested, other.tested))
@@ -406,7 +400,6 @@ def _finding(f, named, sensors):
             float(np.mean(t.value)), unit=effect.unit
         )
         for s, t in zip(sensors, f.tested)
-        if t.value
     }
     return Finding.of(
         effect,
@@ -426,7 +419,7 @@ def _row(f, sensor, t):
     effect, attach = f.model.effect, f.model.effect.attach
     return {
         "id": f.id,
-        "name": f.name + _KINDS[f.model.kind],
+        "name": f.name,
         "stage": STAGES[effect.stage],
         "sensor": sensor.name,
         "parameter": effect.parameter,

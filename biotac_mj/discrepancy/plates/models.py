@@ -1,6 +1,5 @@
-"""Candidate models of presses of a flat plate: the base model, the base model without one of its parts, the
-base model with one effect added. Each model is fitted on one half of the blocks of time and judged on the
-other."""
+"""Candidate models of presses of a flat plate: the base model, and the base model with one effect added. Each
+is fitted on one half of the blocks of time and judged on the other."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -12,7 +11,6 @@ from ...effects.plate import PlateEffect
 from ...matching.fit import Constants, Rows, Setup, fit_constants, fit_states, rows_of
 from ...matching.response import Response
 from ...sensor.channels import counts_from_log_impedance
-from ...skin import Material
 from ..evidence import log_ratio
 from ..recordings.recording import PlainRecording
 
@@ -39,21 +37,18 @@ def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Model:
-    """A model that is set beside the base model.
+    """The base model with one effect.
 
     Attributes:
-      effect: in words, and what attaches it. kind: "has" what the base model has, tried without it; "lacks"
-        what it has not, tried with it; "fits" what no effect explains (gains).
-      response, setup: of the fit. tau: of the load's memory [s], or None. value: of the parameter by
-        constants, None where there is none.
+      effect: in words, and what attaches it. response, setup: of the fit. value: of its parameter by
+        constants. tau: of the load's memory [s], or None.
     """
 
     effect: PlateEffect
-    kind: str
     response: Response
     setup: Setup
+    value: Callable[[Constants], float]
     tau: float | None = None
-    value: Callable[[Constants], float] | None = None
 
     def of(self, recording: PlainRecording, rows: Rows) -> Rows:
         """Rows with the pressing force as the model's memory has it."""
@@ -64,36 +59,16 @@ class Model:
         return dataclasses.replace(rows, past=past[np.rint(rows.time * len(pressing)).astype(int)])
 
 
-def models(response: Response, straight: Response, effects: tuple[PlateEffect, ...]) -> Iterator[Model]:
-    """All that are tried.
-
-    Args:
-      response: the base model's, with a change for each of `effects`, in their order.
-      straight: the base model's without drag.
-    """
-    plain, young = response.amended(np.zeros(len(response.changes))), Material().youngs_modulus
-
-    def but(**changes):
-        return dataclasses.replace(BASE, **changes)
-
-    yield Model(PlateEffect("warmup", "warm-up", "A", "", "change of ln Z"), "has", plain, but(drift=0.0))
-    drag = PlateEffect("drag", "drag of the plate", "K", "", "tangential over normal motion")
-    yield Model(drag, "has", straight, BASE)
-    stiff = PlateEffect("modulus", "Young's modulus other than the default's", "C", "", "E", "Pa")
-    yield Model(stiff, "has", plain, but(hold_modulus=True, modulus=young))
-    gain = PlateEffect("gain", "gains of single electrodes", "T", "", "spread of the gains")
-    yield Model(gain, "fits", plain, but(gains=Setup().gains), value=lambda c: float(c.gain.std()))
+def models(response: Response, effects: tuple[PlateEffect, ...]) -> Iterator[Model]:
+    """All that are tried; response: the base model's, with a change for each of `effects`, in their order."""
+    plain = response.amended(np.zeros(len(response.changes)))
     for tau in _MEMORY:
         one = PlateEffect(f"memory_{tau:g}s", f"relaxation within {tau:g} s", "C", "", "fraction of the load")
-        yield Model(one, "lacks", plain, but(memory=0.3), tau, lambda c: c.memory)
+        setup = dataclasses.replace(BASE, memory=0.3)
+        yield Model(one, plain, setup, lambda c: c.memory, tau)
     for k, one in enumerate(effects):
-        yield Model(
-            one,
-            "lacks",
-            response.only(k),
-            but(amount=1.0),
-            value=lambda c, one=one: one.value(float(c.amount[0])),
-        )
+        setup = dataclasses.replace(BASE, amount=1.0)
+        yield Model(one, response.only(k), setup, lambda c, one=one: one.value(float(c.amount[0])))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,7 +1,6 @@
 """Tables of answers of a flat press: the base model's, and those with each of the catalogue's effects that a
 plate shows."""
 
-import dataclasses
 from collections.abc import Sequence
 
 from ...cache import cached
@@ -19,12 +18,10 @@ _BASE = PlateGrid()
 COARSER = PlateGrid(_BASE.pitch[::3] + _BASE.pitch[-1:], _BASE.roll[::3], _BASE.drag[-1:])
 
 
-def base_response(geometry: SkinGeometry, quiet: bool = False) -> tuple[Response, Response, PlateStates]:
-    """The base model's answers, those without drag, and its states."""
+def base_response(geometry: SkinGeometry, quiet: bool = False) -> tuple[Response, PlateStates]:
+    """The base model's answers, and its states."""
     states = plate_states(geometry, Material(), quiet=quiet)
-    log_z = _readings(states, geometry, {})
-    plain = dataclasses.replace(states.grid, drag=())
-    return Response(states, log_z), Response(states.on(plain), log_z[:, :, :1]), states
+    return Response(states, _readings(states, geometry, {})), states
 
 
 def with_effects(

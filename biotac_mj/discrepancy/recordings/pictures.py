@@ -16,16 +16,12 @@ def pictures_of(diagnosis: Verdict) -> list[Picture]:
     found."""
     d, r = diagnosis, diagnosis.recording
     views = {"as measured": r.electrodes, "without the effects found": d.session.filled()}
-    bars = [
-        plots.Bars(f"{name}, held out", g.unit, g.channels, g.channels_before, g.channels_after, g.noise)
-        for name, g in d.gap.items()
-        if g.unit == "counts"
-    ]
     curves = plots.curves(_panels(d), simulated="simulated: rest and load, as the others say it")
+    overview = plots.overview(r.time, views, r.force, _aside(d))
     return [
         Picture("curves", "curves", curves),
-        Picture("channels", "gap", plots.channels(bars)),
-        Picture("overview", "unknown", plots.overview(r.time, views, r.force, _aside(d))),
+        Picture("channels", "gap", plots.channels(list(d.gap.values()))),
+        Picture("overview", "unknown", overview),
     ]
 
 
@@ -34,7 +30,7 @@ def _aside(d):
     return time[~d.session.fit][0], time[-1]
 
 
-def worst(diagnosis: Verdict) -> list[int]:
+def _worst(diagnosis: Verdict) -> list[int]:
     """Electrodes that the effects change most on the held-out part, by number from 0; of an empty verdict
     those with the largest residual."""
     s = diagnosis.session
@@ -54,7 +50,7 @@ def _panels(d):
         for x in (r.electrodes, r.electrodes - s.filled())
     )
     panels = []
-    for k in worst(d):
+    for k in _worst(d):
         simulated = said[:, np.flatnonzero(m.used == k)[0]] if k in m.used else None
         names = dict.fromkeys(
             f.kind.name

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...sensor.colors import line_color
-from .verdict import electrode_names
+from .verdict import Gap, electrode_names
 
 __all__ = [
-    "Bars",
     "Panel",
     "channels",
     "curves",
@@ -38,22 +37,6 @@ class Panel:
     simulated: np.ndarray | None = None
     amended: np.ndarray | None = None
     aside: tuple[float, float] | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Bars:
-    """RMS of channels without and with what was found.
-
-    Attributes:
-      title; unit; names (c,) of the channels; before, after: (c,); noise: one number, or None.
-    """
-
-    title: str
-    unit: str
-    names: Sequence[str]
-    before: Sequence[float]
-    after: Sequence[float]
-    noise: float | None = None
 
 
 def _figure(width, height, rows=1, columns=1):
@@ -90,18 +73,18 @@ def curves(panels: Sequence[Panel], columns: int = 1, simulated: str = "simulate
     return figure
 
 
-def channels(groups: Sequence[Bars]) -> object:
+def channels(gaps: Sequence[Gap]) -> object:
     """RMS of every channel without and with what was found, beside the noise."""
-    figure, axes = _figure(9, 2.6 * max(1, len(groups)), max(1, len(groups)))
-    for ax, one in zip(axes[:, 0], groups):
-        x = np.arange(len(one.names))
-        ax.bar(x - 0.2, one.before, 0.4, label="simulated", color=_UNAMENDED)
-        ax.bar(x + 0.2, one.after, 0.4, label="amended", color=_AMENDED)
-        if one.noise is not None:
-            ax.axhline(one.noise, color="k", lw=0.7, ls=":", label="noise")
-        ax.set_xticks(x, one.names, fontsize=7)
+    figure, axes = _figure(9, 2.6 * len(gaps), len(gaps))
+    for ax, one in zip(axes[:, 0], gaps):
+        x = np.arange(len(one.channels))
+        ax.bar(x - 0.2, one.channels_before, 0.4, label="simulated", color=_UNAMENDED)
+        ax.bar(x + 0.2, one.channels_after, 0.4, label="amended", color=_AMENDED)
+        if np.isfinite(one.noise):
+            ax.axhline(one.noise, color="k", lw=0.7, ls=":", label="noise and resolution")
+        ax.set_xticks(x, one.channels, fontsize=7)
         ax.set_ylabel(f"RMS [{one.unit}]", fontsize=8)
-        ax.set_title(one.title, fontsize=9)
+        ax.set_title(f"{one.name}, held out", fontsize=9)
         ax.legend(fontsize=7)
     return figure
 

@@ -14,12 +14,11 @@ _SHOWN = 4  # trajectories, of each of two channels
 
 def pictures_of(diagnosis: Verdict) -> list[Picture]:
     """Curves and channels on held-out trajectories, and where the model is off."""
-    drawn = {
-        "curves": ("curves", _curves),
-        "channels": ("gap", _channels),
-        "where": ("where", _where),
-    }
-    return [Picture(name, section, draw(diagnosis)) for name, (section, draw) in drawn.items()]
+    return [
+        Picture("curves", "curves", _curves(diagnosis)),
+        Picture("channels", "gap", plots.channels(list(diagnosis.gap.values()))),
+        Picture("where", "where", _where(diagnosis)),
+    ]
 
 
 def _curves(diagnosis):
@@ -39,13 +38,6 @@ def _curves(diagnosis):
                 )
             )
     return plots.curves(panels, columns=min(_SHOWN, len(diagnosis.locked)))
-
-
-def _channels(diagnosis):
-    c, proof = diagnosis.comparison, diagnosis.proof
-    each = [np.array(gap["channels"]) / c.sigma for gap in (proof.before, proof.after)]
-    title, unit = "held-out trajectories", "times noise and resolution"
-    return plots.channels([plots.Bars(title, unit, c.channels, *each, 1.0)])
 
 
 def _where(diagnosis):
