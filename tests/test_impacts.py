@@ -312,6 +312,31 @@ def test_the_stages_of_a_step_crush_no_light_body():
         assert energy() < start + 1e-4
 
 
+@pytest.mark.parametrize(
+    "integrator, tie, turn",
+    [
+        ("implicitfast", '<connect body1="a" body2="b" anchor=".004 0 .002"/>', 0.6),
+        ("implicitfast", '<weld body1="a" body2="b"/>', 1.0),
+        ("RK4", '<connect body1="a" body2="b" anchor=".004 0 .002"/>', 1.5),
+        ("RK4", '<weld body1="a" body2="b"/>', 3.0),
+    ],
+)
+def test_mujoco_alone_loses_a_tied_pair_that_whirls(integrator, tie, turn):
+    """By so many radians a step, with nothing else in the scene: a limit of what a crush may be."""
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep=".002" integrator="{integrator}" gravity="0 0 0"/><worldbody>'
+        '<body name="a"><freejoint/><geom type="cylinder" size=".0041 .0056" euler="73 254 51" mass=".008"/>'
+        '</body><body name="b" pos=".008 0 .004"><freejoint/><geom size=".003" mass=".008"/></body>'
+        f"</worldbody><equality>{tie}</equality></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    spin = turn / 0.002 * np.array([0.3, 1, 0.2]) / np.linalg.norm([0.3, 1, 0.2])
+    for body in range(2):
+        data.qvel[6 * body :][:6] = *np.cross(spin, data.qpos[7 * body :][:3] - [0.004, 0, 0.002]), *spin
+    mujoco.mj_step(model, data, 30)
+    assert sum(warning.number for warning in data.warning)
+
+
 @pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
 def test_thrown_bodies_settle_with_all_integrators(integrator):
     """With Runge-Kutta 6 of 16 steps did not: its stages took bodies elsewhere than the first one said."""

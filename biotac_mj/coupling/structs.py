@@ -40,6 +40,7 @@ for _stage in (
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
+LIBRARY.mj_mulJacTVec.argtypes = (ctypes.c_void_p,) * 4
 LIBRARY.mj_integratePos.argtypes = (*(ctypes.c_void_p,) * 3, ctypes.c_double)
 
 _SCALARS = {
@@ -311,6 +312,12 @@ class DataView(_View):
         """(k, nv) accelerations by generalised forces (k, nv), without any constraint."""
         out, force = np.empty(force.shape), np.ascontiguousarray(force)
         LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
+        return out
+
+    def pushed_by(self, force: np.ndarray) -> np.ndarray:
+        """(nv,) generalised forces of forces (nefc,) of the constraint rows."""
+        out, force = np.empty(self.model.nv), np.ascontiguousarray(force)
+        LIBRARY.mj_mulJacTVec(self.model.address, self.address, out.ctypes.data, force.ctypes.data)
         return out
 
     def find_poses(self) -> None:

@@ -225,7 +225,7 @@ class World:
             self._group.find_frequencies()
             self._acting, self._now, self._began_with = skins, self.data.qpos.copy(), self.data.qvel.copy()
             if skins[0].instance.by_stages:
-                self._held_trees = self._touched_trees(skins)
+                self._held_trees, self._ties = self._touched_trees(skins), self._force_of_ties()
         else:
             rounds = 1
             self._group.evaluate(np.zeros(self.model.nv))
@@ -244,10 +244,19 @@ class World:
             trees[tree[skin.jacobian[skin.touching].any(axis=(0, 1))]] = True
         return self.data.linked_trees(trees)
 
+    def _force_of_ties(self):
+        """(nv,) generalised forces of equality constraints, as the last solve left them."""
+        force = self.data.rows().efc_force.copy()
+        force[self.data.ne :] = 0.0
+        for t in self.coupled:
+            force[t.metric.numbers] = 0.0
+        return self.data.pushed_by(force)
+
     def _go_on(self):
-        """Lets the forces of the skins, and of MuJoCo's constraints on trees that they touch, that the first
-        of Runge-Kutta's stages found act in this one: both were found for the whole step, and do not hold
-        where a stage has the bodies. All other forces are those of the stage."""
+        """Lets the forces of the skins, and of MuJoCo's contacts, limits and friction on trees that they
+        touch, that the first of Runge-Kutta's stages found act in this one: all were found for the whole
+        step, and do not hold where a stage has the bodies. All other forces are those of the stage: equality
+        constraints turn with what they hold, and answer to the others."""
         data = self.data
         self._take_rows()
         for t in self.coupled:
@@ -256,10 +265,11 @@ class World:
         if self._acting:
             if self._stage == 2:
                 held = self._held_trees[self.model.dof_treeid]
-                self._held = np.where(held, data.qfrc_constraint, 0.0)
+                self._held = np.where(held, data.qfrc_constraint - self._ties, 0.0)
             data.qfrc_passive += self._pushes + self._held
             self._weights = data.rows().efc_D.copy()
             held = data.trees_of_rows()[:, self._held_trees].any(axis=1)
+            held[: data.ne] = False
             data.weigh_constraints(np.where(held, MINVAL, self._weights))
 
     def _leave_constraint_forces(self):
