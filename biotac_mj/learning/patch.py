@@ -10,6 +10,7 @@ import torch
 from ..files import save_figure, write_json
 from ..geometry import load_skin
 from ..geometry.design import check_nelectrode
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import face_areas, node_areas
 from ..recordings import load_one
 from .predictor import PointsModel
@@ -19,8 +20,6 @@ from .weights import find_weights, load_inverse
 if typing.TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
-
-    from ..geometry.skin_geometry import SkinGeometry
 
 _UNTOUCHED = 0.05  # [N]
 # thresholds of a drift note: number of rows, correlation with TDC, and counts above noise and a light touch
@@ -45,7 +44,7 @@ class Estimate(typing.NamedTuple):
 
 
 def estimate(
-    counts: np.ndarray, tare: np.ndarray, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None
+    counts: np.ndarray, tare: np.ndarray, geometry: SkinGeometry, weights: pathlib.Path | str | None = None
 ) -> Estimate:
     """Displacements and contact of raw counts.
 

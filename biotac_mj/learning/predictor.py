@@ -1,23 +1,19 @@
 """The trained forward model: deformed skin -> d ln Z -> impedances and counts, one sensor or many."""
 
-import typing
-
 import numpy as np
 import torch
 from torch import nn
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import node_normals
 from .networks.graph import SparseMatrix
 from .networks.heads import FromRest, LocalHead
+from .networks.points import SkinPoints
+from .training.arrays import Arrays
+from .training.config import LearningConfig
 from .training.features import FilmFeatures, Pod
 from .training.local import counts_change
 from .training.paper import network_change
-
-if typing.TYPE_CHECKING:
-    from ..geometry.skin_geometry import SkinGeometry
-    from .networks.points import SkinPoints
-    from .training.arrays import Arrays
-    from .training.config import LearningConfig
 
 
 class _Served(nn.Module):
@@ -55,9 +51,9 @@ class PointsModel(_Served):
     def __init__(
         self,
         net: nn.Module,
-        points: "SkinPoints",
-        geometry: "SkinGeometry",
-        config: "LearningConfig",
+        points: SkinPoints,
+        geometry: SkinGeometry,
+        config: LearningConfig,
         meta: dict,
     ):
         super().__init__()
@@ -83,7 +79,7 @@ class PointsModel(_Served):
         self._check(displacement)
         return self.electrodes(self.unit * self.to_points.fields(displacement))
 
-    def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
+    def change(self, arrays: Arrays, rows: torch.Tensor) -> torch.Tensor:
         """(k, nelectrode) predicted change of counts in rows of a set."""
         output = self.log_change(arrays.field[rows].float())
         return network_change(output, arrays.tare[rows], self.config)
@@ -109,7 +105,7 @@ class ForwardModel(_Served):
       geometry: SkinGeometry of the training. meta: description in the weights' file. modes: components.
     """
 
-    def __init__(self, geometry: "SkinGeometry", meta: dict, modes: int):
+    def __init__(self, geometry: SkinGeometry, meta: dict, modes: int):
         super().__init__()
         self.meta, self.nvert = meta, geometry.nvert
         self.pod, self.film = Pod(geometry.nvert, modes), FilmFeatures(geometry)

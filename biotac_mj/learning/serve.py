@@ -1,20 +1,17 @@
 """Learned film: electrodes from a network for a step of MuJoCo, of dm-control or of a batch."""
 
+import contextlib
 import functools
 import pathlib
-import typing
 
 import numpy as np
 import torch
+import warp as wp
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.presets import Sensor, read_sensor
+from .predictor import ForwardModel
 from .weights import check_forward, find_weights, load_forward
-
-if typing.TYPE_CHECKING:
-    import warp as wp
-
-    from ..geometry.skin_geometry import SkinGeometry
-    from .predictor import ForwardModel
 
 
 class NetworkFilm:
@@ -28,13 +25,13 @@ class NetworkFilm:
       geometry: the skin. rest: (n,) impedance at rest [ohm].
     """
 
-    def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
+    def __init__(self, geometry: SkinGeometry, weights: pathlib.Path | str | None = None):
         self._weights, self.geometry = find_weights(weights), geometry
         check_forward(self._weights, geometry)
         self.rest = read_sensor(None, design=geometry.design).impedance
 
     @functools.cached_property
-    def model(self) -> "ForwardModel":
+    def model(self) -> ForwardModel:
         return load_forward(self._weights, self.geometry)
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
@@ -65,14 +62,12 @@ class LearnedBatchFilm:
 
     def __init__(
         self,
-        geometry: "SkinGeometry",
+        geometry: SkinGeometry,
         nworld: int,
         device: str = "cpu",
         weights: pathlib.Path | str | None = None,
         sensor: str | Sensor | None = None,
     ):
-        import warp as wp
-
         self.device = wp.get_device(device)
         torch_device = wp.device_to_torch(self.device)
         self.model = load_forward(find_weights(weights), geometry).to(torch_device)
@@ -91,13 +86,9 @@ class LearnedBatchFilm:
                 self.solve_film(wp.from_torch(x, dtype=wp.vec3d), wp.zeros(nworld, dtype=int))
 
     @torch.no_grad()
-    def solve_film(self, x: "wp.array", due: "wp.array") -> None:
+    def solve_film(self, x: wp.array, due: wp.array) -> None:
         """Computes new impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due
         (nworld,) wp.array of int. Launches only: may be captured in a CUDA graph."""
-        import contextlib
-
-        import warp as wp
-
         with contextlib.ExitStack() as stack:
             if self.device.is_cuda:  # in order with Warp's launches
                 stream = wp.stream_to_torch(wp.get_stream(self.device))

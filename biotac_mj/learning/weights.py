@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import pathlib
-import typing
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -12,17 +11,17 @@ import torch
 
 from ..fields import check_entries
 from ..files import replacing
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import design_of
 from ..reading import reading
-
-if typing.TYPE_CHECKING:
-    from ..geometry.skin_geometry import SkinGeometry
-    from .networks.points import SkinPoints
-    from .predictor import ForwardModel, PointsModel
-    from .training.config import LearningConfig
-    from .training.features import Pod
-    from .training.inverse import InverseHead
-    from .training.paper import LatentProjection, PointNet
+from .networks.pointnet import PointNet
+from .networks.points import SkinPoints
+from .predictor import ForwardModel, PointsModel
+from .training.config import LearningConfig
+from .training.features import Pod
+from .training.inverse import InverseHead
+from .training.local import MODES
+from .training.paper import LatentProjection, make_pointnet
 
 _DAMAGED = "it is damaged: train again, or copy it again"
 FORMAT = "biotac_mj.learning.weights/1"
@@ -46,7 +45,7 @@ _DESCRIPTION_OF = {
 _AT_POINTS = {"latent_projection": ("forward", "inverse"), "pointnet": ("forward",)}
 
 
-def mesh_key(geometry: "SkinGeometry") -> str:
+def mesh_key(geometry: SkinGeometry) -> str:
     """Fingerprint of a skin's rest nodes, rounded to a micrometre."""
     return hashlib.sha256(np.rint(geometry.vert * 1e6).astype(np.int32).tobytes()).hexdigest()[:16]
 
@@ -79,15 +78,13 @@ def find_weights(weights: pathlib.Path | str | None, direction: str = "forward")
 def save_forward(
     path: pathlib.Path | str,
     members: Sequence[Callable],
-    pod: "Pod",
-    config: "LearningConfig",
-    geometry: "SkinGeometry",
+    pod: Pod,
+    config: LearningConfig,
+    geometry: SkinGeometry,
     about: dict,
 ) -> None:
     """Writes an ensemble of results of `local.train_head` (half precision, without buffers that follow from
     the mesh)."""
-    from .training.local import MODES
-
     tensors = {"pod.basis": pod.basis[:, :MODES], "pod.scale": pod.scale[:MODES]}
     for k, member in enumerate(members):
         tensors |= {f"member{k}.{name}": value for name, value in member.head.state_dict().items()}
@@ -101,9 +98,7 @@ def save_forward(
     _save(path, tensors, geometry, meta)
 
 
-def save_inverse(
-    path: pathlib.Path | str, head: "InverseHead", geometry: "SkinGeometry", about: dict
-) -> None:
+def save_inverse(path: pathlib.Path | str, head: InverseHead, geometry: SkinGeometry, about: dict) -> None:
     """Writes an `inverse.InverseHead`."""
     _save(
         path,
@@ -115,9 +110,9 @@ def save_inverse(
 
 def save_points_model(
     path: pathlib.Path | str,
-    net: "LatentProjection | PointNet",
-    points: "SkinPoints",
-    config: "LearningConfig",
+    net: LatentProjection | PointNet,
+    points: SkinPoints,
+    config: LearningConfig,
     about: dict,
 ) -> None:
     """Writes a `LatentProjection`, with both directions, or a `PointNet`, with the points at which it reads
@@ -262,14 +257,13 @@ def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) ->
     write_tensors(target, load(pathlib.Path(source).read_bytes()), describe(source) | more)
 
 
-def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel | PointsModel":
+def load_forward(path: pathlib.Path | str, geometry: SkinGeometry) -> ForwardModel | PointsModel:
     """A `predictor.ForwardModel`, or, for a network that reads `SkinPoints`, a `predictor.PointsModel`.
 
     Raises:
       FileNotFoundError: no such file.
       ValueError: another mesh, other channels, or tensors that do not fit.
     """
-    from .predictor import ForwardModel
 
     meta, tensors = _load(path, geometry, "forward")
     if meta["direction"] == "points":
@@ -284,17 +278,12 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
     return model.eval()
 
 
-def check_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> None:
+def check_forward(path: pathlib.Path | str, geometry: SkinGeometry) -> None:
     """Raises like `load_forward` if the header of a file says that it does not fit this skin."""
     _refuse_other(describe(path), path, geometry, "forward")
 
 
 def _points_model(path, meta, tensors, geometry):
-    from .networks.points import SkinPoints
-    from .predictor import PointsModel
-    from .training.config import LearningConfig
-    from .training.paper import LatentProjection, make_pointnet
-
     graph = {k.removeprefix("points."): v for k, v in tensors.items() if k.startswith("points.")}
     with reading(path, "file of weights that fit together", _DAMAGED):
         config = LearningConfig(**meta["config"])
@@ -305,11 +294,9 @@ def _points_model(path, meta, tensors, geometry):
     return PointsModel(net, points, geometry, config, meta).eval()
 
 
-def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "InverseHead | PointsModel":
+def load_inverse(path: pathlib.Path | str, geometry: SkinGeometry) -> InverseHead | PointsModel:
     """An `inverse.InverseHead`, or a latent projection's `predictor.PointsModel`, from weights; raises like
     `load_forward`."""
-    from .training.features import Pod
-    from .training.inverse import InverseHead
 
     meta, tensors = _load(path, geometry, "inverse")
     if meta["direction"] == "points":

@@ -1,17 +1,14 @@
 """The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, with a code
 of 128."""
 
-import typing
 from collections.abc import Sequence
 
 import torch
 from torch import nn
 
 from .graph import ChebConv, SparseMatrix
+from .hierarchy import Level
 from .vae import VAE
-
-if typing.TYPE_CHECKING:
-    from .hierarchy import Level
 
 
 class MeshVAE(VAE):
@@ -30,7 +27,7 @@ class MeshVAE(VAE):
 
     def __init__(
         self,
-        levels: "list[Level]",
+        levels: list[Level],
         first: int = 128,
         channels: Sequence[int] = (128, 128, 256, 64),
         last: int = 64,

@@ -5,17 +5,14 @@ are interpolated to them by the shape functions of its tetrahedra, and from them
 reference skin."""
 
 import dataclasses
-import typing
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import cKDTree
 
+from ...geometry.skin_geometry import SkinGeometry
 from .hierarchy import Level, build_hierarchy
-
-if typing.TYPE_CHECKING:
-    from ...geometry.skin_geometry import SkinGeometry
 
 SAME_SHAPE = (
     0.5e-3  # [m] half the thickness of the skin: at a larger distance the points belong to another skin
@@ -63,7 +60,7 @@ class SkinPoints:
         whole, *levels = build_hierarchy(skin.vert, skin.tets, (skin.nvert / count, *factors))
         return cls(skin.vert[whole.keep], levels, whole.up, reference)
 
-    def reading(self, geometry: "SkinGeometry") -> csr_matrix:
+    def reading(self, geometry: SkinGeometry) -> csr_matrix:
         """(n, nvert) CSR: interpolation from the nodes of a skin to the points.
 
         Raises:
@@ -79,7 +76,7 @@ class SkinPoints:
             )
         return out
 
-    def spreading(self, geometry: "SkinGeometry") -> csr_matrix:
+    def spreading(self, geometry: SkinGeometry) -> csr_matrix:
         """(nvert, n) CSR: interpolation from the points to the nodes of a skin."""
         from ...geometry import load_skin
 

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from ...sensor.channels import check_counts, counts_from_impedance, log_impedance
 from ..networks.graph import SparseMatrix
+from ..networks.points import SkinPoints
 
 if typing.TYPE_CHECKING:
     from ...data import TactileSet
-    from ..networks.points import SkinPoints
 
 
 @dataclasses.dataclass
@@ -93,7 +93,7 @@ class Arrays:
         return torch.as_tensor(value - before, dtype=torch.float32, device=self.device)
 
     @torch.no_grad()
-    def at_points(self, points: "SkinPoints") -> "Arrays":
+    def at_points(self, points: SkinPoints) -> "Arrays":
         """The set with displacements at the points."""
         matrix = SparseMatrix(points.reading(self.geometry)).to(self.device)
         parts = [matrix.fields(u).half() for u in self.field.split(512)]
@@ -147,6 +147,7 @@ def load_arrays(
       ValueError: no displacements or measured counts in it, channels in another order, NaN, or interactions
         without a row before touch.
     """
+
     from ...data import TactileSet
 
     with TactileSet(path) as data:

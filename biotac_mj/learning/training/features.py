@@ -1,18 +1,16 @@
 """Features of a displacement field for the electrodes: principal components, film and strain over each
 electrode, and the mirror image."""
 
-import typing
-
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import nn
 
+from ...geometry.core_surface import CoreSurface
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.film import excitation_places
 from ..networks.points import SAME_SHAPE, shape_values
-
-if typing.TYPE_CHECKING:
-    from ...geometry.skin_geometry import SkinGeometry
 
 _RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
 _FILM = 50e-6  # [m] residual film where the skin touches the core, as in sensor.film
@@ -85,11 +83,8 @@ class FilmFeatures(nn.Module):
       count: features of one electrode.
     """
 
-    def __init__(self, geometry: "SkinGeometry"):
+    def __init__(self, geometry: SkinGeometry):
         super().__init__()
-        from ...geometry.core_surface import CoreSurface
-        from ...sensor.film import excitation_places
-
         node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
         place = geometry.vert[node]
         gap, foot, triangle = CoreSurface(geometry.core_vert, geometry.core_face).closest(place)
@@ -175,13 +170,13 @@ class FilmFeatures(nn.Module):
         return torch.cat([local, linear, whole], 2)
 
 
-def mirror_matrix(geometry: "SkinGeometry") -> csr_matrix:
+def mirror_matrix(geometry: SkinGeometry) -> csr_matrix:
     """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0. Curved surfaces do not map
     onto themselves exactly."""
     return shape_values(geometry.vert, geometry.tets, geometry.vert * [1, 1, -1])
 
 
-def mirror_order(geometry: "SkinGeometry") -> np.ndarray | None:
+def mirror_order(geometry: SkinGeometry) -> np.ndarray | None:
     """(nelectrode,) electrode that is the mirror image of each one in z = 0; None for a fingertip that is
     not symmetric, whose mirrored touches say nothing of it."""
     flip = np.array([1, 1, -1])

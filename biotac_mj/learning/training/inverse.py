@@ -1,6 +1,5 @@
 """From electrodes to the skin: displacements, contact forces and the contact patch."""
 
-import typing
 from collections.abc import Callable
 
 import numpy as np
@@ -12,13 +11,10 @@ from ...sensor.channels import check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
 from . import fitting
-from .features import mirror_order, orthogonal_modes
+from .arrays import Arrays
+from .config import LearningConfig
+from .features import Pod, mirror_order, orthogonal_modes
 from .fitting import Checkpoints, TrainingOptions, root_mean_square
-
-if typing.TYPE_CHECKING:
-    from .arrays import Arrays
-    from .config import LearningConfig
-    from .features import Pod
 
 PATCH = 0.15  # fraction of the largest nodal force above which a node is in the patch
 
@@ -34,7 +30,7 @@ class InverseHead(nn.Module):
 
     def __init__(
         self,
-        pod: "Pod",
+        pod: Pod,
         force_modes: int,
         nouter: int,
         nelectrode: int,
@@ -65,10 +61,10 @@ class InverseHead(nn.Module):
 
 
 def train_inverse(
-    arrays: "Arrays",
+    arrays: Arrays,
     train: np.ndarray,
     validation: np.ndarray,
-    config: "LearningConfig",
+    config: LearningConfig,
     pod: tuple,
     seed: int = 0,
     checkpoints: Checkpoints | None = None,
@@ -159,7 +155,7 @@ def patch_of_push(push: np.ndarray, force: np.ndarray) -> float:
 
 
 @torch.no_grad()
-def inverse_errors(arrays: "Arrays", model: Callable, rows: torch.Tensor, patch: float = PATCH) -> dict:
+def inverse_errors(arrays: Arrays, model: Callable, rows: torch.Tensor, patch: float = PATCH) -> dict:
     """Errors of an inverse model, each (n,): of the field as `field_errors`, of the patch's centre [mm] and
     its overlap, NaN below 0.1 N.
 

@@ -1,7 +1,6 @@
 """Our model: film features over each electrode, target d ln Z, with the simulation's film as a teacher."""
 
 import functools
-import typing
 from collections.abc import Callable
 
 import numpy as np
@@ -11,20 +10,17 @@ from ...geometry.skins import mesh_of_same_design
 from ...sensor.channels import FULL_SCALE
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead
+from ..networks.points import SkinPoints
 from . import fitting
-from .features import FilmFeatures, mirror_matrix, mirror_order
+from .arrays import Arrays
+from .config import LearningConfig
+from .features import FilmFeatures, Pod, mirror_matrix, mirror_order
 from .fitting import Checkpoints, TrainingOptions, root_mean_square
-
-if typing.TYPE_CHECKING:
-    from ..networks.points import SkinPoints
-    from .arrays import Arrays
-    from .config import LearningConfig
-    from .features import Pod
 
 MODES = 32  # components of the mesh that a head reads
 
 
-def film_with_gains(arrays: "Arrays", fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+def film_with_gains(arrays: Arrays, fit: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
     """Change of counts (n, nelectrode) of the simulation's own film in rows (n,), with one gain of d ln Z for
     each electrode fitted to labelled rows `fit`."""
     z = arrays.film_change()
@@ -49,7 +45,7 @@ class Features:
         touches.
     """
 
-    def __init__(self, arrays: "Arrays", config: "LearningConfig"):
+    def __init__(self, arrays: Arrays, config: LearningConfig):
         self.arrays, self.config = arrays, config
         self.film = FilmFeatures(arrays.geometry).to(arrays.device)
         self.local = self._local(lambda u: u)
@@ -71,15 +67,14 @@ class Features:
         return torch.cat([self.film(change(u)) for u in self.arrays.field.split(256)])
 
     @torch.no_grad()
-    def components(self, pod: "Pod", mirrored: bool = False) -> torch.Tensor:
+    def components(self, pod: Pod, mirrored: bool = False) -> torch.Tensor:
         """(n, modes) components of all rows."""
         change = self.mirror if mirrored else lambda u: u.float()
         return torch.cat([pod(change(u)) for u in self.arrays.field.split(512)])
 
     @functools.cached_property
-    def at_points(self) -> tuple["SkinPoints", "Arrays"]:
+    def at_points(self) -> tuple[SkinPoints, Arrays]:
         """Points at which the paper's networks read the skin, and the set there."""
-        from ..networks.points import SkinPoints
 
         own = mesh_of_same_design(self.arrays.geometry, "coarse")
         points = SkinPoints.choose(self.config.mesh_points, self.config.mesh_factors, own)
@@ -90,7 +85,7 @@ def train_head(
     features: Features,
     train: np.ndarray,
     validation: np.ndarray,
-    config: "LearningConfig",
+    config: LearningConfig,
     seed: int,
     pod: tuple,
     checkpoints: Checkpoints | None = None,

@@ -1,8 +1,6 @@
 """The paper's networks (Narang et al., ICRA 2021) on one split: two VAEs, projections between their codes,
 and PointNet++. They read the skin at `SkinPoints`."""
 
-import typing
-
 import numpy as np
 import torch
 from torch import nn
@@ -11,15 +9,12 @@ from ..networks.electrode_vae import ElectrodeVAE, mlp
 from ..networks.heads import FromRest
 from ..networks.mesh_vae import MeshVAE
 from ..networks.pointnet import PointNet
+from ..networks.points import SkinPoints
 from . import fitting
-from .arrays import spread_rows
+from .arrays import Arrays, spread_rows
+from .config import LearningConfig
 from .fitting import Checkpoints, TrainingOptions, fast_products, root_mean_square
 from .local import counts_change
-
-if typing.TYPE_CHECKING:
-    from ..networks.points import SkinPoints
-    from .arrays import Arrays
-    from .config import LearningConfig
 
 
 class LatentProjection(nn.Module):
@@ -29,7 +24,7 @@ class LatentProjection(nn.Module):
       points: SkinPoints. config: LearningConfig. nelectrode: electrodes.
     """
 
-    def __init__(self, points: "SkinPoints", config: "LearningConfig", nelectrode: int):
+    def __init__(self, points: SkinPoints, config: LearningConfig, nelectrode: int):
         super().__init__()
         self.mesh = MeshVAE(
             points.levels,
@@ -58,17 +53,17 @@ class LatentProjection(nn.Module):
         return self.mesh.decode(self.to_mesh(self.electrode.encode(y)[0]))
 
 
-def make_pointnet(points: "SkinPoints", config: "LearningConfig", nelectrode: int) -> PointNet:
+def make_pointnet(points: SkinPoints, config: LearningConfig, nelectrode: int) -> PointNet:
     """The baseline, on 128 of the points."""
     return PointNet(points.place, np.arange(len(points.place)), nelectrode, dropout=config.dropout)
 
 
-def network_target(arrays: "Arrays", rows: torch.Tensor, config: "LearningConfig") -> torch.Tensor:
+def network_target(arrays: Arrays, rows: torch.Tensor, config: LearningConfig) -> torch.Tensor:
     """(k, nelectrode) target of the networks in rows of a set."""
     return arrays.log_change(rows) if config.logarithm else arrays.change(rows) / config.scale
 
 
-def network_change(output: torch.Tensor, tare: torch.Tensor, config: "LearningConfig") -> torch.Tensor:
+def network_change(output: torch.Tensor, tare: torch.Tensor, config: LearningConfig) -> torch.Tensor:
     """Change of counts from a network's output, for counts `tare` at rest, each (k, nelectrode)."""
     return counts_change(output, tare) if config.logarithm else config.scale * output
 
@@ -81,11 +76,11 @@ def _wrong(output, arrays, rows, config):
 
 @fast_products()
 def train_latent_projection(
-    arrays: "Arrays",
-    points: "SkinPoints",
+    arrays: Arrays,
+    points: SkinPoints,
     train: np.ndarray,
     validation: np.ndarray,
-    config: "LearningConfig",
+    config: LearningConfig,
     seed: int = 0,
     checkpoints: Checkpoints | None = None,
 ) -> tuple[LatentProjection, dict]:
@@ -166,11 +161,11 @@ def train_latent_projection(
 
 @fast_products()
 def train_pointnet(
-    arrays: "Arrays",
-    points: "SkinPoints",
+    arrays: Arrays,
+    points: SkinPoints,
     train: np.ndarray,
     validation: np.ndarray,
-    config: "LearningConfig",
+    config: LearningConfig,
     seed: int = 0,
     checkpoints: Checkpoints | None = None,
 ) -> PointNet:

@@ -1,20 +1,17 @@
 """Observations of touch, by the choices of `observe`, from the sensors of all worlds."""
 
 import functools
-import typing
 
 import mujoco
 import numpy as np
 import torch
 import warp as wp
 
+from ...batch import Batch
 from ...fields import as_numbers
 from ...geometry import load_skin
 from ...sensor.weighted import WeightedElectrodes
 from ...short_repr import short_repr
-
-if typing.TYPE_CHECKING:
-    from ...batch import Batch
 
 OBSERVE = ("none", "binary", "force", "electrodes", "electrodes+pac", "learned")
 _CHANNELS = ("electrodes", "pdc", "pac")
@@ -54,7 +51,7 @@ class Touch:
     """
 
     def __init__(
-        self, mjm: mujoco.MjModel, sensordata: torch.Tensor, batches: "dict[str, Batch]", skin: object
+        self, mjm: mujoco.MjModel, sensordata: torch.Tensor, batches: dict[str, Batch], skin: object
     ):
         tensor = functools.partial(torch.as_tensor, device=sensordata.device)
         sensors = [[mjm.sensor(f"{prefix}{name}") for name in _CHANNELS] for prefix in batches]
