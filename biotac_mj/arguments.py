@@ -26,6 +26,15 @@ __all__ = [
 ]
 
 
+# verbs of earlier versions that have another name now
+_FORMER = {
+    "contact-patch": "learn predict inverse",
+    "evaluate": "learn judge",
+    "import-data": "data import",
+    "import-mesh": "lab mesh",
+}
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, with exit code 2. Options must be written in full, since an
     abbreviation may become ambiguous when options are added."""
@@ -95,6 +104,7 @@ class Parser(argparse.ArgumentParser):
                 for name, inner in found.choices.items()
                 if name == value
             ]
+            homes += [f"`biotac {_FORMER[value]}`"] if value in _FORMER else []
             if homes:
                 self.error(f"no verb {value}: it is {' or '.join(homes)}")
         super()._check_value(action, value)

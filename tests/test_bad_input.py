@@ -898,6 +898,8 @@ def numbers():
     yield Row("jelly", "invalid choice: 'jelly'")
     yield Row("view press.h5", "nothing takes press.h5")
     yield Row("generate", "no verb generate: it is `biotac data generate`")
+    yield Row("evaluate", "no verb evaluate: it is `biotac learn judge`")
+    yield Row("learn train electrodes.txt --out many", "electrodes.txt is no set: a folder of networks is")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
     yield Row("play roll_rod --render out.png", "out.png does not end in .gif")
     yield Row("diagnose", "nothing to diagnose")

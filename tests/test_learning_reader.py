@@ -251,12 +251,18 @@ def test_a_force_of_noise_is_not_offered_for_use(tmp_path, capsys):
     write(tmp_path / "rec.h5", [dataclasses.replace(one, object_pos=None, object_quat=None)])
     assert cli.main(train) == 0
     said = capsys.readouterr().out
-    assert "use it with `biotac learn predict" in said and "no better" not in said
+    assert "use it with `biotac learn predict" in said and "note: fy: no better than the mean" in said
+    y = one.force[:, 1]  # white noise
+    assert abs(np.corrcoef(y[1:], y[:-1])[0, 1]) < 0.1
+    assert Reader.load(out).meta["useless"] == ["fy"]
+    predict = ["learn", "predict", out, str(tmp_path / "rec.h5"), "--out", str(tmp_path / "p.csv")]
+    assert cli.main(predict) == 0
+    assert "note: fy: no better than the mean" in capsys.readouterr().out
     noise = np.random.default_rng(5).normal(size=one.force.shape)  # RMSE 2e-4 N below the mean's
     write(tmp_path / "rec.h5", [dataclasses.replace(one, force=noise, object_pos=None, object_quat=None)])
     assert cli.main(train) == 0
     said = capsys.readouterr().out
-    assert "note: force: no better than the mean" in said and "use it with" not in said
+    assert "note: fx, fy, fz: no better than the mean" in said and "use it with" not in said
     write(tmp_path / "rec.h5", [dataclasses.replace(one, force=np.ones_like(noise))])
     assert cli.main(train) == 2
     assert "synthetic: the force never changes, so that it cannot be learned" in capsys.readouterr().err
@@ -286,7 +292,7 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys):
     with h5py.File(tmp_path / "p.h5") as file:
         np.testing.assert_allclose(file["force"][:, 2], table["fz"], rtol=1e-4, atol=1e-5)
         assert file["electrodes_half"].shape == (len(one), 19) and file["force"].attrs["unit"] == "N"
-    assert "note: " not in capsys.readouterr().out
+    assert "never changes" not in capsys.readouterr().out
     dead = dataclasses.replace(one, electrodes=np.where(np.arange(19) == 4, 4095, one.electrodes))
     write(tmp_path / "dead.h5", [dead])
     assert (

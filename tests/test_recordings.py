@@ -207,6 +207,26 @@ def test_units_in_names(tmp_path):
     assert unit_of("Fz_N") == ("N", 1.0)
 
 
+@pytest.mark.parametrize("unit, newtons", [("gf", 9.80665e-3), ("kgf", 9.80665), ("lbf", 4.4482216152605)])
+def test_forces_by_weight_are_newtons(unit, newtons, tmp_path):
+    """In a column's name, with and without brackets, and in a row of units."""
+    names = [f"e{i + 1}" for i in range(19)]
+    rows = np.column_stack([ONE.electrodes, ONE.force / newtons])
+    for k, (axes, units) in enumerate(
+        (
+            ([f"F{x}_{unit}" for x in "xyz"], ""),
+            ([f"F{x} [{unit}]" for x in "xyz"], ""),
+            (["Fx", "Fy", "Fz"], unit),
+        )
+    ):
+        head = [",".join(names + axes), *([",".join(["counts"] * 19 + [unit] * 3)] if units else [])]
+        lines = [",".join(f"{v:.9g}" for v in row) for row in rows]
+        (tmp_path / f"{k}.csv").write_text("\n".join(head + lines) + "\n")
+        (one,) = load(tmp_path / f"{k}.csv")
+        np.testing.assert_allclose(one.force, ONE.force, rtol=1e-6, atol=1e-8)
+        assert f"are read as {unit}" in " ".join(one.notes)
+
+
 def test_quaternions_that_are_none_are_said(tmp_path):
     lines = ["time," + ",".join(f"e{i + 1}" for i in range(19)) + ",object_qw,object_qx,object_qy,object_qz"]
     for k in range(len(ONE.time)):

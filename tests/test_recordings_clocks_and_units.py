@@ -27,7 +27,8 @@ def test_units_that_attributes_say(tmp_path):
             ("time", 1e3 * (ONE.time - ZERO), "ms"),
             ("object_pos", 1e3 * ONE.object_pos, "mm"),
             ("object_quat", ONE.object_quat[:, [1, 2, 3, 0]], "x y z w"),
-            ("force", ONE.force / 9.81, "kgf"),
+            ("force", ONE.force / 9.80665, "kgf"),
+            ("torque", ONE.force, "oz in"),
         ):
             file[name] = value
             file[name].attrs["unit"] = unit
@@ -35,7 +36,8 @@ def test_units_that_attributes_say(tmp_path):
     np.testing.assert_allclose(one.time, ONE.time - ZERO, atol=1e-9)
     np.testing.assert_allclose(one.object_pos, ONE.object_pos, atol=1e-12)
     np.testing.assert_allclose(one.object_quat, ONE.object_quat, atol=1e-12)
-    assert one.force is None and any("left out force, whose unit is 'kgf'" in note for note in one.notes)
+    np.testing.assert_allclose(one.force, ONE.force, atol=1e-12)
+    assert one.torque is None and any("left out torque, whose unit is 'oz in'" in note for note in one.notes)
 
 
 def test_groups_beside_that_of_the_electrodes(tmp_path):

@@ -8,8 +8,10 @@ import scipy.io
 from recorded import synthetic, write_bag, write_btd
 
 from biotac_mj import cli
+from biotac_mj.geometry.design import BIOTAC
 from biotac_mj.recordings import faults, load
 from biotac_mj.recordings.formats.names import is_time, place_of
+from biotac_mj.sensor.channels import log_impedance
 
 ONE = synthetic()
 NAMES = [f"e{i}" for i in range(1, 20)]
@@ -63,6 +65,34 @@ def test_rows_that_lack_an_electrode_are_left_out(tmp_path):
     np.testing.assert_allclose(one.force, F[rows], atol=1e-6)
     said(one, "1 rows lack an electrode, mostly e4: they were left out")
     said(one, "left out 4 rows that have no electrode")
+
+
+@pytest.mark.parametrize("timed", [False, True])
+@pytest.mark.parametrize("value", [np.nan, -1.0, 65535.0])
+def test_a_dead_electrode_leaves_a_log_readable(value, timed, tmp_path):
+    """Whatever a logger writes for it; it reads 0 then, which is named, and is a fault of that electrode."""
+    dead = E.copy()
+    dead[:, 4] = value
+    columns, names = ([T, dead], ["time", *NAMES]) if timed else ([dead], [*NAMES])
+    one = read(table(tmp_path / "r.csv", columns, names))
+    np.testing.assert_array_equal(one.electrodes, np.where(np.arange(19) == 4, 0, E))
+    said(one, "e5")
+    said(one, "taken for dead, 0 there")
+    assert [fault.channels for fault in faults(one) if fault.id == "stuck"] == [(4,)]
+    assert one.rest_correlation == pytest.approx(correlation_without(4))
+
+
+def correlation_without(k):
+    here, known = (np.delete(log_impedance(of), k, -1) for of in (E, BIOTAC.rest_counts))
+    return np.corrcoef(np.median(here, 0), known)[0, 1]
+
+
+def test_an_electrode_that_broke_is_dead_from_then_on(tmp_path):
+    broke = E.copy()
+    broke[len(E) // 4 :, 4] = np.nan
+    one = read(table(tmp_path / "r.csv", [T, broke], ["time", *NAMES]))
+    np.testing.assert_array_equal(one.electrodes, np.nan_to_num(broke))
+    said(one, "e5: no number in most rows: taken for dead, 0 there")
 
 
 @pytest.mark.parametrize("lost", [False, True])

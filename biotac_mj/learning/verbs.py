@@ -96,6 +96,11 @@ def _train(args):
         raise ValueError(
             f"--force and --recording go with one model: give --out FILE.safetensors, not {args.out}"
         )
+    if os.path.isfile(args.source) and not args.source.endswith(".h5"):
+        raise ValueError(
+            f"{args.source} is no set: a folder of networks is trained on one; of a recording with force one "
+            "model is trained, give --out FILE.safetensors"
+        )
     _train_all(args)
 
 
@@ -264,21 +269,25 @@ def _judge_networks(args):
 
 
 def _save_reader(args, reader, scores):
+    from .instants.reader import TARGETS
+
     reader.save(args.out)
     print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} held out")
-    useless = []
     for name, row in scores["targets"].items():
         covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
         error = ""
         if row["rmse"] is not None:
             error = f"RMSE {row['rmse']:.4g} {row['unit']} (the mean {row['rmse_of_mean']:.4g}), "
-            useless += [name] * (not row["better"])
         print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
+    _note_useless(reader.meta)
+    outputs = {name for target in scores["targets"] for name in TARGETS[target]}
     use = f"; use it with `biotac learn predict {args.out} RECORDING`"
-    if useless:
-        use = ""
+    print(f"written: {args.out}{use if outputs - set(reader.meta['useless']) else ''}")
+
+
+def _note_useless(meta):
+    if useless := meta.get("useless"):
         print(f"  note: {', '.join(useless)}: no better than the mean: do not use it, record more touches")
-    print(f"written: {args.out}{use}")
 
 
 def _add_predict(verbs, verb):
@@ -352,6 +361,7 @@ def _predict_instants(args):
     )
     for note in meta.get("notes", ()):
         print(f"  note: {note}")
+    _note_useless(meta)
     if np.median(strange) > 1:
         print("  note: most rows are unlike those that the model was trained on: do not trust it here")
     print(f"written: {args.out}")

@@ -274,9 +274,13 @@ def designed(counts: np.ndarray) -> Design:
 
 
 def rest_correlation(counts: np.ndarray) -> float:
-    """Correlation of the median ln Z of counts (n, nelectrode) with the mean pattern of known sensors."""
-    here, published = np.nanmedian(log_impedance(counts), axis=0), designed(counts).rest_counts
-    return float(np.corrcoef(here, log_impedance(published))[0, 1]) if np.ptp(here) > 1e-9 else 0.0
+    """Correlation of the median ln Z of counts (n, nelectrode) with the mean pattern of known sensors, over
+    the electrodes that change, if any does: dead ones say nothing of a sensor."""
+    alive = np.nanmax(counts, axis=0) > np.nanmin(counts, axis=0)
+    alive |= not alive.any()
+    here, published = (log_impedance(of)[..., alive] for of in (counts, designed(counts).rest_counts))
+    here = np.nanmedian(here, axis=0)
+    return float(np.corrcoef(here, published)[0, 1]) if np.ptp(here) > 1e-9 else 0.0
 
 
 def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:

@@ -47,7 +47,8 @@ class Reader:
     """A model; made by `fit_reader`, stored by `save`.
 
     Attributes:
-      meta: description: "tared" (whether ln Z is relative to a tare), "level" of the intervals, "source".
+      meta: description: "tared" (whether ln Z is relative to a tare), "level" of the intervals, "source",
+        "useless" (names of outputs that the touches held out do not show to be better than the mean).
       tensors: its parameters.
     """
 
@@ -273,7 +274,7 @@ def fit_reader(
 
 def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
     """A model of a set and its test errors: 72 % of the trajectories train, 18 % calibrate the intervals, 10
-    % test.
+    % test. The model's description names the outputs that are no better than the mean.
 
     Raises:
       ValueError: too few trajectories.
@@ -287,8 +288,7 @@ def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
         )
     subset = assign(len(names), seed)
     train, kept, test = (names[subset == name] for name in SPLITS)
-    reader = fit_reader(data, train, kept, seed=seed)
-    return reader, _scores(reader, data, test, train)
+    return _scored(fit_reader(data, train, kept, seed=seed), data, test, train)
 
 
 def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple[Reader, dict]:
@@ -296,16 +296,16 @@ def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple
     the errors. The intervals' coverage is therefore unknown."""
     names = np.unique(data.owner)
     cut = int(fraction * len(names))
-    reader = fit_reader(data, names[:cut], names[cut:], seed=seed)
-    scores = _scores(reader, data, names[cut:], names[:cut])
+    fitted = fit_reader(data, names[:cut], names[cut:], seed=seed)
+    reader, scores = _scored(fitted, data, names[cut:], names[:cut])
     for row in scores["targets"].values():
         row["covered"] = None
     return reader, scores
 
 
-def _scores(reader, data, test, train):
-    """Errors on the trajectories `test`, those of the mean of `train`, and whether the trajectories tell that
-    they are smaller."""
+def _scored(reader, data, test, train):
+    """The model whose description names the outputs that the trajectories `test` do not show to be better
+    than the mean of `train`, and its errors on them beside those of that mean."""
     known = np.isin(data.owner, train)
     rows = np.isin(data.owner, test)
     found = reader.predict(data.counts[rows], data.tare[rows], None if data.pdc is None else data.pdc[rows])
@@ -315,12 +315,20 @@ def _scores(reader, data, test, train):
         error = np.abs(value - truth[name][rows])
         mean = np.abs(np.nanmean(truth[name][known], axis=0) - truth[name][rows])
         there = np.isfinite(error).all(1)
+        error, mean, owner = error[there], mean[there], data.owner[rows][there]
+        columns = TARGETS[name] or reader.electrodes
         out[name] = {
             "unit": UNITS[name],
             "half": float(reader.tensors[f"{name}.half"].mean()),
-            "rmse": float(np.sqrt((error[there] ** 2).mean())) if there.any() else None,
-            "better": is_better(error[there], mean[there], data.owner[rows][there]),
-            "rmse_of_mean": float(np.sqrt((mean[there] ** 2).mean())) if there.any() else None,
-            "covered": float((error <= found.half[name])[there].mean()) if there.any() else None,
+            "rmse": float(np.sqrt((error**2).mean())) if len(error) else None,
+            "rmse_of_mean": float(np.sqrt((mean**2).mean())) if len(error) else None,
+            "covered": float((error <= found.half[name][there]).mean()) if len(error) else None,
+            "useless": [
+                column
+                for k, column in enumerate(columns)
+                if len(error) and not is_better(error[:, k : k + 1], mean[:, k : k + 1], owner)
+            ],
         }
-    return {"targets": out, **{key: reader.meta[key] for key in ("train", "aside")}}
+    useless = [column for row in out.values() for column in row["useless"]]
+    scores = {"targets": out, **{key: reader.meta[key] for key in ("train", "aside")}}
+    return dataclasses.replace(reader, meta=reader.meta | {"useless": useless}), scores

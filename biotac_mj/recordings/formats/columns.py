@@ -12,7 +12,7 @@ import zlib
 import numpy as np
 
 from ...reading import Unfit
-from .names import is_time, place_of
+from .names import UNITS, is_time, place_of
 
 __all__ = ["Table", "open_bytes", "parse_table", "read_columns", "read_table"]
 
@@ -23,8 +23,9 @@ _DAY = 86400.0  # [s]
 _CLOCKS = "seconds, a time of day as 12:34:56.7, or date and time in one word as 2026-01-31T12:34:56.7"
 _LIST = re.compile(r"[\[(](\s*[-+.\deE]+(?:[\s,]+[-+.\deE]+)+,?\s*)[\])]")
 _START = 4096  # characters to search for a list
-_KNOWN_UNITS = {"s", "sec", "ms", "us", "ns", "n", "mn", "nm", "nmm", "mnm", "m", "cm", "mm", "um"}
+_KNOWN_UNITS = {"s", "sec", "ms", "us", "ns", *UNITS}
 _COUNTED = {"", "-", "count", "counts", "bit", "bits", "raw"}  # no unit, or counts
+_EMPTY = ("", "nan", "-nan", "none", "null", "na", "n/a")  # cells without a number
 _MOST = 2**30  # bytes that are read at once: 4 hours of a native log; guards against decompression bombs
 
 
@@ -50,25 +51,30 @@ class Table:
         """Number of columns."""
         return len(self.cells[0])
 
-    def numbers(self, columns: list[int], names: list[str], gaps: bool = False) -> np.ndarray:
+    def lost(self, column: int) -> bool:
+        """Whether most cells of a column are empty or nan, as of a dead electrode."""
+        return np.mean([row[column].lower() in _EMPTY for row in self.cells]) > 0.5
+
+    def numbers(self, columns: list[int], names: list[str], gaps: bool | list[bool] = False) -> np.ndarray:
         """(n, len(columns)) numbers of these columns, called `names` in errors.
 
         Args:
-          gaps: read empty cells and nan as NaN.
+          gaps: whether empty cells and nan are read as NaN, of all columns or of each.
 
         Raises:
           ValueError: a cell is not a finite number; the text has line, column and remedy.
         """
         cells = [[row[k] for k in columns] for row in self.cells]
-        empty = ("", "nan", "-nan", "none", "null", "na", "n/a") if gaps else ()
         try:
             value = np.array(cells, dtype=float)
             good = np.isfinite(value)
         except ValueError:
             value = None
         if value is None or not good.all():
-            value = np.array([[np.nan if c.lower() in empty else _number(c) for c in row] for row in cells])
-            good = np.array([[c.lower() in empty for c in row] for row in cells]) | np.isfinite(value)
+            empty = np.array([[c.lower() in _EMPTY for c in row] for row in cells]) & gaps
+            value = np.array([[_number(c) for c in row] for row in cells])
+            value[empty] = np.nan
+            good = empty | np.isfinite(value)
         if not good.all():
             (r, c), count = np.argwhere(~good)[0], (~good).sum()
             raise ValueError(

@@ -6,7 +6,17 @@ import typing
 
 from ..recording import CHANNELS
 
-__all__ = ["Place", "is_part_of_stamp", "is_stamp", "is_time", "place_of", "unit_named", "unit_of"]
+__all__ = [
+    "UNITS",
+    "Place",
+    "is_part_of_stamp",
+    "is_stamp",
+    "is_time",
+    "place_of",
+    "refuse_unknown_unit",
+    "unit_named",
+    "unit_of",
+]
 
 
 class Place(typing.NamedTuple):
@@ -30,6 +40,21 @@ _BODIES = {
 }
 _BEFORE = r"(?P<who>(?:.*[_\d])?)"
 _COUNTS = r"(?:_(?:counts?|bits?|raw))?"
+# units of force, torque and position in names of columns, by what is written, in N, Nm and m
+_UNITS = {
+    "force": {
+        "n": ("N", 1.0),
+        "mn": ("mN", 1e-3),
+        "kn": ("kN", 1e3),
+        "gf": ("gf", 9.80665e-3),
+        "kgf": ("kgf", 9.80665),
+        "ozf": ("ozf", 0.45359237 / 16 * 9.80665),
+        "lbf": ("lbf", 0.45359237 * 9.80665),
+    },
+    "torque": {"nm": ("Nm", 1.0), "nmm": ("Nmm", 1e-3), "mnm": ("mNm", 1e-3), "ncm": ("Ncm", 1e-2)},
+    "pos": {"m": ("m", 1.0), "cm": ("cm", 1e-2), "mm": ("mm", 1e-3), "um": ("um", 1e-6)},
+}
+_WRITTEN = {field: f"(?:_?(?P<unit>{'|'.join(units)}))?" for field, units in _UNITS.items()}
 _PATTERNS = [
     (re.compile(_BEFORE + pattern), field)
     for field, pattern in {
@@ -40,26 +65,16 @@ _PATTERNS = [
         "pdc": r"pdc(?:_?data)?(?:_?0)?" + _COUNTS,
         "tdc": r"tdc(?:_?data)?(?:_?0)?" + _COUNTS,
         "tac": r"tac(?:_?data)?(?:_?0)?" + _COUNTS,
-        "force": r"(?:force_?|f_?)(?P<axis>[xyz])(?:_?(?P<unit>n|mn))?|(?:.*_)?(?P<whole>force)",
-        "torque": r"(?:torque_?|t_?|m_?)(?P<axis>[xyz])(?:_?(?P<unit>nm|nmm|mnm))?|(?:.*_)?(?P<whole>torque)",
-        "pos": r"(?:position_?|pos_?|p_?)(?P<axis>[xyz])(?:_?(?P<unit>m|cm|mm|um))?"
+        "force": rf"(?:force_?|f_?)(?P<axis>[xyz]){_WRITTEN['force']}|(?:.*_)?(?P<whole>force)",
+        "torque": rf"(?:torque_?|t_?|m_?)(?P<axis>[xyz]){_WRITTEN['torque']}|(?:.*_)?(?P<whole>torque)",
+        "pos": rf"(?:position_?|pos_?|p_?)(?P<axis>[xyz]){_WRITTEN['pos']}"
         r"|(?:.*_)?(?P<whole>(?<!bt_)position|pos)",
         "quat": r"(?:orientation_?|quaternion_?|quat_?|rot_?|o_?|q_?)(?P<axis>[wxyz])"
         r"|(?:.*_)?(?P<whole>quaternion|quat)",
     }.items()
 ]
-# units of force, torque and position in names of columns, in N, Nm and m
-_UNITS = {
-    "n": ("N", 1.0),
-    "mn": ("mN", 1e-3),
-    "nm": ("Nm", 1.0),
-    "nmm": ("Nmm", 1e-3),
-    "mnm": ("mNm", 1e-3),
-    "m": ("m", 1.0),
-    "cm": ("cm", 1e-2),
-    "mm": ("mm", 1e-3),
-    "um": ("um", 1e-6),
-}
+UNITS = {written: unit for units in _UNITS.values() for written, unit in units.items()}
+_BRACKETED = re.compile(r"(.*[^\s_])[\s_]*[\[(]\s*(.*?)\s*[\])]\s*")
 _CLOCK = re.compile(
     r"(?:(?:ros|rosbag|bag|system|host|unix|epoch|elapsed|log|date)_?)?(?:time_?stamp|times?|stamp)"
     r"(?:_?(?:s|secs?|seconds|ms|msecs?|us|usecs?|ns|nsecs?))?|t(?:_(?:s|ms|us|ns))?|secs?|seconds"
@@ -120,14 +135,27 @@ def unit_of(name: str) -> tuple[str, float]:
     plain = _plain(name)
     found = next((f for pattern, _ in _PATTERNS if (f := pattern.fullmatch(plain))), None)
     unit = (found.groupdict().get("unit") if found else None) or ""
-    return _UNITS.get(unit, ("", 1.0))
+    return UNITS.get(unit, ("", 1.0))
 
 
 def unit_named(unit: str) -> tuple[str, float]:
     """A unit of force, torque or position as written, and its size in N, Nm or m; ("", 1) for others."""
     words = {"newton": "N", "newtons": "N", "meter": "m", "metre": "m", "meters": "m", "metres": "m"}
     unit = words.get(unit.lower(), unit)
-    return next((known for known in _UNITS.values() if known[0] == unit), ("", 1.0))
+    return next((known for known in UNITS.values() if known[0] == unit), ("", 1.0))
+
+
+def refuse_unknown_unit(name: str) -> None:
+    """Raises ValueError for a column of force, torque or position whose name has another unit in brackets
+    than those known."""
+    found = _BRACKETED.fullmatch(name)
+    place = place_of(found[1]) if found and place_of(name) is None else None
+    units = _UNITS.get(place.field.rpartition("_")[2]) if place else None
+    if units:
+        known = ", ".join(unit for unit, _ in units.values())
+        raise ValueError(
+            f"column {name!r} has unit {found[2]}: {known} are known; convert the numbers and rename it"
+        )
 
 
 def _split_body(prefix):

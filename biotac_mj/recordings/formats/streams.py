@@ -8,8 +8,9 @@ import numpy as np
 
 from ...geometry.design import BIOTAC, design_named, designs
 from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
+from ...sensor.channels import FULL_SCALE
 from ..recording import CHANNELS, FIELDS, Recording, designed
-from .names import is_stamp, is_time, place_of, unit_of
+from .names import is_stamp, is_time, place_of, refuse_unknown_unit, unit_of
 
 __all__ = ["Stream", "join", "make_streams"]
 
@@ -78,6 +79,7 @@ def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] |
         if name == clock:
             time = _seconds(np.asarray(value, float).ravel(), name)
         elif place is None:
+            refuse_unknown_unit(name)
             unused.append(name)
         else:
             pieces = found.setdefault(place.sensor, {}).setdefault(place.field, {})
@@ -140,10 +142,11 @@ def _without_gaps(stream):
     """A stream without the rows that lack an electrode, as in logs of several clocks merged by time. A
     force or pose in few of the other rows becomes a separate stream, so that it is interpolated to them."""
     electrodes = stream.fields.get("electrodes")
-    if electrodes is None or stream.time is None:
+    if electrodes is None:
         return [stream]
+    electrodes = stream.fields["electrodes"] = _with_dead(stream, electrodes)
     there = np.isfinite(electrodes).all(1)
-    if there.all():
+    if stream.time is None or there.all():
         return [stream]
     some = np.isfinite(electrodes).any(1) & ~there
     least = int(np.isfinite(electrodes[some]).sum(0).argmin())
@@ -168,6 +171,23 @@ def _without_gaps(stream):
     stream.fields = {name: value[there] for name, value in stream.fields.items()}
     stream.time = stream.time[there]
     return [stream, *others]
+
+
+def _with_dead(stream, electrodes):
+    """Electrodes (n, nelectrode) in which those without a number in most of the rows of the others read 0, as
+    dead ones do; they are named in a note."""
+    read = np.isfinite(electrodes)
+    logged = read.sum(1) > electrodes.shape[1] / 2
+    dead = read[logged].mean(0) < 0.5 if logged.any() else np.zeros(electrodes.shape[1], bool)
+    if not dead.any():
+        return electrodes
+    stream.notes.append(f"{stream.source}: {_named(dead)}: no number in most rows: taken for dead, 0 there")
+    return np.where(dead & ~read & logged[:, None], 0.0, electrodes)
+
+
+def _named(electrodes):
+    """Names of electrodes (nelectrode,) bool."""
+    return ", ".join(f"e{k + 1}" for k in np.flatnonzero(electrodes))
 
 
 def _connected(streams):
@@ -413,7 +433,15 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
     if scale is not None:
         fields |= {key: fields[key] * scale for key in there}
         notes.append(f"channels were multiplied by {scale:g}")
-    unit = guess_unit(fields["electrodes"]) if "electrodes" in fields else "counts"
+    unit = "counts"
+    if "electrodes" in fields:
+        read = fields["electrodes"]
+        beyond = ((read < 0) | (read > FULL_SCALE)).all(0) & (np.ptp(read, axis=0) == 0)
+        if beyond.any() and guess_unit(read[:, ~beyond]) == "counts":
+            said_is = f"{_named(beyond)} always {', '.join(f'{v:g}' for v in read[0, beyond])}"
+            notes.append(f"{stream.source}: {said_is}, beyond 0..4095: taken for dead, 0 there")
+            fields["electrodes"] = np.where(beyond, 0.0, read)
+        unit = guess_unit(fields["electrodes"])
     # also treat the other channels as tared or scaled, unless they rest at thousands of raw counts
     units = {
         key: unit for key in there if key == "electrodes" or np.abs(np.nanmedian(fields[key])) < _RAW_OTHERS

@@ -53,8 +53,8 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
 
 
 def _named(table, role):
-    """A table with a header. Empty cells are missing values. For electrodes they need a clock, since rows
-    without electrodes are dropped."""
+    """A table with a header. Empty cells are missing values. For electrodes that are not dead they need a
+    clock, since rows without electrodes are dropped."""
     columns, known = {}, [name for name in table.names if place_of(name) or is_time(name)]
     clock = _clock(table)
     twice = [name for name in dict.fromkeys(known) if known.count(name) > 1]
@@ -63,7 +63,7 @@ def _named(table, role):
     for k, name in enumerate(table.names):
         place = place_of(name)
         if place is not None:
-            gaps = place.field != "electrodes" or clock is not None
+            gaps = place.field != "electrodes" or clock is not None or table.lost(k)
             columns[name] = table.numbers([k], [name], gaps=gaps)[:, 0]
         elif name == clock:
             columns[name] = table.clock(k, name)
@@ -140,9 +140,9 @@ def read_matrix(table: Table, role: str | None = None) -> list[Stream]:
     columns = ["time", *names] if clock else [*names, *(f"column {k + 1}" for k in range(len(names), width))]
     called = columns[:width] if len(columns) > width else columns
     if clock:
-        value = np.column_stack([table.clock(0, "time"), table.numbers(list(range(1, width)), called[1:])])
+        value = np.column_stack([table.clock(0, "time"), _matrix(table, role, 1, called)])
     else:
-        value = table.numbers(list(range(width)), called)
+        value = _matrix(table, role, 0, called)
     if width < len(names) or (width > len(names) and not (more or clock)):
         raise ValueError(_wrong_width(table, names))
     if clock and not (np.diff(value[:, 0]) > 0).all():
@@ -157,6 +157,13 @@ def read_matrix(table: Table, role: str | None = None) -> list[Stream]:
     if role == "orientation":
         notes.append(f"{path.name}: taken for quaternions x y z w, ROS' order")
     return make_streams(path.name, dict(zip(columns if clock else names, value.T)), notes)
+
+
+def _matrix(table, role, first, called):
+    """Numbers of all columns from the first on; dead electrodes may have none."""
+    columns = list(range(first, table.width))
+    gaps = [role == "electrodes" and table.lost(k) for k in columns]
+    return table.numbers(columns, called[first:], gaps)
 
 
 def _fits(count, names):
