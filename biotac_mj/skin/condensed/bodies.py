@@ -21,7 +21,6 @@ __all__ = [
     "number_bodies",
     "place_bodies",
     "pose_by_load",
-    "rigid_column",
     "sum_forces",
     "touching_group",
 ]
@@ -99,16 +98,6 @@ def number_bodies(w: int, t: int, threads: int, outer: int, s: Scratch):
     if t == 0:
         s.borders[w] = column
     sync()
-
-
-@wp.func
-def rigid_column(b: int, arm: vec3):
-    """Motion of a point at an arm from the origin by rigid motion b: translations first, then rotations."""
-    unit = vec3()
-    unit[b % 3] = real(1.0)
-    if b < 3:
-        return unit
-    return wp.cross(unit, arm)
 
 
 @wp.func

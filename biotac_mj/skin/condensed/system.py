@@ -5,8 +5,8 @@ import warp as wp
 
 from ..block import block_rank, block_sum, sync
 from ..contact.faces import Contact
-from ..types import mat33, narrow, real, vec3
-from .bodies import move_nodes, number_bodies, rigid_column
+from ..types import mat33, narrow, real, vec3, vec6
+from .bodies import move_nodes, number_bodies
 from .lanes import add_row, add_rows, begin_row, dot_column, eliminate, gather_rows, sum_rows
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
@@ -294,26 +294,47 @@ def fill_contact(
 
 @wp.func
 def _fill_bodies(
-    w: int, t: int, threads: int, outer: int, equations: int, wide: int, soft: float, s: Scratch
+    w: int, t: int, threads: int, outer: int, equations: int, wide: int, soft: float, c: Constants, s: Scratch
 ):
-    """The bodies' rows of `solve_system`: how forces on the nodes move them."""
+    """What the bodies add to `solve_system`: columns for how contact resists their motions, and rows for how
+    forces on the nodes move them."""
     b = s.bodies
-    for h in range(wp.where(wide > equations + 1, b.compliance.shape[0], 0)):
+    bodies = s.borders[w] / 6
+    for m in range(t, outer * bodies, threads):
+        k = m / bodies
+        column = 6 * (m % bodies)
+        p = s.node[w, s.touched[w, k]]
+        push = wp.mat33()
+        turn = wp.mat33()
+        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+            near = s.place[w, c.ring[e]]
+            if near >= 0:
+                if b.column[s.group[w, near], w] == column:
+                    block = s.block[w, k, e - c.ring_start[p]]
+                    push += block
+                    turn += block * wp.skew(wp.vec3(s.arm[w, near]))
+        for a in range(3):
+            begin = (3 * k + a) * wide + equations + column
+            for i in range(3):
+                s.matrix[w, begin + i] = -push[a, i]
+                s.matrix[w, begin + 3 + i] = turn[a, i]
+    for h in range(wp.where(bodies > 0, b.compliance.shape[0], 0)):
         if b.column[h, w] >= 0:
-            for m in range(t, 6 * wide, threads):
-                i = m / wide
-                j = m % wide
-                value = float(0.0)
+            begin = equations + b.column[h, w]
+            for j in range(t, wide, threads):
+                moved = vec6()
                 if j < 3 * outer:
                     at = s.touched[w, j / 3]
                     unit = vec3()
                     unit[j % 3] = real(1.0)
-                    turn = wp.cross(s.arm[w, at], unit)
-                    load = wp.spatial_vectord(unit[0], unit[1], unit[2], turn[0], turn[1], turn[2])
-                    value = soft * float((b.compliance[h, s.group[w, at], w] * load)[i])
-                elif j == equations + b.column[h, w] + i:
-                    value = 1.0
-                s.matrix[w, (equations + b.column[h, w] + i) * wide + j] = value
+                    turned = wp.cross(s.arm[w, at], unit)
+                    load = vec6(unit[0], unit[1], unit[2], turned[0], turned[1], turned[2])
+                    moved = real(soft) * (b.compliance[h, s.group[w, at], w] * load)
+                for i in range(6):
+                    value = float(moved[i])
+                    if j == begin + i:
+                        value = 1.0
+                    s.matrix[w, (begin + i) * wide + j] = value
 
 
 @wp.func
@@ -357,44 +378,34 @@ def solve_system(
     if equations > 0:
         soft = float(softer)
         fill_contact(w, t, threads, outer, inner, nnode, nin, wide, soft, 0, l, c, s)
-        count = wide - equations  # what follows: motions of bodies, and the right-hand side
-        for m in range(t, outer * count, threads):
-            k = m / count
-            j = m % count
+        for k in range(t, outer, threads):
             p = s.node[w, s.touched[w, k]]
             total = wp.vec3()
             for e in range(c.ring_start[p], c.ring_start[p + 1]):
-                v = wp.vec3()
                 near = s.place[w, c.ring[e]]
-                if near >= 0 and j < count - 1:
-                    body = s.bodies.column[s.group[w, near], w]
-                    if body >= 0 and body <= j and j < body + 6:
-                        v = -wp.vec3(rigid_column(j - body, s.arm[w, near]))
-                elif near >= 0:
+                if near >= 0:
+                    v = wp.vec3()
                     for a in range(3):
                         v[a] = float(s.vector[w, DU, 3 * near + a])
-                total += s.block[w, k, e - c.ring_start[p]] * v
+                    total += s.block[w, k, e - c.ring_start[p]] * v
             for a in range(3):
-                value = total[a]
-                if j == count - 1:
-                    at = 3 * s.touched[w, k] + a
-                    value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * value
-                s.matrix[w, (3 * k + a) * wide + equations + j] = value
-        for m in range(t, inner * count, threads):
-            i = 3 * outer + m / count
-            j = m % count
+                at = 3 * s.touched[w, k] + a
+                value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * total[a]
+                s.matrix[w, (3 * k + a + 1) * wide - 1] = value
+        for k in range(t, inner, threads):
+            at = coordinate_at(w, 3 * outer + k, outer, nnode, s)
+            p = s.core_node[w, at - 3 * nnode]
             value = float(0.0)
-            if j == count - 1:
-                at = coordinate_at(w, i, outer, nnode, s)
-                p = s.core_node[w, at - 3 * nnode]
-                for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
-                    near = s.core_place[w, c.inner_ring[e]]
-                    if near >= 0:
-                        one = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
-                        value += one * float(s.vector[w, DU, 3 * nnode + near])
-                value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * value
-            s.matrix[w, i * wide + equations + j] = value
-        _fill_bodies(w, t, threads, outer, equations, wide, soft, s)
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                near = s.core_place[w, c.inner_ring[e]]
+                if near >= 0:
+                    one = s.core_block[w, k, e - c.inner_ring_start[p]]
+                    value += one * float(s.vector[w, DU, 3 * nnode + near])
+            value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * value
+            s.matrix[w, (3 * outer + k + 1) * wide - 1] = value
+            for j in range(equations, wide - 1):
+                s.matrix[w, (3 * outer + k) * wide + j] = 0.0
+        _fill_bodies(w, t, threads, outer, equations, wide, soft, c, s)
         if eliminate(s.matrix, w, wide - 1, 1) == 0:
             return 0, equations
         for k in range(t, equations, threads):

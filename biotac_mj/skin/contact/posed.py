@@ -102,6 +102,9 @@ def _between_skins(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
     if least_to(geoms, g, d) > real(0.0):  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     other = mesh_field(geoms.grids, geoms.grid[g], y, theirs)
+    d = real(0.5) * (other[3] - mine)
+    if d > real(0.5) * TRILINEAR * geoms.grids.spacing[geoms.own]:  # as surely, by one grid's error alone
+        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     own = mesh_field(geoms.grids, geoms.own, p, mine)
     n = vec3(other[0], other[1], other[2]) - wp.transpose(R) * vec3(own[0], own[1], own[2])
     n = wp.normalize(n)
