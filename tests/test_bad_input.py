@@ -400,8 +400,8 @@ def files_of_text():
         "diagnose --electrodes electrodes.txt --tdc tdc.txt", f"has {NROW - 1}", "tdc.txt", _one_row_less
     )
     yield Row("diagnose --electrodes electrodes.txt --tdc tdc.txt", "tdc is 'x'", "tdc.txt", cell(9, 0, "x"))
-    for words in LOGS[:2]:
-        yield Row(words, "400", "electrodes.txt", lambda path: path.write_text("\n".join(_lines(path)[:50])))
+    for words, least in zip(LOGS[:2], ("at least 76 of this BioTac", "at least 400")):
+        yield Row(words, least, "electrodes.txt", lambda path: path.write_text("\n".join(_lines(path)[:50])))
     for words, said in (
         ("--tare 0", "--tare: '0' is not a whole number"),
         ("--tare 9999", "--tare 9999"),
@@ -912,7 +912,7 @@ def numbers():
         yield Row(
             f"diagnose --quiet --electrodes electrodes.txt --rate {rate}", f"rate is {float(rate):g}: give"
         )
-    both = "shard.h5 and --electrodes electrodes.txt are both given: leave one of them out"
+    both = "shard.h5 and --electrodes electrodes.txt are both given: leave one out"
     yield Row("diagnose shard.h5 --electrodes electrodes.txt", both)
     for option in ("skin coarse", "effects sensor.yaml", "material default", "repeatability 1mm", "in-skin"):
         for words in ("diagnose --electrodes electrodes.txt", "diagnose electrodes.txt"):

@@ -122,6 +122,38 @@ def test_bad_recordings_are_refused_with_the_reason(tmp_path, text, message):
         read_recording(path)
 
 
+def test_four_rows_an_electrode_are_enough():
+    e, rng = unloaded(seconds=0.76)
+    assert not diagnose_recording(PlainRecording(noisy(e, rng), rate=RATE)).findings
+    with pytest.raises(ValueError, match="75 rows are too few .* at least 76 of this BioTac .* series"):
+        PlainRecording(noisy(e, rng)[:75])
+
+
+def test_short_series_of_a_sensor_are_diagnosed_together(tmp_path):
+    """Neither rows that are lost, nor jumps, nor sharp samples are told where one series ends."""
+    e, rng = pressed()[0], np.random.default_rng(1)
+    parts = [noisy(e[250 * k : 250 * k + 250], rng) for k in rng.permutation(32)[:24]]
+    paths = [tmp_path / f"s{k}.txt" for k in range(24)]
+    for path, part in zip(paths, parts):
+        np.savetxt(path, part, fmt="%d")
+    together = read_recording(paths)
+    assert together.name == "s0 and 23 more" and together.joints == tuple(range(250, 6000, 250))
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(together.tick) != 1) + 1, together.joints)
+    found = diagnose_recording(together)
+    assert found.verdict == "no significant disagreement" and found.session.loaded
+    as_one = diagnose_recording(PlainRecording(np.concatenate(parts), rate=RATE))
+    assert [f.id for f in as_one.findings] == ["lost_rows"]
+
+
+def test_series_of_two_sensors_are_not_put_together(tmp_path):
+    for name, count in (("a", 19), ("b", 24)):
+        np.savetxt(tmp_path / f"{name}.txt", np.random.default_rng(0).integers(2000, 2100, (99, count)), "%d")
+    with pytest.raises(ValueError, match="b has 24 electrodes in counts at 100 Hz, a 19"):
+        read_recording([tmp_path / "a.txt", tmp_path / "b.txt"])
+    with pytest.raises(ValueError, match="force and tdc are files beside one recording"):
+        read_recording([tmp_path / "a.txt", tmp_path / "b.txt"], force="f.txt")
+
+
 def test_missing_and_uneven_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_recording(tmp_path / "none.txt")

@@ -374,9 +374,7 @@ def test_a_bag_without_its_library_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
     monkeypatch.setitem(sys.modules, "rosbags", None)
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(
-        ValueError, match=r"a.bag is a bag of ROS: reading it needs pip install 'biotac-mj\[ros\]'"
-    ):
+    with pytest.raises(ValueError, match=r"a.bag is a bag of ROS: it needs pip install 'biotac-mj\[ros\]'"):
         load(tmp_path / "a.bag")
 
 
@@ -480,11 +478,10 @@ def test_recording_from_topics(tmp_path, monkeypatch, ros):
         module("rosidl_runtime_py.utilities", get_message=lambda name: name)
     else:
 
-        def subscriber(name, kind, back, queue_size):
+        def subscriber(name, kind, back, callback_args, queue_size):
             for _ in range(30):
-                back(
-                    types.SimpleNamespace(_buff=b"", _connection_header={"type": "biotac_sensors/BioTacHand"})
-                )
+                kind = {"type": "biotac_sensors/BioTacHand"}
+                back(types.SimpleNamespace(_buff=b"", _connection_header=kind), callback_args)
             return types.SimpleNamespace(unregister=lambda: None)
 
         kind = type("Hand", (), {"deserialize": lambda self, raw: hand()})
@@ -725,7 +722,7 @@ def test_commands(tmp_path, capsys):
     drawn = matplotlib.image.imread(png)
     assert drawn.shape[0] > 1000 and drawn[..., :3].std() > 0.05
     assert cli.main(["recording", "show", rec, "--recording", "jelly", "--out", str(png)]) == 2
-    assert "no recording is called 'jelly': choose one of r" in capsys.readouterr().err
+    assert "has 0 recordings called 'jelly': choose one of r" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -52,9 +52,10 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--electrodes",
+        nargs="+",
         metavar="FILE",
         help="plain recording instead: text, a column of raw counts for each electrode, one row per sample; "
-        "or any file of `biotac recording import`",
+        "or any file of `biotac recording import`; or several, each a series of one sensor",
     )
     add_which(verb)
     verb.add_argument("--force", metavar="FILE", help="with --electrodes: Fx Fy Fz [N] row by row")

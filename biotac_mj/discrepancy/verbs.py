@@ -25,7 +25,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
     """Runs the verb: on a log, on flat presses of one or more sensors (--simulate), or on data with poses."""
     if args.electrodes and args.data:
         raise ValueError(
-            f"{args.data[:80]} and --electrodes {args.electrodes[:80]} are both given: leave one of them out"
+            f"{args.data[:80]} and --electrodes {args.electrodes[0][:80]} are both given: leave one out"
         )
     if not (args.electrodes or args.data):
         raise ValueError(
@@ -41,7 +41,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         if args.which:
             recordings = [choose(recordings, args.data, args.which)[0]]
         if all(one.object_pos is None for one in recordings):
-            args.electrodes = args.data
+            args.electrodes = [args.data]
     elif args.which and not args.electrodes:
         raise ValueError(f"--recording is of a log, and {args.data[:80]} holds trajectories: leave it out")
     if args.data and args.object and not recordings:
@@ -55,8 +55,8 @@ def diagnose_verb(args: argparse.Namespace) -> None:
     if idle:
         raise ValueError(
             f"{' and '.join('--' + name.replace('_', '-') for name in idle)} can act only on a simulation "
-            f"along poses, and {args.electrodes} has none: leave out, or give a recording with the object's "
-            "poses"
+            f"along poses, and {args.electrodes[0]} has none: leave out, or give a recording with poses "
+            "of the object"
         )
     if args.protocol and not args.electrodes:
         raise ValueError(

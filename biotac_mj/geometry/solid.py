@@ -6,6 +6,8 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from .tet_mesh import enclosed_volume
+
 
 def check_size(size: float, what: str = "skin", least: float = 5e-3, most: float = 0.1) -> None:
     """Raises ValueError unless the largest dimension [m] of a body is from `least` to `most`, by default that
@@ -184,8 +186,4 @@ def spread_points(vert: np.ndarray, face: np.ndarray, spacing: float, most: floa
 def fills_hull(vert: np.ndarray, face: np.ndarray) -> bool:
     """Whether a closed mesh is convex: its volume is that of its convex hull to a thousandth."""
     hull = convex_hull(vert)
-    return hull is None or _volume(vert, face) > (1 - 1e-3) * _volume(*hull)
-
-
-def _volume(vert, face):
-    return float(np.linalg.det(vert[face] - vert.mean(axis=0)).sum() / 6)
+    return hull is None or enclosed_volume(vert, face) > (1 - 1e-3) * enclosed_volume(*hull)

@@ -67,29 +67,22 @@ def _ros2(topics, seconds):
 
 
 def _ros1(topics, seconds):
+    import roslib.message
     import rospy
 
     rospy.init_node("biotac_record", anonymous=True, disable_signals=True)
+
+    def add(raw, topic):  # bytes, with the name of their type
+        kind = roslib.message.get_message_class(raw._connection_header["type"])
+        topic.add(kind().deserialize(raw._buff), clock.time())
+
     waiting = [
-        rospy.Subscriber(name, rospy.AnyMsg, _Typed(topic).add, queue_size=1000)
+        rospy.Subscriber(name, rospy.AnyMsg, add, callback_args=topic, queue_size=1000)
         for name, topic in topics.items()
     ]
     clock.sleep(seconds)
     for one in waiting:
         one.unregister()
-
-
-class _Typed:
-    """ROS 1 messages arrive as bytes with the name of their type."""
-
-    def __init__(self, topic):
-        self.topic = topic
-
-    def add(self, raw):
-        import roslib.message
-
-        kind = roslib.message.get_message_class(raw._connection_header["type"])
-        self.topic.add(kind().deserialize(raw._buff), clock.time())
 
 
 def record_serial(

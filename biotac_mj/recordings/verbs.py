@@ -112,14 +112,18 @@ def load_given(args: argparse.Namespace) -> list:
 
 
 def _import(args):
+    _written(args.out, load_given(args))
+
+
+def _written(path, recordings):
+    """Writes recordings and prints what is in them."""
     from .inspection import findings
     from .recording import write
 
-    recordings = load_given(args)
-    write(args.out, recordings)
+    write(path, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
-    print(f"written: {args.out}; see it with `biotac recording show {args.out}`")
+    print(f"written: {path}; see it with `biotac recording show {path}`")
 
 
 def _export(args):
@@ -137,32 +141,20 @@ def _export(args):
 
 
 def _show(args):
+    from .importers import choose
     from .inspection import findings
     from .picture import draw
 
-    found = load_given(args)
-    names = [one.name for one in found]
-    chosen = [one for one in found if args.which is None or one.name.endswith(args.which)]
-    if not chosen:
-        raise ValueError(f"no recording is called {args.which!r}: choose one of {', '.join(names[:12])}")
-    one = chosen[0]
+    one, others = choose(load_given(args), " ".join(args.files), args.which)
     draw(one, args.out)
-    print(f"{one.name}: " + "\n  ".join(findings(one)))
-    if len(found) > 1:
-        print(f"{len(found)} recordings are there: --recording takes one of {', '.join(names[:12])}")
+    print(f"{one.name}: " + "\n  ".join([*findings(one), *others]))
     print(f"written: {args.out}")
 
 
 def _record(args):
-    from .inspection import findings
-    from .recording import write
-
     timeline = f"{os.path.splitext(args.out)[0]}_timeline.yaml" if args.protocol else None
     recordings = _prompted(args, timeline) if timeline else _recorded(args, args.seconds or 10.0)
-    write(args.out, recordings)
-    for one in recordings:
-        print(f"{one.name}: " + "\n  ".join(findings(one)))
-    print(f"written: {args.out}; see it with `biotac recording show {args.out}`")
+    _written(args.out, recordings)
     if timeline:
         print(f"written: {timeline}; next: biotac diagnose {args.out} --protocol {timeline}")
 

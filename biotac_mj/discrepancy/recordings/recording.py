@@ -3,7 +3,9 @@ checked."""
 
 import dataclasses
 import math
+import os
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,7 +22,11 @@ __all__ = ["FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
 
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
-MIN_ROWS = 400  # fewer leave no rows to hold out
+# rows for each electrode: to tell one from all others takes as many coefficients as there are electrodes, and
+# each of two parts, fitted and held out, must leave as many degrees of freedom as that spends
+ROWS_PER_ELECTRODE = 4
+_APART = 1.0  # [s] between two series that are put together, as after a clock that starts anew
+_SAME_RATE = 0.05  # difference of the rates of series of one logger
 _MOST_OF = 0.5  # of the rows must have a force, one after another, or it takes no part
 
 
@@ -42,6 +48,7 @@ class PlainRecording:
       since: (n,) [s] of the file's clock since its first row, None without a clock.
       unit: of what was logged, one of `recordings.UNITS`; electrodes that are not "counts" stand on a rest
         that was assumed (`tared.py`).
+      joints: first rows of further series, where several of one sensor were put together.
 
     Raises:
       ValueError: shapes that differ, numbers that are no counts, or too few rows.
@@ -57,6 +64,7 @@ class PlainRecording:
     missing: np.ndarray | None = None
     unit: str = "counts"
     since: np.ndarray | None = None
+    joints: tuple[int, ...] = ()
 
     @property
     def design(self) -> Design:
@@ -71,10 +79,10 @@ class PlainRecording:
                 f"{' or '.join(read_design(name).title for name in DESIGNS)} is needed, one row per sample"
             )
         _check_numbers(e, "electrodes")
-        if len(e) < MIN_ROWS:
+        if not enough(len(e), self.design):
             raise ValueError(
-                f"{len(e)} rows are too few to fit on one part and check on another: "
-                f"record at least {MIN_ROWS} of this {self.design.title}"
+                f"{len(e)} rows are too few to fit on one part and check on another: record at least "
+                f"{ROWS_PER_ELECTRODE * e.shape[1]} of this {self.design.title}, or give several series of it"
             )
         check_counts(e, self.name)
         for label, width in (("force", 3), ("tdc", None)):
@@ -120,12 +128,21 @@ class PlainRecording:
 
     def part(self, rows: slice) -> "PlainRecording":
         """Some contiguous rows, as a recording."""
+        first, last, _ = rows.indices(len(self))
         cut = {
             name: None if value is None else value[rows]
             for name in ("electrodes", "force", "tdc", "missing", "since")
             for value in [getattr(self, name)]
         }
-        return dataclasses.replace(self, **cut)
+        joints = tuple(k - first for k in self.joints if first < k < last)
+        return dataclasses.replace(self, joints=joints, **cut)
+
+    @property
+    def tick(self) -> np.ndarray:
+        """(n,) number of each row, in which rows that are missing count too."""
+        missing = np.zeros(len(self)) if self.missing is None else self.missing.astype(float)
+        missing[list(self.joints)] = _APART * self.rate
+        return np.arange(len(self)) + np.cumsum(missing)
 
     @property
     def repeated(self) -> np.ndarray:
@@ -138,8 +155,13 @@ class PlainRecording:
         return rest_correlation(self.electrodes)
 
 
+def enough(rows: int, design: Design) -> bool:
+    """Whether so many rows of a sensor can be diagnosed (ROWS_PER_ELECTRODE)."""
+    return rows >= ROWS_PER_ELECTRODE * design.nelectrode
+
+
 def read_recording(
-    electrodes: pathlib.Path | str,
+    electrodes: pathlib.Path | str | Sequence,
     force: pathlib.Path | str | None = None,
     tdc: pathlib.Path | str | None = None,
     rate: float | None = None,
@@ -148,7 +170,8 @@ def read_recording(
     """Reads a recording of any kind that `biotac recording import` knows for `diagnose_recording`.
 
     Args:
-      electrodes: path of it, or of text with a column of counts for each electrode.
+      electrodes: path of it, or of text with a column of counts for each electrode; or paths of several
+        series of one sensor.
       force, tdc: paths of text beside it, 3 columns [N] and 1 of raw counts. rate: rows per second [Hz], None
         takes the file's, or guesses (see PlainRecording). which: recording of a file that has several, None
         takes the first, with a warning.
@@ -156,10 +179,41 @@ def read_recording(
     Raises:
       FileNotFoundError, ValueError: the text names file, line and remedy.
     """
-    found, others = choose(load(electrodes, force=force, tdc=tdc, rate=rate), electrodes, which)
-    plain = as_plain(found)
-    plain.warnings = (*others, *plain.warnings)
+    paths = [electrodes] if isinstance(electrodes, str | os.PathLike) else list(electrodes)
+    if len(paths) > 1 and (force or tdc):
+        raise ValueError("force and tdc are files beside one recording: put them into each of the series")
+    chosen = [choose(load(path, force=force, tdc=tdc, rate=rate), path, which) for path in paths]
+    series = [one for one, _ in chosen]
+    plain = as_plain(_joined(series))
+    plain.joints = tuple(np.cumsum([len(one) for one in series])[:-1].tolist())
+    if plain.joints and plain.missing is not None:
+        plain.missing[list(plain.joints)] = 0
+    plain.warnings = (*(note for _, notes in chosen for note in notes), *plain.warnings)
     return plain
+
+
+def _joined(series):
+    """Electrodes, and the force that all have, of series of one sensor as one recording."""
+    first, *others = series
+    if not others:
+        return first
+    kinds = [(one.counts()[0].shape[1], one.unit("electrodes"), one.rate) for one in series]
+    for one, kind in zip(series, kinds):
+        if kind[:2] != kinds[0][:2] or abs(kind[2] / kinds[0][2] - 1) > _SAME_RATE:
+            said = [f"{n} electrodes in {unit} at {rate:.4g} Hz" for n, unit, rate in (kind, kinds[0])]
+            raise ValueError(
+                f"{one.name} has {said[0]}, {first.name} {said[1]}: give series of one sensor and one logger"
+            )
+    there = ["electrodes", *(["force"] if all(one.force is not None for one in series) else [])]
+    length = [one.time[-1] - one.time[0] + _APART for one in series]
+    start = np.cumsum([0.0, *length[:-1]])
+    return Recording(
+        np.concatenate([one.time - one.time[0] + begin for one, begin in zip(series, start)]),
+        **{name: np.concatenate([getattr(one, name) for one in series]) for name in there},
+        units={"electrodes": first.unit("electrodes")},
+        name=f"{first.name} and {len(others)} more",
+        rate_source=first.rate_source,
+    )
 
 
 def as_plain(found: Recording | PlainRecording) -> PlainRecording:
@@ -199,7 +253,7 @@ def _with_force(found):
     edges = np.flatnonzero(np.diff(np.pad(there.astype(int), 1)))
     begin, end = max(zip(edges[::2], edges[1::2]), key=lambda run: run[1] - run[0], default=(0, 0))
     said = f"the force is not there in {(~there).sum()} of {len(there)} rows"
-    if end - begin < max(MIN_ROWS, _MOST_OF * len(there)):
+    if end - begin < _MOST_OF * len(there) or not enough(end - begin, found.design):
         return dataclasses.replace(found, force=None), [f"{said}: it took no part"]
     return found.rows(slice(begin, end)), [f"{said}: only rows {begin + 1} to {end} took part"]
 

@@ -9,7 +9,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from ...quality.clock import CLOCK_FAULT
 from ...quality.noise import noise_level, running_median
 from .confidence import NAMED, USUAL, farthest
-from .recording import MIN_ROWS
 from .session import Session
 
 __all__ = ["Rest", "rest"]
@@ -19,6 +18,7 @@ __all__ = ["Rest", "rest"]
 _LIVELY = 1.0
 # of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
+_COMPARED = 400  # rows of the shortest recording in USUAL
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
 _FEW = 3  # samples that are sharp in a recording of any length
 _STILL, _QUIET = (
@@ -68,8 +68,8 @@ def rest(session: Session) -> Rest:
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
     faults += _contradicted(session)
     far, name = farthest(features, USUAL[kind]["features"])
-    # as few rows as in a recording that is refused say nothing
-    if far > USUAL[kind]["limit"] and len(session.recording) * session.fresh >= MIN_ROWS:
+    compared = len(session.recording) * session.fresh >= _COMPARED
+    if compared and far > USUAL[kind]["limit"]:
         departs = "; ".join(
             f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most from "
             f"{c['from']:.0f} s to {c['to']:.0f} s"
@@ -77,6 +77,8 @@ def rest(session: Session) -> Rest:
         )
         faults = [*faults, departs if name == "level3" else said[name]]
     text = "; ".join(faults) or "what each electrode does, the others and its own earlier blocks explain"
+    if not (faults or compared):
+        text = f"what fewer than {_COMPARED} new rows leave is not compared with that of other recordings"
     return Rest(bool(faults), text, kind, listed, features)
 
 
@@ -114,21 +116,23 @@ def _of_rows(session):
     r = session.recording
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh
-    if len(x) < 128:
+    series = [one for one in np.split(np.arange(len(x)), np.searchsorted(rows, r.joints)) if len(one)]
+    if len(x) < 128 or max(map(len, series)) < 64:
         return {"low": 0.0}, {}
-    size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
-    power, over = _spectrum(x, size, (np.hanning(size) ** 2).sum() / 12)  # rounding
+    size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, min(len(x) // 3, max(map(len, series)))))
+    power, over = _spectrum(x, series, size, (np.hanning(size) ** 2).sum() / 12)  # rounding
     f = np.fft.rfftfreq(size, 1 / rate)
     band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
     over = over[band]
     if r.force is not None:  # a touch that comes again is none of the sensor's
-        over = over - np.maximum(_spectrum(r.force[rows], size, 1e-12)[1][band].max(1), 0)[:, None]
+        over = over - np.maximum(_spectrum(r.force[rows], series, size, 1e-12)[1][band].max(1), 0)[:, None]
     beats = 2 * np.sqrt(power[band]) / np.hanning(size).sum()  # [counts]
     most_over = int(over.mean(1).argmax())
     swing = float(np.sort(beats[most_over])[-3])
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
     # from one row to the next, more than noise and than the rows around
     step = np.abs(np.diff(x, axis=0))
+    step[[one[0] - 1 for one in series[1:]]] = 0
     usual = uniform_filter1d(step, 21, axis=0)
     sharp = (step > 6 * noise_level(x) + 2) & (step > 5 * usual)
     # noise never comes again in all electrodes
@@ -159,12 +163,12 @@ def _of_rows(session):
     }, said
 
 
-def _spectrum(x, size, least):
-    """(f, c) power of x (n, c) in windows of `size` rows, straight lines taken out, and the logarithm of how
-    far it rises above that around."""
+def _spectrum(x, series, size, least):
+    """(f, c) power of x (n, c) in windows of `size` rows of one of the series, straight lines taken out, and
+    the logarithm of how far it rises above that around."""
     window, line = np.hanning(size)[:, None], np.vander(np.linspace(-1, 1, size), 2)
     project = line @ np.linalg.pinv(line)
-    parts = [x[a : a + size] for a in range(0, len(x) - size + 1, size // 2)]
+    parts = [x[one[a : a + size]] for one in series for a in range(0, len(one) - size + 1, size // 2)]
     power = np.mean([np.abs(np.fft.rfft((y - project @ y) * window, axis=0)) ** 2 for y in parts], axis=0)
     power += least
     return power, np.log(power / running_median(power, 2 * max(4, size // 32) + 1, "nearest"))

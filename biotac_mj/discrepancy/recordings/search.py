@@ -111,7 +111,8 @@ def _levels(session, named):
 def _beside(session, checked, named):
     """Rows that are missing, and how late the electrodes follow the force; then all are judged together."""
     # an exchange or a jump is no lost row, nor what begins on all electrodes
-    begun = tuple(f.start for f in session.findings if f.of_all and f.trend is None and f.start > 0)
+    begun = [f.start for f in session.findings if f.of_all and f.trend is None and f.start > 0]
+    begun += session.recording.time[list(session.recording.joints)].tolist()
     for fault in lost_rows(as_log(session.recording, session.counts, session.masked), checked.faults, begun):
         fault.confidence = confidence(fault)
         _adopt(session, *(([fault], []) if clear(fault, named) else ([], [fault])))

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...recordings.protocol import STEPS, Protocol
 from .candidates import Candidate
-from .recording import MIN_ROWS, PlainRecording
+from .recording import PlainRecording, enough
 
 __all__ = ["moved", "stretches"]
 
@@ -24,7 +24,7 @@ def stretches(recording: PlainRecording, protocol: Protocol) -> list[tuple[bool,
             found.append((touched, slice(first, last)))
     if len(found) < 2:
         return []
-    return [(touched, rows) for touched, rows in found if rows.stop - rows.start >= MIN_ROWS]
+    return [(touched, rows) for touched, rows in found if enough(rows.stop - rows.start, recording.design)]
 
 
 def _clock(recording):

@@ -40,6 +40,21 @@ def is_bag(path: pathlib.Path) -> bool:
         return file.read(16).startswith(_MARKS)
 
 
+def _types(path, store):
+    """Message types of one of rosbags' stores, and those of DEFINITIONS.
+
+    Raises:
+      ValueError: rosbags is not installed."""
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise ValueError(f"{path} is a bag of ROS: it needs pip install 'biotac-mj[ros]'") from None
+    types = get_typestore(Stores[store])
+    for name, text in DEFINITIONS.items():
+        types.register(get_types_from_msg(text, name))
+    return types
+
+
 def read_bag(path: pathlib.Path) -> list[Stream]:
     """Streams of all topics with recognised content.
 
@@ -47,14 +62,9 @@ def read_bag(path: pathlib.Path) -> list[Stream]:
       ValueError: rosbags is not installed, the bag is damaged, or nothing is recognised; the text lists the
         topics.
     """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError:
-        raise ValueError(f"{path} is a bag of ROS: reading it needs pip install 'biotac-mj[ros]'") from None
-    types = get_typestore(Stores.LATEST)
-    for name, text in DEFINITIONS.items():
-        types.register(get_types_from_msg(text, name))
+    types = _types(path, "LATEST")
+    from rosbags.highlevel import AnyReader
+
     topics, seen = {}, []
     with reading(path / "metadata.yaml" if path.is_dir() else path, "bag of ROS", _REMEDY):
         with AnyReader([path], default_typestore=types) as bag:
@@ -106,20 +116,15 @@ def write_bag(
     Raises:
       ValueError: rosbags is not installed, the folder exists, or a raw channel of the sensor is missing.
     """
-    try:
-        from rosbags.rosbag1 import Writer as Writer1
-        from rosbags.rosbag2 import Writer as Writer2
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError:
-        raise ValueError(f"{path} is to be a bag of ROS: it needs pip install 'biotac-mj[ros]'") from None
     path = pathlib.Path(path)
     if ros not in (1, 2) or form not in FORMS:
         raise ValueError(f"ros is {ros} and form {form!r}: choose 1 or 2, and one of {', '.join(FORMS)}")
     refuse_existing(path)
     rows = rows_of(recording, form)
-    types = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-    for name, text in DEFINITIONS.items():
-        types.register(get_types_from_msg(text, name))
+    types = _types(path, "ROS1_NOETIC" if ros == 1 else "ROS2_HUMBLE")
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import Writer as Writer2
+
     make = Messages(lambda name, /, **fields: types.types[name](**fields), ros)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # whole or not at all

@@ -59,6 +59,7 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     """Electrode number -> its jumps in order, of electrodes with few."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated)
+    tick = r.tick[rows]
     masked = session.masked[rows]
     if len(rows) < 200:
         return {}
@@ -84,8 +85,8 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     )  # of each electrode: times and alone of the plainest step that did not stay
     for i, k in zip(*np.nonzero(clear[0] | clear[1])):
         at = i + h
-        # it came back from where it measured nothing, or the load has moved on while rows were held
-        if masked[max(at - h, 0) : at + h, k].any() or rows[at] - rows[at - 1] > _HELD:
+        # it came back from where it measured nothing, or rows were held or missing meanwhile
+        if masked[max(at - h, 0) : at + h, k].any() or tick[at] - tick[at - 1] > _HELD:
             continue
         if not np.ptp(x[at - h : at, k]) or not np.ptp(x[at : at + h, k]):
             continue  # it stands still there: stuck
@@ -228,6 +229,7 @@ def jumped_alike(session: Session) -> Candidate | None:
     some more than others, what feeds them all does not."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated)
+    tick = r.tick[rows]
     if len(rows) < 200 or session.masked.mean() > 0.5:
         return None
     x = last_measured(session.counts[rows], session.masked[rows])
@@ -244,7 +246,7 @@ def jumped_alike(session: Session) -> Candidate | None:
         return None
     at, change = i + _LINE, float(offset[i])
     stays = np.median(x[at : at + _STAYS].mean(0) - x[max(at - _STAYS, 0) : at].mean(0))
-    if not 0.5 < stays / change < 1.6 or rows[at] - rows[at - 1] > _HELD:
+    if not 0.5 < stays / change < 1.6 or tick[at] - tick[at - 1] > _HELD:
         return None
     by_gain = apart[1][i] < apart[0][i]
     share, since = float(gain[i]), rows[at] / r.rate
