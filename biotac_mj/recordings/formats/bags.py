@@ -40,19 +40,20 @@ def is_bag(path: pathlib.Path) -> bool:
         return file.read(16).startswith(_MARKS)
 
 
-def _types(path, store):
-    """Message types of one of rosbags' stores, and those of DEFINITIONS.
+def _library(path, store):
+    """Message types of one of rosbags' stores with those of DEFINITIONS, its reader, and writers for ROS 1
+    and 2.
 
     Raises:
       ValueError: rosbags is not installed."""
     try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags import highlevel, rosbag1, rosbag2, typesys
     except ImportError:
         raise ValueError(f"{path} is a bag of ROS: it needs pip install 'biotac-mj[ros]'") from None
-    types = get_typestore(Stores[store])
+    types = typesys.get_typestore(typesys.Stores[store])
     for name, text in DEFINITIONS.items():
-        types.register(get_types_from_msg(text, name))
-    return types
+        types.register(typesys.get_types_from_msg(text, name))
+    return types, highlevel.AnyReader, (rosbag1.Writer, rosbag2.Writer)
 
 
 def read_bag(path: pathlib.Path) -> list[Stream]:
@@ -62,12 +63,10 @@ def read_bag(path: pathlib.Path) -> list[Stream]:
       ValueError: rosbags is not installed, the bag is damaged, or nothing is recognised; the text lists the
         topics.
     """
-    types = _types(path, "LATEST")
-    from rosbags.highlevel import AnyReader
-
+    types, reader, _ = _library(path, "LATEST")
     topics, seen = {}, []
     with reading(path / "metadata.yaml" if path.is_dir() else path, "bag of ROS", _REMEDY):
-        with AnyReader([path], default_typestore=types) as bag:
+        with reader([path], default_typestore=types) as bag:
             seen = sorted({f"{one.topic} ({one.msgtype})" for one in bag.connections})
             useless = set()
             for connection, received, raw in bag.messages():
@@ -121,15 +120,12 @@ def write_bag(
         raise ValueError(f"ros is {ros} and form {form!r}: choose 1 or 2, and one of {', '.join(FORMS)}")
     refuse_existing(path)
     rows = rows_of(recording, form)
-    types = _types(path, "ROS1_NOETIC" if ros == 1 else "ROS2_HUMBLE")
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
-
+    types, _, writers = _library(path, "ROS1_NOETIC" if ros == 1 else "ROS2_HUMBLE")
     make = Messages(lambda name, /, **fields: types.types[name](**fields), ros)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # whole or not at all
         made = pathlib.Path(folder) / path.name
-        writer = Writer1(made) if ros == 1 else Writer2(made, version=8)
+        writer = writers[0](made) if ros == 1 else writers[1](made, version=8)
         serialize = types.serialize_ros1 if ros == 1 else types.serialize_cdr
         with writer:
             places = {
