@@ -444,7 +444,7 @@ class Instance:
         geometry = self.setup.skin.geometry
         return Touches(self.touching.group, geometry.outer_face, geometry.nvert, self.setup.ngroup)
 
-    def touches(self, wrench: np.ndarray, by_place: bool) -> list[tuple[int, np.ndarray]]:
+    def touches(self, wrench: np.ndarray, by_place: bool) -> tuple[np.ndarray, np.ndarray]:
         """Wrenches (ngroup, 6) on the touching bodies as contacts of their geoms, see `Touches.find`.
         by_place: at the places where the skin pushes; else on the axis of the wrench."""
         found, skin, result = self._touches, self.setup.skin, self._result

@@ -11,7 +11,7 @@ here."""
 
 import ctypes
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,18 +27,6 @@ _CONTACT, _TOUCH = _SENSORS[2:]
 _ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
 _PYRAMIDAL = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
 PYRAMID = 10  # edges of a contact's friction pyramid with six components
-
-
-class _Touch(NamedTuple):
-    """A geom on a skin, in the world: the BioTac's body, the geom, centre of pressure [m], normal from core
-    to geom, and force [N] and torque [N m] on the geom about the centre."""
-
-    core: int
-    geom: int
-    pos: np.ndarray
-    normal: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
 
 
 class Loads:
@@ -63,10 +51,13 @@ class Loads:
     def write(self, acting: dict) -> None:
         """Writes cfrc_ext, cfrc_int and the sensors. acting: {instance: wrenches (ngroup, 6) that its bodies
         get}, in the BioTac's frame."""
-        touches = [t for instance, wrench in acting.items() for t in self._touches(instance, wrench)]
+        data, touches = self.data.struct, []
+        for instance, wrench in acting.items():
+            which, vectors = instance.touches(wrench, self._by_place)
+            if len(which):
+                touches.append((instance.touching, which, vectors))
         if not touches and not self._welded:
             return
-        data = self.data.struct
         kept = data.contact, data.ncon, data.efc_force
         contact, force = self._listed(touches)
         data.contact, data.ncon = contact.ctypes.data, len(contact)
@@ -79,34 +70,31 @@ class Loads:
         finally:
             data.contact, data.ncon, data.efc_force = kept
 
-    def _touches(self, instance, wrench):
-        core = instance.touching.core
-        turned = self.data.xmat[core].reshape(3, 3).T
-        for k, vectors in instance.touches(wrench, self._by_place):
-            pos, normal, *load = vectors @ turned
-            yield _Touch(core, int(instance.touching.geom[k]), self.data.xpos[core] + pos, normal, *load)
-
     def _listed(self, touches):
         """MuJoCo's contacts with the touches behind them, and the forces of all rows: none of the skins' own,
         and those of the touches."""
-        data = self.data.struct
-        contact = np.zeros(data.ncon + len(touches), CONTACT)
-        force = np.zeros(data.nefc + PYRAMID * len(touches))
+        data, count = self.data.struct, sum(len(which) for _, which, _ in touches)
+        contact = np.zeros(data.ncon + count, CONTACT)
+        force = np.zeros(data.nefc + PYRAMID * count)
         ctypes.memmove(contact.ctypes.data, data.contact, data.ncon * CONTACT.itemsize)
         ctypes.memmove(force.ctypes.data, data.efc_force, data.nefc * 8)
         contact[data.ncon :] = self._touch
         for one in self.coupled:
             force[one.metric.numbers] = 0.0
         pyramidal = self.model.opt.cone == _PYRAMIDAL
-        for k, t in enumerate(touches):
-            row, one = data.nefc + PYRAMID * k, contact[data.ncon + k]
-            frame = contact_frame(t.normal)
-            one["pos"], one["frame"], one["efc_address"] = t.pos, frame.ravel(), row
-            one["geom"] = one["geom1"], one["geom2"] = self._core_geom[t.core], t.geom
-            value = np.concatenate([frame @ t.force, frame @ t.torque])
-            if pyramidal:  # two edges: their sum is a fifth of the normal force, their difference a component
-                value = (value[0] / 5 + value[1:, None] * np.array([1.0, -1.0])).ravel() / 2
-            force[row : row + len(value)] = value
+        k, row = data.ncon, data.nefc
+        for touching, which, vectors in touches:
+            core = touching.core
+            vectors = vectors @ self.data.xmat[core].reshape(3, 3).T
+            for geom, (pos, normal, *load) in zip(touching.geom[which].tolist(), vectors):
+                one, frame = contact[k], contact_frame(normal)
+                one["pos"], one["frame"], one["efc_address"] = self.data.xpos[core] + pos, frame.ravel(), row
+                one["geom"] = one["geom1"], one["geom2"] = self._core_geom[core], geom
+                value = (load @ frame.T).ravel()
+                if pyramidal:  # two edges: their sum is a fifth of the push, their difference a component
+                    value = (value[0] / 5 + value[1:, None] * np.array([1.0, -1.0])).ravel() / 2
+                force[row : row + len(value)] = value
+                k, row = k + 1, row + PYRAMID
         return contact, force
 
 

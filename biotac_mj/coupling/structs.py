@@ -231,12 +231,17 @@ class DataView(_View):
     def rows(self) -> types.SimpleNamespace:
         """Arrays of the constraint rows by name. They lie in the arena, and are others once MuJoCo has made
         constraints again."""
-        struct = self.struct
-        where = [getattr(struct, name) for name in _ROWS]
-        where += [struct.nefc, struct.ne, struct.nJ, struct.nisland]
+        where = [ctypes.string_at(*part) for part in self._arena]
         if where != self._where:
             self._where, self._rows = where, types.SimpleNamespace(**{n: self.array(n) for n in _ROWS})
         return self._rows
+
+    @functools.cached_property
+    def _arena(self):
+        """Where mjData has what says where the rows are, and its size: numbers of rows, and pointers."""
+        spans, kind = (("ncon", "nisland"), ("contact", "efc_force")), type(self.struct)
+        fields = ([getattr(kind, name) for name in span] for span in spans)
+        return [(self.address + a.offset, b.offset + b.size - a.offset) for a, b in fields]
 
     def row_states(self) -> np.ndarray:
         """(nefc,) states of the rows, mjtConstraintState, where MuJoCo's constraint solver left them. Where

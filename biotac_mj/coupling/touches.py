@@ -107,11 +107,10 @@ class Touches:
         self._found = [a.numpy()[:, 0] for a in found]
         self._find = row((find_touches, (ngroup, 1), [1, *fixed, *given, *found]))
 
-    def find(self) -> list[tuple[int, np.ndarray]]:
-        """[(number of a geom, (4, 3) of centre of pressure [m], normal out of the skin there, force [N] and
-        torque [N m] about the centre)] of geoms on which something acts."""
+    def find(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (k,) of geoms on which something acts, and (k, 4, 3): centre of pressure [m], normal out of
+        the skin there, force [N], and torque [N m] about the centre."""
         self._find()
         pos, normal, share, wrench = self._found
         which = share.nonzero()[0]
-        vectors = np.concatenate([pos, normal, wrench], axis=1).reshape(-1, 4, 3)
-        return list(zip(which.tolist(), vectors[which]))
+        return which, np.concatenate([pos, normal, wrench], axis=1)[which].reshape(-1, 4, 3)

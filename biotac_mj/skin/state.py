@@ -293,9 +293,6 @@ class SavedState(types.SimpleNamespace):
         return type(self)(**(vars(self) | changes))
 
 
-_State = typing.TypeVar("_State", bound=SavedState)
-
-
 def variables_of(tier: str, options: Iterable[str]) -> list[Variable]:
     """Variables of a tier with these options."""
     return [v for v in VARIABLES if tier in v.tiers and v.is_there(options)]
@@ -317,24 +314,28 @@ class StateLayout:
     Args:
       tier: FULL or CONDENSED. options: see `options_of`.
       sizes: of the axes by name, except those of tables.
+      room: most rows of the tables by name; None: those of the plugin state, `ROOM`.
 
     Attributes:
       size: number of numbers. slices: of each variable and table.
       of_steps, of_skin: names of variables outside tables that a skin keeps, and does not keep, when it is
         reset to rest by itself.
+      columns: numbers in a row of each table.
     """
 
-    def __init__(self, tier: str, options: Iterable[str], sizes: dict[str, int]):
+    def __init__(
+        self, tier: str, options: Iterable[str], sizes: dict[str, int], room: dict[str, int] | None = None
+    ):
         variables, rows = saved_variables(tier, options)
         self._shapes = {v.name: tuple(sizes[axis] for axis in v.axes) + v.item for v in variables}
         self._rest = {v.name: v.reset for v in variables}
         self.of_steps = tuple(v.name for v in variables if v.outlives_rest)
         self.of_skin = tuple(v.name for v in variables if not v.outlives_rest)
-        self._columns = {name: _columns(of) for name, of in rows.items()}
-        self._room = {name: ROOM[name][tier] for name in rows}
+        self.columns = {name: _columns(of) for name, of in rows.items()}
+        self._room = room or {name: ROOM[name][tier] for name in rows}
         counts = {name: int(np.prod(shape)) for name, shape in self._shapes.items()}
         self._used = sum(counts.values())  # the tables follow, and are mostly empty
-        counts |= {name: 1 + self._room[name] * n for name, n in self._columns.items()}
+        counts |= {name: 1 + self._room[name] * n for name, n in self.columns.items()}
         ends = np.cumsum(list(counts.values())).tolist()
         self.slices = {
             name: slice(end - count, end) for (name, count), end in zip(counts.items(), ends, strict=True)
@@ -347,53 +348,66 @@ class StateLayout:
 
     def rows(self, state: np.ndarray, name: str) -> np.ndarray:
         """View (k, n) of a table's rows in a state (size,)."""
-        part, n = self.part(state, name), self._columns[name]
-        count = int(part[0])
-        return part[1 : 1 + n * count].reshape(count, n)
+        begin, n = self.slices[name].start, self.columns[name]
+        count = int(state[begin])
+        return state[begin + 1 : begin + 1 + n * count].reshape(count, n)
 
-    def rest(self, kind: type[_State] = SavedState) -> _State:
-        """State after a reset; variables whose reset is no number are zero."""
-        made = {}
-        for name, shape in self._shapes.items():
-            value = self._rest[name]
-            value = value if isinstance(value, (int, float)) and np.isfinite(value) else 0.0
-            made[name] = np.full(shape, value, float) if shape else float(value)
-        return kind(**made, **{name: np.zeros((0, n)) for name, n in self._columns.items()})
+    def value(self, state: np.ndarray, name: str) -> np.ndarray | float:
+        """A variable or a table of a state (size,): a view, or a number."""
+        if name in self.columns:
+            return self.rows(state, name)
+        shape, part = self._shapes[name], state[self.slices[name]]
+        return part.reshape(shape) if shape else float(part[0])
 
-    def read(self, state: np.ndarray, kind: type[_State] = SavedState) -> _State:
+    def rest(self) -> np.ndarray:
+        """State (size,) after a reset; variables whose reset is no number are zero."""
+        out = np.zeros(self.size)
+        for name, value in self._rest.items():
+            if isinstance(value, (int, float)) and np.isfinite(value):
+                self.part(out, name)[:] = value
+        return out
+
+    def read(self, state: np.ndarray) -> SavedState:
         """The saved state of a state (size,), as views of it."""
-        found = {}
-        for name, shape in self._shapes.items():
-            part = state[self.slices[name]]
-            found[name] = part.reshape(shape) if shape else float(part[0])
-        return kind(**found, **{name: self.rows(state, name) for name in self._columns})
+        return SavedState(**{name: self.value(state, name) for name in self.slices})
 
     def write(self, saved: SavedState, state: np.ndarray) -> None:
-        """Inverse of `read`. Missing values are zero; unused rows of tables are unchanged.
+        """Inverse of `read`. Missing values and unused rows of tables are unchanged.
 
         Raises:
           ValueError: more rows than a table can have.
         """
-        values = vars(saved)
-        for name in self._shapes:
-            self.part(state, name)[:] = np.ravel(values.get(name, 0.0))
-        for name, n in self._columns.items():
-            table, part = values[name], self.part(state, name)
-            if len(table) > self._room[name]:
-                raise ValueError(
-                    f"{len(table)} contact samples touch, the state holds {self._room[name]}: does a body "
-                    "swallow the finger (sizes are in metres)? Else take a coarser skin, or fewer samples= "
-                    "in options['skin']"
-                )
-            part[0] = len(table)
-            part[1 : 1 + n * len(table)] = table.ravel()
+        for name, value in vars(saved).items():
+            begin, value = self.slices[name].start, np.asarray(value)
+            if name in self.columns:
+                self.check_room(name, len(value))
+                state[begin] = len(value)
+                begin += 1
+            state[begin : begin + value.size] = value.ravel()
+
+    def check_room(self, name: str, count: int) -> None:
+        """Raises ValueError for more rows than a table can have."""
+        if count > self._room[name]:
+            raise ValueError(
+                f"{count} contact samples touch, the state holds {self._room[name]}: does a body "
+                "swallow the finger (sizes are in metres)? Else take a coarser skin, or fewer samples= "
+                "in options['skin']"
+            )
+
+    def _in_use(self, state):
+        ends = [(self.slices[name].start, n) for name, n in self.columns.items()]
+        return [slice(0, self._used), *(slice(at, at + 1 + n * int(state[at])) for at, n in ends)]
+
+    def copy(self, state: np.ndarray) -> np.ndarray:
+        """Copy of a state (size,), with zeros in unused rows."""
+        out = np.zeros(self.size)
+        for part in self._in_use(state):
+            out[part] = state[part]
+        return out
 
     def key(self, state: np.ndarray) -> bytes:
         """Bytes of a state without unused rows, as a key."""
-        return state[: self._used].tobytes() + b"".join(
-            self.part(state, name)[: 1 + n * int(self.part(state, name)[0])].tobytes()
-            for name, n in self._columns.items()
-        )
+        return b"".join([state[part].tobytes() for part in self._in_use(state)])
 
 
 def _columns(variables):

@@ -1,21 +1,81 @@
 """The arrays of a skin's state, declared in `state`: resets of some worlds on the device, and transfer of one
 world to the host and back."""
 
+import functools
 import operator
 import typing
 
 import numpy as np
 import warp as wp
 
+from ..launches import in_a_row, recorded
 from .data import SkinData
 from .geoms import GeomSet
-from .state import FULL, SavedState, options_of, saved_variables, variables_of
+from .state import FULL, SavedState, StateLayout, options_of, saved_variables, variables_of
 from .transfer import Transfer
+from .types import real
 
 __all__ = ["StateArrays"]
 
+wp.set_module_options({"enable_backward": False})
+
 # indices of the six numbers of a symmetric 3 x 3 matrix, and back
 _ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
+
+
+@wp.kernel
+def _save_rows(
+    # In:
+    number: wp.array2d(dtype=typing.Any),
+    reset: typing.Any,
+    others: wp.array2d(dtype=real),
+    first: int,
+    begin: int,
+    end: int,
+    # Out:
+    row_out: wp.array(dtype=real),
+):
+    """Appends the items that are not reset, of which the first has the number `first`, to the table at
+    `begin`, which counts those beyond its `end`, too."""
+    if first == 0:
+        row_out[begin] = real(0.0)
+    for i in range(number.shape[0]):
+        if number[i, 0] != reset:
+            at = begin + 1 + (2 + others.shape[1]) * int(row_out[begin])
+            row_out[begin] += real(1.0)
+            if at < end:
+                row_out[at] = real(first + i)
+                row_out[at + 1] = real(number[i, 0])
+                for k in range(others.shape[1]):
+                    row_out[at + 2 + k] = others[i, k]
+
+
+@wp.kernel
+def _load_rows(
+    # In:
+    row: wp.array(dtype=real),
+    first: int,
+    begin: int,
+    reset: typing.Any,
+    # Out:
+    number_out: wp.array2d(dtype=typing.Any),
+    others_out: wp.array2d(dtype=real),
+):
+    """The inverse: items without a row are reset."""
+    for i in range(number_out.shape[0]):
+        number_out[i, 0] = reset
+    for r in range(int(row[begin])):
+        at = begin + 1 + (2 + others_out.shape[1]) * r
+        i = int(row[at]) - first
+        if i >= 0 and i < number_out.shape[0]:
+            number_out[i, 0] = number_out.dtype(row[at + 1])
+            for k in range(others_out.shape[1]):
+                others_out[i, k] = row[at + 2 + k]
+
+
+for _kind in (int, real):
+    wp.overload(_save_rows, {"number": wp.array2d(dtype=_kind), "reset": _kind})
+    wp.overload(_load_rows, {"reset": _kind, "number_out": wp.array2d(dtype=_kind)})
 
 
 class StateArrays:
@@ -24,17 +84,25 @@ class StateArrays:
     Args:
       data, geoms: of the skin.
       tier: FULL or CONDENSED.
+      layout: of the rows of numbers; None: with room for all.
       holders: other holders of arrays by name. Variables of missing holders are omitted.
 
     Attributes:
       arrays: by variable name.
+      layout: of the rows of numbers.
     """
 
-    def __init__(self, data: SkinData, geoms: GeomSet, tier: str = FULL, **holders: typing.Any):
+    def __init__(
+        self,
+        data: SkinData,
+        geoms: GeomSet,
+        tier: str = FULL,
+        layout: StateLayout | None = None,
+        **holders: typing.Any,
+    ):
         model = data.model
         self.nworld, self._device, self._tier = data.nworld, model.device, tier
-        self._memory, self._nsample, self._x = data.memory, len(model.sample), data.x
-        self._geoms = geoms
+        self._data, self._geoms, self._nsample = data, geoms, len(model.sample)
         holders |= {"data": data, "outer": data.outer, "worlds": data.worlds, "geoms": geoms.struct}
         holders |= {"touched": data.touched(geoms.count)}
         if data.core:
@@ -50,11 +118,16 @@ class StateArrays:
         self._sources, self._kappa = sources, data.worlds.kappa
         variables, rows = saved_variables(tier, options)
         self._plain = [v for v in variables if v.name in self.arrays]
-        self._values = [(v.name, _value_of(v)) for v in self._plain]
         self._rows = {name: _blocks(of, self.arrays) for name, of in rows.items()}
-        of_rows = [v.name for blocks in self._rows.values() for block in blocks for v in block]
-        follow = [name for name in ("x_last", "kept", "touched_by") if name in self.arrays]
-        self._loaded, self._views = [*(v.name for v in self._plain), *of_rows, *follow], None
+        if layout is None:
+            sizes = {axis: 0 for v in variables for axis in v.axes}
+            sizes |= {axis: n for v, array in self._found for axis, n in zip(v.axes, array.shape)}
+            room = {
+                name: sum(self.arrays[v.name].shape[0] * int(np.prod(v.item)) for v, *_ in blocks)
+                for name, blocks in self._rows.items()
+            }
+            layout = StateLayout(tier, options, sizes, room)
+        self.layout = layout
 
     # --- some of the worlds, on the device ---
 
@@ -82,8 +155,8 @@ class StateArrays:
     def reset(self, mask: wp.array) -> None:
         """Resets the worlds of mask, (nworld,) of bool, after `prepare`. Launches only."""
         self._all.launch_where(mask)
-        if self._memory:
-            self._memory.forget(self._x, mask)
+        if self._data.memory:
+            self._data.memory.forget(self._data.x, mask)
 
     def reset_skin(self, mask: wp.array) -> None:
         """Resets the skin of the worlds of mask, and keeps variables of geoms and steps."""
@@ -95,78 +168,108 @@ class StateArrays:
 
     # --- a single world, on the host ---
 
-    def save(self, kind: type[SavedState] = SavedState) -> SavedState:
+    def save(self) -> SavedState:
         """State of the first world, without the variables of the host."""
-        host = self._host()
-        saved = {name: value(host[name]) for name, value in self._values}
-        for name, blocks in self._blocks.items():
-            tables, begin = [_rows(block) for block in blocks], 0
-            for table, block in zip(tables, blocks, strict=True):
-                table[:, 0] += begin
-                begin += len(block[0][1])
-            saved[name] = tables[0] if len(tables) == 1 else np.concatenate(tables)
-        return kind(**saved)
+        row = self.save_row()
+        names = *(v.name for v in self._plain), *self._rows
+        return SavedState(**{name: self.layout.value(row, name) for name in names})
 
     def save_of(self, holder: str) -> dict:
         """State of one holder, by variable name."""
-        host = self._host()
-        names = {v.name for v in self._plain if v.holder == holder}
-        return {name: value(host[name]) for name, value in self._values if name in names}
+        saved = self.save()
+        return {v.name: getattr(saved, v.name) for v in self._plain if v.holder == holder}
+
+    def save_row(self) -> np.ndarray:
+        """State of the first world as a row of numbers, with zeros for the variables of the host.
+
+        Raises:
+          ValueError: more contact than the layout has room for.
+        """
+        row, plain, save, _ = self._transfers
+        if self._device.is_cuda:
+            for name, copy in self._host.items():
+                wp.copy(copy, self.arrays[name])
+        for v, numbers, array in plain:
+            numbers[...] = array[..., _ROW, _COLUMN] if v.symmetric else array
+        for launch in save:
+            launch()
+        for name in self._rows:
+            self.layout.check_room(name, int(self.layout.part(row, name)[0]))
+        return self.layout.copy(row)
 
     def load(self, saved: SavedState) -> None:
         """Sets the state of a single world; the inverse of `save`, with rows in ascending order of items.
-        Missing values are reset."""
-        values, host, self._geoms.posed = vars(saved), self._host(), True
-        for v in self._plain:
-            value = values.get(v.name)
-            if value is None:
-                value = self._sources[v.reset].numpy()[_first(v)] if v.reset in self._sources else v.reset
-            elif v.symmetric:
-                value = value[..., _WHOLE].reshape(host[v.name].shape)
-            if value is not None and not isinstance(value, str):
-                host[v.name][...] = value
-        for name, blocks in self._blocks.items():
-            _put_rows(values.get(name, np.zeros((0, 2))), blocks)
-        if self._tier == FULL:
-            host["x_last"][:] = host["x"]
-        contacts = values.get("contacts", np.zeros((0, 2))).astype(int)
-        host["kept"][:] = 0
-        host["kept"][contacts[:, 0] // self._nsample] = 1
-        if "touched_by" in host:
-            host["touched_by"][:] = 0
-            host["touched_by"][contacts[:, 1]] = 1
+        Missing values are unchanged."""
+        row = self.save_row()
+        self.layout.write(saved, row)
+        self.load_row(row)
+
+    def load_row(self, state: np.ndarray) -> None:
+        """Sets the state of a single world from a row of numbers."""
+        row, plain, _, load = self._transfers
+        row[:], self._geoms.posed = state, True
+        for v, numbers, array in plain:
+            array[...] = numbers[..., _WHOLE].reshape(array.shape) if v.symmetric else numbers
+        for launch in load:
+            launch()
+        sample, geom = self.layout.rows(row, "contacts")[:, :2].astype(int).T
+        for name, marked in (("kept", sample // self._nsample), ("touched_by", geom)):
+            if name in self._marks:
+                self._marks[name][:] = 0
+                self._marks[name][marked] = 1
         if self._device.is_cuda:
-            for name, value in host.items():
-                array = self.arrays[name]
-                array.assign(value.reshape(*array.shape, *getattr(array.dtype, "_shape_", ())))
-        if self._memory:
-            self._memory.recall(self._x)
+            for name, copy in self._host.items():
+                wp.copy(self.arrays[name], copy)
+        if self._tier == FULL:
+            wp.copy(self._data.x_last, self._data.x)
+        if self._data.memory:
+            self._data.memory.recall(self._data.x)
 
-    def view(self, name: str) -> np.ndarray:
-        """Array of a variable in the first world on the host; a view on the CPU."""
-        v = next(v for v, _ in self._found if v.name == name)
-        return self.arrays[name].numpy()[_first(v)]
-
+    @functools.cached_property
     def _host(self):
-        """Arrays of the first world that `save` and `load` use."""
-        if self._views is None or self._device.is_cuda:
-            self._views = {name: self.view(name) for name in self._loaded}
-            self._blocks = {name: _tables(blocks, self._views) for name, blocks in self._rows.items()}
-        return self._views
+        """Arrays on the CPU that a row is saved from and loaded to: on CUDA copies."""
+        names = [v.name for v in self._plain]
+        names += [v.name for blocks in self._rows.values() for block in blocks for v in block]
+        names += [name for name in ("kept", "touched_by") if name in self.arrays]
+        found = {name: self.arrays[name] for name in names}
+        found = {n: wp.empty_like(a, device="cpu") if a.device.is_cuda else a for n, a in found.items()}
+        self._marks = {name: found[name].numpy()[:, 0] for name in ("kept", "touched_by") if name in found}
+        return found
+
+    @functools.cached_property
+    def _transfers(self):
+        """A row of numbers; variables, their parts of it and their arrays; launches that write the tables of
+        the row, and that read them."""
+        host, layout = self._host, self.layout
+        with wp.ScopedDevice("cpu"):
+            row, save, load = wp.zeros(layout.size, dtype=real), [], []
+            for name, blocks in self._rows.items():
+                first, part = 0, layout.slices[name]
+                for v, *others in blocks:
+                    items, more = _numbers(host[v.name], True), wp.zeros((1, 0), dtype=real)
+                    for other in others:
+                        more = _numbers(host[other.name])
+                    reset, known = items.dtype(v.reset), (first, part.start)
+                    save.append(recorded(_save_rows, 1, [items, reset, more, *known, part.stop], [row]))
+                    load.append(recorded(_load_rows, 1, [row, *known, reset], [items, more]))
+                    first += len(items)
+        numbers, plain = row.numpy(), []
+        for v in self._plain:
+            first = (*[slice(None)] * len(v.axes), 0) if v.axes else slice(1)
+            array = host[v.name].numpy()[first]
+            part = layout.part(numbers, v.name).reshape(*array.shape[: len(v.axes) or 1], *v.item)
+            plain.append((v, part, array))
+        return numbers, plain, in_a_row(save), in_a_row(load)
 
 
-def _first(v):
-    """Index of the first world; a slice for a number per world, so that the result is a view."""
-    if not v.axes and not v.item:
-        return slice(0, 1)
-    return (*[slice(None)] * len(v.axes), 0)
-
-
-def _value_of(v):
-    """Function from a variable's array in a world to its saved value."""
-    if v.symmetric:
-        return lambda view: view[..., _ROW, _COLUMN]
-    return np.copy if v.axes or v.item else lambda view: float(view[0])
+def _numbers(array, single=False):
+    """Numbers of the first world of an array [item, world] on the CPU, (item, number); `single`: each is an
+    item."""
+    kind = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+    size, item = (wp.types.type_size_in_bytes(t) for t in (kind, array.dtype))
+    (n, _), (stride, _) = array.shape, array.strides
+    shape, strides = ((n * item // size, 1), (size, size)) if single else ((n, item // size), (stride, size))
+    return wp.array(ptr=array.ptr, dtype=kind, shape=shape, strides=strides, device="cpu", copy=False)
 
 
 def _blocks(variables, arrays):
@@ -180,36 +283,3 @@ def _blocks(variables, arrays):
         else:
             blocks[-1].append(v)
     return blocks
-
-
-def _tables(blocks, host):
-    """For each variable of each block its reset and its array in one world, a row for each item."""
-    sizes = (host[block[0].name].size for block in blocks)
-    return [[(v.reset, host[v.name].reshape(n, -1)) for v in block] for n, block in zip(sizes, blocks)]
-
-
-def _rows(block):
-    """Rows of a block: indices of its items, and their values."""
-    reset, column = block[0]
-    at = (column[:, 0] != reset).nonzero()[0]
-    return np.concatenate([at[:, None], *(items[at] for _, items in block)], axis=1, dtype=float)
-
-
-def _put_rows(table, blocks):
-    """Inverse of `_rows` for all blocks; items without a row are reset."""
-    begin, number = 0, table[:, 0]
-    for (reset, column), *others in blocks:
-        end = begin + len(column)
-        rows = table
-        if len(blocks) > 1:
-            rows = table[np.searchsorted(number, begin) : np.searchsorted(number, end)]
-        at, done = rows[:, 0].astype(int) - begin, 2
-        column[:] = reset
-        column[at, 0] = rows[:, 1]
-        for reset, items in others:
-            if reset is not None:
-                items[:] = reset
-            if len(at):
-                items[at] = rows[:, done : done + items.shape[1]]
-            done += items.shape[1]
-        begin = end

@@ -40,7 +40,7 @@ class CondensedStepper(FemStepper):
 
     @functools.cached_property
     def _rest(self):
-        return Memory.rest(len(self._geoms))
+        return self._layout.rest()
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
@@ -73,10 +73,8 @@ class CondensedStepper(FemStepper):
             memory = self._skin.outside(*released)  # as those of the full tier do
         begin = self._read(near.state) if near is not None and bodies is not None else None
         out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies, begin)
-        new = np.zeros_like(state)
-        self._layout.write(out.memory, new)
         return SkinResult(
-            state=new,
+            state=out.memory.row,
             wrench=out.wrench,
             tangent=out.tangent,
             vert_xpos=out.vert_xpos[: self._geometry.nvert],
@@ -102,7 +100,7 @@ class CondensedStepper(FemStepper):
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         self._place_geoms(state, geom_pos, geom_mat)
         for name in self._layout.of_skin:
-            self._part(state, name)[:] = getattr(self._rest, name)
+            self._part(state, name)[:] = self._part(self._rest, name)
 
     def _read(self, state) -> Memory:
-        return self._layout.read(state, Memory)
+        return Memory(state, self._layout)

@@ -87,7 +87,7 @@ class FemStepper:
 
     @functools.cached_property
     def _arrays(self):
-        return StateArrays(self._data, self._geom_set)
+        return StateArrays(self._data, self._geom_set, layout=self._layout)
 
     @functools.cached_property
     def _geom_set(self):
@@ -102,19 +102,19 @@ class FemStepper:
         return self._layout.part(state, name)
 
     def reset(self, state: np.ndarray) -> None:
-        state[:] = 0
-        self._layout.write(self._rest, state)
+        state[:] = self._rest
 
     @functools.cached_property
     def _rest(self):
-        rest = self._layout.rest()
-        rest.x, rest.resting = self._nodes, float(not (self.inertial or self._material.remembers))
+        known = {"x": self._nodes, "resting": not (self.inertial or self._material.remembers)}
         if _filled(self._options):
-            rest.x, rest.last_pressure = self._model.rest.vert, self._model.rest.pressure
+            known |= {"x": self._model.rest.vert, "last_pressure": self._model.rest.pressure}
             if self._material.remembers:  # no friction in the rubber, nothing to relax: by the shape at rest
                 self._data.reset()
-                rest = rest.replace(**self._arrays.save_of("rubber"))
-        return rest
+                known |= self._arrays.save_of("rubber")
+        row = self._layout.rest()
+        self._layout.write(SavedState(**known), row)
+        return row
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
@@ -262,8 +262,8 @@ class FemStepper:
             step(model, d, geoms, dt, core_pos[1:], core_mat[1:])
         else:
             step(model, d, geoms, dt)
-        new = np.zeros_like(state)
-        self._pack(new)
+        new = self._arrays.save_row()
+        self._part(new, "started")[:] = 1.0
         if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *released, 0.0):
             return self._still(state, *released)
         return SkinResult(
@@ -385,12 +385,12 @@ class FemStepper:
 
     def _unpack(self, state, **instead):
         """Loads a state; `instead`: values that replace parts of it."""
-        self._arrays.load(self._layout.read(state).replace(**instead))
+        if instead:
+            state = state.copy()
+            self._layout.write(SavedState(**instead), state)
+        self._arrays.load_row(state)
         self._geom_set.set_pose(*self.came_to(state))
         self._geom_set.advance()
-
-    def _pack(self, state):
-        self._layout.write(self._arrays.save().replace(started=1.0), state)
 
     def _sticking(self, state):
         return self.contact_rows(state)[:, 0].astype(int)

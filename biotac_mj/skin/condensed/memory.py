@@ -1,6 +1,7 @@
 """State of a condensed skin between steps, and outcome of a step."""
 
 import dataclasses
+import functools
 import typing
 
 import numpy as np
@@ -12,19 +13,40 @@ __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Memory", "Outcome", "layout_of"]
 MAX_FORCES, MAX_CONTACTS = (ROOM[name][CONDENSED] for name in ("forces", "contacts"))
 
 
+@functools.cache
 def layout_of(ngeom: int) -> StateLayout:
     """Layout of the state of a skin with `ngeom` geoms, as a row of numbers."""
     return StateLayout(CONDENSED, (), {"geom": ngeom})
 
 
-class Memory(SavedState):
-    """State of a skin between steps, by the names of `state.VARIABLES`. `started`: whether a step was made;
-    `forces` (k, 2): contact coordinates with a force, in ascending order, and the forces [N]."""
+class Memory:
+    """State of a skin between steps: a row of numbers, read by the names of `state.VARIABLES`. `started`:
+    whether a step was made; `forces` (k, 2): contact coordinates with a force, in ascending order, and the
+    forces [N].
+
+    Args:
+      row: it is not copied. layout: `layout_of` its geoms.
+    """
+
+    def __init__(self, row: np.ndarray, layout: StateLayout):
+        self.row, self.layout = row, layout
 
     @classmethod
     def rest(cls, ngeom: int) -> typing.Self:
         """State of a skin without contact, and without previous poses of geoms."""
-        return layout_of(ngeom).rest(cls)
+        layout = layout_of(ngeom)
+        return cls(layout.rest(), layout)
+
+    def __getattr__(self, name):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self.layout.value(self.row, name)
+
+    def replace(self, **changes: typing.Any) -> typing.Self:
+        """A state with some values replaced."""
+        out = type(self)(self.layout.copy(self.row), self.layout)
+        self.layout.write(SavedState(**changes), out.row)
+        return out
 
     @property
     def coordinate(self) -> np.ndarray:
@@ -36,14 +58,9 @@ class Memory(SavedState):
         """Forces (k,) on these coordinates [N]."""
         return self.forces[:, 1]
 
-    def contents(self) -> tuple:
+    def contents(self) -> bytes:
         """All variables, to be compared."""
-        values = sorted(vars(self).items())
-        return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for _, v in values)
-
-    def key(self) -> tuple:
-        """All variables on which the nodes depend."""
-        return self.forces.tobytes(), self.pressure, self.solved.tobytes()
+        return self.layout.key(self.row)
 
 
 @dataclasses.dataclass

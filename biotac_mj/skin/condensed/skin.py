@@ -21,7 +21,7 @@ from ..program import Program
 from ..state import CONDENSED
 from ..state_arrays import StateArrays
 from .linear import LinearSkin
-from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome
+from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome, layout_of
 from .refusals import refuse
 from .step import CondensedStep, Room
 from .structs import Remembered
@@ -65,7 +65,7 @@ class CondensedSkin:
         self._run = Program("cpu", lambda program: step.launch(tangent, program)).run
         self._normal_forces = NormalForces(step.touch, geoms.struct, self._data.x)
         self._recall = Program("cpu", step.recall).run
-        self._state = StateArrays(self._data, geoms, CONDENSED, **step.holders)
+        self._state = StateArrays(self._data, geoms, CONDENSED, layout_of(geoms.count), **step.holders)
         self._nodes, self._views = {}, self._view()
         previous, balance = step.previous, step.previous.balance
         arrays = {name: getattr(balance, name) for name in Remembered.vars}
@@ -173,31 +173,35 @@ class CondensedSkin:
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
         v["tier"][0] = -1  # without an equilibrium the error is not known
         self._run()
-        load_factor = float(v["load_factor"][0])
+        load_factor, nodes = float(v["load_factor"][0]), v["x"].copy()
         if load_factor > 0:
-            memory = self._read()
+            memory = Memory(self._state.save_row(), memory.layout)
+            memory.layout.part(memory.row, "started")[:] = 1.0
             self._held = memory.contents()
-            self._keep(memory, v["x"].copy())
+            self._keep(self._held, nodes)
+        push = v["sample_force"][memory.contacts[:, 0].astype(int)]
         return Outcome(
             memory=memory,
             wrench=v["wrench"].copy(),
             tangent=self._tangent[:, 0].copy(),
-            vert_xpos=v["x"].copy(),
+            vert_xpos=nodes,
             measured=v["tier"][0] > 0,
             converged=v["reason"][0] == CONVERGED,
             iterations=int(v["iterations"][0]),
             error=float(v["error"][0]),
-            load=np.linalg.norm(v["sample_force"][memory.contacts[:, 0].astype(int)], axis=1),
+            load=np.sqrt((push * push).sum(axis=1)),
             load_factor=load_factor,
         )
 
     def _load(self, memory):
         """Loads a state."""
-        nodes, v, before = self.nodes(memory), self._views, memory.contents()
+        v, before = self._views, memory.contents()
         if before != self._held:  # as a rule a step begins where the last one of this skin has ended
-            self._state.load(memory)
+            nodes = self.nodes(memory, before)
+            self._state.load_row(memory.row)
+            v["x"][:] = nodes
         self._held = None
-        v["x"][:] = v["x_last"][:] = nodes
+        v["x_last"][:] = v["x"]
         if not memory.started:
             v["pos_last"][:] = np.nan
         # what no candidate writes
@@ -213,11 +217,6 @@ class CondensedSkin:
         v["solved"][0], v["after"][0] = near.solved, near.after
         v["pos"][:], v["mat"][:], v["begins"][0] = near.geom_pos, near.geom_mat, 1
 
-    def _read(self):
-        memory = self._state.save(Memory)
-        memory.started = 1.0
-        return memory
-
     # --- at rest, and near it  ---
 
     def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
@@ -232,8 +231,7 @@ class CondensedSkin:
     def at_rest(self, pos: np.ndarray, mat: np.ndarray) -> Outcome:
         """Outcome for geoms at these poses, which do not touch the skin."""
         memory, n = Memory.rest(self.geoms.count), self.geoms.ngroup
-        memory.started = 1.0
-        memory.geom_pos, memory.geom_mat = np.array(pos), np.array(mat)
+        memory = memory.replace(started=1.0, geom_pos=pos, geom_mat=mat)
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
         return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
 
@@ -245,24 +243,25 @@ class CondensedSkin:
 
     # --- what a memory says  ---
 
-    def nodes(self, memory: Memory) -> np.ndarray:
-        """Nodes (nvert, 3) of a state [m]; read only."""
+    def nodes(self, memory: Memory, contents: bytes = b"") -> np.ndarray:
+        """Nodes (nvert, 3) of a state [m]; read only. contents: of the memory, if they are known."""
         if not len(memory.forces) and memory.pressure == 0:
             return self.rest
-        found = self._nodes.get(memory.key())
+        contents = contents or memory.contents()
+        found = self._nodes.get(contents)
         if found is None:
-            self._state.load(memory)
+            self._state.load_row(memory.row)
             self._held = None
             self._views["x"][:] = self.rest
             self._recall()
             found = self._views["x"].copy()
-            self._keep(memory, found)
+            self._keep(contents, found)
         return found
 
-    def _keep(self, memory, nodes):
+    def _keep(self, contents, nodes):
         if len(self._nodes) > 16:
             self._nodes.clear()
-        self._nodes[memory.key()] = nodes
+        self._nodes[contents] = nodes
 
     def contact_force(self, memory: Memory) -> np.ndarray:
         """Forces (nvert, 3) of the geoms on the nodes [N]."""
@@ -274,6 +273,6 @@ class CondensedSkin:
     def normal_force_of_faces(self, memory: Memory, touched: np.ndarray) -> np.ndarray:
         """Normal forces (nface,) of the geoms on the outer faces [N]. touched: (n,) indices of the faces that
         are evaluated; the others get 0."""
-        v = self._views
+        v, self._held = self._views, None
         v["x"][:], v["pos"][:], v["mat"][:] = self.nodes(memory), memory.geom_pos, memory.geom_mat
         return self._normal_forces(touched)
