@@ -18,7 +18,7 @@ from .implicit.kinematics import Kinematics
 from .implicit.metric import Metric
 from .implicit.rules import EULER, PATIENCE, stayed
 from .implicit.step_arrays import StepArrays
-from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
+from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, STAYED, Setup
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
@@ -95,7 +95,7 @@ class Instance:
         self.state = data.plugin_state[start : start + setup.nstate]
         self.parts, self.state_address = setup.parts(self.state), self.state.ctypes.data
         self._result = self._reading = self._pose = self._geom_pose = None
-        self.put, self._solved, self.sensed = None, {}, False
+        self.put, self._solved, self.sensed, self._stays = None, {}, False, False
         self._error, self._outcome = False, _ALONE
         self.step_gamma, self.frequency = np.full(setup.ngroup, EULER), None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
@@ -144,7 +144,7 @@ class Instance:
         self.refuse_foreign_state()
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
-        self.put, self.sensed = None, False
+        self.put, self.sensed, self._stays = None, False, False
         self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
         if self.two_way and self.model.opt.integrator == _DISCRETE:
             raise ValueError(
@@ -238,6 +238,20 @@ class Instance:
             self._result = skin.untouched
         self._pose, self._reading = (pos, mat), None
 
+    def stay(self) -> SkinResult | None:
+        """Instead of `solve_for_pose`, for bodies where the skin was solved in the last step: the result is
+        the same, if that solve left the skin as it was. None: it did not, or a solve is needed for more."""
+        stays, skin, state = self.parts[0][STAYED], self.setup.skin, self.parts[2]
+        parted = self.put is not None or self.touching.parted
+        if not stays or parted or self.setup.config.textures is not None:
+            return None
+        wrench, tangent, *pose = (part.copy() for part in self.last_model())
+        with skin.lock:
+            vert, pressure = skin.stepper.vert_xpos(state), skin.stepper.pressure(state)
+        result = SkinResult(state, wrench, tangent, vert, pressure, measured=stays > 0, pose=tuple(pose))
+        self._result, self._reading, self._pose, self._stays = result, None, result.pose, True
+        return result
+
     def solve_for_pose(
         self,
         pos: np.ndarray,
@@ -255,7 +269,7 @@ class Instance:
         An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
           end of the step.
         """
-        self._pose = pos, mat
+        self._pose, self._stays = (pos, mat), False
         dt = self.model.opt.timestep
         begin, also = {}, core
         if getattr(self.setup.skin.stepper, "begins_near", False) and near is not None and near.converged:
@@ -330,6 +344,11 @@ class Instance:
             pose=tuple(p.copy() for p in last),
             vert_xpos=stepper.vert_xpos(state),
         )
+
+    def found_foretold(self, state: np.ndarray) -> None:
+        """Says that the last solve, with this result's `state`, left the skin as it was."""
+        stepper = self.setup.skin.stepper
+        self._stays = hasattr(stepper, "pressure") and stepper.pressure(state) is not None
 
     def concluded(
         self, rounds: int, settled: bool, withheld: float, energy: np.ndarray, ends: tuple, acting: np.ndarray
@@ -540,7 +559,8 @@ class Instance:
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach = REACHED if ends else OUT_OF_REACH
-        head[:] = head[FAILED] + (not good), good - steps, reach
+        stays = good * self._stays * (1 if result.measured else -1)
+        head[:] = head[FAILED] + (not good), good - steps, reach, stays
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
@@ -552,7 +572,7 @@ class Instance:
         else:
             skin[:] = result.state
         if self.touching.parted:  # what is in the skin when contact is back was put there, as at the start
-            head[STARTED] = 0.0
+            head[STARTED] = head[STAYED] = 0.0
             stepper = self.setup.skin.stepper
             if hasattr(stepper, "resting") and stepper.resting(skin):
                 stepper.reset(skin)

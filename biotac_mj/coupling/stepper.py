@@ -121,7 +121,7 @@ class SkinStepper(Protocol):
         results may be short of the poses asked for."""
 
     # A stepper may have the methods below. With the first, bodies that were placed have not slid there; with
-    # the others a skin that rests costs next to nothing.
+    # the others a skin that rests, or stays as it is, costs next to nothing.
 
     def put(
         self, state: np.ndarray, placed: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
@@ -132,6 +132,9 @@ class SkinStepper(Protocol):
 
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""
+
+    def pressure(self, state: np.ndarray) -> float | None:
+        """Pressure of the liquid in a state [Pa], None where the skin changes while nothing moves."""
 
     def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
         """Whether the skin rests and no geom at these poses reaches it by a step's acceleration."""

@@ -346,11 +346,13 @@ class StateLayout:
         """View of the numbers of a variable in a state (size,)."""
         return state[self.slices[name]]
 
+    def table(self, state: np.ndarray, name: str) -> np.ndarray:
+        """View (most rows, n) of a table in a state (size,)."""
+        return self.part(state, name)[1:].reshape(-1, self.columns[name])
+
     def rows(self, state: np.ndarray, name: str) -> np.ndarray:
         """View (k, n) of a table's rows in a state (size,)."""
-        begin, n = self.slices[name].start, self.columns[name]
-        count = int(state[begin])
-        return state[begin + 1 : begin + 1 + n * count].reshape(count, n)
+        return self.table(state, name)[: int(self.part(state, name)[0])]
 
     def value(self, state: np.ndarray, name: str) -> np.ndarray | float:
         """A variable or a table of a state (size,): a view, or a number."""

@@ -1,81 +1,21 @@
 """The arrays of a skin's state, declared in `state`: resets of some worlds on the device, and transfer of one
 world to the host and back."""
 
-import functools
 import operator
 import typing
 
 import numpy as np
 import warp as wp
 
-from ..launches import in_a_row, recorded
 from .data import SkinData
 from .geoms import GeomSet
 from .state import FULL, SavedState, StateLayout, options_of, saved_variables, variables_of
 from .transfer import Transfer
-from .types import real
 
 __all__ = ["StateArrays"]
 
-wp.set_module_options({"enable_backward": False})
-
 # indices of the six numbers of a symmetric 3 x 3 matrix, and back
 _ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
-
-
-@wp.kernel
-def _save_rows(
-    # In:
-    number: wp.array2d(dtype=typing.Any),
-    reset: typing.Any,
-    others: wp.array2d(dtype=real),
-    first: int,
-    begin: int,
-    end: int,
-    # Out:
-    row_out: wp.array(dtype=real),
-):
-    """Appends the items that are not reset, of which the first has the number `first`, to the table at
-    `begin`, which counts those beyond its `end`, too."""
-    if first == 0:
-        row_out[begin] = real(0.0)
-    for i in range(number.shape[0]):
-        if number[i, 0] != reset:
-            at = begin + 1 + (2 + others.shape[1]) * int(row_out[begin])
-            row_out[begin] += real(1.0)
-            if at < end:
-                row_out[at] = real(first + i)
-                row_out[at + 1] = real(number[i, 0])
-                for k in range(others.shape[1]):
-                    row_out[at + 2 + k] = others[i, k]
-
-
-@wp.kernel
-def _load_rows(
-    # In:
-    row: wp.array(dtype=real),
-    first: int,
-    begin: int,
-    reset: typing.Any,
-    # Out:
-    number_out: wp.array2d(dtype=typing.Any),
-    others_out: wp.array2d(dtype=real),
-):
-    """The inverse: items without a row are reset."""
-    for i in range(number_out.shape[0]):
-        number_out[i, 0] = reset
-    for r in range(int(row[begin])):
-        at = begin + 1 + (2 + others_out.shape[1]) * r
-        i = int(row[at]) - first
-        if i >= 0 and i < number_out.shape[0]:
-            number_out[i, 0] = number_out.dtype(row[at + 1])
-            for k in range(others_out.shape[1]):
-                others_out[i, k] = row[at + 2 + k]
-
-
-for _kind in (int, real):
-    wp.overload(_save_rows, {"number": wp.array2d(dtype=_kind), "reset": _kind})
-    wp.overload(_load_rows, {"reset": _kind, "number_out": wp.array2d(dtype=_kind)})
 
 
 class StateArrays:
@@ -128,6 +68,9 @@ class StateArrays:
             }
             layout = StateLayout(tier, options, sizes, room)
         self.layout = layout
+        of_rows = [v.name for blocks in self._rows.values() for block in blocks for v in block]
+        follow = [name for name in ("x_last", "kept", "touched_by") if name in self.arrays]
+        self._loaded, self._views = [*(v.name for v in self._plain), *of_rows, *follow], None
 
     # --- some of the worlds, on the device ---
 
@@ -185,17 +128,22 @@ class StateArrays:
         Raises:
           ValueError: more contact than the layout has room for.
         """
-        row, plain, save, _ = self._transfers
-        if self._device.is_cuda:
-            for name, copy in self._host.items():
-                wp.copy(copy, self.arrays[name])
-        for v, numbers, array in plain:
-            numbers[...] = array[..., _ROW, _COLUMN] if v.symmetric else array
-        for launch in save:
-            launch()
+        host, layout = self._host(), self.layout
+        row = np.zeros(layout.size)
+        for v in self._plain:
+            value = host[v.name]
+            layout.part(row, v.name)[:] = (value[..., _ROW, _COLUMN] if v.symmetric else value).ravel()
         for name in self._rows:
-            self.layout.check_room(name, int(self.layout.part(row, name)[0]))
-        return self.layout.copy(row)
+            table, count = layout.table(row, name), 0
+            for first, column, reset, others in self._blocks[name]:
+                at = (column != reset).nonzero()[0]
+                layout.check_room(name, count + len(at))
+                rows, count = table[count : count + len(at)], count + len(at)
+                rows[:, 0], rows[:, 1] = first + at, column[at]
+                for items in others:
+                    rows[:, 2:] = items[at]
+            layout.part(row, name)[0] = count
+        return row
 
     def load(self, saved: SavedState) -> None:
         """Sets the state of a single world; the inverse of `save`, with rows in ascending order of items.
@@ -204,72 +152,47 @@ class StateArrays:
         self.layout.write(saved, row)
         self.load_row(row)
 
-    def load_row(self, state: np.ndarray) -> None:
+    def load_row(self, row: np.ndarray) -> None:
         """Sets the state of a single world from a row of numbers."""
-        row, plain, _, load = self._transfers
-        row[:], self._geoms.posed = state, True
-        for v, numbers, array in plain:
-            array[...] = numbers[..., _WHOLE].reshape(array.shape) if v.symmetric else numbers
-        for launch in load:
-            launch()
+        host, self._geoms.posed = self._host(), True
+        for v in self._plain:
+            value, array = self.layout.part(row, v.name), host[v.name]
+            array[...] = (value.reshape(-1, 6)[:, _WHOLE] if v.symmetric else value).reshape(array.shape)
+        for name, blocks in self._blocks.items():
+            table = self.layout.rows(row, name)
+            ends = np.searchsorted(table[:, 0], [first for first, *_ in blocks[1:]]).tolist()
+            for begin, end, (first, column, reset, others) in zip([0, *ends], [*ends, None], blocks):
+                at = table[begin:end, 0].astype(int) - first
+                column[:] = reset
+                column[at] = table[begin:end, 1]
+                for items in others:
+                    items[at] = table[begin:end, 2:]
         sample, geom = self.layout.rows(row, "contacts")[:, :2].astype(int).T
         for name, marked in (("kept", sample // self._nsample), ("touched_by", geom)):
-            if name in self._marks:
-                self._marks[name][:] = 0
-                self._marks[name][marked] = 1
-        if self._device.is_cuda:
-            for name, copy in self._host.items():
-                wp.copy(self.arrays[name], copy)
+            if name in host:
+                host[name][:] = 0
+                host[name][marked] = 1
         if self._tier == FULL:
-            wp.copy(self._data.x_last, self._data.x)
+            host["x_last"][:] = host["x"]
+        if self._device.is_cuda:
+            for name, value in host.items():
+                array = self.arrays[name]
+                array.assign(value.reshape(*array.shape, *getattr(array.dtype, "_shape_", ())))
         if self._data.memory:
             self._data.memory.recall(self._data.x)
 
-    @functools.cached_property
     def _host(self):
-        """Arrays on the CPU that a row is saved from and loaded to: on CUDA copies."""
-        names = [v.name for v in self._plain]
-        names += [v.name for blocks in self._rows.values() for block in blocks for v in block]
-        names += [name for name in ("kept", "touched_by") if name in self.arrays]
-        found = {name: self.arrays[name] for name in names}
-        found = {n: wp.empty_like(a, device="cpu") if a.device.is_cuda else a for n, a in found.items()}
-        self._marks = {name: found[name].numpy()[:, 0] for name in ("kept", "touched_by") if name in found}
-        return found
+        """Arrays of the first world that a row is saved from and loaded to: views on the CPU."""
+        if self._views is None or self._device.is_cuda:
+            self._views = {name: self._view(name) for name in self._loaded}
+            self._blocks = {name: _numbered(blocks, self._views) for name, blocks in self._rows.items()}
+        return self._views
 
-    @functools.cached_property
-    def _transfers(self):
-        """A row of numbers; variables, their parts of it and their arrays; launches that write the tables of
-        the row, and that read them."""
-        host, layout = self._host, self.layout
-        with wp.ScopedDevice("cpu"):
-            row, save, load = wp.zeros(layout.size, dtype=real), [], []
-            for name, blocks in self._rows.items():
-                first, part = 0, layout.slices[name]
-                for v, *others in blocks:
-                    items, more = _numbers(host[v.name], True), wp.zeros((1, 0), dtype=real)
-                    for other in others:
-                        more = _numbers(host[other.name])
-                    reset, known = items.dtype(v.reset), (first, part.start)
-                    save.append(recorded(_save_rows, 1, [items, reset, more, *known, part.stop], [row]))
-                    load.append(recorded(_load_rows, 1, [row, *known, reset], [items, more]))
-                    first += len(items)
-        numbers, plain = row.numpy(), []
-        for v in self._plain:
-            first = (*[slice(None)] * len(v.axes), 0) if v.axes else slice(1)
-            array = host[v.name].numpy()[first]
-            part = layout.part(numbers, v.name).reshape(*array.shape[: len(v.axes) or 1], *v.item)
-            plain.append((v, part, array))
-        return numbers, plain, in_a_row(save), in_a_row(load)
-
-
-def _numbers(array, single=False):
-    """Numbers of the first world of an array [item, world] on the CPU, (item, number); `single`: each is an
-    item."""
-    kind = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
-    size, item = (wp.types.type_size_in_bytes(t) for t in (kind, array.dtype))
-    (n, _), (stride, _) = array.shape, array.strides
-    shape, strides = ((n * item // size, 1), (size, size)) if single else ((n, item // size), (stride, size))
-    return wp.array(ptr=array.ptr, dtype=kind, shape=shape, strides=strides, device="cpu", copy=False)
+    def _view(self, name):
+        v = next(v for v, _ in self._found if v.name == name)
+        # a slice for a number per world, so that the result is a view
+        first = (*[slice(None)] * len(v.axes), 0) if v.axes or v.item else slice(0, 1)
+        return self.arrays[name].numpy()[first]
 
 
 def _blocks(variables, arrays):
@@ -283,3 +206,13 @@ def _blocks(variables, arrays):
         else:
             blocks[-1].append(v)
     return blocks
+
+
+def _numbered(blocks, host):
+    """(number of the first item, one number of each, its reset, further arrays) of each block of a table."""
+    out, first = [], 0
+    for v, *others in blocks:
+        column = host[v.name].reshape(-1)
+        out.append((first, column, v.reset, [host[o.name] for o in others]))
+        first += len(column)
+    return out

@@ -7,6 +7,7 @@ from ...geometry.rigid_warp import LEVER
 from ...skin.bodies import BodyMotion
 from ..instance import Instance
 from ..structs import DataView
+from .rules import FORETOLD, STILL
 
 __all__ = ["Coupled", "size"]
 
@@ -73,6 +74,9 @@ class Coupled:
         arrays.evaluate()
         if self.withdrawn:
             arrays.acting[:] = 0.0
+        if self.result is None:  # where the last step has left it
+            self.still = arrays.off[0] < STILL and not arrays.placed.any()
+            self.result = self.instance.stay() if self.still else None
         self.off = np.inf if self.result is None else float(arrays.off[0])
 
     @property
@@ -99,6 +103,10 @@ class Coupled:
         arrays = self.arrays
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
+        if self.still and self.result is None and result.converged:
+            wrong, wrench = np.abs(result.wrench - arrays.acting), np.abs(result.wrench)
+            if wrong.max() < FORETOLD * wrench.max():
+                self.instance.found_foretold(result.state)
         self.result, self.may_act = result, result.converged and self._cost < _MOST
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
         arrays.pos0[:], arrays.mat0[:] = result.pose

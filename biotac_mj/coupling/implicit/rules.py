@@ -7,8 +7,10 @@ from typing import Any
 __all__ = [
     "MAX_CORRECTIONS",
     "EULER",
+    "FORETOLD",
     "LOSS_FREQUENCY",
     "PATIENCE",
+    "STILL",
     "TELEPORT",
     "TOLERANCE",
     "beta_of",
@@ -24,6 +26,10 @@ __all__ = [
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which a skin is not solved again: a
 # solve leaves its bodies open by as much, and over so short a way its linear model errs by 5e-4 of the force
 TOLERANCE = 5e-6
+# a skin stays as it is while its bodies come no further than this from where it was solved [m]: there PAC
+# changes by less than a tenth of a count; if the solve there has found what its linear model foretold, to so
+# much of the wrenches
+STILL, FORETOLD = 2e-9, 1e-6
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's

@@ -97,6 +97,9 @@ class CondensedStepper(FemStepper):
     def resting(self, state: np.ndarray) -> bool:
         return not self._part(state, "forces")[0]
 
+    def pressure(self, state: np.ndarray) -> float:
+        return float(self._part(state, "pressure")[0])
+
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         self._place_geoms(state, geom_pos, geom_mat)
         for name in self._layout.of_skin:

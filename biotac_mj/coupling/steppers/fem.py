@@ -304,6 +304,11 @@ class FemStepper:
         """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
         return bool(self._part(state, "resting")[0])
 
+    def pressure(self, state: np.ndarray) -> float | None:
+        if self.inertial or self._material.remembers:
+            return None
+        return float(self._part(state, "last_pressure")[0]) - self._model.rest.pressure
+
     def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
         """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they
         come in a step [BioTac frame]."""

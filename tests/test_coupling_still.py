@@ -1,0 +1,81 @@
+"""A skin whose bodies stay where it was solved is not solved again."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+from biotac_mj.coupling.steppers.condensed import CondensedStepper
+from biotac_mj.coupling.steppers.fem import FemStepper
+
+STEPPERS = {"full": FemStepper, "condensed": CondensedStepper}
+MASS = 0.1
+
+
+@pytest.fixture
+def solves(monkeypatch):
+    """Counts solves of skins."""
+    made = []
+    for stepper in set(STEPPERS.values()):
+        own = stepper.solve_skin
+        monkeypatch.setattr(
+            stepper, "solve_skin", lambda *a, _own=own, **k: (made.append(0), _own(*a, **k))[1]
+        )
+    return made
+
+
+def ball(tier, **keywords):
+    """A ball that has come to rest on a pad which looks up; its joint is damped."""
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.worldbody.add_site(name="tip", quat=[1, -1, 0, 0])
+    body = spec.worldbody.add_body(name="ball", pos=[-10e-3, 0, 13.2e-3])
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=[5.0, 0, 0])
+    body.add_geom(name="ball", size=[5e-3, 0, 0], mass=MASS)
+    handle = biotac_mj.attach(spec, site="tip", tier=tier, skin="coarse", **keywords)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    while data.time < 0.5:
+        mujoco.mj_step(model, data)
+    biotac_mj.plugin.check()
+    return model, data, handle
+
+
+@pytest.mark.parametrize("tier", STEPPERS)
+def test_a_skin_under_a_ball_at_rest_is_not_solved_again(tier, solves):
+    """Its readings go on; a copy goes on to the same bits; what moves the ball is felt at once."""
+    model, data, handle = ball(tier)
+    resting = handle.read(data, "contact_force").copy()
+    solves.clear()
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+    other = mujoco.MjData(model)
+    mujoco.mj_copyData(other, model, data)
+    for _ in range(10):
+        for one in (data, other):
+            mujoco.mj_step(model, one)
+    assert not solves
+    assert (other.qpos == data.qpos).all() and (other.plugin_state == data.plugin_state).all()
+    assert (other.sensordata == data.sensordata).all()
+    assert abs(resting[1] - MASS * 9.81) < 1e-4 * MASS * 9.81
+    status = handle.read(data, "status")
+    assert status[0] == 1 and status[1] == 0 and status[4] == list(STEPPERS).index(tier)
+    counts = handle.read(data, "electrodes").copy()
+    height = data.qpos[0]
+    data.xfrc_applied[model.body("ball").id, 2] = -0.1  # N
+    solved_at, before = height, len(solves)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+        if len(solves) > before:
+            solved_at, before = data.qpos[0], len(solves)
+        assert abs(data.qpos[0] - solved_at) < 5e-9  # further than this no linear model goes
+    assert data.qpos[0] < height - 1e-5
+    assert abs(handle.read(data, "contact_force")[1] - MASS * 9.81 - 0.1) < 0.01 and (handle.read(data, "electrodes") != counts).any()
+
+
+def test_a_skin_that_is_asked_for_more_is_solved(solves):
+    """Textures want what each contact bears."""
+    model, data, _ = ball("condensed", textures={"ball": "cork"})
+    solves.clear()
+    mujoco.mj_step(model, data)
+    assert solves
