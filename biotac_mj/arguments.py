@@ -11,21 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from .files import check_output, check_output_file, picture_kind, refuse_existing, refuse_inputs
 from .units import SI, UNITS, number_of, question, read_quantity
 
-__all__ = [
-    "SEED",
-    "Parser",
-    "add_ray",
-    "check_device",
-    "device",
-    "output_file",
-    "output_folder",
-    "place",
-    "quantity",
-    "real",
-    "whole",
-]
-
-
 # verbs of earlier versions that have another name now
 _FORMER = {
     "contact-patch": "learn predict inverse",

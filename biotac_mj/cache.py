@@ -22,8 +22,6 @@ import platformdirs
 
 from .files import replacing
 
-__all__ = ["Entry", "cache_folder", "cached", "digest", "key_of", "replace_file", "touch"]
-
 _FORMAT = "2"  # of keys and files
 _SKIN = ("geometry", "skin")  # folders whose code makes most arrays
 _LARGEST = 4  # default limit of the folder, see BIOTAC_CACHE_GB [GB]

@@ -12,8 +12,6 @@ import numpy as np
 
 from .short_repr import short_repr
 
-__all__ = ["as_numbers", "as_real", "as_whole", "check_entries", "check_types", "either", "refuse_unknown"]
-
 _CALLED = {
     bool: "true or false",
     int: "a whole number",

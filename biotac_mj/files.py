@@ -20,20 +20,6 @@ if typing.TYPE_CHECKING:
     import h5py
     from matplotlib.figure import Figure
 
-__all__ = [
-    "check_output",
-    "check_output_file",
-    "hdf5",
-    "picture_kind",
-    "refuse_existing",
-    "refuse_inputs",
-    "remove_leftovers",
-    "replacing",
-    "save_figure",
-    "write_json",
-    "write_npz",
-]
-
 _MARK = ".biotac-"  # start of the names of temporary files
 _ROOM = 32  # characters that the name of a temporary file needs beyond the suffix
 

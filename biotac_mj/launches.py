@@ -12,8 +12,6 @@ try:
 except ImportError:
     _pack = None
 
-__all__ = ["in_a_row", "recorded", "repeated"]
-
 # versions of Warp in whose code the signature of CPU kernels was checked: addresses of bounds and arguments
 _KNOWN = ("1.19.",)
 

@@ -8,9 +8,6 @@ import tempfile
 
 import warp as wp
 
-__all__ = ["announce_compilation", "quiet_warp"]
-
-
 # written to standard error by C code of Warp 1.19, at every log level
 _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 

@@ -12,18 +12,6 @@ import numpy as np
 
 from .short_repr import short_repr
 
-__all__ = [
-    "Array",
-    "Unfit",
-    "check_arrays",
-    "read_hdf5",
-    "read_json",
-    "read_npz",
-    "read_text",
-    "read_yaml",
-    "reading",
-]
-
 _KINDS = {"finite": "fiu", "number": "fiu", "index": "iu", "flag": "biu", "text": "OSU"}
 
 

@@ -25,8 +25,6 @@ import tqdm
 from .files import replacing
 from .versions import versions
 
-__all__ = ["Task", "end_with_parent", "one_per_gpu", "run_tasks"]
-
 Work = Callable[[Iterable, pathlib.Path, Callable[[int | str], object]], Iterator]
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"

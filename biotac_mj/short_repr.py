@@ -3,8 +3,6 @@
 import re
 import reprlib
 
-__all__ = ["short_repr"]
-
 
 class _Short(reprlib.Repr):
     """Chooses by the type itself, since reprlib uses the type's name, and several types are called

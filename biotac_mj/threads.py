@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["cores", "run_in_threads", "single_thread"]
-
 
 @functools.cache
 def _libraries():

@@ -3,8 +3,6 @@
 import signal
 import threading
 
-__all__ = ["trimesh"]
-
 
 def _load():
     """Loads trimesh, and delays Ctrl-C until it is loaded: trimesh takes any exception during the import of

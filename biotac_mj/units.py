@@ -5,8 +5,6 @@ import re
 
 from .short_repr import short_repr
 
-__all__ = ["SI", "UNITS", "number_of", "question", "read_quantity"]
-
 # units of each kind in SI; the SI unit first, the usual unit second
 UNITS = {
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6},

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["versions"]
-
 
 def versions() -> dict:
     """Name of the package -> version."""

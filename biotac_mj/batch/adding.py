@@ -11,8 +11,6 @@ from ..coupling.parts import add_parts, add_slots, check_place, check_touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_of_design, skin_reference
 
-__all__ = ["add"]
-
 
 def add(
     spec: mujoco.MjSpec,

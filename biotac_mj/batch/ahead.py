@@ -17,8 +17,6 @@ import warp as wp
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["kernels_of_step", "launched_by"]
-
 _CONVEX, _LEVEL = "ccd_kernel", 2  # of 3
 
 

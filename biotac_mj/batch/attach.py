@@ -53,9 +53,6 @@ from .solids import set_solids
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-
-__all__ = ["attach", "core_of", "make"]
-
 # what takes long to compile, or is launched first: it begins before the skin is made
 _KERNELS = [rest_gap.module, meshes, closest, liquid, rest, rounds, film_kernels, core_surface]
 _KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, dynamics, energy, integrator, skin_kernels]

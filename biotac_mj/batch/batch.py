@@ -30,9 +30,6 @@ from .solid_contacts import SolidContacts
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-
-__all__ = ["Batch"]
-
 _ROUNDING = 1e-3  # of the most energy that a skin holds: accelerations are of single precision
 
 

@@ -32,8 +32,6 @@ from .skin import solve_group
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Hook"]
-
 
 class Hook:
     """Callback of a mujoco_warp Model. It steps all batches of the Model together, after the callbacks that

@@ -13,16 +13,6 @@ from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
 from ..skin.types import double, mat33, mat66, real, vec3, vec6, widen
 
-__all__ = [
-    "accept_models",
-    "body_forces",
-    "core_pose",
-    "geom_poses",
-    "reset_models",
-    "write_force",
-    "write_sensors",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

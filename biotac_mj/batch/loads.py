@@ -16,8 +16,6 @@ from ..skin.types import double, real, vec3, vec6, widen
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Loads"]
-
 wp.set_module_options({"enable_backward": False})
 
 _FORCE, _TORQUE, _TOUCH, _CONTACT = (

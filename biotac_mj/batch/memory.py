@@ -7,8 +7,6 @@ import warp as wp
 
 from ..skin import SkinModel
 
-__all__ = ["Scratch", "arrays_of"]
-
 
 def arrays_of(roots: Iterable) -> Iterator[wp.array]:
     """Every wp.array with memory that objects hold, once: themselves, in containers, in structs and in

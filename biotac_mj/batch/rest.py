@@ -28,8 +28,6 @@ from ..skin.program import Launcher
 from ..skin.state import allocate
 from ..skin.types import mat33, mat66, real, vec3, vec4, vec6
 
-__all__ = ["Clearance", "Rest"]
-
 wp.set_module_options({"enable_backward": False})
 
 _CLEAR = wp.constant(wp.float64(CLEAR))

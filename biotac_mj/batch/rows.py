@@ -11,8 +11,6 @@ from ..skin.transfer import Transfer, words_of
 from ..skin.types import real
 from .batch import Batch
 
-__all__ = ["Draws", "Rows"]
-
 
 class Draws(NamedTuple):
     """Random draws of one BioTac: the word where its seed begins, and [(first word, words (n, k) of n

@@ -20,8 +20,6 @@ from ..skin.modes import skin_modes
 from ..skin.touched import Touched
 from .skin import BatchSkin
 
-__all__ = ["Draw", "Senses", "draws"]
-
 wp.set_module_options({"enable_backward": False})
 
 _POOL = 256  # sensors that resets draw from, at least

@@ -25,8 +25,6 @@ from . import skin_kernels as kernels
 from .memory import arrays_of
 from .rest import Rest
 
-__all__ = ["BatchSkin", "solve_group"]
-
 _WORK = 1000  # of a two-way condensed skin's solve: all worlds wait for the dearest
 
 

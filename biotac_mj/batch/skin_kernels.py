@@ -6,18 +6,6 @@ from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
 from ..skin.types import mat33, real, vec3, vec6
 
-__all__ = [
-    "begin_at_rest",
-    "begin_frames",
-    "begin_near",
-    "copy_anchors",
-    "find_bare",
-    "forget_contacts",
-    "forget_poses",
-    "read_outputs",
-    "scale_tangents",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

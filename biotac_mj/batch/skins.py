@@ -20,8 +20,6 @@ from .ahead import launched_by
 from .senses import Senses
 from .skin import BatchSkin
 
-__all__ = ["PoseBatch", "Skins"]
-
 
 class Skins:
     """One BioTac in each of `nworld` worlds, in the touching bodies' poses that the caller gives.

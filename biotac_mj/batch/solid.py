@@ -5,8 +5,6 @@ import warp as wp
 
 from ..skin.types import double, real, vec6, widen
 
-__all__ = ["add_push", "sum_contacts"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -14,8 +14,6 @@ from ..skin.types import double, mat33, real, vec3, widen
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["SolidContacts"]
-
 wp.set_module_options({"enable_backward": False})
 
 _CONSTRAINT = wp.constant(1)  # bit of mujoco_warp's ContactType

@@ -11,8 +11,6 @@ from ..coupling.config import Config
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["set_solids"]
-
 
 def set_solids(mjm: mujoco.MjModel, m: "mjw.Model", core: int, friction: np.ndarray, priority: int) -> None:
     """Gives the geoms of body `core`, and their pairs, the skins' friction (nworld,) and contact priority, as

@@ -15,8 +15,6 @@ from .forward import simulate
 from .indentation import Indentation, plan_indentation
 from .reference import stand_in
 
-__all__ = ["PAPER", "Comparison", "comparison_table", "evaluate", "plan_indentations"]
-
 # Narang et al., ICRA 2021: force errors are means of the norm over time [N], nodal errors of the displacement
 # norms [m].
 PAPER = {

@@ -10,8 +10,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import load_skin
 from ..skin.model import SkinOptions
 
-__all__ = ["CONFIGURATIONS", "Configuration", "configuration"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:

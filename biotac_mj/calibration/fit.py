@@ -18,8 +18,6 @@ from .forward import simulate
 from .indentation import Indentation
 from .statistics import covariance, ljung_box
 
-__all__ = ["PARAMETERS", "Calibration", "FitParameter", "calibrate", "forces_and_jacobian", "parameter"]
-
 _STEP = 0.01  # finite difference of a scaled parameter: 1 % of a positive one, far above the solver's error
 # Solver tolerance at which forces repeat to 1e-5 N. A step without convergence makes the cost jump, so the
 # iteration limit is high.

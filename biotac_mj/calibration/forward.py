@@ -14,8 +14,6 @@ from ..skin import GeomSet, SkinModel, SkinOptions, bake_distance_grid, step
 from ..skin.per_world import make_worlds
 from .indentation import Indentation
 
-__all__ = ["Response", "Steps", "displacement_norms", "simulate", "steps_of"]
-
 _LARGEST_STEP = 2.5e-4  # [m] longer displacements between two samples are divided into several steps
 
 

@@ -13,15 +13,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..reading import Array, read_hdf5, reading
 from ..sensor.channels import check_force
 
-__all__ = [
-    "COLUMNS",
-    "Indentation",
-    "plan_indentation",
-    "plan_shear",
-    "read_indentation",
-    "write_indentation",
-]
-
 COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
 _ORIENTATION = ("quat_w", "quat_x", "quat_y", "quat_z")
 _PRESS = {"time": Array(("n",)), "force": Array(("n", 3)), "indenter_pose": Array(("n", 7))}

@@ -18,8 +18,6 @@ from .comparison import Comparison
 from .fit import Calibration
 from .indentation import Indentation
 
-__all__ = ["Kept"]
-
 _MADE = {
     kind.__name__: kind for kind in (Calibration, Comparison, ContactLaw, Indentation, Material, SkinOptions)
 }

@@ -10,8 +10,6 @@ from .forward import simulate
 from .indentation import Indentation
 from .refinement import skin as named_skin
 
-__all__ = ["STAND_IN", "stand_in"]
-
 STAND_IN = "own rubber with liquid, in place of ANSYS"
 
 

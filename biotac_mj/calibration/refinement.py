@@ -9,8 +9,6 @@ from ..geometry.edge_nodes import EDGES, with_edge_nodes
 from ..geometry.skin_geometry import PARTS, SkinGeometry
 from ..geometry.skins import load_skin
 
-__all__ = ["refined", "skin"]
-
 _PREFIX = "refined:"
 
 

@@ -8,8 +8,6 @@ import numpy as np
 from .. import files
 from .fit import Calibration
 
-__all__ = ["calibration_table", "write_json", "write_picture"]
-
 _UNITS = {
     "youngs_modulus": "Pa",
     "contact_stiffness": "Pa/m",

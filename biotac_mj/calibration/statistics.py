@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["covariance", "ljung_box"]
-
 # statsmodels has both (S_hac_simple, acorr_ljungbox) but needs pandas, which nothing else here needs
 
 

@@ -21,8 +21,6 @@ from .refinement import refined
 from .refinement import skin as named_skin
 from .report import calibration_table, write_json, write_picture
 
-__all__ = ["calibrate_verb", "compare_verb"]
-
 # arguments for the synthetic skin only, and their defaults
 _TRUTH = {
     "truth": "rubber",

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from ..arguments import SEED, device
 from .names import MATERIALS, SKINS, TIERS
 
-__all__ = ["add_device", "add_options", "add_sensor", "add_skin", "add_verb", "choice"]
-
 
 class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
     """Adds informative defaults to the help."""

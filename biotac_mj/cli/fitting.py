@@ -7,8 +7,6 @@ from ..recordings.verbs import add_load_arguments
 from .common import add_device, add_options, add_verb
 from .names import CONFIGURATIONS, INDENTER_HELP, INDENTERS, MATERIALS, SKINS
 
-__all__ = ["add_calibrate", "add_compare", "add_estimate"]
-
 
 def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb to the command line."""

@@ -1,19 +1,5 @@
 """Names in the help, without importing the modules that define them (tests compare them)."""
 
-__all__ = [
-    "INDENTER_HELP",
-    "LOCATION_HELP",
-    "INDENTERS",
-    "TIERS",
-    "MATERIALS",
-    "SKINS",
-    "PEGS",
-    "OBJECTS",
-    "INTERACTIONS",
-    "TASKS",
-    "CONFIGURATIONS",
-]
-
 INDENTERS = (
     "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm "
     "cube_14mm ring_7mm"

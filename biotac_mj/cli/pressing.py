@@ -8,8 +8,6 @@ from ..reading import reading
 from .common import add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP, TASKS
 
-__all__ = ["add_design", "add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
-
 _LONGEST_STEP = 0.1  # [s] quasi-static presses use longer internal steps
 _LONG_HOLD = 5.0  # [s] a longer one is more likely of milliseconds, and needs its unit
 

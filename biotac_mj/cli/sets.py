@@ -6,8 +6,6 @@ from ..arguments import SEED, add_ray, check_device, output_folder, quantity, re
 from .common import add_sensor, add_skin, add_verb
 from .names import INTERACTIONS, OBJECTS
 
-__all__ = ["add_generate", "add_data"]
-
 
 def add_generate(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb to the command line."""

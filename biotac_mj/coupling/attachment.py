@@ -20,8 +20,6 @@ from .settings import SettingKeywords, Settings
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
 
-__all__ = ["attach"]
-
 _MOST_SLOTS = 100_000  # a second or two of attaching; beyond any scene
 
 

@@ -11,20 +11,6 @@ import numpy as np
 from ..fields import as_real, as_whole, refuse_unknown
 from ..short_repr import short_repr
 
-__all__ = [
-    "COUPLINGS",
-    "PLUGIN_NAME",
-    "TIERS",
-    "ON_ERROR",
-    "ROUNDS",
-    "OWN",
-    "SOLID",
-    "TO_COME",
-    "Config",
-    "collides",
-    "refuse_two_way",
-]
-
 OWN = 1 << 30  # bit of contype and conaffinity that BioTacs alone have
 SOLID = 1 | OWN  # contype and conaffinity of core, nail and clamp: MuJoCo's default, and other BioTacs'
 TO_COME = 64  # bodies that a BioTac makes room for beyond those it sees: a place costs 60 kB, 0.2 us a step

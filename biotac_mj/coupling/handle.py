@@ -18,8 +18,6 @@ from .config import Config
 from .setup import Setup
 from .structs import ModelView
 
-__all__ = ["SENSORS", "Handle", "handles", "sensor_widths"]
-
 SENSORS = (*BIOTAC.widths, "contact_force", "status")
 
 

@@ -15,8 +15,6 @@ from ..short_repr import short_repr
 from .config import collides
 from .touching import deformable
 
-__all__ = ["add_parts", "add_slots", "check_place", "check_touching"]
-
 
 def check_place(
     spec: mujoco.MjSpec, site: str | None, body: str | None, prefix: str, pos: ArrayLike, quat: ArrayLike

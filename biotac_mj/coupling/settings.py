@@ -18,8 +18,6 @@ if typing.TYPE_CHECKING:
     from ..effects.amended import Effects
     from ..skin import Material, SkinOptions
 
-__all__ = ["ContactSettings", "SensorSettings", "SettingKeywords", "Settings", "SkinSettings"]
-
 Mesh = str | pathlib.Path | SkinGeometry
 
 

@@ -6,8 +6,6 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable
 
-__all__ = ["Shared", "trim_memory"]
-
 
 @functools.cache
 def _malloc_trim():

@@ -3,10 +3,7 @@ change from rest."""
 
 import numpy as np
 
-from ..sensor.colors import FULL_CHANGE as FULL_SCALE
 from ..sensor.colors import electrode_colors
-
-__all__ = ["CORE", "FULL_SCALE", "OBJECT", "PAD_UP", "SKIN", "Shown", "electrode_colors"]
 
 # what all pictures show: as in mjcf/biotac.xml, and of what touches the skin
 SKIN, CORE, OBJECT = np.array([0.25, 0.6, 0.4]), np.array([0.25, 0.25, 0.28]), np.array([0.85, 0.45, 0.15])

@@ -8,8 +8,6 @@ from ..geometry.rigid import cross
 from .solid_contacts import contacts_of
 from .structs import LIBRARY, DataView, ModelView
 
-__all__ = ["SOLVED", "solid_wrench"]
-
 LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 SOLVED = 1e-3  # of the forces at hand, which MuJoCo's constraint solver may leave open
 

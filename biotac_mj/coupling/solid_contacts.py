@@ -17,8 +17,6 @@ from ..geometry.solid import fills_hull
 from .structs import LIBRARY, DataView, ModelView, c_structs
 from .touching import Touching, mesh_of
 
-__all__ = ["CONTACT", "SolidContacts", "SolidPairs", "contact_frame", "contacts_of"]
-
 LIBRARY.mj_addContact.argtypes = (ctypes.c_void_p,) * 3
 CONTACT = np.dtype(c_structs("mjContact"))
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)

@@ -14,8 +14,6 @@ from .config import OWN, Config
 from .stepper import Geom
 from .structs import ModelView
 
-__all__ = ["Touching", "deformable", "find_geoms", "forget_notes", "geom_type", "mesh_of", "outside_geoms"]
-
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",

@@ -8,8 +8,6 @@ import numpy as np
 
 from .evidence import max_t
 
-__all__ = ["Cells"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cells:

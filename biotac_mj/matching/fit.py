@@ -8,8 +8,6 @@ import numpy as np
 from ..sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
 from .response import Loaded, Response
 
-__all__ = ["SIGNS", "Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states", "rows_of"]
-
 # Fx, Fy, Fz of a recording as along, across, pressing
 SIGNS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _LOADED, _FEWEST = 0.5, 40  # [N] least force of a loaded row; least number of these

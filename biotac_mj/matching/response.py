@@ -9,8 +9,6 @@ from scipy.interpolate import CubicSpline
 from ..sensor.film import FilmConduction
 from .states import PlateStates
 
-__all__ = ["Loaded", "Response", "log_changes"]
-
 
 def log_changes(states: PlateStates, film: FilmConduction) -> np.ndarray:
     """(npitch, nroll, npath, nload, nelectrode) change of ln Z from rest in the states, by a film of their

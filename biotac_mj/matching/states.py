@@ -16,8 +16,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from ..skin.model import filled
 
-__all__ = ["PlateGrid", "PlateStates", "plate_states"]
-
 _STEP = 1.6e-4  # [m] step towards the core
 _DEEPEST = 4.5e-3  # [m] from first touch: more than skin and gap
 _LOST = 3  # steps without equilibrium that end a path

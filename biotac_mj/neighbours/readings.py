@@ -8,8 +8,6 @@ import numpy as np
 if typing.TYPE_CHECKING:
     import torch
 
-__all__ = ["BioTacData", "world_mask"]
-
 
 @dataclasses.dataclass
 class BioTacData:

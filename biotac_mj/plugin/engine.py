@@ -14,8 +14,6 @@ from ..coupling import structs
 from ..coupling.config import PLUGIN_NAME, Config
 from .errors import guarded, watch_interrupts
 
-__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "register", "world_of"]
-
 # Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see
 # `biotac_mj.coupling.config`.
 ATTRIBUTES = tuple(field.name for field in dataclasses.fields(Config))

@@ -18,8 +18,6 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 
-__all__ = ["check", "clear_errors", "explained", "guarded", "interrupt", "watch_interrupts"]
-
 _lock = threading.Lock()
 _first = None  # the first error since the last `check`
 _doors = set()  # code of the outermost Python functions of callbacks: what is raised there, C throws away

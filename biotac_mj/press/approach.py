@@ -10,8 +10,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.solid import winding
 from ..geometry.surface import face_areas
 
-__all__ = ["first_touch", "is_inside", "nearest_point", "normal_at", "room", "surface_point"]
-
 # radius over which a normal is averaged [m]: about two edges of the default skin
 _PATCH = 1.5e-3
 _TOUCHING = 1e-5  # [m] largest depth of bonded skin in a solid

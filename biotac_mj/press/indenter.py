@@ -16,8 +16,6 @@ from ..reading import reading
 from ..triangles import trimesh
 from ..units import read_quantity
 
-__all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
-
 _SMALLEST, _LARGEST = 1e-4, 0.5  # [m] along the longest axis
 _STL_HEADER, _STL_FACE = 84, 50  # bytes of a binary STL, with the number of faces at the header's end
 _ALONG = ("radius", "half length")

@@ -19,8 +19,6 @@ from ..units import SI, UNITS, question, read_quantity
 from . import approach
 from .indenter import Indenter, add_indenter
 
-__all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
-
 _DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
 _LONGEST_STEP = 1.0  # [s]
 _ROUND = 2 * math.pi + 1e-9  # [rad]

@@ -16,8 +16,6 @@ from .path import LEAD, PressOptions, plan_path
 from .record import PressRecord
 from .scene import build_scene
 
-__all__ = ["PressResult", "press", "render"]
-
 
 class PressResult(typing.NamedTuple):
     """Result of `press`: record, picture = press(...).

@@ -12,8 +12,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import CHANNELS
 from ..versions import versions
 
-__all__ = ["CSV_COLUMNS", "PressRecord", "write_readings", "write_skin"]
-
 _BEFORE, _AFTER = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N"), ("nonconverged", "tier")
 CSV_COLUMNS = (*_BEFORE, *CHANNELS, *_AFTER)  # of a BioTac
 

@@ -11,8 +11,6 @@ from ..view.offscreen import stage
 from .indenter import Indenter, add_indenter
 from .path import LEAD, Path, PressOptions
 
-__all__ = ["build_scene", "see_through"]
-
 _PREFIX = "biotac_"
 _FOVY, _ASPECT = 40.0, 1.4  # of the camera [deg], width over height
 

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["last_measured", "line_ends"]
-
 
 def last_measured(x: np.ndarray, masked: np.ndarray) -> np.ndarray:
     """(n, c) values of x (n, c); samples masked (n, c) take the last one before them that is not."""

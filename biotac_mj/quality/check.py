@@ -14,8 +14,6 @@ from .sample_hold import sample_and_hold
 from .spikes import off_rows, spikes
 from .stuck import dead, stuck_or_clipped
 
-__all__ = ["Checked", "check", "less", "lost_rows", "sample_faults"]
-
 _LEAST = 200  # rows: sixteen blocks of twelve; fewer do not show the noise
 
 

@@ -5,8 +5,6 @@ import numpy as np
 from .fault import Fault
 from .repeats import repeated_rows
 
-__all__ = ["BUS_RATE", "CLOCK_FAULT", "clock_faults", "guessed_rate", "missing_rows", "usual_step"]
-
 # [Hz] refresh rate of each electrode (SynTouch manual); a faster logger repeats rows
 BUS_RATE = 100.0
 CLOCK_FAULT = "the clock "  # prefix of messages that say that times cannot be trusted

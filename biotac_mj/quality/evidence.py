@@ -5,8 +5,6 @@ import functools
 import numpy as np
 from scipy.special import kl_div
 
-__all__ = ["BLOCKS", "NAN", "by_block", "evidence", "runs", "sign_flip", "stretch"]
-
 BLOCKS = 16  # of a log; each counts as independent evidence
 NAN = float("nan")
 

@@ -12,8 +12,6 @@ from .fault import Fault
 from .log import Log
 from .noise import running_median
 
-__all__ = ["hum"]
-
 _WANDERS = 3.0  # [s] coherence time of a line's phase
 _LINES = 8
 _THERE = 0.15  # least fraction of the blocks that show the line

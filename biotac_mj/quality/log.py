@@ -9,8 +9,6 @@ from ..sensor.channels import NELECTRODE
 from .clock import BUS_RATE
 from .repeats import repeated_rows
 
-__all__ = ["Log"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Log:

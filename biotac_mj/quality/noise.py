@@ -12,8 +12,6 @@ from .evidence import BLOCKS, evidence, runs
 from .fault import Fault
 from .log import Log
 
-__all__ = ["ROUNDING", "noise_level", "noisy", "running_median", "sound_noise"]
-
 ROUNDING = 0.29  # [counts] of a number rounded to whole ones: 1 / sqrt(12)
 _FEWEST = 20  # rows of a block that show its noise
 # logarithm of a channel's noise over the median one's, by itself and over the law, which it exceeds in this

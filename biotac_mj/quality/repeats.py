@@ -4,8 +4,6 @@ import numpy as np
 
 from ..sensor.channels import NELECTRODE
 
-__all__ = ["repeated_rows"]
-
 
 def repeated_rows(counts: np.ndarray) -> np.ndarray:
     """(n,) bool: rows of counts (n, c) that equal the one before, unless by chance.

@@ -13,8 +13,6 @@ from .fault import Fault
 from .log import Log
 from .noise import ROUNDING, noise_level, sound_noise
 
-__all__ = ["at_rest"]
-
 _ROW, _SAMPLE = 8.0, 5.5  # times the noise: of a row over all channels, of a sample
 _FEW, _NEAR = 4, 3  # of either; rows around one of all channels that belong to it
 _SLOW = (4, 8)  # rows of means, whose noise is compared with that of rows

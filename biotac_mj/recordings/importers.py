@@ -24,8 +24,6 @@ from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read
 
-__all__ = ["READERS", "Loaded", "choose", "load", "load_one"]
-
 _NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 

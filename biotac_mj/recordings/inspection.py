@@ -11,8 +11,6 @@ from ..sensor.channels import FULL_SCALE
 from .recording import CHANNELS, CLOCKED, REST_LIKE, Recording, check_recording
 from .tared import with_baseline
 
-__all__ = ["check_clock", "doubts", "faults", "findings", "warnings"]
-
 _REPEATED = 0.02  # fraction of repeated rows; fewer occur by chance
 _MOST_TRAVEL = 3.0  # [m] largest travel of a finger or an object; robots reach two
 _STILL = 20  # rows; fewer may be equal by chance in a working channel

@@ -11,8 +11,6 @@ from .formats.messages import Topic
 from .formats.streams import join, make_streams
 from .recording import Recording
 
-__all__ = ["streams_of_lines", "record_serial", "record_topics"]
-
 
 def record_topics(topics: list[str], seconds: float, object_name: str | None = None) -> list[Recording]:
     """Recordings of running topics.

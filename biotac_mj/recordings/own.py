@@ -5,8 +5,6 @@ import numpy as np
 from ..sensor.channels import counts_from_log_impedance, log_impedance
 from ..sensor.presets import PER_DEGREE
 
-__all__ = ["noise", "rest_of"]
-
 _TIMES = np.geomspace(0.1, 1.1, 60)  # candidate time constants of warm-up, over the recording's length
 _LIGHT = 0.08  # fraction of rows of a loaded sensor that are used: those with least force
 

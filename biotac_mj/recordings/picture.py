@@ -9,8 +9,6 @@ from ..sensor.acquisition_kernels import SLOT_RATE
 from ..sensor.colors import change_map, line_color
 from .recording import Recording, check_recording
 
-__all__ = ["draw", "pac_spectrum"]
-
 _REST = 0.02  # fraction of rows at the start whose median is the baseline
 _RATE = SLOT_RATE / 2  # [Hz] of samples
 _WINDOW = 176  # samples of a spectrum: 12.5 Hz apart

@@ -17,8 +17,6 @@ from ..files import replacing
 from ..reading import read_yaml
 from ..short_repr import short_repr
 
-__all__ = ["SCHEMA", "STEPS", "Prompter", "Protocol", "Segment", "Step", "read_protocol", "write_protocol"]
-
 SCHEMA = "biotac_mj.protocol/1"
 MOVE = 3.0  # [s] pause between two segments
 _REMEDY = "`biotac checkup --out protocol.yaml` writes one"

@@ -23,18 +23,6 @@ from ..sensor.channels import (
 from ..short_repr import short_repr
 from .tared import with_baseline
 
-__all__ = [
-    "CLOCKED",
-    "FIELDS",
-    "REST_LIKE",
-    "SCHEMA",
-    "UNITS",
-    "Field",
-    "Recording",
-    "read",
-    "write",
-]
-
 SCHEMA = "biotac_mj.recording/1"
 UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normalised")
 # least correlation of the baseline (`Recording.rest_correlation`) for electrodes in the usual order: five

@@ -6,8 +6,6 @@ import numpy as np
 
 from .recording import Recording
 
-__all__ = ["force_on_object", "of_simulation"]
-
 _NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
 
 

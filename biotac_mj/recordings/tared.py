@@ -5,8 +5,6 @@ import numpy as np
 from ..geometry.design import BIOTAC, design_of_channels
 from ..sensor.channels import FULL_SCALE
 
-__all__ = ["with_baseline"]
-
 _EDGE = 1.0  # [counts] distance of the results from the ends of the converter
 _WHOLE = 0.02  # [counts] rounding of logs of whole counts minus a mean
 

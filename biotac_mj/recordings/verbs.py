@@ -9,8 +9,6 @@ from ..files import refuse_existing
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
-__all__ = ["add_load_arguments", "add_which", "add_verbs", "load_given"]
-
 
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
     """Adds them to argparse's subparsers; verb(verbs, name, run, text) makes one."""

@@ -18,8 +18,6 @@ from ..sensor.film import FilmConduction
 from ..skin import PRESETS, Material, SkinOptions
 from .touch import MOST, Touch
 
-__all__ = ["PLATE", "fitted_touches", "plate_path"]
-
 PLATE = "geom:plane"
 _LOADED = 0.5  # [N] least force for a fitted pose, as in `matching`
 _LEAD = 5e-6  # [m] distance of row 0 before first touch

@@ -30,8 +30,6 @@ from ..skin.settings import plain, read_dict, read_settings
 from .fitted import PLATE, fitted_touches
 from .touch import Touch, touches_of
 
-__all__ = ["POSES", "ResimulateOptions", "ResimulateReport", "resimulate"]
-
 POSES = ("recorded", "fitted")
 
 

@@ -13,8 +13,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..recordings import Recording
 from ..recordings.own import rest_of
 
-__all__ = ["MOST", "Touch", "biotac_poses", "pose", "touches_of"]
-
 MOST = 2000  # rows of a touch: its nodes are in memory
 _FEWEST = 8  # rows: fewer do not show a press, and `biotac diagnose` rejects them
 _GAP = 0.5  # [s] without a row ends a touch

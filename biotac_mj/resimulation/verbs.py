@@ -6,8 +6,6 @@ from collections.abc import Callable
 from ..arguments import SEED, add_ray, check_device, device, output_folder, real, whole
 from ..recordings.verbs import add_load_arguments, add_which
 
-__all__ = ["add_verb"]
-
 _TEXT = "X Y Z [m], then QW QX QY QZ where it is turned"
 
 

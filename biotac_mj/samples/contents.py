@@ -1,7 +1,5 @@
 """Content of the samples."""
 
-__all__ = ["EFFECT", "EVERY", "OBJECT", "PLACES", "SKIN", "TOUCHES"]
-
 OBJECT, SKIN = "sphere_7mm", "coarse"
 # repeated at the same locations with different depths, so that force can be learned where it is evaluated
 PLACES, TOUCHES = 10, 50

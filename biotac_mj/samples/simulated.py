@@ -20,8 +20,6 @@ from ..recordings.simulated import of_simulation
 from ..resimulation.resimulate import ResimulateOptions, resimulate
 from .contents import EFFECT, EVERY, OBJECT, PLACES, SKIN, TOUCHES
 
-__all__ = ["make_set", "record_touches", "tables"]
-
 _TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand's, and on either side of it
 _GENTLE = 0.3, 0.6  # range of the drawn fraction of the planned depth: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch

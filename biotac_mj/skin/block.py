@@ -5,8 +5,6 @@ import warp as wp
 
 from .types import real, vec3, vec6
 
-__all__ = ["block_max", "block_memory", "block_rank", "block_sum", "sum_of_lanes", "sync"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -12,8 +12,6 @@ from ..geometry import rigid_warp
 from ..geometry.rigid import cross, rotation
 from .types import mat33, vec3
 
-__all__ = ["Bodies", "BodyMotion", "follow_wrench", "make_bodies", "uncoupled_geoms"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -8,8 +8,6 @@ from .newton import bodies, nodes
 from .program import Launcher
 from .types import real, vec3
 
-__all__ = ["CompliantBodies"]
-
 
 class CompliantBodies:
     """The compliant bodies of all worlds of `forces`. Methods put launches into a program; `on` flags the

@@ -30,8 +30,6 @@ if typing.TYPE_CHECKING:
     from .geoms import GeomSet
     from .precondition import Preconditioner
 
-__all__ = ["ContactState", "SkinData"]
-
 
 class ContactState:
     """Contact of one surface: anchors, and results of the last evaluation; see `state.VARIABLES`, where

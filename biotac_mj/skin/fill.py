@@ -12,8 +12,6 @@ from .geoms import GeomSet
 from .liquid import Rest, Rests
 from .step import step
 
-__all__ = ["rest_state", "rest_worlds"]
-
 # Tolerances of intermediate steps and of the last, which leaves no residual for later steps. Without contact
 # the scale is the smallest load, 1e-12 J.
 _INTERMEDIATE, _FINAL = 1e-2, 1e-5

@@ -17,8 +17,6 @@ from .precondition.dense import FEW, LANES_FEW, THREADS_FEW
 from .program import Fork, Launcher
 from .types import mat33, real, vec3
 
-__all__ = ["Forces", "Vectors"]
-
 _LISTED = 1 << 16  # most threads for listed faces: each takes several faces if there are more
 _BLOCKS = 1 << 10  # most blocks of threads, likewise
 _FACES = 4  # faces of the cavity that one thread sums, with many worlds

@@ -13,8 +13,6 @@ from .contact.touch import CORE, MESHES, SKINS, SOLIDS
 from .state import allocate
 from .types import mat33, real, vec3
 
-__all__ = ["SIZES", "GeomSet", "check_rounding", "shapes_of"]
-
 # number of MuJoCo's three sizes that a geom type uses
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0, "skin": 0}
 

@@ -28,15 +28,6 @@ from ..short_repr import short_repr
 from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
 
-__all__ = [
-    "Liquid",
-    "Rest",
-    "release_pressure",
-    "settle_pressure",
-    "volume_gradient",
-    "wet_faces",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 WATER = 2.2e9  # [Pa]

@@ -30,8 +30,6 @@ from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
 from .types import real, vec3
 
-__all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "filled", "solved_geometry"]
-
 # (SkinModel) -> liquid.Rest; set by the module `fill`, which imports `step` and thus this module
 solve_rest = None
 

@@ -19,8 +19,6 @@ from ..cache import cached
 from .liquid import WATER, volume_gradient
 from .model import SkinModel
 
-__all__ = ["NMODE", "SkinModes", "skin_modes"]
-
 NMODE, _COUNT = 24, 48  # modes that are kept, and that are computed
 
 

@@ -13,8 +13,6 @@ from .fill import rest_worlds
 from .model import SkinModel, SkinOptions
 from .state import FULL
 
-__all__ = ["NAMES", "make_room", "make_worlds"]
-
 _LAW = ("friction_exponent", "friction_pressure", "adhesion", "adhesion_hysteresis")
 _LIQUID = ("bulk_modulus", "fill_volume")
 NAMES = (*_LAW, *_LIQUID, "modulus")

@@ -16,8 +16,6 @@ import warp as wp
 
 from ..launches import in_a_row, recorded, repeated
 
-__all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels", "finish_compiling"]
-
 
 class Launcher:
     """Launches kernels immediately, on one device."""

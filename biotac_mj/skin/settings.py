@@ -17,8 +17,6 @@ from .contact.law import ContactLaw
 from .model import SkinOptions, filled
 from .rubber.material import PRESETS, Material
 
-__all__ = ["Settings", "plain", "read_dict", "read_material", "read_modulus", "read_settings"]
-
 _KEYS = ("skin", "modulus")
 
 

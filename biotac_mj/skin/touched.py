@@ -12,8 +12,6 @@ from .data import SkinData
 from .modes import SkinModes
 from .types import real, vec3
 
-__all__ = ["Touched", "faces_of"]
-
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.spatial_vectord

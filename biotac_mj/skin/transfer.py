@@ -7,8 +7,6 @@ import warp as wp
 
 from .types import real
 
-__all__ = ["Transfer", "words_of"]
-
 wp.set_module_options({"enable_backward": False})
 
 _CHUNK = 8  # items that a thread writes at a time on CUDA; on the CPU one thread writes an array

@@ -9,22 +9,6 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-__all__ = [
-    "DOUBLE",
-    "SINGLE",
-    "Precision",
-    "double",
-    "mat33",
-    "mat66",
-    "narrow",
-    "real",
-    "single",
-    "vec3",
-    "vec4",
-    "vec6",
-    "widen",
-]
-
 real = wp.float64
 vec3 = wp.vec3d
 vec4 = wp.vec4d

@@ -11,8 +11,6 @@ from ..sensor.colors import FULL_CHANGE, electrode_colors
 if typing.TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["Maps"]
-
 _SCALE = 6.0  # [pixel / mm]
 _HEIGHT, _BAR = 180, 260  # height of the strip, largest width of the colour scale [pixel]
 

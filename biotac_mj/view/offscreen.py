@@ -14,8 +14,6 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-__all__ = ["SHOWN", "Offscreen", "find_gl", "frame_bodies", "show_bodies", "stage"]
-
 _MARGIN = 1.1  # size of the picture over that of the framed geoms
 SHOWN = 3  # MuJoCo draws geom groups below this by default
 

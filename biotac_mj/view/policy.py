@@ -18,8 +18,6 @@ from ..tasks.batched.task import BatchTask
 from .maps import Maps
 from .offscreen import Offscreen, find_gl
 
-__all__ = ["play_task", "save_gif", "show_page", "show_window"]
-
 _SIZE = 480, 360  # of a GIF [pixel]
 _SHOWN, _LAST = 2.2, 0.6  # duration of the episodes in a GIF, and of the last picture of each [s]
 

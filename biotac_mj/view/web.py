@@ -6,10 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..coupling.show import CORE, FULL_SCALE, OBJECT, SKIN, electrode_colors
+from ..coupling.show import CORE, OBJECT, SKIN
 from ..geometry.skin_geometry import SkinGeometry
-
-__all__ = ["FIELDS", "Field", "Finger", "Moment", "Page"]
+from ..sensor.colors import FULL_CHANGE, electrode_colors
 
 _WINDOW = 200  # samples in a trace of a simulation
 _MAP = 280, 190  # size of the electrode map, along x and around the finger
@@ -350,10 +349,10 @@ def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
     scale = "".join(
         f'<rect x="{(width + s * _SCALE) / 2 - 4:g}" y="{height + 2}" width="8" height="9" '
         f'fill="rgb{_rgb(color)}"/>'
-        for s, color in zip(value, electrode_colors(FULL_SCALE * value))
+        for s, color in zip(value, electrode_colors(FULL_CHANGE * value))
     )
     ticks = "".join(
-        f'<text x="{width / 2 + s * _SCALE / 2:g}" y="{height + 22}">{s * FULL_SCALE:+g}</text>'
+        f'<text x="{width / 2 + s * _SCALE / 2:g}" y="{height + 22}">{s * FULL_CHANGE:+g}</text>'
         for s in (-1, 1)
     )
     return (

@@ -17,8 +17,6 @@ from ..reading import Array, read_hdf5
 from ..sensor.channels import check_counts, check_force
 from .web import FIELDS, Finger, Moment, Page
 
-__all__ = ["play_file", "play_model", "play_press"]
-
 _PRESS = {
     "vert_xpos": Array(("n", "nvert", 3)),
     "outer_face": Array((None, 3), "index"),

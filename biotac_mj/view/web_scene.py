@@ -5,8 +5,6 @@ import numpy as np
 
 from .offscreen import SHOWN
 
-__all__ = ["Scene"]
-
 
 class Scene:
     """Adds the visible geoms of `model` to a viser server, except planes and those of `hidden` bodies.

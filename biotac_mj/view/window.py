@@ -23,8 +23,6 @@ from ..press.scene import see_through
 from ..reading import reading
 from .offscreen import frame_bodies, show_bodies, stage
 
-__all__ = ["build_hand", "build_scene", "view"]
-
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 _BALL = "biotac_ball"  # in a hand's model, which may have a ball of its own
 _EYE = -0.3, -0.5, -0.8  # direction of the camera in the BioTac frame

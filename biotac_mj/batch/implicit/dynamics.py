@@ -10,12 +10,6 @@ import warp as wp
 from ...skin.newton.worlds import NOT_FINITE
 from ...skin.types import mat66, real, vec6
 
-__all__ = [
-    "acting_wrenches",
-    "add_forces",
-    "find_rows",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -10,8 +10,6 @@ import warp as wp
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Ends"]
-
 # what mujoco_warp's kinematics writes
 _POSES = "xpos xquat xmat xanchor xaxis xipos ximat geom_xpos geom_xmat site_xpos site_xmat".split()
 

@@ -12,8 +12,6 @@ from ...skin.types import real, vec6
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Cones", "Factor"]
-
 wp.set_module_options({"enable_backward": False})
 
 _BLOCK = 64  # threads that factor a world's matrix

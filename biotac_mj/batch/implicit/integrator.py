@@ -26,17 +26,6 @@ from .factor import Cones, Factor
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = [
-    "BLOCK",
-    "Correction",
-    "Integrator",
-    "Slope",
-    "accept",
-    "begin_correction",
-    "corrections",
-    "find_amiss",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -15,8 +15,6 @@ from ...skin.block import sync
 from ...skin.types import real, vec6
 from .rounds import Model
 
-__all__ = ["Response", "add_stiffness", "factor", "substitute"]
-
 wp.set_module_options({"enable_backward": False})
 
 

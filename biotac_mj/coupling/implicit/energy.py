@@ -13,15 +13,6 @@ from .marks import MarkedWorlds, mark
 from .rounds import Model, Rounds, Solid, force_of
 from .rules import EULER, beta_of, in_store, lacking, share_within, spared
 
-__all__ = [
-    "conclude",
-    "find_energy",
-    "find_gain",
-    "pass_by",
-    "restrain",
-    "withdraw",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -17,8 +17,6 @@ import numpy as np
 from ..structs import LIBRARY, DataView, ModelView
 from .springs import Springs
 
-__all__ = ["Integrator"]
-
 LIBRARY.mjd_smooth_vel.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
 _EULER, _FAST, _IMPLICIT = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "IMPLICITFAST", "IMPLICIT")

@@ -13,8 +13,6 @@ from ..structs import DataView, ModelView
 from ..touching import Touching
 from .poses import Bodies
 
-__all__ = ["Kinematics", "row"]
-
 
 class Kinematics:
     """Poses and Jacobians of the bodies of a `Touching`, about the origin of the BioTac frame and in that

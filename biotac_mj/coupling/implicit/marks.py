@@ -3,8 +3,6 @@ them."""
 
 import warp as wp
 
-__all__ = ["MarkedWorlds", "Marks", "mark"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -22,8 +22,6 @@ from ..touching import Touching
 from .kinematics import row
 from .rows import write_rows
 
-__all__ = ["Metric"]
-
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
 _NEVER = int(mujoco.mjtSleepPolicy.mjSLEEP_NEVER)
 _NEEDED = {

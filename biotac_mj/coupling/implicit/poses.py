@@ -12,8 +12,6 @@ from ...geometry.rigid_warp import is_finite, rotation
 from ...skin.types import mat33, real, vec3, vec6
 from .rounds import Rounds, follow
 
-__all__ = ["Bodies"]
-
 wp.set_module_options({"enable_backward": False})
 
 

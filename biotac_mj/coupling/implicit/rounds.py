@@ -14,27 +14,6 @@ from ...skin.types import mat33, mat66, real, vec3, vec6
 from .marks import MarkedWorlds, mark
 from .rules import EULER, TELEPORT, TOLERANCE, beta_of, gamma_of
 
-__all__ = [
-    "Model",
-    "Rounds",
-    "Solid",
-    "ask",
-    "begin_rounds",
-    "choose_gamma",
-    "distance_off",
-    "follow",
-    "force_of",
-    "judge",
-    "uncoupled_poses",
-    "use_euler",
-    "look",
-    "look_inside",
-    "make_model",
-    "make_rounds",
-    "tell_bodies",
-    "wrenches",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

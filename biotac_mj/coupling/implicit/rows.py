@@ -7,8 +7,6 @@ import warp as wp
 
 from ...skin.types import mat66, real, vec6
 
-__all__ = ["hold_by_rows", "keep_held", "write_rows"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -18,8 +18,6 @@ from .rows import keep_held
 from .rules import LOSS_FREQUENCY
 from .springs import Springs
 
-__all__ = ["StepArrays"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -30,8 +30,6 @@ from .integrator import Integrator
 from .rules import MAX_CORRECTIONS, TOLERANCE, poorly_corrected
 from .springs import Springs
 
-__all__ = ["ASTRAY", "World"]
-
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
 # [m] from where a skin was solved: there Runge-Kutta's stages may lead its bodies, other than the first says

@@ -27,8 +27,6 @@ from .vibration import Shaking
 if typing.TYPE_CHECKING:
     from ...learning.serve import NetworkFilm
 
-__all__ = ["LearnedReadings", "SensorReadings", "film_of", "materials_of", "textures_of"]
-
 
 class SensorReadings:
     """`PhysicsReadings` behind the `Readings` protocol.

@@ -8,8 +8,6 @@ from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.readings import check_settings
 from ...sensor.signals import read_signal
 
-__all__ = ["ReadingsOptions"]
-
 
 @dataclasses.dataclass(frozen=True)
 class ReadingsOptions:

@@ -12,8 +12,6 @@ from ...skin.touched import faces_of
 from ..stepper import Geom, SkinResult
 from ..steppers.fem import FemStepper
 
-__all__ = ["Shaking"]
-
 
 class Shaking:
     """Excitation of the modes of one skin.

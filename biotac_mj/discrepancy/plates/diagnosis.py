@@ -26,8 +26,6 @@ from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, electrode
 from .models import BASE, Judged, Model, judge, models, press_rows
 from .where import leading, missing, press_cells
 
-__all__ = ["PlateDiagnosis", "Sensor", "Tested", "Tried", "diagnose_presses"]
-
 _TIMES = 4000  # permutations of the electrodes
 _BLOCKS = "blocks of time that took no part in the fit"
 

@@ -14,8 +14,6 @@ from ...sensor.channels import counts_from_log_impedance
 from ..evidence import log_ratio
 from ..recordings.recording import PlainRecording
 
-__all__ = ["BASE", "Judged", "Model", "blocks", "judge", "models", "press_rows"]
-
 BASE = Setup(gains=0.0)
 _DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chosen; the rest is held out
 _ROWS = 300  # loaded rows that are looked at: time to fit goes with them

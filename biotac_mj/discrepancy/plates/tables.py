@@ -11,8 +11,6 @@ from ...matching.states import PlateGrid, PlateStates, plate_states
 from ...sensor.film import FilmConduction
 from ...skin import Material
 
-__all__ = ["COARSER", "base_response", "with_effects"]
-
 # Where effects that need states of their own have them: a change is smoother than what it changes.
 _BASE = PlateGrid()
 COARSER = PlateGrid(_BASE.pitch[::3] + _BASE.pitch[-1:], _BASE.roll[::3], _BASE.drag[-1:])

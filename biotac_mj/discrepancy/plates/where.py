@@ -8,8 +8,6 @@ from ..report.verdict import electrode_names
 from ..where import Cells
 from .models import Judged, blocks
 
-__all__ = ["leading", "missing", "press_cells"]
-
 _LEADS = 1.3  # times the median electrode's RMS: such electrodes lead
 _FEWEST = 8  # rows of a cell
 

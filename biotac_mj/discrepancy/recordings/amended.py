@@ -10,8 +10,6 @@ from ...recordings.recording import designed
 from ...sensor.channels import FULL_SCALE
 from .session import Session
 
-__all__ = ["amended_sensor", "running"]
-
 _MATERIAL = "calibrated"  # the rubber that real sensors were matched with
 
 

@@ -8,8 +8,6 @@ from .model import LEAST, WINDOW
 from .recording import FORCE_MOVED
 from .session import Session
 
-__all__ = ["not_identifiable"]
-
 
 def not_identifiable(session: Session) -> list[str]:
     """A line for each kind of data that the recording lacks (`Effect.asks`), with the names of the effects

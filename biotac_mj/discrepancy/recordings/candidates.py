@@ -18,9 +18,6 @@ from .recording import PlainRecording
 if TYPE_CHECKING:
     from .detectors.trends import Trend
 
-__all__ = ["KINDS", "Candidate", "as_candidates", "as_log"]
-
-
 KINDS = {effect.id: effect for effect in entries("log")}
 _MOST = 12  # electrodes: what more have is of the sensor
 

@@ -10,8 +10,6 @@ import functools
 
 import numpy as np
 
-__all__ = ["Components", "Conditional"]
-
 
 class Components:
     """Principal components of rows x (n, c), c columns about their means.

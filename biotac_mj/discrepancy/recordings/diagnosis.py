@@ -15,8 +15,6 @@ from .recording import PlainRecording
 from .rest import Rest, rest
 from .session import Session
 
-__all__ = ["RecordingDiagnosis", "concluded"]
-
 _NEXT = 3  # experiments
 
 

@@ -11,8 +11,6 @@ from ...quality.noise import noise_level
 from ...sensor.channels import FULL_SCALE, log_impedance
 from .conditional import Components, Conditional
 
-__all__ = ["CHANGES", "LEAST", "WINDOW", "Model", "slope_of"]
-
 _BIN = 0.1  # [s]: load moves by hand, below 10 Hz
 _CELLS = 48  # of the rows fitted, whose levels are compared
 WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most

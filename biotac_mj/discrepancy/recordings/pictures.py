@@ -6,8 +6,6 @@ from ...sensor.channels import counts_from_log_impedance
 from ..report import plots
 from ..report.verdict import Picture, Verdict
 
-__all__ = ["pictures_of"]
-
 _SHOWN = 4  # channels
 
 

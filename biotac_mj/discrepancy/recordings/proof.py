@@ -13,8 +13,6 @@ from .detectors.latency import force_view
 from .recording import FORCE_MOVED
 from .session import Session
 
-__all__ = ["blocks", "prove", "views"]
-
 _BLOCKS = 8  # of the held-out rows, whose errors are compared
 
 _FEWEST = 5  # samples

@@ -6,8 +6,6 @@ from .candidates import Candidate
 from .model import Model
 from .recording import PlainRecording
 
-__all__ = ["Session"]
-
 
 class Session:
     """The recording less what was found.

@@ -12,8 +12,6 @@ from ...files import replacing
 from .text import cell, columns
 from .verdict import Picture, Verdict
 
-__all__ = ["AMENDED", "page", "write_report"]
-
 AMENDED = "sensor_amended.yaml"
 
 

@@ -8,15 +8,6 @@ import numpy as np
 from ...sensor.colors import line_color
 from .verdict import Gap, electrode_names
 
-__all__ = [
-    "Panel",
-    "channels",
-    "curves",
-    "matrix",
-    "plates",
-    "overview",
-]
-
 _UNAMENDED, _AMENDED = "0.6", "tab:blue"
 _ASIDE = "0.92"  # grey behind held-out rows
 

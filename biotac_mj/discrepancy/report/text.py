@@ -5,8 +5,6 @@ import math
 from ...effects.effect import STAGES
 from .verdict import Finding, Verdict
 
-__all__ = ["cell", "columns", "summary"]
-
 _NUMBERS = 6  # parameters of an effect that are printed
 _CELLS, _TRIED = 6, 12  # cells and causes that are printed
 _HIDDEN = {"id", "stage", "unit", "attach"}  # columns of tables that are for programs

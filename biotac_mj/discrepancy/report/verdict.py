@@ -20,18 +20,6 @@ if typing.TYPE_CHECKING:
     from ...effects.effect import Effect, Param
     from ...effects.sensor_file import SensorFile
 
-__all__ = [
-    "SCHEMA",
-    "VERSION",
-    "Estimate",
-    "Finding",
-    "Gap",
-    "Picture",
-    "Verdict",
-    "electrode_names",
-    "of_electrodes",
-]
-
 SCHEMA, VERSION = "biotac_mj.verdict", 3
 _NOISELESS = 2e-6  # counts or newtons: a simulated force has no noise, which is taken for half of that
 _ABOVE = 1.05  # times noise and resolution, from which on something is above them

@@ -25,8 +25,6 @@ if typing.TYPE_CHECKING:
     from .search import Search
     from .whitening import Comparison
 
-__all__ = ["Beliefs", "Explanation", "believed", "pooled", "weights"]
-
 _MOST = 6  # explanations, the likeliest ones
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
 

@@ -16,8 +16,6 @@ from .trajectory import Trajectory
 if typing.TYPE_CHECKING:
     from .model.simulator import Simulator
 
-__all__ = ["Bounds", "Contact", "drawn", "trajectory_of"]
-
 _BACK, _LEAD = 50e-3, 20e-6  # [m] from which an object comes; before first touch, where row 0 is
 _SPEEDS, _HOLDS = (0.5e-3, 20e-3), (0.2, 10.0)  # [m/s], [s], both uniform in their logarithm
 _LONGEST = 60.0  # hold, in times that a press takes

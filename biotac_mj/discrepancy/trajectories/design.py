@@ -16,8 +16,6 @@ if typing.TYPE_CHECKING:
     from .model.simulator import Simulator
     from .trajectory import Trajectory
 
-__all__ = ["Plan", "Planned", "Separation", "planned"]
-
 _PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
 _BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
 _REPEATS = 2  # of a contact: of a law of another form more of the same tells less than it is expected to

@@ -15,8 +15,6 @@ if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
     from .whitening import Comparison
 
-__all__ = ["Fit", "changes", "fit_effects", "parameters", "sizes"]
-
 _NUISANCE = [f.name for f in dataclasses.fields(Nuisance)]
 _MOVES = np.array([0.05, 0.05, 0.02, 0.2, 0.2, 0.2, 0.2, 0.3])  # of the nuisance, for differences
 _SMALL, _SHAPE = 0.3, 0.2  # the same of a parameter's scale and of a shape's logarithm

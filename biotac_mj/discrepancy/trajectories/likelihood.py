@@ -21,8 +21,6 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["COURSES", "Likelihood", "courses", "kernel", "of"]
-
 _ROWS = 1500  # of all trajectories, that eigenvectors are computed of; of more, some are left out
 # Lengths over which what a model misses changes: across the skin (a contact's radius), in depth, in heading,
 # in the logarithm of the time since touch, in the session.

@@ -7,8 +7,6 @@ from ..report.verdict import Picture, Verdict
 from .fitting import fit_effects
 from .where import residual_cells
 
-__all__ = ["pictures_of"]
-
 _SHOWN = 4  # trajectories, of each of two channels
 
 

@@ -7,8 +7,6 @@ import textwrap
 from ...files import replacing
 from .design import Plan
 
-__all__ = ["COLUMNS", "write_plan", "write_poses"]
-
 COLUMNS = "contact object time object_pos_x object_pos_y object_pos_z object_qw object_qx object_qy object_qz"
 _WIDTH = 170  # letters in a line of the picture
 

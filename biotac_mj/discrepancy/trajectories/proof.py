@@ -16,8 +16,6 @@ if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
-__all__ = ["Proof", "borne_out", "proved"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Proof:

@@ -10,8 +10,6 @@ from ...recordings.inspection import warnings
 from ...recordings.recording import Recording
 from .trajectory import Trajectory
 
-__all__ = ["trajectories_of"]
-
 _ROWS = 40  # of a contact: the skin is solved in each, and more of them share their errors
 _AFTER = 0.3  # [s] of a contact's end, without touch
 # [m] from the skin, or from row to row: on the way elsewhere, where a straight line may cross the finger

@@ -16,8 +16,6 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["astray", "few_off", "next_experiment", "of_base", "of_data", "strays"]
-
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 # Mean square of one alone beyond what another balance at an edge makes of it: at most 5.2 in 41 contacts of
 # sensors with nothing hidden, 28 where one of eleven presses was deep enough for rubber that stiffens.

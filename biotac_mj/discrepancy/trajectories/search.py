@@ -18,8 +18,6 @@ if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
     from .whitening import Comparison
 
-__all__ = ["Candidate", "Search", "found", "screened"]
-
 _SOLVED, _FURTHER = 2, 4  # times that the skin is solved for an effect that moves the object; and again
 _WORTH, _MUCH = 5.0, 30.0  # [nats] of evidence that is worth it; that solving the rubber is worth
 _SETTLED = 1.0  # [nats] that a solution changes where a fit has found its end

@@ -7,8 +7,6 @@ import json
 
 from ..evidence import RATE
 
-__all__ = ["SETTINGS", "Settings"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Settings:

@@ -12,8 +12,6 @@ if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
-__all__ = ["SEEN", "Signatures", "isolability"]
-
 SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
 
 

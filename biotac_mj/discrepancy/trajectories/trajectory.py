@@ -9,13 +9,6 @@ from ...geometry.design import BIOTAC, SINGLES, design_of_channels
 from ...quality.noise import noise_level
 from ...sensor.channels import check_counts, check_force
 
-__all__ = [
-    "Trajectory",
-    "measurement_noise",
-    "read_trajectories",
-    "write_trajectories",
-]
-
 # columns of a set's counts, from the end
 _SINGLE = tuple(SINGLES.index(name) - len(SINGLES) for name in ("pdc", "tdc"))
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of

@@ -12,8 +12,6 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["channel_groups", "conditions", "left_over", "phases", "residual_cells", "where"]
-
 TRENDS = "along finger", "across finger", "clock", "temperature"  # over trajectories
 _FEWEST = 5  # trajectories that know a cell
 _SAID = 3  # cells that are said of what has no name

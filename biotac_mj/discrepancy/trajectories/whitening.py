@@ -11,8 +11,6 @@ from .model.fields import Fields
 from .model.simulator import Simulator
 from .settings import SETTINGS
 
-__all__ = ["Comparison", "REPEATABILITY"]
-
 # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
 REPEATABILITY = 0.05e-3
 

@@ -39,8 +39,6 @@ _SURE = 1 - SETTINGS.rate  # the most that is stated: so many of all names are f
 # likelihood from 98 names in 113 laboratories whose laws are not the catalogue's
 _LEFT_OUT = 28.0, 134.0
 
-__all__ = ["TrajectoryDiagnosis", "about_rests", "diagnose"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrajectoryDiagnosis(Verdict):

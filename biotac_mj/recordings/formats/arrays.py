@@ -11,8 +11,6 @@ from .names import is_stamp, is_time
 from .streams import Stream, make_streams
 from .text import read_matrix
 
-__all__ = ["is_numpy", "read_numpy"]
-
 _NPY, _ZIP = b"\x93NUMPY", b"PK\x03\x04"
 _REMEDY = "save it again with numpy.save or numpy.savez, numbers alone"
 

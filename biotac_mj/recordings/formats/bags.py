@@ -11,8 +11,6 @@ from .driver import FORMS, KINDS, Messages, rows_of
 from .messages import Topic
 from .streams import Stream
 
-__all__ = ["DEFINITIONS", "FORMS", "is_bag", "read_bag", "write_bag"]
-
 _MARKS = (b"#ROSBAG V", b"\x89MCAP", b"SQLite format 3")
 _REMEDY = "give a .bag of ROS 1, the folder of a ROS 2 bag, or its .mcap or .db3 file; copy a cut one again"
 # definitions of biotac_sensors and tactile_msgs, which ROS does not include

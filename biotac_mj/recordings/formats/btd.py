@@ -15,8 +15,6 @@ from ...geometry.design import design_named, design_of_channels, designs
 from ...quality.clock import BUS_RATE
 from .streams import Stream
 
-__all__ = ["is_btd", "read_btd"]
-
 # channels' numbers in the log
 _PAC, _PDC, _TAC, _TDC, _E1 = 0, 1, 2, 3, 17
 _BEGIN = b"Begin File"

@@ -14,8 +14,6 @@ import numpy as np
 from ...reading import Unfit
 from .names import UNITS, is_time, place_of
 
-__all__ = ["Table", "open_bytes", "parse_table", "read_columns", "read_table"]
-
 _HEX = re.compile(r"0x[0-9a-f]+", re.I)
 _BARE_HEX = re.compile(r"(?=.*\d)[0-9a-f]{1,4}", re.I)  # without 0x, up to 16 bits
 _TIME_OF_DAY = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{1,2}(?:\.\d*)?)\]?")

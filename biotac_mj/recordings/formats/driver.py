@@ -9,8 +9,6 @@ from ...geometry.design import Design
 from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import Recording
 
-__all__ = ["FORMS", "KINDS", "TOPICS", "Messages", "check_form", "row_of", "rows_of"]
-
 FORMS = ("biotac_sensors", "tactile_msgs")
 TOPICS = dict(zip(FORMS, ("biotac_pub", "tactile_states")))
 # of a topic's messages

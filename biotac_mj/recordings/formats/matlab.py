@@ -11,8 +11,6 @@ from ...reading import reading
 from .names import is_time, place_of, unit_named
 from .streams import Stream, make_streams
 
-__all__ = ["is_matlab", "read_hdf5", "read_matlab"]
-
 _WHAT, _REMEDY = (
     "MATLAB file",
     "save it again with `save -v7`, variables called electrodes, pdc, pac, force, time",

@@ -6,8 +6,6 @@ from ..recording import CHANNELS
 from .names import place_of
 from .streams import Stream, make_streams
 
-__all__ = ["Topic"]
-
 _SKIPPED = ("header", "bt_time", "__msgtype__")
 # fields whose positions and orientations are not a sensor's: of joints and inertial units
 _OTHER_POSES = {"effort", "orientation_covariance"}

@@ -6,18 +6,6 @@ import typing
 
 from ..recording import CHANNELS
 
-__all__ = [
-    "UNITS",
-    "Place",
-    "is_part_of_stamp",
-    "is_stamp",
-    "is_time",
-    "place_of",
-    "refuse_unknown_unit",
-    "unit_named",
-    "unit_of",
-]
-
 
 class Place(typing.NamedTuple):
     """Meaning of a column.

@@ -11,8 +11,6 @@ from ...reading import Array, read_hdf5, reading
 from ...sensor.channels import NELECTRODE
 from ..recording import Recording
 
-__all__ = ["read_nvidia"]
-
 _KEYS = {
     "electrode_vals/data": Array(("n", NELECTRODE)),
     "contact_loc/data": Array(("n", 3)),

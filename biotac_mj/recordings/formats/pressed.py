@@ -9,8 +9,6 @@ from ...geometry.design import SINGLES
 from ...reading import Array, read_hdf5
 from ..recording import Recording
 
-__all__ = ["KEYS", "read_press", "settings_of"]
-
 KEYS = {
     "time": Array(("n",)),
     "counts": Array(("n", "nchannel")),

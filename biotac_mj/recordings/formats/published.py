@@ -3,8 +3,6 @@
 import pathlib
 import re
 
-__all__ = ["companions", "is_companion", "object_of", "rate_of"]
-
 # File name -> names of files logged with it.
 _COMPANIONS = (
     (re.compile(r"(.+)_bio(\.csv(?:\.gz)?)"), (r"\1_cp\2", r"\1_cw\2")),  # slides over materials

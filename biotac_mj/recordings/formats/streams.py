@@ -12,8 +12,6 @@ from ...sensor.channels import FULL_SCALE
 from ..recording import CHANNELS, FIELDS, Recording, designed
 from .names import is_stamp, is_time, place_of, refuse_unknown_unit, unit_of
 
-__all__ = ["Stream", "join", "make_streams"]
-
 _OF_ONE_SENSOR = {"force", "torque", "sensor_pos", "sensor_quat"}
 _HOLE = 0.25  # [s] longest gap of a force or pose log that is interpolated
 # Raw counts of a resting electrode are thousands (four sensors: 2000 to 3500) and fall to 259 at 10 N; tared

@@ -11,8 +11,6 @@ from .columns import Table, parse_table
 from .names import is_part_of_stamp, is_stamp, is_time, place_of
 from .streams import Stream, make_streams
 
-__all__ = ["RUPPEL", "read_matrix", "read_text"]
-
 # Ruppel et al. (IAS-15, 2019): a table that may come without a header
 RUPPEL = ("time", "px", "py", "pz", "fx", "fy", "fz", "pac0", "pac1", "pdc", "tac", "tdc", *ELECTRODES)
 _SINGLE = ("pdc", "tdc", "tac")

@@ -22,19 +22,6 @@ from .lanes import keep_rows
 from .states import Increment
 from .structs import BACK, Constants, Scratch
 
-__all__ = [
-    "ROOT3",
-    "choose_view",
-    "find_faces",
-    "find_inner_faces",
-    "find_nodes",
-    "forget_faces",
-    "is_deep",
-    "largest_displacement",
-    "may_be_touched",
-    "measure_core",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 _MESH = wp.constant(GEOM_TYPES["mesh"])

@@ -24,8 +24,6 @@ from .rest_tangent import rest_tangent
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["SurfaceCompliance"]
-
 _LARGEST_FILE = 2e9  # rows of a finer skin are computed in each process [bytes]
 _BATCH = 60  # right-hand sides solved together
 _FORMAT = "3"  # `between` float32, scales float32, rows float16, and a checksum uint32 of all that

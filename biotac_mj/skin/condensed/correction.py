@@ -12,8 +12,6 @@ import dataclasses
 import math
 from typing import Any
 
-__all__ = ["FITTED", "Correction", "correction", "is_measured", "softening_of", "swelling_of"]
-
 _TOUCH = 0.01  # compressed fraction of the thickness above which the skin counts as compressed
 
 

@@ -4,19 +4,6 @@ import warp as wp
 
 from ..block import block_memory
 
-__all__ = [
-    "MOST_EQUATIONS",
-    "add_row",
-    "add_rows",
-    "begin_row",
-    "dot_column",
-    "dot_columns",
-    "eliminate",
-    "gather_rows",
-    "keep_rows",
-    "sum_rows",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 MOST_EQUATIONS = 1024  # that `eliminate` has room for

@@ -20,8 +20,6 @@ from .structs import Constants
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["LinearSkin"]
-
 wp.set_module_options({"enable_backward": False})
 
 # half a step of the differences that give the directions away from the core, half a cell of its grid [m]

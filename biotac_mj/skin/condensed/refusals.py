@@ -2,8 +2,6 @@
 
 from ..model import SkinOptions
 
-__all__ = ["refuse"]
-
 
 def refuse(rubber: tuple[str, ...], options: SkinOptions, has_liquid: bool, on_cuda: bool) -> None:
     """Refuses settings of a skin that the condensed tier does not support.

@@ -13,8 +13,6 @@ from ..types import vec3
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["rest_tangent"]
-
 
 def rest_tangent(model: "SkinModel") -> sp.csc_matrix:
     """Tangent of elastic forces and of the liquid's pressure at `model.rest`, over the free coordinates

@@ -14,8 +14,6 @@ from .states import Linear
 from .structs import DU, Constants, F, G, Remembered, Scratch
 from .system import fill_contact, gather_blocks
 
-__all__ = ["conclude", "correct", "place_nodes", "recall"]
-
 wp.set_module_options({"enable_backward": False})
 
 _softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)

@@ -16,8 +16,6 @@ from .states import BALANCED, DONE, NEWTON, SEARCH
 from .stepping import begin_step, conclude_balance, search
 from .structs import Constants, Remembered, Scratch
 
-__all__ = ["block_of", "whole_step", "phases"]
-
 wp.set_module_options({"enable_backward": False})
 
 LARGEST_BLOCK = 256  # threads of a world, the most samples of a face

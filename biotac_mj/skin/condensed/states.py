@@ -5,18 +5,6 @@ import warp as wp
 
 from ..types import real
 
-__all__ = [
-    "BALANCED",
-    "DONE",
-    "Increment",
-    "Linear",
-    "LoadStepping",
-    "NEWTON",
-    "Newton",
-    "SEARCH",
-    "Solve",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 # next phase: none; broad phase of an increment; Newton's method; decision about increment and step

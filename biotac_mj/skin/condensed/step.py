@@ -20,8 +20,6 @@ from .solve import block_of, phases, whole_step
 from .states import Increment, LoadStepping, Newton
 from .structs import NVECTOR, Previous, Remembered, Scratch
 
-__all__ = ["CondensedStep", "Room", "kernels_for_cuda"]
-
 wp.set_module_options({"enable_backward": False})
 
 

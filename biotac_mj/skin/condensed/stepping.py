@@ -28,8 +28,6 @@ from .states import BALANCED, DONE, NEWTON, SEARCH, Increment, Linear, LoadStepp
 from .structs import Constants, F, G, Remembered, Scratch
 from .system import count_contacts, gather_load
 
-__all__ = ["begin_step", "conclude_balance", "search"]
-
 wp.set_module_options({"enable_backward": False})
 
 _is_measured = wp.func(is_measured)

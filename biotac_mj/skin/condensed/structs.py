@@ -8,8 +8,6 @@ from ..state import declared
 from ..types import mat33, real, vec3
 from .states import Solve
 
-__all__ = ["Constants", "Previous", "Remembered", "Scratch"]
-
 
 @wp.struct
 class Constants:

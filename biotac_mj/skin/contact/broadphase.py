@@ -12,24 +12,6 @@ from ..types import double, mat33, real, single, vec3
 from .faces import Contact, Laws
 from .posed import Geoms, bound_to, place_on, touch_bound
 
-__all__ = [
-    "ALL",
-    "ClearanceCache",
-    "contact_range",
-    "face_ball",
-    "face_clearance",
-    "geom_clearance",
-    "geoms_within",
-    "has",
-    "store_clearance",
-    "list_near",
-    "list_unknown",
-    "motion_bound",
-    "sample_clearance",
-    "sample_within",
-    "track_geoms",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 FREE = wp.constant(real(1.0))  # [m] clearance of a face far from all geoms

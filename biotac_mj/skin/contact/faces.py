@@ -11,25 +11,6 @@ from ..program import Program
 from ..types import mat33, real, vec3
 from .posed import Geoms, Meeting, distance_to, meet, place_on
 
-__all__ = [
-    "Contact",
-    "FaceSum",
-    "Laws",
-    "NormalForces",
-    "balanced_fraction",
-    "block_index",
-    "commit_contacts",
-    "commit_face",
-    "empty_laws",
-    "face_samples",
-    "clear_bounds",
-    "limit_contacts",
-    "partial_wrench",
-    "normal_forces",
-    "sum_normal_forces",
-    "sum_wrench",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

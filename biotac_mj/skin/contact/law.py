@@ -30,8 +30,6 @@ from .faces import Laws
 if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
 
-__all__ = ["ContactLaw", "GridTooCoarse", "WorldLaws", "contact_law"]
-
 # range^2 = _RESOLVED W h / E*: the softening slope is then half of the stiffness E* / h of a patch of one
 # face
 _RESOLVED = 4.0

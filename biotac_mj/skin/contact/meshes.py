@@ -22,21 +22,6 @@ from ...geometry.closest import (
 from ...geometry.solid import no_solid
 from ..types import double, real, single, vec3
 
-__all__ = [
-    "NEAR_SURFACE",
-    "TRILINEAR",
-    "DistanceGrid",
-    "Grids",
-    "bake_distance_grid",
-    "grid_value",
-    "mesh_distance",
-    "mesh_field",
-    "pack_grids",
-    "smooth_distance",
-    "spline_field",
-    "to_triangles",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 _MAX_TRIANGLES = 48  # in the list of a cell; the bounding volume hierarchy is faster for more

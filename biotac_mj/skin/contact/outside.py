@@ -6,8 +6,6 @@ from ..block import block_max, block_sum
 from ..types import mat33, real, vec3
 from .posed import Geoms, bound_to, distance_from
 
-__all__ = ["leave_skin"]
-
 wp.set_module_options({"enable_backward": False})
 
 _ROUNDS = wp.constant(24)  # each takes the deepest point's depth off

@@ -15,8 +15,6 @@ from ..types import real, vec3
 from .meshes import TRILINEAR, DistanceGrid, grid_value, mesh_distance
 from .posed import Geoms, place_on
 
-__all__ = ["MOST", "Overlaps"]
-
 wp.set_module_options({"enable_backward": False})
 
 MOST = 6  # contacts of a part with a shape, and seeds of a part

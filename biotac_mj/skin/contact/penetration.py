@@ -10,15 +10,6 @@ from .meshes import TRILINEAR, grid_value
 from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
 
-__all__ = [
-    "core_clearance",
-    "geoms_core_clearance",
-    "mark_crushed",
-    "start_path_outside",
-    "mark_deep_geoms",
-    "rest_gap",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 _ROUNDS = 4  # steps out of the skin: the distance from a mesh outside its grid is only a lower bound

@@ -25,8 +25,6 @@ from .touch import SOLIDS
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["ProximityQuery", "poses"]
-
 wp.set_module_options({"enable_backward": False})
 
 _REGION = 2e-3  # motion of the geoms for which a region is valid [m]

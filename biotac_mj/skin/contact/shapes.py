@@ -9,16 +9,6 @@ import warp as wp
 from ..types import real, vec3
 from .meshes import NEAR_SURFACE, TRILINEAR, Grids, grid_value, mesh_distance, spline_field, to_triangles
 
-__all__ = [
-    "GEOM_TYPES",
-    "distance",
-    "distance_bound",
-    "distance_to_edge",
-    "lower_bound",
-    "primitive_distance",
-    "rough_bound",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

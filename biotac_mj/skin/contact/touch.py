@@ -30,22 +30,6 @@ from .posed import (
 )
 from .shapes import distance, lower_bound, primitive_distance
 
-__all__ = [
-    "BLOCK",
-    "CONSISTENT",
-    "CORE",
-    "LAGGED",
-    "MESHES",
-    "CURRENT",
-    "SKINS",
-    "SOLIDS",
-    "RECORDED",
-    "contact_kernels",
-    "smooth_traction",
-    "smooth_stick_or_slip",
-    "stick_or_slip",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 # kinds of geoms that kernels support: one smooth mesh; and three kinds, each with the ones before

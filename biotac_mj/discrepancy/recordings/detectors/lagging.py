@@ -13,8 +13,6 @@ from ..candidates import Candidate
 from ..conditional import Conditional
 from ..session import Session
 
-__all__ = ["lagging"]
-
 _BAND = (0.015, 0.25)  # [s] of smoothing between which touches move: noise is faster, drift slower
 _OWN = 1e-3  # of an electrode's variance that no other tells
 _LEAST = 0.05  # of what an electrode differs by: 0.13 at most in 35 pieces of sound sensors

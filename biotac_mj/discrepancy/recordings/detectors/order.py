@@ -8,8 +8,6 @@ from ....quality.noise import noise_level
 from ..candidates import Candidate
 from ..session import Session
 
-__all__ = ["slipped"]
-
 _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where another was
 # of the same: by this much it jumps, in the median of those exchanged and each. In 740 recordings of four
 # authors 23 exchanges reach 10.3, and of all else that goes on so 9.3

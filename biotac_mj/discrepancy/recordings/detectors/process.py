@@ -15,8 +15,6 @@ from ..conditional import Components
 from ..model import Model
 from .trends import BLOCKS, Trend
 
-__all__ = ["Process", "process"]
-
 _CELLS = 250  # of time, at most
 _FEWEST = 60
 _AXES = np.array([1, 0.8, 0.6, 0.5, 0.4, 0.3])  # weights of principal components, where a load is

@@ -14,8 +14,6 @@ if typing.TYPE_CHECKING:
     from ..fitting import Fit
     from ..whitening import Comparison
 
-__all__ = ["other_modulus"]
-
 _LOG_MODULUS = 0.2  # smaller factors are within what batches of rubber, force sensors and warmth make
 _LIKE_MODULUS = "BC"  # stages: another law of load, or what gives way, takes part of a modulus or gives some
 _OTHER_MESH = 0.5

@@ -14,8 +14,6 @@ from ....geometry.design import Design, designs
 from ....geometry.skins import shipped_skin
 from ....sensor.acquisition_kernels import SLOT_RATE
 
-__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "ages", "widen"]
-
 # In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
 # is a finding (`effects.contact.Friction`). The film has 20 to 100 um where 50 are the default
 # (`sensor.film.FilmConduction`). The bus reads one electrode after another: a row's are half a frame old

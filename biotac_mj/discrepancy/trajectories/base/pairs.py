@@ -19,8 +19,6 @@ if typing.TYPE_CHECKING:
     from ..fitting import Fit
     from ..whitening import Comparison
 
-__all__ = ["cross_talk", "exchanged"]
-
 _SWAPPED = 3.0  # nats per trajectory that each electrode has to gain in another's place
 _SWAP_CHANCE = 0.01  # of all electrodes of a ring together
 

@@ -15,8 +15,6 @@ if typing.TYPE_CHECKING:
     from ..model.simulator import Simulator
     from ..trajectory import Trajectory
 
-__all__ = ["rested"]
-
 _LOG_DIVIDER = float(np.log(DIVIDER))
 _LEAST, _MOST = 40.0, 4055.0  # [counts] beyond which an electrode is at the end of what it can read
 # Electrodes that rest elsewhere, which comparisons about the rest leave out.

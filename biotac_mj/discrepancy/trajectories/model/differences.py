@@ -23,8 +23,6 @@ from .fields import MAPS, Curve, Fields, stack, unstack
 if typing.TYPE_CHECKING:
     from ..trajectory import Trajectory
 
-__all__ = ["Solver", "filled", "inflated", "softer", "solved_fields", "spots", "sunk", "tacky"]
-
 _SHIFT = 40e-6  # [m] of the poses for differences
 # [m] along the press: densest where errors of poses lie, since rows before the touch begin to touch there
 _DEEPER = 20e-6 * np.array([-6, -4, -2, -1, 0, 1, 2, 4, 6])

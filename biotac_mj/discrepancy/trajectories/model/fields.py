@@ -13,8 +13,6 @@ from ....sensor.channels import temperature_from_counts
 
 _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
 
-__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "square", "stack", "unlike", "unstack"]
-
 MAPS = "along", "across"  # of a modulus that varies with place
 _ANSWERS = {name for effect in CATALOGUE for name in effect.answers}  # that effects after the skin use
 

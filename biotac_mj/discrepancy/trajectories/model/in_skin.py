@@ -24,8 +24,6 @@ if typing.TYPE_CHECKING:
     from ..trajectory import Trajectory
     from .fields import Fields
 
-__all__ = ["FOLLOWS", "InSkinSimulator", "in_the_skin", "remember", "solve_with_memory"]
-
 FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that say what follows from the skin here
 _LITTLE = 0.01  # share below which nothing is solved
 _ALIKE = 0.25  # of logarithms of share and shapes, within which another solution would say the same

@@ -7,8 +7,6 @@ from ....effects.sensor_file import read_sensor_file
 from .in_skin import InSkinSimulator
 from .simulator import Simulator
 
-__all__ = ["load_simulator"]
-
 _KINDS = {"reduced": Simulator, "in_skin": InSkinSimulator}
 
 

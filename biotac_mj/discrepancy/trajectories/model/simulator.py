@@ -33,8 +33,6 @@ from .fields import Fields, apart, nearest, sizes, square, stack
 if typing.TYPE_CHECKING:
     from ..trajectory import Trajectory
 
-__all__ = ["Simulator", "placed"]
-
 TIERS = ("condensed", "full")
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
 _STEP = 0.3  # of a parameter's scale, for the change by it where the skin is solved with effects
