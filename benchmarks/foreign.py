@@ -19,7 +19,7 @@ from biotac_mj.data.generation.plan import Motion
 from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.generation.synthetic_sensor import SyntheticSensor
 from biotac_mj.geometry import load_skin
-from biotac_mj.geometry.electrodes import electrode_positions
+from biotac_mj.geometry.design import electrode_positions
 from biotac_mj.matching.fit import rows_of
 from biotac_mj.matching.response import log_changes
 from biotac_mj.matching.states import PlateGrid, plate_states

@@ -25,7 +25,7 @@ from records import write_json
 from vibration import read_rows, resting
 
 import biotac_mj
-from biotac_mj.geometry.electrodes import electrode_positions
+from biotac_mj.geometry.design import electrode_positions
 from biotac_mj.matching.fit import Setup, fit_constants, rows_of
 from biotac_mj.matching.response import Response
 from biotac_mj.recordings import load_one

@@ -18,11 +18,11 @@ from meshing import mesh_between, write_obj
 from parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
 
 from biotac_mj.files import replacing
-from biotac_mj.geometry.assembly import assemble, fixed_nodes
 from biotac_mj.geometry.card import skin_numbers
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
-from biotac_mj.geometry.importing import read_obj
 from biotac_mj.geometry.indenters import INDENTERS, indenter
+from biotac_mj.geometry.making.assembly import assemble, fixed_nodes
+from biotac_mj.geometry.making.importing import read_obj
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.geometry.tet_mesh import TetMesh

@@ -17,8 +17,8 @@ import numpy as np
 from meshing import mesh_between
 from parametric import biotac_bodies, electrodes
 
-from biotac_mj.geometry.assembly import fixed_nodes
-from biotac_mj.geometry.importing import read_obj
+from biotac_mj.geometry.making.assembly import fixed_nodes
+from biotac_mj.geometry.making.importing import read_obj
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh
 

@@ -23,10 +23,10 @@ import pathlib
 import numpy as np
 from make_assets import write_card
 
-from biotac_mj.geometry.assembly import assemble, fixed_nodes
 from biotac_mj.geometry.design import read_design
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
-from biotac_mj.geometry.pads import dome_core, dome_shell, on_ellipsoid, plate
+from biotac_mj.geometry.making.assembly import assemble, fixed_nodes
+from biotac_mj.geometry.making.pads import dome_core, dome_shell, on_ellipsoid, plate
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh
 

@@ -14,8 +14,7 @@ import dataclasses
 
 import numpy as np
 
-from biotac_mj.geometry.design import BIOTAC
-from biotac_mj.geometry.electrodes import electrode_positions
+from biotac_mj.geometry.design import BIOTAC, electrode_positions
 
 __all__ = [
     "BioTacDimensions",

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from biotac_mj.geometry import TetMesh, load_skin
-from biotac_mj.geometry.assembly import assemble
+from biotac_mj.geometry.making.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 

@@ -7,7 +7,7 @@ from meshing import write_obj
 from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.geometry.pads import dome_core, dome_shell
+from biotac_mj.geometry.making.pads import dome_core, dome_shell
 
 SIX = [[0, 0, -6], [2, 0, -5.6], [-2, 0, -5.6], [0, 2, -5.6], [0, -2, -5.6], [3, 3, -4]]  # [mm]
 GROUND = [[5, 0, -3], [-5, 0, -3]]

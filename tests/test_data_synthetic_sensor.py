@@ -12,7 +12,7 @@ import biotac_mj
 from biotac_mj.data.generation.liquid_conduction import LiquidConduction
 from biotac_mj.data.generation.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, Waves, relax
 from biotac_mj.geometry import load_skin
-from biotac_mj.geometry.pads import column_tetrahedra
+from biotac_mj.geometry.making.pads import column_tetrahedra
 from biotac_mj.sensor.channels import (
     counts_from_impedance,
     impedance_from_counts,

@@ -138,7 +138,7 @@ def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, fric
             getattr(geoms.struct, name).numpy()[:] = value
         geoms.set_pose(pos[5:] + far * along, mat[5])
         record = advance(skin, geoms, before, 1.0, skin.constants)
-        assert not record.changes[0].lost and record.on_core
+        assert not record.changes[0].lost and (skin.data.core.trial_geom.numpy() >= 0).any()
         force.append(record.wrench[0, 0, :3].numpy())
     change = np.linalg.norm(np.diff(force, axis=0), axis=1)
     assert change.max() < 3 * np.median(change)

@@ -12,14 +12,12 @@ from biotac_mj.calibration import (
     configuration,
     parameter,
     plan_indentation,
-    plan_shear,
     simulate,
 )
 from biotac_mj.calibration.fit import forces_and_jacobian
 from biotac_mj.calibration.indentation import write_indentation
-from biotac_mj.differentiable import record
 from biotac_mj.differentiable.fit import Forces, forces_of
-from biotac_mj.skin import Material, step
+from biotac_mj.skin import Material
 from biotac_mj.skin.settings import read_material
 
 TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5, liquid=False)
@@ -45,50 +43,6 @@ def test_forces_are_those_of_the_fit_by_differences(shell, data):
     assert not lost
     assert force == pytest.approx(data.force, abs=2e-5)
     assert np.abs(slopes).max((0, 1)).min() > 1e-2
-
-
-@pytest.fixture
-def iterations(monkeypatch):
-    """Of Newton's method in each step of presses."""
-    counts = []
-
-    def counted(model, data, *args):
-        step(model, data, *args)
-        counts.append(int(data.worlds.iterations.numpy()[0]))
-
-    monkeypatch.setattr(record, "step", counted)
-    return counts
-
-
-def test_begins_near_the_press_before(shell, data, iterations):
-    """And ends where one does that knows of none; from a guess that leads nowhere too."""
-    wanted, at = [parameter("E"), parameter("mu")], np.array([1.18e6, 0.49])
-    force, slopes, _ = Forces()(shell, TRUTH, wanted, at, data)
-    alone = sum(iterations)
-    forces = Forces()
-    forces(shell, TRUTH, wanted, [1.2e6, 0.5], data)
-    iterations.clear()
-    there, their_slopes, lost = forces(shell, TRUTH, wanted, at, data)
-    assert sum(iterations) < 0.6 * alone and not lost
-    assert there == pytest.approx(force, abs=2e-5)
-    assert their_slopes == pytest.approx(slopes, abs=3e-3 * np.abs(slopes).max())
-    for past in forces._last.steps:
-        past.x[:] = np.nan
-    there, _, lost = forces(shell, TRUTH, wanted, np.array([1.2e6, 0.5]), data)
-    assert not lost and there == pytest.approx(data.force, abs=2e-5)
-
-
-@pytest.mark.slow
-def test_on_the_core_the_press_before_is_forgotten(shell):
-    """There a step has several balances: 4 mN apart in the last but one, found from the press before."""
-    way = plan_shear(skin="coarse")
-    wanted = [parameter(name) for name in ("E", "nu", "mu")]
-    at = np.array([1.2523513e6, 0.32096787, 0.53626427])
-    forces = Forces()
-    forces(shell, TRUTH, wanted, np.array([1.5e6, 0.32, 0.6]), way)
-    there, _, _ = forces(shell, TRUTH, wanted, at, way)
-    alone, _, _ = Forces()(shell, TRUTH, wanted, at, way)
-    assert there == pytest.approx(alone, abs=2e-5)
 
 
 @pytest.mark.slow  # quick: the verb finds them

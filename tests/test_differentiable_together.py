@@ -127,7 +127,11 @@ def test_inverse_of_steps_solves_as_the_factor_does(preconditioner, transpose):
     pos, mat = given["pos"].detach().numpy(), np.tile(np.eye(3), (2, 13, 1, 1, 1))
     numbers = {name: skin.own[name] for name in OF_SKIN}
     record = follow(both, pos, mat, given["friction"].detach().numpy(), numbers).steps[-1]
-    assert record.on_core and len(record.slips) and not any(change.lost for change in record.changes)
+    assert (
+        (both.data.core.trial_geom.numpy() >= 0).any()
+        and len(record.slips)
+        and not any(change.lost for change in record.changes)
+    )
     step = LinearStep(both, record)
     right = torch.randn(record.x.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = step.solve(right, transpose)
@@ -159,16 +163,14 @@ def test_systems_of_worlds(single):
         found = (rows(v) / near).view(w, n, 3).permute(1, 0, 2)
         return found.float() if single else found
 
-    def solve(error, most, start=None):
+    def solve(error, most):
         how = {"digits": 1e-4, "restart": 40} if single else {}
-        return solve_by_gmres(product, inverse, right, error, start, most, **how)
+        return solve_by_gmres(product, inverse, right, error, most, **how)
 
     x, count = solve(1e-9, 400)
     exact = torch.linalg.solve(A, rows(right))
     assert (rows(x) - exact).abs().max() < 1e-7 * exact.abs().max()
     assert count > 10 and not x[:, 1].any()
-    again, fewer = solve(1e-9, 400, start=x * (1 + 1e-5))
-    assert fewer < count and (again - x).abs().max() < 1e-7 * x.abs().max()
     with pytest.raises(ValueError, match="of world 0 was not solved with 3 products"):
         solve(1e-9, 3)
 

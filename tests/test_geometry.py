@@ -22,8 +22,8 @@ from biotac_mj.geometry import (
     load_skin,
 )
 from biotac_mj.geometry.card import skin_numbers
-from biotac_mj.geometry.electrodes import electrode_positions
-from biotac_mj.geometry.importing import read_obj
+from biotac_mj.geometry.design import electrode_positions
+from biotac_mj.geometry.making.importing import read_obj
 from biotac_mj.geometry.skins import design_of
 from biotac_mj.geometry.surface import face_areas, node_areas, node_normals
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume

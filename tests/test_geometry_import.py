@@ -8,8 +8,8 @@ from blocks import four_nodes
 from meshing import write_obj
 
 from biotac_mj.geometry import TetMesh, import_mesh
-from biotac_mj.geometry.assembly import fixed_nodes, split_surfaces
-from biotac_mj.geometry.importing import read_obj, read_tet_mesh
+from biotac_mj.geometry.making.assembly import fixed_nodes, split_surfaces
+from biotac_mj.geometry.making.importing import read_obj, read_tet_mesh
 
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
 TABLE = PAPER.parent / "electrodes_nv_frame_mm.csv"

@@ -14,7 +14,7 @@ import biotac_mj
 from biotac_mj.cli import main
 from biotac_mj.data.generation.synthetic_sensor import SensorVariation
 from biotac_mj.geometry.design import Design, read_design
-from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
+from biotac_mj.geometry.making.pads import block, dome_core, dome_shell, plate
 from biotac_mj.geometry.skins import place_of
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 from biotac_mj.press import PressOptions, build_scene, plan_path, press, report

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from ..geometry.assembly import fixed_nodes
 from ..geometry.edge_nodes import EDGES, with_edge_nodes
+from ..geometry.making.assembly import fixed_nodes
 from ..geometry.skin_geometry import PARTS, SkinGeometry
 from ..geometry.skins import load_skin
 

@@ -273,33 +273,13 @@ class _Export:
         return pa.Table.from_arrays(arrays, names=list(self.all_features))
 
     def _tasks(self, pa):
-        """The tasks' texts are the index of a pandas frame: its metadata says so."""
+        """The tasks' texts are the index of a pandas frame, as the metadata that pandas reads says."""
         table = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), "task": self.tasks})
-        column = {
-            "field_name": "task_index",
-            "name": "task_index",
-            "pandas_type": "int64",
-            "numpy_type": "int64",
-            "metadata": None,
-        }
-        text = {
-            "field_name": "task",
-            "name": "task",
-            "pandas_type": "unicode",
-            "numpy_type": "object",
-            "metadata": None,
-        }
-        header = {
-            "field_name": None,
-            "name": None,
-            "pandas_type": "unicode",
-            "numpy_type": "object",
-            "metadata": {"encoding": "UTF-8"},
-        }
+        text = dict(field_name="task", name="task", pandas_type="unicode", numpy_type="object", metadata=None)
         pandas = {
             "index_columns": ["task"],
-            "column_indexes": [header],
-            "columns": [column, text],
+            "column_indexes": [],
+            "columns": [text],
             "pandas_version": "2.0.0",
         }
         self._parquet("meta/tasks", table.replace_schema_metadata({"pandas": json.dumps(pandas)}))

@@ -1,8 +1,6 @@
 """`calibrate` by gradients: one press gives the forces and their derivatives by all parameters; finite
 differences need a press for each."""
 
-import dataclasses
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,52 +11,22 @@ from ..calibration import calibrate as calibrate_with
 from ..calibration.forward import Steps, steps_of
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
-from .record import Record, follow
+from .record import follow
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, push_forward
 
 _PRECISION = 1e-4  # of derivatives, which only set the direction
 
 
-@dataclasses.dataclass
-class _Press:
-    """The last press, as initial guess of the next.
-
-    Attributes:
-      skin, indentation, parameters: identify it.
-      scaled: (p,) parameters. steps: records. slopes: (p, 1, nstep, nvert, 3) derivatives of their nodes.
-    """
-
-    skin: Skin
-    indentation: Indentation
-    parameters: list
-    scaled: np.ndarray
-    steps: list[Record]
-    slopes: np.ndarray
-
-    def of(self, skin: Skin, indentation: Indentation, parameters: list) -> bool:
-        """Whether it belongs to these."""
-        return self.skin is skin and self.indentation is indentation and self.parameters == parameters
-
-    def guesses(self, scaled: np.ndarray) -> list[torch.Tensor | None]:
-        """First-order guess of the nodes (nvert, 1, 3) of each step for other parameters. None if the step
-        did not converge or may have several equilibria: which one is found must depend on the press only, not
-        on earlier ones."""
-        moved = np.tensordot(scaled - self.scaled, self.slopes, 1)[0, :, :, None]
-        unsure = [step.on_core or step.changes[0].sharp or step.changes[0].lost for step in self.steps]
-        return [None if no else step.x + dx for step, dx, no in zip(self.steps, moved, unsure)]
-
-
 class Forces:
-    """`calibration.fit.forces_and_jacobian` by gradients. Caches the skin between calls, and the last press
-    as a guess.
+    """`calibration.fit.forces_and_jacobian` by gradients. Caches the skin between calls.
 
     Raises:
       ValueError: a parameter without gradient.
     """
 
     def __init__(self):
-        self._skins, self._last = {}, None
+        self._skins = {}
 
     def __call__(
         self,
@@ -83,28 +51,16 @@ class Forces:
         slopes = torch.autograd.functional.jacobian(numbers, values).numpy()
         slopes = slopes * [p.slope(float(v)) for p, v in zip(parameters, values)]
         friction = material.friction if "friction" not in names else float(values[names.index("friction")])
-        press = functools.partial(
-            follow,
-            skin,
-            steps.pos[None],
-            steps.mat[None],
-            np.array([friction]),
-            dict(zip(NUMBERS, numbers(values))),
-            dt=steps.dt,
-        )
-        scaled = np.array([p.scaled(float(v)) for p, v in zip(parameters, values)])
-        last = self._last if self._last and self._last.of(skin, indentation, parameters) else None
-        trajectory = press(guesses=last and last.guesses(scaled))
-        if last and trajectory.steps[-1].changes[0].lost:
-            trajectory = press()
+        made = dict(zip(NUMBERS, numbers(values)))
+        path = steps.pos[None], steps.mat[None]
+        trajectory = follow(skin, *path, np.array([friction]), made, dt=steps.dt)
         by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
         tangents = Inputs(
             np.zeros((len(parameters), 1, len(steps.pos), 1, 6)),
             np.array(by_friction)[:, None],
             dict(zip(NUMBERS, slopes[..., None])),
         )
-        found = push_forward(skin, trajectory, tangents, last and last.slopes)
-        self._last = _Press(skin, indentation, list(parameters), scaled, trajectory.steps, found.nodes)
+        found = push_forward(skin, trajectory, tangents)
         change = found.wrench[:, 0, steps.ends, 0, :3]
         force = np.array([trajectory.steps[i].wrench[0, 0, :3].numpy() for i in steps.ends])
         return force, np.moveaxis(change, 0, -1), sum(r.changes[0].lost for r in trajectory.steps)

@@ -3,7 +3,6 @@ final state of every step. No step is solved twice."""
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from ..skin.program import Launcher
 from ..skin.state import SavedState
 from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, SkinWorlds
-from .touching import Anchors, at_sharp_edges, find_touching, rows, touching_samples
+from .touching import Anchors, at_sharp_edges, find_touching, rows
 
 _NOTHING = 1e-15  # of the largest energy density of the rubber
 _WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds` in a step
@@ -61,7 +60,6 @@ class Record:
       touches, slips: samples in contact, slipping, at its end.
       yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped, (n,) points that
         exceeded their largest energy; empty without memory.
-      on_core: samples in contact with the core, at its end.
       changes: of each world, relative to the step before. smoothing: half width of first contact [m].
       dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`.
     """
@@ -79,7 +77,6 @@ class Record:
     slips: torch.Tensor
     yields: np.ndarray
     loads: np.ndarray
-    on_core: int
     changes: list[Changes]
     dt: float
     constants: np.ndarray
@@ -106,7 +103,6 @@ def follow(
     dt: np.ndarray | None = None,
     constants: np.ndarray | None = None,
     smoothing: float = 0.0,
-    guesses: Sequence[torch.Tensor | None] | None = None,
 ) -> Trajectory:
     """Moves the geoms along paths, from skins at rest.
 
@@ -118,8 +114,6 @@ def follow(
       dt: (nstep,) times of the steps [s]; required for a Prony series.
       constants: of the rubber's memory; None: the skin's.
       smoothing: half width of first contact, see `press` [m].
-      guesses: for each step an initial guess of the nodes (nvert, nworld, 3) [m], None: from the step before.
-        The press then ends at the first step without equilibrium.
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
@@ -147,13 +141,8 @@ def follow(
     steps, before = [], None
     for t in range(pos.shape[1]):
         geoms.set_pose(pos[:, t], mat[:, t])
-        if guesses and guesses[t] is not None:
-            wp.to_torch(data.increment).copy_(guesses[t] - wp.to_torch(data.x))
-            data.worlds.guessed.fill_(1)
         before = advance(skin, geoms, before, float(dt[t]), constants)
         steps.append(before)
-        if guesses and any(changes.lost for changes in before.changes):
-            break
     return Trajectory(rest, steps, vert)
 
 
@@ -202,10 +191,9 @@ def advance(
     counts = {name: count.expand(skin.nworld).tolist() for name, count in counts.items()}
     changes = [Changes(**{name: of[w] for name, of in counts.items()}) for w in range(skin.nworld)]
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else x.new_zeros(skin.nworld)
-    on_core = len(touching_samples(data.core.trial_geom)[0]) if data.core else 0
     return Record(
         geoms, x, x_last, begun, anchors, poses, skin.read(*_WORLD), skin.tensor(data.wrench).clone(),
-        pressure, touches, slips, yields, loads, on_core, changes, dt, constants, skin.smoothing,
+        pressure, touches, slips, yields, loads, changes, dt, constants, skin.smoothing,
     )  # fmt: skip
 
 

@@ -112,16 +112,12 @@ def pull_back(skin: SkinWorlds, trajectory: Trajectory, outputs: Outputs, shape:
     return found
 
 
-def push_forward(
-    skin: SkinWorlds, trajectory: Trajectory, inputs: Inputs, guess: np.ndarray | None = None
-) -> Outputs:
+def push_forward(skin: SkinWorlds, trajectory: Trajectory, inputs: Inputs) -> Outputs:
     """Tangents of the outputs from k tangents of the inputs.
 
     Args:
       inputs: with arrays of a leading k: pose (k, nworld, nstep, ngeom, 6), friction (k, nworld, ngeom),
         numbers (k, nworld), ...
-      guess: (k, nworld, nstep, nvert, 3) initial guess of the nodes' tangents, such as those of a similar
-        press.
 
     Returns:
       Outputs with a leading k, arrays of the host.
@@ -130,7 +126,6 @@ def push_forward(
     steps, k, like = trajectory.steps, len(inputs.pose), trajectory.steps[0].x
     pose, friction = skin.tensor(inputs.pose).permute(0, 2, 3, 1, 4), skin.tensor(inputs.friction).mT
     numbers = {name: skin.tensor(inputs.numbers[name]) for name in NUMBERS}
-    guess = None if guess is None else skin.tensor(guess).permute(2, 0, 3, 1, 4)
     moves, none = inputs.vert is not None, like.new_zeros(skin.nworld)
     x, pressure, anchors = [torch.zeros_like(like)] * k, [none] * k, [None] * k
     memory, out = [no_memory(skin)] * k, []
@@ -157,7 +152,6 @@ def push_forward(
                 vert[i] if moves else None,
                 memory[i],
                 constants[i] if t is not None else 0 * constants[i],
-                None if guess is None or t is None else guess[t, i],
             )
             wrench.append(six)
         return torch.stack(wrench)

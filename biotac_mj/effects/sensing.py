@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..geometry.design import BIOTAC
-from ..geometry.electrodes import electrode_positions
+from ..geometry.design import BIOTAC, electrode_positions
 from ..sensor.channels import PDC_REST
 from ..sensor.presets import MOST_LATENCY, Sensor
 from .effect import Effect, Param, Run, Whole, memory, shifted

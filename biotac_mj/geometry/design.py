@@ -234,3 +234,8 @@ def check_nelectrode(design: Design, nelectrode: int, whose: str) -> None:
 
 
 BIOTAC = read_design("biotac")
+
+
+def electrode_positions(design: Design = BIOTAC) -> np.ndarray:
+    """(nelectrode, 3) [mm], in the design's published frame: that of Lin et al. 2013 for the BioTac."""
+    return np.array(design.electrodes_mm)

@@ -10,12 +10,12 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist, squareform
 
 from ..files import refuse_existing, write_json
-from ..geometry.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
 from ..geometry.core_surface import CoreSurface
 from ..geometry.design import DESIGNS, Design
 from ..geometry.edge_nodes import with_edge_nodes
-from ..geometry.importing import read_obj, read_tet_mesh
-from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
+from ..geometry.making.assembly import EMPTY, FIXED_WITHIN, assemble, fixed_nodes
+from ..geometry.making.importing import read_obj, read_tet_mesh
+from ..geometry.making.pads import block, dome_core, dome_shell, on_ellipsoid, plate
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.solid import check_size
 from ..geometry.tet_mesh import TetMesh, connected_cells, enclosed_volume

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from ...geometry.closest import ray_distances
 from ...geometry.core_surface import CoreSurface
-from ...geometry.pads import column_tetrahedra
+from ...geometry.making.pads import column_tetrahedra
 from ...geometry.rigid import across
 from ...geometry.skin_geometry import SkinGeometry
 from ...geometry.surface import face_areas, node_normals

@@ -17,8 +17,7 @@ import numpy as np
 from ...effects.rubber import modulus_of
 from ...geometry import load_skin
 from ...geometry.core_surface import CoreSurface
-from ...geometry.design import BIOTAC, Design
-from ...geometry.electrodes import electrode_positions
+from ...geometry.design import BIOTAC, Design, electrode_positions
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.film import excitation_places
 from ...sensor.presets import Sensor, draw_sensor

@@ -172,7 +172,6 @@ def solve_by_gmres(
     inverse: Callable[[torch.Tensor], torch.Tensor],
     right: torch.Tensor,
     precision: float,
-    start: torch.Tensor | None = None,
     most: int = _MOST,
     digits: float = 0.0,
     restart: int = _MOST,
@@ -187,7 +186,6 @@ def solve_by_gmres(
       product, inverse: A and its approximate inverse times a tensor (n, nworld, 3).
       right: (n, nworld, 3).
       precision: relative error of x in each world.
-      start: initial guess, such as solutions of similar systems.
       most: largest number of products.
       digits: reduction of a residual before it is recomputed; 0: never.
       restart: size of the basis.
@@ -195,12 +193,8 @@ def solve_by_gmres(
     Raises:
       ValueError: no convergence within `most`: a matrix is nearly singular.
     """
-    x, residual = torch.zeros_like(right), right
-    if start is not None and start.any():
-        x, residual = start.clone(), right - product(start)
-    z = inverse(residual)
-    size = _lengths(_rows(z if residual is right else x))
-    wanted, count = precision * size, 0
+    x, z = torch.zeros_like(right), inverse(right)
+    wanted, count = precision * _lengths(_rows(z)), 0
     while True:
         beta = _lengths(_rows(z))
         going = ~(beta <= wanted)

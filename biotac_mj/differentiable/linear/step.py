@@ -106,10 +106,8 @@ class LinearStep:
             self._inverses[transpose] = made
         return self._inverses[transpose]
 
-    def solve(
-        self, r: torch.Tensor, transpose: bool = False, start: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """K^-1 r or K^-T r for r (nvert, nworld, 3), from an initial guess `start`; zero at fixed nodes."""
+    def solve(self, r: torch.Tensor, transpose: bool = False) -> torch.Tensor:
+        """K^-1 r or K^-T r for r (nvert, nworld, 3); zero at fixed nodes."""
         with single_thread():
             inverse = self._inverse(transpose)
             found, count = solve_by_gmres(
@@ -117,7 +115,6 @@ class LinearStep:
                 inverse,
                 r * self._free,
                 self._skin.precision,
-                start,
                 digits=inverse.digits,
                 restart=inverse.restart,
             )
@@ -194,11 +191,9 @@ class LinearStep:
         vert: torch.Tensor | None = None,
         memory: Memory | None = None,
         constants: torch.Tensor | None = None,
-        guess: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, Memory | None]:
         """Tangents of the step's outputs, as named in `pull`, from those of its inputs, of rest positions
-        (nvert, 3), of the old memory and of the memory's constants; omitted ones are zero. guess: (nvert,
-        nworld, 3) initial guess of the nodes' tangents."""
+        (nvert, 3), of the old memory and of the memory's constants; omitted ones are zero."""
         given = self.none() | given
         outer, core, at, s = self._outer, self._core, self.touching, self._outer.slopes
         felt, anchor = outer.push(given)
@@ -223,7 +218,7 @@ class LinearStep:
             fixed = (1 - self._free) * vert[:, None]
             moved = push_rest(self._skin, self.record.x[:, 0].numpy(), vert.numpy())
             force += torch.from_numpy(moved)[:, None] - self._whole_tangent(fixed)
-        x = self.solve(force, start=None if guess is None else guess * self._free) + fixed
+        x = self.solve(force) + fixed
         if memory:
             there = None if vert is None else vert.numpy()
             memory = self.memory.push(memory, own, moduli, x[:, 0].numpy(), there)

@@ -35,8 +35,7 @@ from scipy.special import j1
 from biotac_mj.cache import cached
 from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
 from biotac_mj.geometry.core_surface import CoreSurface
-from biotac_mj.geometry.design import BIOTAC, Design
-from biotac_mj.geometry.electrodes import electrode_positions
+from biotac_mj.geometry.design import BIOTAC, Design, electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import connected_cells

@@ -9,8 +9,7 @@ import numpy as np
 
 from ....effects.logged import SHARED
 from ....effects.sensing import Thermal
-from ....geometry.design import Design
-from ....geometry.electrodes import electrode_positions
+from ....geometry.design import Design, electrode_positions
 from ....recordings.recording import designed
 from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ...evidence import sign_flip

@@ -3,8 +3,7 @@ other have a touch, a bubble or a rub in common, which are no fault of electroni
 
 import numpy as np
 
-from ....geometry.design import BIOTAC, Design
-from ....geometry.electrodes import electrode_positions
+from ....geometry.design import BIOTAC, Design, electrode_positions
 
 __all__ = ["MOST", "ahead", "beyond", "neighbours"]
 

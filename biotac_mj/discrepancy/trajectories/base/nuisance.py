@@ -92,7 +92,7 @@ def _frame(design):
 def _neighbourhood(design, length=4.0):
     """(nelectrode, nelectrode) rows of weights that fall off with distance [mm] and sum to 1, zero on the
     diagonal."""
-    from ....geometry.electrodes import electrode_positions
+    from ....geometry.design import electrode_positions
 
     p = electrode_positions(design)
     near = np.exp(-((np.linalg.norm(p[:, None] - p[None], axis=2) / length) ** 2)) * (1 - np.eye(len(p)))

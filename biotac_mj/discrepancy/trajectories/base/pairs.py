@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ....effects.electrodes import Exchange
 from ....effects.sensing import CrossTalk
-from ....geometry.electrodes import electrode_positions
+from ....geometry.design import electrode_positions
 from ...evidence import signed_root_t
 from ..fitting import fit_effects
 

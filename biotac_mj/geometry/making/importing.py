@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 
-from biotac_mj.geometry.assembly import assemble
+from biotac_mj.geometry.making.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, connected_cells, enclosed_volume
 from biotac_mj.reading import read_text, reading

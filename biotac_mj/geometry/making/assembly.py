@@ -4,8 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from biotac_mj.geometry.core_surface import CoreSurface
-from biotac_mj.geometry.design import BIOTAC, Design
-from biotac_mj.geometry.electrodes import electrode_positions
+from biotac_mj.geometry.design import BIOTAC, Design, electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.solid import check_size
 from biotac_mj.geometry.surface import face_areas

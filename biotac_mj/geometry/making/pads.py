@@ -6,7 +6,7 @@ any other unit of length."""
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .tet_mesh import TetMesh
+from ..tet_mesh import TetMesh
 
 
 def _disc(rings):
