@@ -25,8 +25,6 @@ _SURE = 16.0  # nats: changes match the size and ends of the band by chance once
 _NEAR = 1 / 16  # of the band
 _LOOSE = 1 / 4  # of the band, if other channels overflow: the load moves channels meanwhile
 _TIMES = 3  # overflows in each direction: a single excursion may be a spike
-# for a single excursion: smallest band and shortest duration in rows
-_LARGE, _AWAY = 1024, 3
 _USUAL = 0.95  # quantile of the channel's steps; larger ones come from the load
 _FRACTION = 0.8  # least fraction of overflows among changes of more than half a band
 
@@ -183,22 +181,21 @@ def _overflowing(x):
                 and np.ptp(x[rows[0] + 1 :, k]) < band
             ):
                 once.append(k)
-            away = band >= _LARGE and len(mine) == 2 and _is_single_overflow(x[:, k], mine, band)
-            if not away and len(mine) < max(_TIMES, _FRACTION * len(rows)):
+            if len(mine) < max(_TIMES, _FRACTION * len(rows)):
                 continue
             after = x[mine[0] + 1 :, k]
             inside = after[: mine[-1] - mine[0]]
             ends = np.where(step[mine] < 0, x[mine + 1, k], x[mine, k])  # on the lower side
             same = np.unique(ends, return_counts=True)[1].max()  # a dropout always goes to the same count
             # one faulty bit of a word moves it out of the band
-            few = away or 2 * same <= len(ends)
+            few = 2 * same <= len(ends)
             # minus one band, an overflow is an ordinary step; a spike of nearly that size is not
             usual = np.quantile(np.delete(np.abs(step), rows), _USUAL) + 1
-            continues = away or np.median(remainder[remainder < _NEAR * band]) <= usual
+            continues = np.median(remainder[remainder < _NEAR * band]) <= usual
             if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few and continues:
                 both.append(k)
                 near = np.maximum(remainder[remainder < _NEAR * band], noise[k]) + 1
-                nats -= np.log(2 * near / band).sum() + (4 * np.log(_NEAR) if away else 0)
+                nats -= np.log(2 * near / band).sum()
         if both and nats > _SURE:
             return float(band), np.union1d(both, once).astype(int)
     return 0.0, np.zeros(0, int)
@@ -211,14 +208,3 @@ def _without_rails(x):
     ends = np.isin(x, (0, FULL_SCALE))
     ends &= np.pad(same, ((1, 0), (0, 0))) | np.pad(same, ((0, 1), (0, 0)))
     return last_measured(x, ends)
-
-
-def _is_single_overflow(x, rows, band):
-    """Whether x (n,), which leaves after the first and returns after the second of two rows, goes from one
-    end of a band to the other. Spikes and broken wires do not start and end there."""
-    ends = x[[rows[0], rows[0] + 1, rows[1], rows[1] + 1]] % band / band
-    near = np.minimum(ends, 1 - ends) < _NEAR
-    low = ends < 0.5
-    across = (low == [low[0], not low[0], not low[0], low[0]]).all()
-    one = np.abs(np.diff(x)[rows]).max() < 1.5 * band
-    return rows[1] - rows[0] >= _AWAY and near.all() and across and one

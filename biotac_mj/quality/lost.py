@@ -4,7 +4,7 @@ measured."""
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import percentile_filter, uniform_filter1d
+from scipy.ndimage import percentile_filter
 from scipy.signal import find_peaks
 
 from ..sensor.channels import FULL_SCALE
@@ -22,7 +22,6 @@ _NEVER = 1e-5  # fraction of rows in which that happens by chance
 _FEW = 4  # channels of 19 that may jump for other reasons
 _BEGUN = 2.0  # [s] accuracy of the start of an effect on all channels
 _CHANCE = 12.0  # nats: one in 1e5
-_WINDOW = 12  # rows of a window that shows whether a channel has noise
 _LEAST = 200  # rows
 # places to check; ratio of the other device's change there to its usual change: at least 5 where a logger
 # lost rows, at most 0.9 where only electrodes jump
@@ -31,9 +30,6 @@ _END, _MEETS = 4, 2.0  # rows at either end, and their largest distance in noise
 _LINE = 4  # rows of the line fitted on either side
 # least score of a jump, least ratio to its neighbourhood, and least distance between jumps in rows
 _SCORE, _TIMES, _SPACING = 4.0, 3.0, 13
-# [s] length of a bin and of a window; fraction of windows to ignore, since a step is no load; change [counts]
-# of the six most active of 19 channels within windows with contact
-_BIN, _SPAN, _LIVELIEST, _MOVED = 0.1, 3.0, 0.04, 6.0
 
 
 def dropped(log: Log) -> list[Fault]:
@@ -122,13 +118,12 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
         for i in _isolated(score, around)
         if all(abs(rows[i + _LINE] / log.rate - start) > _BEGUN for start in begun)
     ]
-    places = _in_order(_not_after_repeats(log, x, rows, places), x, before, after)
     if not places:
         return []
     # equal changes on all channels come from the supply, not from a load
     change = (after - before)[places]
     chosen = np.array(places)[np.abs(change.mean(1)) <= 2 * change.std(1)]
-    if not len(chosen) or not _moved(log):  # at rest a loss cannot be seen
+    if not len(chosen):
         return []
     at = rows[chosen + _LINE]
     when = ", ".join(f"{row / log.rate:.2f}" for row in sorted(at)[:6])
@@ -149,50 +144,6 @@ def _isolated(score, around):
     times = np.where(score > _SCORE, score / around, 0.0)
     places, _ = find_peaks(times, height=_TIMES, distance=_SPACING)
     return places[np.argsort(-times[places], kind="stable")].tolist()
-
-
-def _not_after_repeats(log, x, rows, places):
-    """Places that do not follow repeated or jittering rows, after which the load has moved on."""
-    bend = np.abs(np.diff(x, n=3, axis=0))
-    usual = np.maximum(np.median(bend, axis=0), 0.5)
-    return [
-        i
-        for i in places
-        if not log.masked[max(rows[i + _LINE] - 3 * _LINE, 0) : rows[i + _LINE] + 1].all(1).any()
-        and np.median(bend[max(i + _LINE - 2 * _WINDOW, 0) : i + _LINE - 3] / usual) > 0.4
-    ]
-
-
-def _in_order(places, x, before, after):
-    """Places with missing rows, without those at repeated or reversed rows: from these the signal jumps back
-    to another place."""
-    _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
-    again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * _LINE) > 0.4
-    out = []
-    for i in places:
-        size = np.linalg.norm(after[i] - before[i])
-        back = any(
-            np.linalg.norm(before[i] - before[j]) + np.linalg.norm(after[i] - after[j]) < 0.25 * size
-            for j in places
-            if j != i
-        )
-        if not back and not again[i : i + 2 * _LINE].any():
-            out.append(i)
-    return out
-
-
-def _moved(log):
-    """Whether channels change by tens of counts within seconds, as under a load."""
-    size = max(1, round(_BIN * log.rate))
-    m = len(log) // size
-    x = log.counts[: m * size].reshape(m, size, -1).mean(1)
-    span = min(max(4, round(_SPAN * log.rate / size)), m)
-    cells = x[: m // span * span].reshape(m // span, span, -1)
-    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]
-    power = ((cells - basis @ (basis.T @ cells)) ** 2).sum(1) / (span - 2)
-    liveliest = (power / np.maximum(power.mean(0), 1e-12)).max(1)
-    power = power[liveliest <= np.quantile(liveliest, 1 - _LIVELIEST)].mean(0)
-    return bool(np.median(np.sqrt(np.sort(power)[-max(1, log.some(6)) :])) >= _MOVED)
 
 
 def _alternative(log, found, rows, at, noise, x):

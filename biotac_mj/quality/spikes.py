@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 from scipy.stats import poisson
 
 from .evidence import NAN, by_block, evidence
@@ -16,15 +16,9 @@ __all__ = ["off_rows", "spikes"]
 _FEW = 4  # channels of 19 that may leave at once for other reasons
 _TIMES = 4  # samples of a channel, more than chance explains
 _ROWS = 7  # times the noise, distance of all of these from the signal
-# times the noise plus one count, distance of a sample from the signal; fraction of such samples in real
-# recordings
-_FAR, _BY_ITSELF = 20.0, 3e-6
+_FAR = 20.0  # times the noise plus one count, distance of a sample of a loose contact from the signal
 _RARE = 1e-5  # fraction of such rows by chance
-# channels that one cable may affect, and least ratio of their spikes to others': if more channels have as
-# many, the cause is a common one
-_CABLE, _MORE = 3, 1.4
-_COINCIDENT = 0.5  # fraction of samples of two channels in the same rows above which they have one cause
-_OFTEN_EACH = 3  # most of these per channel
+_CABLE = 3  # channels that one cable may affect: if more have as many spikes, the cause is a common one
 _ADJACENT, _REPEATED = 0.1, 0.3  # fraction of outliers side by side, without and with repeated rows
 _GONE = 100  # [counts] by which most channels leave for a row: no load does that
 _MOST = 12  # channels of 19 that leave and return at once: no touch lasts one or two rows
@@ -32,43 +26,36 @@ _SPAN = 7  # rows of the running median
 
 
 def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Finds spikes: single samples far from the signal, in one channel, in several channels of the same row,
-    or in any channel now and then. Channels that often leave for longer have the fault "contact"."""
+    """Finds channels with single samples far from the signal. Those that often leave for longer have the
+    fault "contact"."""
     x, coarse = log.counts, np.zeros(log.channels)
     for f in faults:
         if f.step:
             coarse[list(f.channels)] = f.step
     bad = _outliers(x, coarse) & ~log.masked
     bad &= bad.sum(1, keepdims=True) <= max(1, log.some(_FEW))  # an event of all has another cause
-    number = bad.sum(0)  # compared with neighbouring samples only
-    ordered = np.concatenate([np.zeros(_CABLE), np.sort(number)])
+    number = bad.sum(0)
     off = np.abs(x - running_median(x, _SPAN, "mirror"))
     far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
-    own = (far.sum(0) >= _TIMES) & (number > _MORE * (1 + ordered[-1 - _CABLE]))
-    own &= (far.sum(0) >= _TIMES).sum() <= _CABLE
     found = []
-    for alike in _coincident(bad):
-        k = int(alike[0])
+    for k in np.argsort(-number, kind="stable")[: np.count_nonzero(number >= _TIMES)]:
         if _consecutive(log, bad[:, k]):
             if far[:, k].sum() >= _TIMES:
-                found.append(_loose_contact(log, k, bad[:, k]))
+                found.append(_loose_contact(log, int(k), bad[:, k]))
             continue
         mask = np.zeros(x.shape, bool)
-        mask[:, alike] = bad[:, alike]
+        mask[:, k] = bad[:, k]
         message = (
-            f"{number[k]} samples of {log.name(alike)} leave their neighbours by more than ten times the "
-            f"noise, {'in the same rows' if len(alike) > 1 else 'one at a time'}"
+            f"{number[k]} samples of {log.name([k])} leave their neighbours by more than ten times the "
+            "noise, one at a time"
         )
-        one = _spikes(log, alike, mask, number[k], message, by_block(mask[:, k], _RARE))
-        others = (
-            1 if len(alike) > 1 else 1 + np.append(np.zeros(_CABLE), np.sort(np.delete(number, k)))[-_CABLE]
-        )
+        one = _spikes(log, [k], mask, number[k], message, by_block(mask[:, k], _RARE))
+        # one cable may have several channels: as many more must have fewer
+        others = 1 + np.append(np.zeros(_CABLE), np.sort(np.delete(number, k)))[-_CABLE]
         one.p = float(poisson.sf(number[k] - 1, others))
         one.features["alone"] = float(np.log(number[k] / others))
-        if own[k]:
-            _by_far(one, far[:, k], log)
         found.append(one)
-    return found + _scattered(log, far)
+    return found
 
 
 def _spikes(log, channels, mask, number, message, strength):
@@ -97,22 +84,6 @@ def _loose_contact(log, k, bad):
     return Fault("contact", (k,), rows[0] / log.rate, rows[-1] / log.rate, message)
 
 
-def _coincident(bad):
-    """Channels with a few outliers bad (n, c) bool, each with those that have them in the same rows. Healthy
-    sensors have none, so these are no evidence against each other. Most samples first."""
-    number = bad.sum(0)
-    near = maximum_filter1d(bad.astype(np.int8), 3, axis=0)
-    fraction = bad.T.astype(float) @ near / np.maximum(number, 1)[:, None]
-    alike = np.minimum(fraction, fraction.T) >= _COINCIDENT
-    unassigned, out = number >= _TIMES, []
-    for k in np.argsort(-number, kind="stable"):
-        if unassigned[k]:
-            mine = [int(k), *(int(j) for j in np.flatnonzero(alike[k] & unassigned) if j != k)]
-            unassigned[mine] = False
-            out.append(tuple(mine))
-    return out
-
-
 def _consecutive(log, bad):
     """Whether outliers (n,) bool are often consecutive: a loose contact or an overflow lasts longer than a
     sample. Rows that the logger repeats count as one, unless too many repeat."""
@@ -122,28 +93,6 @@ def _consecutive(log, bad):
         np.count_nonzero(np.diff(at) == 1) > max(1, fraction * len(at))
         for at, fraction in ((fresh, _ADJACENT), (rows, _REPEATED))
     )
-
-
-def _by_far(fault, far, log):
-    """Adds evidence of outliers far (n, ...) bool that no channel has by chance."""
-    fault.p = min(fault.p, float(poisson.sf(far.sum() - 1, _BY_ITSELF * log.channels * len(far))))
-    fault.detector = "far"
-
-
-def _scattered(log, far):
-    """Finds rare outliers far (n, c) bool in any channel: bits or words lost in transmission."""
-    number = far.sum(0)
-    hit = np.flatnonzero(number)
-    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):  # more are a fault of the channel
-        return []
-    message = (
-        f"{number.sum()} samples of {log.name(hit)} leave their neighbours by more than {_FAR:.0f} times the "
-        "noise, one at a time"
-    )
-    found = _spikes(log, hit, far, number.sum(), message, by_block(far.any(1), _RARE))
-    found.p = 1.0
-    _by_far(found, far, log)
-    return [found]
 
 
 def off_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:

@@ -20,15 +20,11 @@ _BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
 # middle half of the channel's range; fraction of samples there that a low-pass makes constant: 0.45 to 0.61
 # for low-passes of three authors, 0 at limits (34 channels of five authors)
 _INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
-# least duration in rows (no spike); neighbouring rows, and ratio of a jump to their steps
-_STAY, _ADJACENT, _THROWN = 3, 4, 3.0
 _STANDS = 8.0  # [counts] most jitter of a constant channel
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
 _ALIVE = 1.2  # [counts] of noise, four times that of rounding
 _STAYS_PUT = 0.8  # of the samples between the first and the last constant one
-_MOVED = 6.0  # times its noise, that a channel with a limit moves by
-_OFTEN = 0.5  # of the rows at a limit that stay there: 0.44 at most at codes that a converter prefers
 
 
 def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
@@ -66,14 +62,10 @@ def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     limited = fraction > np.maximum(_FRACTION, 6 * ordered[-1 - max(1, log.some(8))])
     # a row that repeats another has the same state
     before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
-    sure = _thrown_to_an_end(log) | _long_constant(log, log.read[rows])[before]
-    side = _limits(log, rows)
+    sure = _long_constant(log, log.read[rows])[before]
     found = []
-    for k in np.flatnonzero(single | limited | sure.any(0) | (side != 0)):
+    for k in np.flatnonzero(single | limited | sure.any(0)):
         if k in known:
-            continue
-        if side[k]:
-            found.append(_limited(log, int(k), int(side[k])))
             continue
         at = np.zeros(len(rows), bool)
         at[1:-1] = quiet[:, k] & (single | limited)[k]
@@ -92,37 +84,6 @@ def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     return found
 
 
-def _limits(log, rows):
-    """(c,) side of the channels that stand still at an end of what they read in rows (n,), and elsewhere do
-    not: 1 the upper, -1 the lower end, 0 none. However often that is: a channel may rest at its limit."""
-    x = log.read[rows]
-    same = np.diff(x, axis=0) == 0
-    out = np.zeros(log.channels, int)
-    noise = sound_noise(np.median(x, axis=0))
-    alive = (noise > _ALIVE) & (np.ptp(x, axis=0) > _MOVED * noise)
-    for side in (1, -1) if log.signed and log.converter else ():  # else the rest may be an end
-        end = side * (side * x).max(0)
-        at = x[1:] == end
-        stays = (same & at).sum(0)
-        chance = ((same & ~at).sum(0) + 1) / ((~at).sum(0) + 1)  # noise repeats a value as often elsewhere
-        often = np.maximum(chance, np.median(chance))
-        sure = (stays * -np.log(often) > _CHANCE + np.log(x.size)) & (stays > _OFTEN * at.sum(0))
-        for k in np.flatnonzero(sure & alive & (out == 0)):
-            ends = _moving_range(x[1:][~at[:, k], k])
-            comes = len(runs(at[:, k])[0])
-            if comes > 1 and _at_ends(end[[k]], ends)[side > 0].all():
-                out[k] = side
-    return out
-
-
-def _limited(log, k, side):
-    """Fault of channel k with a limit at one side of what it reads."""
-    start, length = runs(log.read[:, k] == side * (side * log.read[:, k]).max())
-    found = _constant_fault(log, k, side, log.read[start, k], start, length)
-    on = np.flatnonzero(found.mask[:, k])
-    return _with_ties(found, len(start), found.mask[on[0] : on[-1] + 1, k].mean() > _STAYS_PUT)
-
-
 def _long_constant(log, x):
     """(n, c) bool: samples of x (n, c) that repeat longer than chance allows. If a step is zero with
     probability q, runs of m steps have probability q^m, and the longest in n rows is about log n / -log q. q
@@ -135,22 +96,6 @@ def _long_constant(log, x):
         sure = (nats > _CHANCE + np.log(x.size)) & (length >= _BRIEF * log.rate)
         for a, n in zip(start[sure], length[sure]):
             out[a : a + n + 1, k] = True
-    return out
-
-
-def _thrown_to_an_end(log):
-    """(n, c) bool: samples at an end of the converter for longer than a spike, entered or left by a step
-    larger than those around it, which no load makes."""
-    out = np.zeros(log.counts.shape, bool)
-    ends = np.isin(log.read, (0, FULL_SCALE)) & ~log.masked & log.converter
-    for k in np.flatnonzero(ends.any(0)):
-        step = np.abs(np.diff(log.read[:, k], prepend=np.nan, append=np.nan))
-        for a, n in zip(*runs(ends[:, k])):
-            sides = (step[a], step[max(a - _ADJACENT, 0) : a]), (step[a + n], step[a + n + 1 :][:_ADJACENT])
-            thrown = [
-                one > _THROWN * max(np.nanmax(neighbours, initial=1.0), 1.0) for one, neighbours in sides
-            ]
-            out[a : a + n, k] = n >= _STAY and any(thrown)
     return out
 
 
@@ -213,7 +158,7 @@ def _constant_faults(log, k, still, sure):
             continue
         if not side and np.median(ranges[mine]) > _STANDS:
             continue  # no noise but movement: low-pass or smaller gain
-        if not side and (found or length.max() < _BRIEF * log.rate and not sure.any()):
+        if not side and (found or length.max() < _BRIEF * log.rate):
             continue
         one = _constant_fault(log, k, side, values[mine], start[mine], length[mine])
         if (one.mask[:, k] & sure).any():

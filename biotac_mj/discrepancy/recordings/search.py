@@ -14,9 +14,9 @@ from ...recordings.protocol import Protocol
 from ..evidence import discoveries
 from .candidates import as_candidates, as_log
 from .confidence import NAMED, confidence
-from .detectors.jumps import jumped, jumped_alike
+from .detectors.jumps import jumped
 from .detectors.lagging import lagging
-from .detectors.latency import clock_offset, delayed
+from .detectors.latency import delayed
 from .detectors.levels import levels, settle
 from .detectors.order import slipped
 from .diagnosis import RecordingDiagnosis, concluded
@@ -92,8 +92,6 @@ def _levels(session, named):
     """Channels that are exchanged, jumps, and trends over time, the strongest first."""
     if (finding := slipped(session)) is not None:
         _take(session, finding, named)
-    if (finding := jumped_alike(session)) is not None:
-        _take(session, finding, named)
     for finding in jumped(session):
         _take(session, finding, named)
     refused = set()
@@ -116,9 +114,7 @@ def _beside(session, checked, named):
     for fault in lost_rows(as_log(session.recording, session.counts, session.masked), checked.faults, begun):
         fault.confidence = confidence(fault)
         _adopt(session, *(([fault], []) if clear(fault, named) else ([], [fault])))
-    if offset := clock_offset(session):
-        session.unnamed.append(offset)
-    elif (finding := delayed(session)) is not None:
+    if (finding := delayed(session)) is not None:
         _take(session, finding, named)
     if (finding := lagging(session)) is not None:
         _take(session, finding, named)
@@ -183,7 +179,7 @@ def _proved(session):
 
 def _checkup(session, protocol, named):
     """Findings of single stretches of a protocol that the whole log does not show."""
-    r, known, found = session.recording, list(session.findings), []
+    r, found = session.recording, []
     for touched, rows in stretches(r, protocol):
         some = diagnose_recording(r.part(rows), named=named).findings
         if not touched:  # nothing but noise is there
@@ -193,22 +189,13 @@ def _checkup(session, protocol, named):
                 fault.confidence = confidence(fault)
             some += as_candidates([f for f in more if clear(f, named)])[0]
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
-        found += [moved(f, rows, r) for f in some if not f.kind.silent and not _told(f, known)]
+        found += [moved(f, rows, r) for f in some if not f.kind.silent]
     enough = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
     for finding, yes in zip(found, enough):
         if not yes or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
         elif not any(f.id == finding.id and _alike(f, finding) for f in session.findings):
             session.accept(finding)  # no other stretch has said it
-
-
-def _told(finding, known):
-    """Whether the whole log says of these electrodes what a stretch of it does, or has another cause for a
-    level there: an exchange, a loss of liquid or a jump looks like a drift in a part."""
-    level = finding.trend is not None
-    return any(
-        f.id == finding.id or level and not f.delay and not f.of_log for f in known if _alike(f, finding)
-    )
 
 
 def _alike(one, other):

@@ -1,7 +1,6 @@
 """Jumps of an electrode from one row to the next, which no load and no drift makes: straight lines on either
-side do not meet, on no other electrode at that row but a few that jump with it and are no patch
-(`together.py`), and it stays where it has jumped to. A touch that one electrode alone feels makes such an
-edge as well; when the load is as it was it is gone, and a jump is not."""
+side do not meet, on no other electrode at that row, and it stays where it has jumped to. A touch that one
+electrode alone feels makes such an edge as well; when the load is as it was it is gone, and a jump is not."""
 
 import typing
 
@@ -10,13 +9,11 @@ from scipy.ndimage import maximum_filter1d
 
 from ....quality.beside import last_measured, line_ends
 from ....quality.noise import noise_level
-from ....recordings.recording import designed
 from ..candidates import Candidate
 from ..conditional import Conditional
 from ..session import Session
-from .together import MOST, beyond, neighbours
 
-__all__ = ["Edge", "edges", "jumped", "jumped_alike"]
+__all__ = ["Edge", "edges", "jumped"]
 
 _LINE = 6  # rows of a line
 _AROUND = 36  # rows on either side
@@ -37,8 +34,6 @@ _MATCH, _BINS = 0.05, 1000
 # anything where the load never is
 _KEPT = 0.5
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
-# times the noise and what electrodes differ by, that all jump alike
-_ALIKE = 8.0
 # logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
 _CURVED = 0.18
 # standard errors of a gain: with less a level alone has changed, with more nothing is known of the gain
@@ -47,7 +42,7 @@ _SURE, _UNSURE = 0.2, 0.5
 
 class Edge(typing.NamedTuple):
     """A jump: time [s], step [counts], how many times what is around it (times) and what is on others
-    (alone; of those that jump together the product)."""
+    (alone)."""
 
     time: float
     step: float
@@ -71,19 +66,15 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
     times = np.zeros_like(size)  # not used elsewhere
     times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
-    near = maximum_filter1d(size, 3, axis=0)
-    log = np.log(np.maximum(near, 1.0))
-    still = [np.exp(beyond(log, most))[:, None] for most in (1, MOST)]  # of those that do not jump
-    single, several = (size / s for s in still)
-    clear = [peak & (times > _TIMES) & (a > _ALONE) & (times * a > _BOTH) for a in (single, several)]
-    if not clear[1].any():
+    second = np.sort(maximum_filter1d(size, 3, axis=0), axis=1)[:, [-2]]
+    alone = size / np.maximum(second, 1.0)
+    clear = peak & (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
+    if not clear.any():
         return {}
     stays = _stays(x)
-    found: dict[tuple, tuple] = {}  # row, electrode: its height
-    passing = np.zeros(
-        x.shape[1]
-    )  # of each electrode: times and alone of the plainest step that did not stay
-    for i, k in zip(*np.nonzero(clear[0] | clear[1])):
+    found: dict[int, list[tuple]] = {}  # electrode: place and height of what stays
+    passing = np.zeros(x.shape[1])  # times and alone of the plainest step that does not
+    for i, k in zip(*np.nonzero(clear)):
         at = i + h
         # it came back from where it measured nothing, or rows were held or missing meanwhile
         if masked[max(at - h, 0) : at + h, k].any() or tick[at] - tick[at - 1] > _HELD:
@@ -95,32 +86,22 @@ def edges(session: Session) -> dict[int, list[Edge]]:
         least, most = _AT_ONCE
         if not least * abs(step[i, k]) - rough < np.abs(row).max() < most * abs(step[i, k]) + rough:
             continue
-        group = np.flatnonzero(near[i] > 1.001 * still[1][i])
         height = stays[at, k]
-        if k in group and not 0.5 < height / step[i, k] < 1.6:  # what jumps with it says nothing of the load
-            height = _stays(x, np.setdiff1d(group, [k]), slice(at, at + 1))[0, k]
         if 0.5 < height / step[i, k] < 1.6:
-            # within the error nothing moves
-            found[int(i), int(k)] = height if abs(height - step[i, k]) < rough else step[i, k]
-        elif clear[0][i, k]:
-            passing[k] = max(passing[k], times[i, k] * single[i, k])
-    out: dict[int, list[Edge]] = {}
-    for (i, k), height in found.items():
-        mine = _together(i, np.flatnonzero(near[i] > 1.001 * still[1][i]), found, designed(x))
-        alone = several[i, k] if k in mine else single[i, k]
-        # where touches make such steps that pass, one of these stays now and then
-        if alone > _ALONE and times[i, k] * alone > max(_BOTH, _PASSING * passing[k]):
-            # each of those that jump together says so by itself
-            joint = float(np.prod([max(near[i, j] / still[1][i, 0], 1.0) for j in mine])) if mine else alone
-            edge = Edge(rows[i + h] / r.rate, float(height), float(times[i, k]), max(joint, float(alone)))
-            out.setdefault(k, []).append(edge)
-    return {k: mine for k, mine in out.items() if len(mine) <= _MOST}
-
-
-def _together(row, electrodes, found, design):
-    """The electrodes that jump together at a row: most of the given ones, if they form no patch; or none."""
-    mine = {int(k) for k in electrodes} & {k for i, k in found if abs(i - row) <= 2}
-    return mine if len(mine) >= max(2, len(electrodes) / 2) and not neighbours(electrodes, design) else set()
+            within = abs(height - step[i, k]) < rough  # the error: nothing moves
+            found.setdefault(int(k), []).append((i, height if within else step[i, k]))
+        else:
+            passing[k] = max(passing[k], times[i, k] * alone[i, k])
+    out = {
+        k: [
+            Edge(rows[i + h] / r.rate, float(height), float(times[i, k]), float(alone[i, k]))
+            for i, height in mine
+            # where touches make such steps that pass, one of these stays now and then
+            if times[i, k] * alone[i, k] > _PASSING * passing[k]
+        ]
+        for k, mine in found.items()
+    }
+    return {k: mine for k, mine in out.items() if 0 < len(mine) <= _MOST}
 
 
 def _around(size, row, column):
@@ -133,10 +114,10 @@ def _around(size, row, column):
     return np.partition(around, rank, axis=1)[:, rank]
 
 
-def _stays(x, without=(), rows=slice(None)):
-    """(rows, nelectrode) by how much the mean of the rows after each row of x (n, nelectrode) lies above
-    that of the rows before it, less what the same of the other electrodes, some left out, says of it: the
-    load may have moved meanwhile."""
+def _stays(x):
+    """(n, nelectrode) by how much the mean of the rows after each row of x (n, nelectrode) lies above that of
+    the rows before it, less what the same of the other electrodes says of it: the load may have moved
+    meanwhile."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
     at = np.arange(len(x))
     a, b = np.maximum(at - _STAYS, 0), np.minimum(at + 1 + _STAYS, len(x))
@@ -146,12 +127,8 @@ def _stays(x, without=(), rows=slice(None)):
     change[[*at[:2], *at[-2:]]] = 0
     scale = np.maximum(1.4826 * np.median(np.abs(change), axis=0), 0.3)
     y = np.clip(change / scale, -_CLEAR, _CLEAR)  # no jump says what electrodes have in common
-    said = np.setdiff1d(np.arange(x.shape[1]), without)
-    y = y[:, said]
     given = Conditional(y.T @ y / len(y), np.full(y.shape[1], 0.05))
-    change, y, out = change[rows], y[rows], np.zeros_like(change[rows])
-    out[:, said] = change[:, said] + (given.residual(y) - y) * scale[said]
-    return out
+    return change + (given.residual(y) - y) * scale
 
 
 def _kept(session, k, at, total, jumping):
@@ -222,56 +199,6 @@ def jumped(session: Session) -> list[Candidate]:
             )
         )
     return out
-
-
-def jumped_alike(session: Session) -> Candidate | None:
-    """The plainest jump of all electrodes by the same counts, or by the same share of them: a touch moves
-    some more than others, what feeds them all does not."""
-    r = session.recording
-    rows = np.flatnonzero(~r.repeated)
-    tick = r.tick[rows]
-    if len(rows) < 200 or session.masked.mean() > 0.5:
-        return None
-    x = last_measured(session.counts[rows], session.masked[rows])
-    noise = np.maximum(noise_level(x), 0.7)
-    left, right, spread = line_ends(x, _LINE)
-    step = right - left
-    level = np.maximum(left + right, 1) / 2
-    offset, gain = (np.median(s, axis=1) for s in (step, step / level))
-    error = np.median(noise) * spread
-    apart = [np.median(np.abs(step - made), axis=1) for made in (offset[:, None], gain[:, None] * level)]
-    alike = np.abs(offset) / np.maximum(np.minimum(*apart) * 1.4826, error)
-    i = int(np.argmax(alike))
-    if alike[i] < _ALIKE:
-        return None
-    at, change = i + _LINE, float(offset[i])
-    stays = np.median(x[at : at + _STAYS].mean(0) - x[max(at - _STAYS, 0) : at].mean(0))
-    if not 0.5 < stays / change < 1.6 or tick[at] - tick[at - 1] > _HELD:
-        return None
-    by_gain = apart[1][i] < apart[0][i]
-    share, since = float(gain[i]), rows[at] / r.rate
-    error = float(error / np.sqrt(x.shape[1]))
-
-    def correct(counts, time):
-        late = (time >= since - 0.5 / r.rate)[:, None]
-        return counts / (1 + share * late) if by_gain else counts - change * late
-
-    what, width = (share, error / float(np.median(level[i]))) if by_gain else (change, error)
-    return Candidate(
-        "count_gain" if by_gain else "count_offset",
-        tuple(range(x.shape[1])),
-        since,
-        float(r.time[-1]),
-        f"from one row to the next all electrodes jump alike, by {change:+.0f} counts in the median",
-        {"change": (what, what - 2 * width, what + 2 * width)},
-        nats=float(alike[i] ** 2 / 2),
-        p=float(len(x) * np.exp(-(alike[i] ** 2) / 2)),
-        detector="slip",
-        sudden=True,
-        ties=("count_offset" if by_gain else "count_gain",),
-        correct=correct,
-        verified=True,  # by the rows themselves
-    )
 
 
 def _gains(session, k, since):

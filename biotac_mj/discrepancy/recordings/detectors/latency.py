@@ -6,10 +6,7 @@ on the electrodes' side of the regression, so that it never changes what has to 
 smoothed alike, by 20 ms, which takes the electrodes' noise out of the comparison.
 
 A log's electrodes are of the bus's last frame and its force is of now, so every log is late by up to a frame.
-Delays of a frame are therefore part of the model that a latency is compared with.
-
-Where they do not even move at the same times, one of them was logged by another clock, or with another touch
-(`clock_offset`)."""
+Delays of a frame are therefore part of the model that a latency is compared with."""
 
 from collections.abc import Callable
 
@@ -25,7 +22,7 @@ from ..conditional import Components
 from ..recording import FORCE_MOVED
 from ..session import Session
 
-__all__ = ["ForceView", "clock_offset", "delayed", "force_view"]
+__all__ = ["ForceView", "delayed", "force_view"]
 
 _BLOCKS = 24
 _SMOOTH = 0.02  # [s]
@@ -36,13 +33,6 @@ _P = 0.02
 _SOUND = 5  # delays that are tried within a frame
 _TAUS = np.geomspace(0.007, 0.4, 12)  # [s] of low-passes that a delay is compared with
 _TIE = 1.64  # standard errors, paired over blocks
-_BAND = (0.1, 1.0)  # [s] of smoothing between which touches move: noise is faster, drift slower
-_MOVES = 20.0  # [Hz] in which activities are compared
-_NEAR = 1.0  # [s] up to which what is late is an effect of the sensor
-_LEAST = 15.0  # [s]: in less two logs that have nothing in common may look alike
-# correlation of how much force and electrodes move, in 12 to 190 s of two real sensors: 0.70 to 0.96 as they
-# are; with the force put 3.4 s off at least 0.68 there and 0.48 at most in time; turned around 0.57 at most
-_FAR, _LESS, _NOTHING = 0.6, 0.15, 0.25
 
 
 class ForceView:
@@ -86,10 +76,6 @@ class ForceView:
     def at_delay(self, delay: float) -> np.ndarray:
         """(blocks,) mean of `errors` over components where the electrodes are `delay` [s] late."""
         return self.errors(lambda x: shifted(x, self.time, -delay)).mean(1)
-
-    def spread(self) -> np.ndarray:
-        """(blocks,) the same where the electrodes say nothing."""
-        return self.errors(np.zeros_like).mean(1)
 
     def at_low_pass(self, tau: float) -> np.ndarray:
         """(blocks,) the same where they follow the force by a first-order low-pass of tau [s]."""
@@ -166,52 +152,3 @@ def _vertex(x, y):
         return float(x[i])
     bend, slope, _ = np.polyfit(x[i - 1 : i + 2] - x[i], y[i - 1 : i + 2], 2)
     return float(np.clip(x[i] - 0.5 * slope / max(bend, 1e-12), x[i - 1], x[i + 1]))
-
-
-def clock_offset(session: Session) -> str | None:
-    """Line on force and electrodes of a loaded sensor that were logged by two clocks; None if they were not.
-    Touches that come again move both as well seconds later: where they do, the electrodes also tell the force
-    better."""
-    r = session.recording
-    n = len(r)
-    if r.force is None or not session.loaded or r.force.std(0).max() < FORCE_MOVED or n / r.rate < _LEAST:
-        return None
-    view = force_view(session, np.ones(n, bool))
-    if view is None:
-        return None
-    step = max(1, round(r.rate / _MOVES))
-    a, b = (_activity(x, r.rate)[::step] for x in (session.counts[:, view.usable], r.force))
-    met = view.at_delay(0.0)
-    m, rate = len(a), r.rate / step
-    size = 2 * m  # zeros behind: the end of a recording says nothing of its beginning
-    both = np.fft.irfft(np.fft.rfft(a, size).conj() * np.fft.rfft(b, size), size)
-    lag = (np.arange(size) + m) % size - m
-    c = both / np.maximum(m - np.abs(lag), 1)
-    near = np.abs(lag) <= _NEAR * rate
-    far = ~near & (np.abs(lag) <= m // 2)
-    if not far.any():
-        return None
-    best = np.flatnonzero(far)[c[far].argmax()]
-    here, there = c[near].max(), c[best]
-    late = -lag[best] / rate
-    if there >= _FAR and there - here >= _LESS and sign_flip(met - view.at_delay(late)) < _P:
-        when = "after" if lag[best] > 0 else "before"
-        return (
-            f"force and electrodes do not meet: it moves best as they do {abs(lag[best]) / rate:.1f} s "
-            f"{when} them; were they logged by two clocks, or is one from another row on?"
-        )
-    if here < _NOTHING and sign_flip(view.spread() - met) >= _P:
-        return "force and electrodes move at different times: are they of the same touches?"
-    return None
-
-
-def _activity(x, rate):
-    """(n,) how much the median column of x (n, k) moves, standardised; a column's fault does not count."""
-    fast, slow = (gaussian_filter1d(x, s * rate, axis=0, mode="nearest") for s in _BAND)
-    size = np.abs(fast - slow)
-    if x.shape[1] > 3:
-        size = np.median(size / np.maximum(size.mean(0), 1e-12), axis=1)
-    else:
-        size = np.linalg.norm(size, axis=1)
-    size = np.log(size + np.quantile(size, 0.2) + 1e-12)
-    return (size - size.mean()) / max(size.std(), 1e-12)
