@@ -65,16 +65,16 @@ def touched(seed=5, seconds=60, noise=2.0):
 
 
 def test_a_hard_release_is_no_jump():
-    """Three electrodes feel a touch that ends within one row; after it they read as before it, and one that
+    """One electrode feels a touch that ends within one row; after it it reads as before it, and one that
     jumped does not."""
     counts, _ = touched()
     last = 5800
-    counts[last - 90 : last, [1, 10, 16]] += np.rint(150 * np.linspace(0, 1, 90)[:, None] ** 0.3)
-    assert {1, 10, 16} <= set(edges(session(counts)))
+    counts[last - 90 : last, 10] += np.rint(150 * np.linspace(0, 1, 90) ** 0.3)
+    assert 10 in edges(session(counts))
     assert not jumped(session(counts))
     counts, _ = touched()
-    counts[last:, [1, 10, 16]] += 150
-    assert {f.channels for f in jumped(session(counts))} >= {(10,), (16,)}
+    counts[last:, 10] += 150
+    assert [f.channels for f in jumped(session(counts))] == [(10,)]
 
 
 def test_hard_touches_are_nothing_unusual():
@@ -89,20 +89,6 @@ def test_hard_touches_are_nothing_unusual():
     halves = np.r_[counts[2870:], counts[:2870]]
     halves[3129:] += np.rint(80 * rng.standard_normal(19))
     assert rest(session(halves)).features["sharp"] > 1
-
-
-def test_a_common_jump_is_a_jump_unless_of_a_patch():
-    """A plug has electrodes here and there, a touch has neighbours; a fourth that does not stay is none."""
-    counts, _, rng = pressed(3, 14)
-    counts = noisy(counts, rng)
-    apart, patch = counts.copy(), counts.copy()
-    apart[400:, [1, 10, 16]] += 150
-    assert set(edges(session(apart))) == {1, 10, 16}
-    assert {f.channels for f in jumped(session(apart))} == {(1,), (10,), (16,)}
-    apart[400:402, 7] += 150
-    assert set(edges(session(apart))) == {1, 10, 16}
-    patch[400:, [0, 1, 2]] += 150
-    assert not edges(session(patch))
 
 
 def test_electrodes_that_change_together_stand_out_of_the_others():
