@@ -99,50 +99,34 @@ class TetMesh:
           ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or
             non-manifold surface, unused vertices; the text says how many, which comes first and what to do.
         """
-        bad = np.flatnonzero(~np.isfinite(self.vert).all(axis=1))
-        if len(bad):
-            raise ValueError(
-                f"{len(bad)} vertices are NaN or infinite, the first is vertex {bad[0]}: "
-                "the file is damaged, export it again"
-            )
-        bad = np.flatnonzero(((self.elem < 0) | (self.elem >= len(self.vert))).any(axis=1))
-        if len(bad):
-            raise ValueError(
-                f"{len(bad)} tetrahedra name vertices outside 0..{len(self.vert) - 1}, "
-                f"the first is tetrahedron {bad[0]} = {self.elem[bad[0]].tolist()}: "
-                "indices must be 0-based (subtract 1 if the file counts from 1)"
-            )
-        corner = self.vert[self.elem]
-        longest = np.max(
-            [np.linalg.norm(corner[:, i] - corner[:, j], axis=1) for i, j in _FACE_PAIRS], axis=0
-        )
-        flat = np.flatnonzero(np.abs(self.volumes) <= _DEGENERATE * longest**3)
-        if len(flat):
-            raise ValueError(
-                f"{len(flat)} tetrahedra are degenerate (no volume), the first is tetrahedron {flat[0]} = "
-                f"{self.elem[flat[0]].tolist()}: "
-                "merge its nodes or mesh again with a larger edge length"
-            )
-        inverted = np.flatnonzero(self.volumes < 0)
-        if len(inverted):
-            remedy = (
-                "swap two indices of every tetrahedron"
-                if len(inverted) == len(self.elem)
-                else "swap two of its indices, or mesh again"
-            )
-            raise ValueError(
-                f"{len(inverted)} tetrahedra are inverted (negative volume), the first is tetrahedron "
-                f"{inverted[0]} = "
-                f"{self.elem[inverted[0]].tolist()}: {remedy}"
-            )
+        corner = "vertex {}".format
+        lost = ~np.isfinite(self.vert).all(axis=1)
+        _refuse(lost, "vertices are NaN or infinite", corner, "the file is damaged, export it again")
+
+        def tet(k):
+            return f"tetrahedron {k} = {self.elem[k].tolist()}"
+
+        outside = ((self.elem < 0) | (self.elem >= len(self.vert))).any(axis=1)
+        what = f"tetrahedra name vertices outside 0..{len(self.vert) - 1}"
+        _refuse(outside, what, tet, "indices must be 0-based (subtract 1 if the file counts from 1)")
+        edge = [self.vert[self.elem[:, i]] - self.vert[self.elem[:, j]] for i, j in _FACE_PAIRS]
+        flat = np.abs(self.volumes) <= _DEGENERATE * np.linalg.norm(edge, axis=2).max(axis=0) ** 3
+        remedy = "merge its nodes or mesh again with a larger edge length"
+        _refuse(flat, "tetrahedra are degenerate (no volume)", tet, remedy)
+        inverted = self.volumes < 0
+        remedy = "swap two of its indices, or mesh again"
+        remedy = "swap two indices of every tetrahedron" if inverted.all() else remedy
+        _refuse(inverted, "tetrahedra are inverted (negative volume)", tet, remedy)
         check_closed(self.boundary)
-        unused = np.setdiff1d(np.arange(len(self.vert)), self.elem)
-        if len(unused):
-            raise ValueError(
-                f"{len(unused)} vertices belong to no tetrahedron, the first is vertex {unused[0]}: "
-                "remove them and renumber"
-            )
+        unused = ~np.isin(np.arange(len(self.vert)), self.elem)
+        _refuse(unused, "vertices belong to no tetrahedron", corner, "remove them and renumber")
         return self
+
+
+def _refuse(wrong, what, called, remedy):
+    """Raises ValueError if any of (n,) bool `wrong` is set, with their number and the first of them."""
+    if wrong.any():
+        raise ValueError(f"{wrong.sum()} {what}, the first is {called(int(wrong.argmax()))}: {remedy}")
 
 
 def triangle_numbers(face: np.ndarray) -> np.ndarray:

@@ -39,6 +39,23 @@ _HUGE = 1e9  # limit of any number of a sensor: above it sums of counts are no l
 _GAIN = 0.1
 
 
+# fields of a sensor, whether a value is possible, and what is
+_LIMITS = (
+    ("pdc_noise pac_noise tac_noise tdc_noise loss lowpass", lambda x: x >= 0, "0 or more"),
+    ("latency", lambda x: 0 <= x <= MOST_LATENCY, f"0 or more, at most {MOST_LATENCY:g}"),
+    ("noise", lambda x: min(x or (0,)) >= 0, "0 or more each"),
+    ("warm_time power", lambda x: x > 0, "more than 0"),
+    ("pac_colour", lambda x: 0 <= x < 1, "0 or more, less than 1"),
+    ("per_degree", lambda x: x != 0, "another number than 0"),
+    (
+        "relaxation",
+        lambda x: 0 <= x[0] <= 1 and x[1] > 0,
+        "a fraction from 0 to 1 and a time of more than 0 s",
+    ),
+    ("saturation", lambda x: 0 <= x[0] <= 1 and x[1] > 0, "a fraction from 0 to 1 and a knee of more than 0"),
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class Sensor:
     """Constants of one sensor with n electrodes. Counts have 12 bits; rest values are untouched, at the
@@ -127,30 +144,11 @@ class Sensor:
                 f"rest of a sensor is {short_repr(self.rest)}: no electrode rests at more than one count, "
                 f"these look normalised; give counts of 12 bits (times {FULL_SCALE:g})"
             )
-        fraction, knee = self.saturation
-        limits = {
-            **{f"{name}_noise": (0, None) for name in ("pdc", "pac", "tdc", "tac")},
-            "loss": (0, None),
-            "lowpass": (0, None),
-            "latency": (0, MOST_LATENCY),
-        }
-        for name, (low, high) in limits.items():
-            self._refuse(name, low <= getattr(self, name) <= (high or _HUGE), f"{low} or more", high)
-        self._refuse("noise", min(self.noise or (0,)) >= 0, "0 or more each")
-        for name in ("warm_time", "power"):
-            self._refuse(name, getattr(self, name) > 0, "more than 0")
-        self._refuse("pac_colour", 0 <= self.pac_colour < 1, "0 or more, less than 1")
-        self._refuse("per_degree", self.per_degree != 0, "another number than 0")
-        good = 0 <= self.relaxation[0] <= 1 and self.relaxation[1] > 0
-        self._refuse("relaxation", good, "a fraction from 0 to 1 and a time of more than 0 s")
-        good = 0 <= fraction <= 1 and knee > 0
-        self._refuse("saturation", good, "a fraction from 0 to 1 and a knee of more than 0")
-
-    def _refuse(self, name, good, wanted, most=None):
-        if not good:
-            more = "" if most is None else f", at most {most:g}"
-            value = short_repr(getattr(self, name))
-            raise ValueError(f"{name} of a sensor is {value}: give {wanted}{more}")
+        for names, fits, wanted in _LIMITS:
+            for name in names.split():
+                value = getattr(self, name)
+                if not fits(value):
+                    raise ValueError(f"{name} of a sensor is {short_repr(value)}: give {wanted}")
 
     @property
     def nelectrode(self) -> int:
