@@ -3,7 +3,7 @@
 python benchmarks/thermal.py --data DIR --json OUT [--figure OUT.png]
 
 DIR has `<object>_<id>_<trial>_HOLD.mat` (F?tdc, F?tac and the gripper's JEff at 100 Hz). Objects are looked
-up by name in `sensor/materials.py`. Fitted on trials 1 to 3 of steel and acrylic, all fingers together:
+up by name in `assets/materials.txt`. Fitted on trials 1 to 3 of steel and acrylic, all fingers together:
 heater, losses, contact conductance and area (`_START` below, with the width of what sources leave open as a
 prior), TAC's gain and each finger's rest. Everything else is predicted: a trial's grip force (JEff) and first
 temperature are its only input. Without such trials the sensor is `HeatParameters()`."""

@@ -14,6 +14,7 @@ import importlib.metadata
 import pathlib
 
 import numpy as np
+from indenter_meshes import make_mesh
 from meshing import mesh_between, write_obj
 from parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
 
@@ -103,7 +104,7 @@ def main():
         write_obj(ASSETS / "clamp.obj", *_metres(clamp_plate()))
     if "indenters" in only:
         for name in INDENTERS:
-            write_obj(ASSETS / "indenters" / f"{name}.obj", *indenter(name).mesh())
+            write_obj(ASSETS / "indenters" / f"{name}.obj", *make_mesh(indenter(name)))
 
     rigid = {name: read_obj(ASSETS / f"{name}.obj")[0] for name in ("core", "nail", "clamp")}
     position, normal = electrodes(bodies["core"])

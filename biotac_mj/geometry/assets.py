@@ -1,4 +1,4 @@
-"""Paths of the shipped meshes."""
+"""Paths of shipped files."""
 
 import importlib.resources
 import pathlib

@@ -15,8 +15,9 @@ import numpy as np
 from ..coupling.config import OWN, SOLID, TO_COME, collides
 from ..coupling.settings import SettingKeywords, Settings
 from ..fields import as_whole
+from ..geometry.assets import asset_path
 from ..short_repr import short_repr
-from .mounts import TIP, Mount, read_mounts
+from .mounts import Mount, read_mounts
 
 if typing.TYPE_CHECKING:
     from ..coupling.handle import Handle
@@ -24,63 +25,9 @@ if typing.TYPE_CHECKING:
 _MASKS = "contype", "conaffinity"
 _CORE_MASS = 4e-3  # of the BioTac [kg], subtracted from the link that carries it
 
-# The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the
-# Menagerie's meshes.
-_SHADOW = {
-    finger: Mount(f"{finger}distal", (0, 0, (35e-3 if finger == "th" else 32e-3) - TIP))
-    for finger in ("ff", "mf", "rf", "lf", "th")
-}
-# Shadow's BioTac fingers (shadow-robot/sr_common, hand/xacro/finger/biotac): no moving distal joint; the
-# sensor is fixed to the middle link at z = 8 mm (thumb 10 mm, turned by -90 deg about z). The sphere of the
-# fingertip is (0, 4, 29) mm behind a joint fixed at 20 deg at z = 20 mm, that is at (0, -6.2, 48.6) mm; ours
-# is at (-14.3, -0.8, 0) mm of the BioTac frame.
-_SHADOW_AUTHENTIC = {
-    f: dataclasses.replace(m, pos=(0, -5.4e-3, 36.3e-3 if f == "th" else 34.3e-3)) for f, m in _SHADOW.items()
-}
-# Menagerie's Allegro: capsules end 41 mm (fingers) and 55 mm (thumb) beyond the last joint; fingers bend
-# towards +x.
-_ALLEGRO = {
-    finger: Mount(f"{finger}_tip", (0, 0, (55e-3 if finger == "th" else 41e-3) - TIP), pad=(1.0, 0.0, 0.0))
-    for finger in ("ff", "mf", "rf", "th")
-}
-# Menagerie's LEAP: tips end at y = -50 mm (fingers) and -62 mm (thumb), their flat pads face -x at 11.2 mm, z
-# = +-14.5 mm.
-_LEAP = {
-    finger: Mount(
-        f"{finger}_ds",
-        (8.2e-3 - 11.2e-3, TIP - length, z),
-        tip=(0.0, -1.0, 0.0),
-        pad=(-1.0, 0.0, 0.0),
-        replaces=(f"{finger}_tip", f"{finger}_ds_visual"),  # the latter draws both tip and link
-        shown=tuple(f"{finger}_ds_collision_{i}" for i in (1, 2, 3)),
-    )
-    for finger, length, z in (
-        ("if", 50e-3, 14.5e-3),
-        ("mf", 50e-3, 14.5e-3),
-        ("rf", 50e-3, 14.5e-3),
-        ("th", 62e-3, -14.5e-3),
-    )
-}
-# Menagerie's 2F-85: the pads end at z = 37.5 mm; the plate behind them, which remains, begins at y = 0, and a
-# BioTac extends 5.3 mm behind its axis.
-_GRIPPER = {f: Mount(f"{f}_pad", (0, -5.3e-3, 37.5e-3 - TIP)) for f in ("left", "right")}
-# Menagerie's Tetheria Aero: the tip's mesh ends at z = 26.8 mm (thumb 31.8 mm), its middle is 2.2 mm (3.4 mm)
-# to the pad's side of the joint's plane. Tendons of the link remain.
-_AERO = {
-    finger: Mount(
-        f"{name}_distal_link",
-        (0, -3.4e-3 if finger == "th" else -2.2e-3, (31.8e-3 if finger == "th" else 26.8e-3) - TIP),
-    )
-    for finger, name in zip(("if", "mf", "rf", "pf", "th"), ("index", "middle", "ring", "pinky", "thumb"))
-}
-HANDS = {
-    "shadow_hand": _SHADOW,
-    "shadow_hand_authentic": _SHADOW_AUTHENTIC,
-    "allegro_hand": _ALLEGRO,
-    "leap_hand": _LEAP,
-    "aero_hand": _AERO,
-    "robotiq_2f85": _GRIPPER,
-}
+_KNOWN = "shadow_hand", "shadow_hand_authentic", "allegro_hand", "leap_hand", "aero_hand", "robotiq_2f85"
+# each with its source in the file, which is like one of `biotac hand mount`
+HANDS = {hand: read_mounts(asset_path(f"hands/{hand}.yaml")) for hand in _KNOWN}
 
 
 @typing.overload
