@@ -75,7 +75,7 @@ class Coupled:
         if self.withdrawn:
             arrays.acting[:] = 0.0
         if self.result is None:  # where the last step has left it
-            self.still = arrays.off[0] < STILL and not arrays.placed.any()
+            self.still = len(arrays.acting) > 0 and arrays.off[0] < STILL and not arrays.placed.any()
             self.result = self.instance.stay() if self.still else None
         self.off = np.inf if self.result is None else float(arrays.off[0])
 
