@@ -435,7 +435,7 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
     if "electrodes" in fields:
         read = fields["electrodes"]
         beyond = ((read < 0) | (read > FULL_SCALE)).all(0) & (np.ptp(read, axis=0) == 0)
-        if beyond.any() and guess_unit(read[:, ~beyond]) == "counts":
+        if beyond.any() and not beyond.all() and guess_unit(read[:, ~beyond]) == "counts":
             said_is = f"{_named(beyond)} always {', '.join(f'{v:g}' for v in read[0, beyond])}"
             notes.append(f"{stream.source}: {said_is}, beyond 0..4095: taken for dead, 0 there")
             fields["electrodes"] = np.where(beyond, 0.0, read)

@@ -158,10 +158,10 @@ def read_matrix(table: Table, role: str | None = None) -> list[Stream]:
 
 
 def _matrix(table, role, first, called):
-    """Numbers of all columns from the first on; dead electrodes may have none."""
+    """Numbers of all columns from the first on; dead electrodes beside others may have none."""
     columns = list(range(first, table.width))
-    gaps = [role == "electrodes" and table.lost(k) for k in columns]
-    return table.numbers(columns, called[first:], gaps)
+    lost = [role == "electrodes" and table.lost(k) for k in columns]
+    return table.numbers(columns, called[first:], lost if not all(lost) else False)
 
 
 def _fits(count, names):
