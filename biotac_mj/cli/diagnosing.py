@@ -7,8 +7,6 @@ from ..arguments import SEED, check_device, device, output_file, output_folder, 
 from .common import add_options, add_verb
 from .names import TIERS
 
-__all__ = ["add_checkup", "add_diagnose", "add_next"]
-
 
 def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb to the command line."""

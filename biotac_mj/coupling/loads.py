@@ -19,8 +19,6 @@ import numpy as np
 from .solid_contacts import CONTACT, contact_frame
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
-__all__ = ["PYRAMID", "Loads", "core_geom", "passes"]
-
 LIBRARY.mj_rnePostConstraint.argtypes = LIBRARY.mj_sensorAcc.argtypes = (ctypes.c_void_p,) * 2
 _SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "CONTACT", "TOUCH")]
 _CONTACT, _TOUCH = _SENSORS[2:]

@@ -11,18 +11,6 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from .config import Config
 
-__all__ = [
-    "Geom",
-    "Readings",
-    "SkinResult",
-    "SkinStepper",
-    "check_names",
-    "make_readings",
-    "make_stepper",
-    "register_readings",
-    "register_stepper",
-]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Geom:

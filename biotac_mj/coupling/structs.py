@@ -16,8 +16,6 @@ import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, enums, structs
 
-__all__ = ["LIBRARY", "MINVAL", "DataView", "ModelView", "c_structs"]
-
 LIBRARY = ctypes.CDLL(
     str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
 )  # already loaded: this only finds it

@@ -6,8 +6,6 @@ import warp as wp
 from ..skin.types import real, vec3, vec6
 from .implicit.kinematics import row
 
-__all__ = ["Touches", "find_touches"]
-
 wp.set_module_options({"enable_backward": False})
 
 _TINY = wp.constant(wp.float64(1e-12))  # [N]

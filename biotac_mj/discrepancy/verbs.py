@@ -15,9 +15,6 @@ if typing.TYPE_CHECKING:
     from .recordings.recording import PlainRecording
     from .report.verdict import Verdict
 
-__all__ = ["checkup_verb", "diagnose_verb", "diagnose_with_states", "next_verb"]
-
-
 _OF_POSES = ("object", "effects", "skin", "material", "options", "repeatability", "in_skin", "earlier")
 
 

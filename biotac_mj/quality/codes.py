@@ -12,8 +12,6 @@ from .fault import Fault
 from .log import Log
 from .noise import noise_level, sound_noise
 
-__all__ = ["coarse", "mostly_coarse", "put_back"]
-
 # visits of a code after which one in a hundred of its neighbours is unvisited by chance
 _OFTEN = 5
 _CUT, _CODES = 4, 16  # least step and number of codes if a single channel is coarse

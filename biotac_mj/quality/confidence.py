@@ -4,8 +4,6 @@ import numpy as np
 
 from .fault import Fault
 
-__all__ = ["NAMED", "PAIRS", "PER_CANDIDATE", "WEIGHTS", "clear", "confidence", "probability"]
-
 # least confidence of a name; named faults are removed from the counts before further searches. In 209 logs
 # with faults by three authors 9 of 12 names between this and 0.65 were right
 NAMED = 0.6

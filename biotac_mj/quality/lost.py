@@ -15,8 +15,6 @@ from .fault import Fault
 from .log import Log
 from .noise import noise_level
 
-__all__ = ["dropped", "jumping", "unmeasured"]
-
 _MOST = 12  # channels of 19; no load drives as many to an end of the converter at once
 _NEVER = 1e-5  # fraction of rows in which that happens by chance
 _FEW = 4  # channels of 19 that may jump for other reasons

@@ -10,8 +10,6 @@ from .evidence import BLOCKS, by_block, evidence, runs
 from .fault import Fault
 from .log import Log
 
-__all__ = ["sample_and_hold"]
-
 # fraction of rows that repeat the one before by rounding alone, and its factor on the observed fraction
 _BY_CHANCE, _FEW = 1e-4, 0.05
 _OFTEN = 0.002  # fraction of rows that may repeat by chance

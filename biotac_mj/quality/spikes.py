@@ -11,8 +11,6 @@ from .fault import Fault
 from .log import Log
 from .noise import ROUNDING, noise_level, running_median
 
-__all__ = ["off_rows", "spikes"]
-
 _FEW = 4  # channels of 19 that may leave at once for other reasons
 _TIMES = 4  # samples of a channel, more than chance explains
 _ROWS = 7  # times the noise, distance of all of these from the signal

@@ -11,8 +11,6 @@ from .fault import Fault
 from .log import Log
 from .noise import sound_noise
 
-__all__ = ["dead", "stuck_or_clipped"]
-
 _WINDOW = 12  # rows of a window that shows whether a channel has noise
 _QUIET = 0.3  # of its usual noise: 3 of 1000 windows of a real sensor have less by chance
 _FRACTION = 0.01  # of the rows

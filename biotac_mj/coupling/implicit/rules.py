@@ -4,25 +4,6 @@ numbers, for Python and Warp."""
 import math
 from typing import Any
 
-__all__ = [
-    "MAX_CORRECTIONS",
-    "EULER",
-    "FORETOLD",
-    "LOSS_FREQUENCY",
-    "PATIENCE",
-    "STILL",
-    "TELEPORT",
-    "TOLERANCE",
-    "beta_of",
-    "gamma_of",
-    "in_store",
-    "lacking",
-    "poorly_corrected",
-    "share_within",
-    "spared",
-    "stayed",
-]
-
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which a skin is not solved again: a
 # solve leaves its bodies open by as much, and over so short a way its linear model errs by 5e-4 of the force
 TOLERANCE = 5e-6

@@ -13,8 +13,6 @@ from ..shared import trim_memory
 from ..stepper import Geom, SkinResult
 from .fem import PATIENT, FemStepper
 
-__all__ = ["CondensedStepper"]
-
 _PATIENCE = 0.75  # of two-way skins: somebody waits for the step, and the next one goes on
 
 

@@ -18,8 +18,6 @@ from ...recordings.inspection import check_clock, doubts
 from ...recordings.recording import rest_correlation
 from ...sensor.channels import check_counts, check_force
 
-__all__ = ["FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
-
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 # rows for each electrode: to tell one from all others takes as many coefficients as there are electrodes, and

@@ -25,8 +25,6 @@ from .recording import PlainRecording, as_plain
 from .segments import moved, stretches
 from .session import Session
 
-__all__ = ["diagnose_recording"]
-
 _MOST = 8  # of trends over time
 _LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it

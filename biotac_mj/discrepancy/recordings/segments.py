@@ -8,8 +8,6 @@ from ...recordings.protocol import STEPS, Protocol
 from .candidates import Candidate
 from .recording import PlainRecording, enough
 
-__all__ = ["moved", "stretches"]
-
 
 def stretches(recording: PlainRecording, protocol: Protocol) -> list[tuple[bool, slice]]:
     """Whether something touched the sensor, and rows, of the contiguous stretches in which it did or did not;

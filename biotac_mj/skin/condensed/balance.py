@@ -19,8 +19,6 @@ from .states import BALANCED, Increment, Linear, Newton
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system
 
-__all__ = ["CUT", "TOLERANCE", "newton_from", "newton_method"]
-
 wp.set_module_options({"enable_backward": False})
 
 TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps would cause chatter

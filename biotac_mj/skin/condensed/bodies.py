@@ -15,16 +15,6 @@ from ..newton.load_path import partial_turn
 from ..types import real, vec3
 from .structs import Constants, F, Scratch
 
-__all__ = [
-    "find_groups",
-    "move_nodes",
-    "number_bodies",
-    "place_bodies",
-    "pose_by_load",
-    "sum_forces",
-    "touching_group",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.spatial_vectord

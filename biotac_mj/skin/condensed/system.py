@@ -11,16 +11,6 @@ from .lanes import add_row, add_rows, begin_row, dot_column, eliminate, gather_r
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
-__all__ = [
-    "coordinate_at",
-    "count_contacts",
-    "fill_contact",
-    "gather_blocks",
-    "gather_load",
-    "multiply",
-    "solve_system",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

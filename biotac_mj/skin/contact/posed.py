@@ -20,24 +20,6 @@ from .shapes import (
     primitive_distance,
 )
 
-__all__ = [
-    "SKIN",
-    "WINDOW",
-    "Geoms",
-    "Meeting",
-    "LoadPath",
-    "bound_to",
-    "distance_from",
-    "distance_to",
-    "face_radius",
-    "convected_anchor",
-    "least_to",
-    "meet",
-    "meet_side",
-    "place_on",
-    "touch_bound",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 WINDOW = 1.25  # radius around edges, over the distance of a face's corners from its samples, see `meet`

@@ -13,8 +13,6 @@ from ..candidates import Candidate
 from ..conditional import Conditional
 from ..session import Session
 
-__all__ = ["Edge", "edges", "jumped"]
-
 _LINE = 6  # rows of a line
 _AROUND = 36  # rows on either side
 _STAYS = 30  # rows after which it is still there

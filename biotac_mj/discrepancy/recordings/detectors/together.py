@@ -5,8 +5,6 @@ import numpy as np
 
 from ....geometry.design import BIOTAC, Design, electrode_positions
 
-__all__ = ["ahead"]
-
 _MOST = 4  # electrodes that have an effect of their own, at most
 _NEAR = 4  # neighbours of an electrode
 
