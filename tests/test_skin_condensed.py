@@ -402,7 +402,7 @@ def test_what_is_clear_of_the_skin(coarse):
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
     for away in (5e-4, 9e-4, 1.2e-3, 1e-2, 5e-4):
-        assert skin.clear((start - away * direction)[None], EYE, 1e-3) == (away > 1e-3)
+        assert skin.proximity.clear((start - away * direction)[None], EYE, 1e-3) == (away > 1e-3)
 
 
 # --- a function of its arguments

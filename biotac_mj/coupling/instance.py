@@ -56,6 +56,7 @@ class Instance:
       kinematics: `Kinematics` of the touching bodies.
       sensed: whether the readings of this step are written.
       number: among the two-way instances; springs: `Springs` of the mjData.
+      stays: whether the last solve left the skin as it was.
       put: the skin's state after bodies were placed before this step; None: none was.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
@@ -95,7 +96,7 @@ class Instance:
         self.state = data.plugin_state[start : start + setup.nstate]
         self.parts, self.state_address = setup.parts(self.state), self.state.ctypes.data
         self._result = self._reading = self._pose = self._geom_pose = None
-        self.put, self._solved, self.sensed, self._stays = None, {}, False, False
+        self.put, self._solved, self.sensed, self.stays = None, {}, False, False
         self._error, self._outcome = False, _ALONE
         self.step_gamma, self.frequency = np.full(setup.ngroup, EULER), None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
@@ -144,7 +145,7 @@ class Instance:
         self.refuse_foreign_state()
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
-        self.put, self.sensed, self._stays = None, False, False
+        self.put, self.sensed, self.stays = None, False, False
         self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
         if self.two_way and self.model.opt.integrator == _DISCRETE:
             raise ValueError(
@@ -242,14 +243,16 @@ class Instance:
         """Instead of `solve_for_pose`, for bodies where the skin was solved in the last step: the result is
         the same, if that solve left the skin as it was. None: it did not, or a solve is needed for more."""
         stays, skin, state = self.parts[0][STAYED], self.setup.skin, self.parts[2]
-        parted = self.put is not None or self.touching.parted
-        if not stays or parted or self.setup.config.textures is not None:
+        changes = self.put is not None or self.touching.parted or self.setup.config.textures is not None
+        known = stays and not changes and hasattr(skin.stepper, "pressure")
+        pressure = skin.stepper.pressure(state) if known else None
+        if pressure is None:
             return None
         wrench, tangent, *pose = (part.copy() for part in self.last_model())
         with skin.lock:
-            vert, pressure = skin.stepper.vert_xpos(state), skin.stepper.pressure(state)
+            vert = skin.stepper.vert_xpos(state)
         result = SkinResult(state, wrench, tangent, vert, pressure, measured=stays > 0, pose=tuple(pose))
-        self._result, self._reading, self._pose, self._stays = result, None, result.pose, True
+        self._result, self._reading, self._pose, self.stays = result, None, result.pose, True
         return result
 
     def solve_for_pose(
@@ -269,7 +272,7 @@ class Instance:
         An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
           end of the step.
         """
-        self._pose, self._stays = (pos, mat), False
+        self._pose, self.stays = (pos, mat), False
         dt = self.model.opt.timestep
         begin, also = {}, core
         if getattr(self.setup.skin.stepper, "begins_near", False) and near is not None and near.converged:
@@ -344,11 +347,6 @@ class Instance:
             pose=tuple(p.copy() for p in last),
             vert_xpos=stepper.vert_xpos(state),
         )
-
-    def found_foretold(self, state: np.ndarray) -> None:
-        """Says that the last solve, with this result's `state`, left the skin as it was."""
-        stepper = self.setup.skin.stepper
-        self._stays = hasattr(stepper, "pressure") and stepper.pressure(state) is not None
 
     def concluded(
         self, rounds: int, settled: bool, withheld: float, energy: np.ndarray, ends: tuple, acting: np.ndarray
@@ -428,16 +426,9 @@ class Instance:
                     RuntimeWarning,
                     stacklevel=2,
                 )
-            out[self.sensor["status"]] = (
-                float(good),
-                self.state[FAILED] + (not good),
-                result.iterations,
-                result.residual,
-                tier,
-                rounds,
-                result.load_factor,
-                withheld,
-            )
+            failed, way = self.state[FAILED] + (not good), result.load_factor
+            of_step = good, failed, result.iterations, result.residual, tier, rounds, way, withheld
+            out[self.sensor["status"]] = of_step
 
     def _acting(self):
         """Wrench (6,) on the BioTac in its frame as it acts now, and whether skin, bodies and MuJoCo's
@@ -537,16 +528,8 @@ class Instance:
 
     def _flag(self):
         if "status" in self.sensor:
-            self.data.sensordata[self.sensor["status"]] = (
-                -1.0,
-                self.state[FAILED],
-                0.0,
-                np.nan,
-                self._tier,
-                0.0,
-                0.0,
-                0.0,
-            )
+            of_step = -1.0, self.state[FAILED], 0.0, np.nan, self._tier, 0.0, 0.0, 0.0
+            self.data.sensordata[self.sensor["status"]] = of_step
 
     def commit_step(self) -> None:
         """Commits the solved step."""
@@ -559,7 +542,7 @@ class Instance:
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach = REACHED if ends else OUT_OF_REACH
-        stays = good * self._stays * (1 if result.measured else -1)
+        stays = good * self.stays * (1 if result.measured else -1)
         head[:] = head[FAILED] + (not good), good - steps, reach, stays
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)

@@ -284,10 +284,6 @@ class SavedState(types.SimpleNamespace):
     numbers, and tables (k, n), whose rows have the index of an item and the values of the table's variables.
     `contacts` (k, 5) has sample, geom and anchor (in the geom's frame) [m] of touching samples."""
 
-    def copy(self) -> typing.Self:
-        """A deep copy."""
-        return type(self)(**{k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()})
-
     def replace(self, **changes: typing.Any) -> typing.Self:
         """A state with some values replaced."""
         return type(self)(**(vars(self) | changes))
@@ -396,20 +392,9 @@ class StateLayout:
                 "in options['skin']"
             )
 
-    def _in_use(self, state):
-        ends = [(self.slices[name].start, n) for name, n in self.columns.items()]
-        return [slice(0, self._used), *(slice(at, at + 1 + n * int(state[at])) for at, n in ends)]
-
-    def copy(self, state: np.ndarray) -> np.ndarray:
-        """Copy of a state (size,), with zeros in unused rows."""
-        out = np.zeros(self.size)
-        for part in self._in_use(state):
-            out[part] = state[part]
-        return out
-
     def key(self, state: np.ndarray) -> bytes:
         """Bytes of a state without unused rows, as a key."""
-        return b"".join([state[part].tobytes() for part in self._in_use(state)])
+        return state[: self._used].tobytes() + b"".join(self.rows(state, n).tobytes() for n in self.columns)
 
 
 def _columns(variables):

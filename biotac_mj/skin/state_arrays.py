@@ -58,17 +58,17 @@ class StateArrays:
         self._sources, self._kappa = sources, data.worlds.kappa
         variables, rows = saved_variables(tier, options)
         self._plain = [v for v in variables if v.name in self.arrays]
-        self._rows = {name: _blocks(of, self.arrays) for name, of in rows.items()}
+        self._rows = {name: [v for v in of if v.name in self.arrays] for name, of in rows.items()}
         if layout is None:
             sizes = {axis: 0 for v in variables for axis in v.axes}
             sizes |= {axis: n for v, array in self._found for axis, n in zip(v.axes, array.shape)}
-            room = {
-                name: sum(self.arrays[v.name].shape[0] * int(np.prod(v.item)) for v, *_ in blocks)
-                for name, blocks in self._rows.items()
+            items = {
+                name: [len(self.arrays[v.name]) * np.prod(v.item, dtype=int) for v in of if v.starts]
+                for name, of in self._rows.items()
             }
-            layout = StateLayout(tier, options, sizes, room)
+            layout = StateLayout(tier, options, sizes, {name: sum(n) for name, n in items.items()})
         self.layout = layout
-        of_rows = [v.name for blocks in self._rows.values() for block in blocks for v in block]
+        of_rows = [v.name for of in self._rows.values() for v in of]
         follow = [name for name in ("x_last", "kept", "touched_by") if name in self.arrays]
         self._loaded, self._views = [*(v.name for v in self._plain), *of_rows, *follow], None
 
@@ -185,7 +185,7 @@ class StateArrays:
         """Arrays of the first world that a row is saved from and loaded to: views on the CPU."""
         if self._views is None or self._device.is_cuda:
             self._views = {name: self._view(name) for name in self._loaded}
-            self._blocks = {name: _numbered(blocks, self._views) for name, blocks in self._rows.items()}
+            self._blocks = {name: _blocks(of, self._views) for name, of in self._rows.items()}
         return self._views
 
     def _view(self, name):
@@ -195,24 +195,15 @@ class StateArrays:
         return self.arrays[name].numpy()[first]
 
 
-def _blocks(variables, arrays):
-    """Groups the variables of a table; each group begins with a variable that starts a table."""
-    blocks = []
-    for v in variables:
-        if v.name not in arrays:
-            continue
-        if v.starts:
-            blocks.append([v])
-        else:
-            blocks[-1].append(v)
-    return blocks
-
-
-def _numbered(blocks, host):
-    """(number of the first item, one number of each, its reset, further arrays) of each block of a table."""
+def _blocks(variables, host):
+    """(number of the first item, one number of each, its reset, further arrays) of each block of a table; a
+    variable that starts a table begins one."""
     out, first = [], 0
-    for v, *others in blocks:
-        column = host[v.name].reshape(-1)
-        out.append((first, column, v.reset, [host[o.name] for o in others]))
-        first += len(column)
+    for v in variables:
+        if v.starts:
+            column = host[v.name].reshape(-1)
+            out.append((first, column, v.reset, []))
+            first += len(column)
+        else:
+            out[-1][3].append(host[v.name])
     return out

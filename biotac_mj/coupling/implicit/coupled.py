@@ -105,8 +105,7 @@ class Coupled:
         self._cost += result.cost
         if self.still and self.result is None and result.converged:
             wrong, wrench = np.abs(result.wrench - arrays.acting), np.abs(result.wrench)
-            if wrong.max() < FORETOLD * wrench.max():
-                self.instance.found_foretold(result.state)
+            self.instance.stays = bool(wrong.max() < FORETOLD * wrench.max())
         self.result, self.may_act = result, result.converged and self._cost < _MOST
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
         arrays.pos0[:], arrays.mat0[:] = result.pose

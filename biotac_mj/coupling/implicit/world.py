@@ -333,9 +333,15 @@ class World:
         run_in_threads([functools.partial(run_in_threads, mine, 1) for mine in shared.values()], threads)
 
     def _predict(self, skins, outside):
-        """Finds where the bodies go under the skins' models, and how far that is from where the skins were
-        solved."""
-        self._group.evaluate(self._accelerations(skins, outside))
+        """Finds where MuJoCo will move the bodies under the skins' linear models, and how far that is from
+        where the skins were solved; leaves the forces that do this in place.
+
+        The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
+        (a - a') corrects it."""
+        self._found, moved = self._corrected(skins, outside)
+        for skin in skins:
+            skin.excess[:] = skin.instance.metric.excess(self._found)
+        self._group.evaluate(moved)
 
     def _damp(self, skins, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
@@ -363,18 +369,6 @@ class World:
             for skin in skins:
                 skin.withdraw()
             self._predict(skins, outside)
-
-    def _accelerations(self, skins, outside):
-        """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
-        forces that do this in place.
-
-        The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
-        (a - a') corrects it."""
-        found, moved = self._corrected(skins, outside)
-        self._found = found
-        for skin in skins:
-            skin.excess[:] = skin.instance.metric.excess(found)
-        return moved
 
     def _corrected(self, skins, outside):
         """Accelerations a and a'."""
@@ -418,8 +412,5 @@ class World:
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
         self.data.qfrc_passive += self._group.apply()
-        self._project()
-
-    def _project(self):
         if self.data.is_dual:  # it works on what the rows were before
             self.data.project_constraints()

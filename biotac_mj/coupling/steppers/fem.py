@@ -131,7 +131,7 @@ class FemStepper:
 
     def used(self, state: np.ndarray) -> SavedState:
         """Copy of the part of a state that is in use."""
-        return self._layout.read(state).copy()
+        return copy.deepcopy(self._layout.read(state))
 
     def begun_at(
         self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
@@ -278,7 +278,9 @@ class FemStepper:
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
             load_factor=float(d.load_factor[0]),
-            load=np.linalg.norm(d.outer.sample_force.numpy()[self._sticking(new), 0], axis=1),
+            load=np.linalg.norm(
+                d.outer.sample_force.numpy()[self.contact_rows(new)[:, 0].astype(int), 0], axis=1
+            ),
             cost=(int(d.worlds.work.numpy()[0]) - before) / model.options.max_work,
         )
 
@@ -396,9 +398,6 @@ class FemStepper:
         self._arrays.load_row(state)
         self._geom_set.set_pose(*self.came_to(state))
         self._geom_set.advance()
-
-    def _sticking(self, state):
-        return self.contact_rows(state)[:, 0].astype(int)
 
 
 def _travel(pos0, mat0, pos, mat):

@@ -44,7 +44,7 @@ class Memory:
 
     def replace(self, **changes: typing.Any) -> typing.Self:
         """A state with some values replaced."""
-        out = type(self)(self.layout.copy(self.row), self.layout)
+        out = type(self)(self.row.copy(), self.layout)
         self.layout.write(SavedState(**changes), out.row)
         return out
 
@@ -57,10 +57,6 @@ class Memory:
     def force(self) -> np.ndarray:
         """Forces (k,) on these coordinates [N]."""
         return self.forces[:, 1]
-
-    def contents(self) -> bytes:
-        """All variables, to be compared."""
-        return self.layout.key(self.row)
 
 
 @dataclasses.dataclass

@@ -127,27 +127,22 @@ class CondensedSkin:
                 "geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was "
                 "never set"
             )
-        pos, mat, effort = np.asarray(geom_pos), np.asarray(geom_mat), [allowed * self._first]
-        v = self._views
+        pos, mat, most, v = np.asarray(geom_pos), np.asarray(geom_mat), allowed * self._first, self._views
         v["compliance"][:] = v["predicted"][:] = 0.0
         if bodies is not None:
             v["compliance"][:, :, 0], v["predicted"][:, 0] = bodies.compliance, bodies.wrench
             v["origin"][:, 0], v["arm"][:, 0], v["spin"][:, 0] = bodies.pos, bodies.arm, bodies.spin
         self.proximity.pose(pos, mat)
         if bodies is not None or not self.proximity.deep(pos, mat):
-            out = self._follow(memory, pos, mat, effort, bodies, near)
-        else:
-            shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
-            fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
-            known = memory if memory.started else self.outside(shallow, mat)
-            out = self._follow(known, shallow, mat, effort)
-            out = dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
-        out.cost = allowed - effort[0] / self._first
-        return out
+            return self._follow(memory, pos, mat, most, bodies, near)
+        shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
+        fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
+        known = memory if memory.started else self.outside(shallow, mat)
+        out = self._follow(known, shallow, mat, most)
+        return dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
 
-    def _follow(self, memory, pos, mat, effort, bodies=None, near=None):
-        """Solves for poses that are not too deep. effort: [limit of the cost], from which it subtracts its
-        cost."""
+    def _follow(self, memory, pos, mat, most, bodies=None, near=None):
+        """Solves for poses that are not too deep. most: limit of the cost, in evaluations."""
         far, let_go = np.inf, (pos, mat)
         if bodies is not None:  # where the bodies go without the skin
             self._uncouple()
@@ -156,12 +151,11 @@ class CondensedSkin:
             motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
             far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
-            if self.untouched(*let_go):  # the geoms do not touch the skin, or leave it
+            if self.proximity.clear(*let_go, 0.0):  # the geoms do not touch the skin, or leave it
                 return self.at_rest(*let_go)
-        out = self._solve(memory, pos, mat, effort[0], near)
-        effort[0] -= self._views["spent"][0]
-        if not out.converged and self.untouched(*let_go):
-            return self.at_rest(*let_go)
+        out = self._solve(memory, pos, mat, most, near)
+        if not out.converged and self.proximity.clear(*let_go, 0.0):
+            return dataclasses.replace(self.at_rest(*let_go), cost=out.cost)
         return out
 
     def _solve(self, memory, pos, mat, most, near):
@@ -177,7 +171,7 @@ class CondensedSkin:
         if load_factor > 0:
             memory = Memory(self._state.save_row(), memory.layout)
             memory.layout.part(memory.row, "started")[:] = 1.0
-            self._held = memory.contents()
+            self._held = memory.layout.key(memory.row)
             self._keep(self._held, nodes)
         push = v["sample_force"][memory.contacts[:, 0].astype(int)]
         return Outcome(
@@ -191,11 +185,12 @@ class CondensedSkin:
             error=float(v["error"][0]),
             load=np.sqrt((push * push).sum(axis=1)),
             load_factor=load_factor,
+            cost=float(v["spent"][0]) / self._first,
         )
 
     def _load(self, memory):
         """Loads a state."""
-        v, before = self._views, memory.contents()
+        v, before = self._views, memory.layout.key(memory.row)
         if before != self._held:  # as a rule a step begins where the last one of this skin has ended
             nodes = self.nodes(memory, before)
             self._state.load_row(memory.row)
@@ -219,15 +214,6 @@ class CondensedSkin:
 
     # --- at rest, and near it  ---
 
-    def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether geoms at these poses touch no sample of the undeformed skin, and none is inside the
-        core."""
-        return self.proximity.clear(pos, mat, 0.0)
-
-    def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
-        """Whether the undeformed skin is further than `margin` [m] from geoms at these poses."""
-        return self.proximity.clear(geom_pos, geom_mat, margin)
-
     def at_rest(self, pos: np.ndarray, mat: np.ndarray) -> Outcome:
         """Outcome for geoms at these poses, which do not touch the skin."""
         memory, n = Memory.rest(self.geoms.count), self.geoms.ngroup
@@ -247,7 +233,7 @@ class CondensedSkin:
         """Nodes (nvert, 3) of a state [m]; read only. contents: of the memory, if they are known."""
         if not len(memory.forces) and memory.pressure == 0:
             return self.rest
-        contents = contents or memory.contents()
+        contents = contents or memory.layout.key(memory.row)
         found = self._nodes.get(contents)
         if found is None:
             self._state.load_row(memory.row)
