@@ -242,16 +242,16 @@ class Instance:
     def stay(self) -> SkinResult | None:
         """Instead of `solve_for_pose`, for bodies where the skin was solved in the last step: the result is
         the same, if that solve left the skin as it was. None: it did not, or a solve is needed for more."""
-        stays, skin, state = self.parts[0][STAYED], self.setup.skin, self.parts[2]
+        reach, skin, state = self.parts[0][STARTED], self.setup.skin, self.parts[2]
         changes = self.put is not None or self.touching.parted or self.setup.config.textures is not None
-        known = stays and not changes and hasattr(skin.stepper, "pressure")
+        known = abs(reach) == STAYED and not changes and hasattr(skin.stepper, "pressure")
         pressure = skin.stepper.pressure(state) if known else None
         if pressure is None:
             return None
         wrench, tangent, *pose = (part.copy() for part in self.last_model())
         with skin.lock:
             vert = skin.stepper.vert_xpos(state)
-        result = SkinResult(state, wrench, tangent, vert, pressure, measured=stays > 0, pose=tuple(pose))
+        result = SkinResult(state, wrench, tangent, vert, pressure, measured=reach > 0, pose=tuple(pose))
         self._result, self._reading, self._pose, self.stays = result, None, result.pose, True
         return result
 
@@ -542,8 +542,9 @@ class Instance:
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach = REACHED if ends else OUT_OF_REACH
-        stays = good * self.stays * (1 if result.measured else -1)
-        head[:] = head[FAILED] + (not good), good - steps, reach, stays
+        if good and self.stays:
+            reach = STAYED if result.measured else -STAYED
+        head[:] = head[FAILED] + (not good), good - steps, reach
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
@@ -555,7 +556,7 @@ class Instance:
         else:
             skin[:] = result.state
         if self.touching.parted:  # what is in the skin when contact is back was put there, as at the start
-            head[STARTED] = head[STAYED] = 0.0
+            head[STARTED] = 0.0
             stepper = self.setup.skin.stepper
             if hasattr(stepper, "resting") and stepper.resting(skin):
                 stepper.reset(skin)

@@ -34,10 +34,11 @@ __all__ = [
 
 # head of the plugin state: steps that did not converge; whether the last committed step did, or less the
 # steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
-# reach of the skin in it; whether the last solve left the skin as it was, -1 where its error is not measured
-_HEAD = 4
-FAILED, CONVERGED, STARTED, STAYED = range(_HEAD)
-REACHED, OUT_OF_REACH = 1.0, 2.0
+# reach of the skin in it
+_HEAD = 3
+FAILED, CONVERGED, STARTED = range(_HEAD)
+# STAYED: the last solve left the skin as it was; negative where its error is not measured
+REACHED, OUT_OF_REACH, STAYED = 1.0, 2.0, 3.0
 # of a touching body: wrench, tangent, the pose they belong to, the pose at the end of the step, the energy
 # that it has in the skin at most [J], infinite where that is not known, and the angular frequency [rad/s] at
 # which it bounces

@@ -229,17 +229,19 @@ class DataView(_View):
     def rows(self) -> types.SimpleNamespace:
         """Arrays of the constraint rows by name. They lie in the arena, and are others once MuJoCo has made
         constraints again."""
-        where = [ctypes.string_at(*part) for part in self._arena]
+        counts, pointers = self._arena
+        where = counts.raw, pointers.raw
         if where != self._where:
             self._where, self._rows = where, types.SimpleNamespace(**{n: self.array(n) for n in _ROWS})
         return self._rows
 
     @functools.cached_property
     def _arena(self):
-        """Where mjData has what says where the rows are, and its size: numbers of rows, and pointers."""
+        """Bytes of mjData that say where the rows are: their numbers, and pointers into the arena."""
         spans, kind = (("ncon", "nisland"), ("contact", "efc_force")), type(self.struct)
         fields = ([getattr(kind, name) for name in span] for span in spans)
-        return [(self.address + a.offset, b.offset + b.size - a.offset) for a, b in fields]
+        sizes = [(a.offset, b.offset + b.size - a.offset) for a, b in fields]
+        return [(ctypes.c_char * size).from_address(self.address + offset) for offset, size in sizes]
 
     def row_states(self) -> np.ndarray:
         """(nefc,) states of the rows, mjtConstraintState, where MuJoCo's constraint solver left them. Where

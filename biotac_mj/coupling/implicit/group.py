@@ -61,7 +61,7 @@ class SkinGroup:
         constraints let them."""
         self._springs.take(None)
         self._springs.factor(None)
-        self._springs.stiffness.numpy()[:] = 0.0
+        self._springs.held[:] = 0.0
         for skin in self._skins:
             skin.arrays.add_stiffness()
         for skin in self._skins:

@@ -28,7 +28,8 @@ class Springs:
 
     Attributes:
       own: of each skin, the first row of each slot, (nslot,) views to write to.
-      L: (1, nv, nv) wp.array, the factor that was found last. stiffness: (1, nv, nv) of all skins.
+      L: (1, nv, nv) wp.array, the factor that was found last. stiffness: (1, nv, nv) of all skins; held:
+        a view of it.
     """
 
     def __init__(self, model: ModelView, data: DataView, nslot: Sequence[int]):
@@ -44,6 +45,7 @@ class Springs:
         self._parts = [self._own[a:b] if a < b else none for a, b in zip(ends, ends[1:])]
         self.own = [part.numpy()[:, 0] for part in self._parts]
         self._here = {"inertia": self._inertia.numpy(), "rows": self._rows.numpy()}
+        self.held = self.stiffness.numpy()
         self._make_room(1, 1)
 
     def _make_room(self, rows, entries):
