@@ -11,7 +11,7 @@ from logs import RATE, noisy, pressed
 from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.discrepancy.report.files import write_report
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.recordings.tared import with_baseline
+from biotac_mj.recordings.recording import with_baseline
 
 
 def log(tmp_path, values):

@@ -176,8 +176,7 @@ class Effect(abc.ABC):
       of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
       wiring: whether it assigns electrodes to channels, and has no other form.
       of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
-      moves_object: whether it moves the object. pose_offset: whether it moves all poses equally, like their
-        scatter between trials.
+      pose_offset: whether it moves all poses of the object equally, like their scatter between trials.
       remembers: whether rubber or contact can model it inside the skin, with a delay of the films.
       answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it uses.
       instead_of: nuisance parameters of the base model that it replaces.
@@ -208,7 +207,6 @@ class Effect(abc.ABC):
     of_pairs = False
     wiring = False
     of_rest = False
-    moves_object = False
     pose_offset = False
     remembers = False
     answers: tuple = ()

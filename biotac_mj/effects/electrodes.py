@@ -101,11 +101,6 @@ class Exchange(Effect):
     def rejection_reason(self, theta: dict) -> str | None:
         return "partly" if max(abs(v - 1) for v in theta.values()) > _WHOLE else None
 
-    def unsearched(self, theta: dict) -> list[int]:
-        """The remainder of a baseline, after a fraction of another electrode's counts was fitted, is no
-        offset."""
-        return [i for i, _ in self.reads]
-
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
         """Channels with their baselines; a channel's counts from ln Z refer to the baseline that it shows."""
         before, read = np.array(sensor.rest), np.eye(sensor.nelectrode)

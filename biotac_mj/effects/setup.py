@@ -34,7 +34,7 @@ class Radius(Effect):
 
 class Misalignment(Effect):
     id, name, stage = "misalign", "constant misalignment of the sensor", "S"
-    moves_object = pose_offset = True
+    pose_offset = True
     physics = "all poses have the same small shift and rotation about the sensor's axes"
     params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in "xyz"} | {
         k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
@@ -53,7 +53,7 @@ class Misalignment(Effect):
 
 class DepthZero(Effect):
     id, name, stage = "depth0", "zero of the depth", "S"
-    moves_object = pose_offset = True
+    pose_offset = True
     physics = "the object touches earlier or later than by its pose, equally everywhere"
     params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
     confusable = {"mount": "light load: an offset remains, a compliance vanishes", "radius": "another tool"}
@@ -74,7 +74,6 @@ def _compliance_fraction(load: np.ndarray, theta: dict) -> np.ndarray:
 
 class Mount(Effect):
     id, name, stage = "mount", "compliance of mount or robot", "B"
-    moves_object = True
     physics = "the object moves back in proportion to the force: d - F / k"
     params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
     rare = _until("N", 0.3, 30.0, 2.0)
@@ -87,7 +86,6 @@ class Mount(Effect):
 
 class Rocking(Effect):
     id, name, stage = "rocking", "rocking of the sensor", "B"
-    moves_object = True
     physics = "the sensor is shifted and tilted in proportion to the force, always in one direction"
     params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in "xyz"} | {
         k: Param("rad/N", -0.1, 0.1, "0-0.5 mm/N at a lever of 5 to 20 mm", 5e-3)
@@ -124,7 +122,6 @@ def _load_feedback(run, moved):
 
 class RockingTorque(Effect):
     id, name, stage = "rocking_torque", "rocking of the sensor by its torque", "B"
-    moves_object = True
     physics = "a clamp behind the sensor rotates by the torque about it, with a compliance per axis"
     params = {
         k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)

@@ -164,10 +164,6 @@ class Design:
         """JSON of all fields, for `read_design` and stored skins."""
         return json.dumps(dataclasses.asdict(self))
 
-    def of_sensor(self, name: str) -> dict:
-        """Fields of one of `sensors`."""
-        return self.sensors[name]
-
 
 @functools.cache
 def _parsed(text):

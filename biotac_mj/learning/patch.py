@@ -128,18 +128,8 @@ def contact_patch(
         for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))
     }
     one["centre_mm"] = table["centre_mm"][row] or [float("nan")] * 3
-    _figure(
-        geometry,
-        outer,
-        field[row],
-        contact[row],
-        is_force,
-        centre[row],
-        counts[row],
-        rest,
-        one,
-        out / "contact.png",
-    )
+    here = Estimate(field[row], contact[row], is_force, fraction)
+    _figure(geometry, outer, here, centre[row], counts[row] - rest, one, out / "contact.png")
     return one
 
 
@@ -214,42 +204,30 @@ def draw_skin(
     return matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(0, limit), cmap)
 
 
-def _figure(geometry, outer, field, contact, is_force, centre, counts, tare, one, path):
+def _figure(geometry, outer, here, centre, change, one, path):
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.9), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1, 0.8])
-    shape = geometry.vert + field
-    depth = 1e3 * np.linalg.norm(field, axis=1)
-    bar = draw_skin(
-        left,
-        shape,
-        geometry.outer_face,
-        depth,
-        max(depth[outer].max(), 1e-3),
-        "displacement from electrodes [mm]",
-    )
-    figure.colorbar(bar, ax=left, shrink=0.8)
-    nodal = np.zeros(geometry.nvert)
-    nodal[outer] = contact / _node_area(geometry, outer) * 1e-3 if is_force else 1e3 * contact
-    bar = draw_skin(
-        middle,
-        shape,
-        geometry.outer_face,
-        nodal,
-        max(nodal.max(), 1e-6),
-        f"{'contact pressure' if is_force else 'push'} from electrodes [{'kPa' if is_force else 'mm'}]",
-        "inferno",
-    )
+    shape, face = geometry.vert + here.displacement, geometry.outer_face
+    depth = 1e3 * np.linalg.norm(here.displacement, axis=1)
+    limit, title = max(depth[outer].max(), 1e-3), "displacement from electrodes [mm]"
+    figure.colorbar(draw_skin(left, shape, face, depth, limit, title), ax=left, shrink=0.8)
+    nodal, title = np.zeros(geometry.nvert), "push from electrodes [mm]"
+    nodal[outer] = 1e3 * here.contact
+    if here.is_force:
+        nodal[outer] *= 1e-6 / _node_area(geometry, outer)
+        title = "contact pressure from electrodes [kPa]"
+    bar = draw_skin(middle, shape, face, nodal, max(nodal.max(), 1e-6), title, "inferno")
     figure.colorbar(bar, ax=middle, shrink=0.8)
     if np.isfinite(centre).all():
         middle.plot(1e3 * centre[0], 1e3 * centre[2], "+", color="c", ms=12, mew=2)
     e = 1e3 * geometry.electrode_pos
     for axis in (left, middle):
         axis.plot(e[:, 0], e[:, 2], ".", color="w", ms=3)
-    right.bar(np.arange(1, len(counts) + 1), counts - tare, color="C0")
+    right.bar(np.arange(1, len(change) + 1), change, color="C0")
     right.set_xlabel("electrode"), right.set_title("measured change [counts]", fontsize=10)
-    force = f"force about {one['force']:.2f} N, " if is_force else ""
+    force = f"force about {one['force']:.2f} N, " if here.is_force else ""
     what = f"row {one['row']}: {force}patch {one['area_mm2']:.1f} mm2"
     figure.suptitle(f"{what} (network trained on synthetic data)", fontsize=10)
     save_figure(path, figure, 120)

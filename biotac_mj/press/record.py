@@ -9,11 +9,9 @@ import numpy as np
 
 from ..files import hdf5, replacing
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import CHANNELS
 from ..versions import versions
 
 _BEFORE, _AFTER = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N"), ("nonconverged", "tier")
-CSV_COLUMNS = (*_BEFORE, *CHANNELS, *_AFTER)  # of a BioTac
 
 
 @dataclasses.dataclass
@@ -84,7 +82,7 @@ class PressRecord:
 
 
 def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
-    """readings.csv: a header (CSV_COLUMNS; channels are counts), then one row for each saved step."""
+    """readings.csv: a header (channels are counts), then one row for each saved step."""
     tier = record.parameters.get("tier", "full")
     rows = np.column_stack([record.time, record.depth, record.force])
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:

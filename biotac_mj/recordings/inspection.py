@@ -8,8 +8,7 @@ from ..quality.fault import Fault
 from ..quality.log import Log
 from ..quality.stuck import dead
 from ..sensor.channels import FULL_SCALE
-from .recording import CHANNELS, CLOCKED, REST_LIKE, Recording, check_recording
-from .tared import with_baseline
+from .recording import CHANNELS, CLOCKED, REST_LIKE, Recording, check_recording, with_baseline
 
 _REPEATED = 0.02  # fraction of repeated rows; fewer occur by chance
 _MOST_TRAVEL = 3.0  # [m] largest travel of a finger or an object; robots reach two

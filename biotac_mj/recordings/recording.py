@@ -16,12 +16,12 @@ from ..quality.clock import BUS_RATE, usual_step
 from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import (
+    FULL_SCALE,
     check_counts,
     check_force,
     log_impedance,
 )
 from ..short_repr import short_repr
-from .tared import with_baseline
 
 SCHEMA = "biotac_mj.recording/1"
 UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normalised")
@@ -29,6 +29,8 @@ UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normal
 # BioTacs in published recordings have 0.52 to 0.71, shuffled ones mostly less than this, a BioTac SP 0.02
 REST_LIKE = 0.3
 CLOCKED = "the file's times"  # `rate_source` of a recording whose file has times
+_EDGE = 1.0  # [counts] distance of the results from the ends of the converter
+_WHOLE = 0.02  # [counts] rounding of logs of whole counts minus a mean
 _REACH = 100.0  # [m] from its frame's origin: a more distant position is not in metres
 _REMEDY = "give a file that `biotac recording import` wrote"
 
@@ -269,6 +271,20 @@ def rest_correlation(counts: np.ndarray) -> float:
     here, published = (log_impedance(of)[..., alive] for of in (counts, designed(counts).rest_counts))
     here = np.nanmedian(here, axis=0)
     return float(np.corrcoef(here, published)[0, 1]) if np.ptp(here) > 1e-9 else 0.0
+
+
+def with_baseline(values: np.ndarray) -> np.ndarray:
+    """(n, nelectrode) counts from tared values (n, nelectrode): plus the mean rest counts of known sensors,
+    shifted as little as keeps all of an electrode's values off the ends of the converter. If values differ by
+    whole counts, as after subtraction of a mean, the results are whole."""
+    rest = designed(values).rest_counts.round()
+    turn = np.exp(2j * np.pi * values)
+    fraction = np.angle(turn.mean(0)) / (2 * np.pi)  # fractional count common to all values of an electrode
+    whole = np.abs(values - fraction - np.rint(values - fraction)).max(0) < _WHOLE
+    out = np.where(whole, np.rint(values - fraction), values)
+    low, high = np.floor(_EDGE - out.min(0)), np.ceil(FULL_SCALE - _EDGE - out.max(0))
+    # a range larger than the converter's means that the values were scaled: the ends are lost
+    return np.clip(out + np.clip(rest, low, np.maximum(low, high)), _EDGE, FULL_SCALE - _EDGE)
 
 
 def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:

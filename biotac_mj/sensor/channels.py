@@ -42,7 +42,7 @@ _NOISE_SLOPE, _NOISE_LEVEL = 15.8, 6.6  # [counts]
 
 # Published rest counts of three sensors, e1..e19. They are data, not parameters: only the cell constants
 # derive from them.
-REST_COUNTS = {name: np.array(BIOTAC.of_sensor(name)["rest"], dtype=float) for name in BIOTAC.published}
+REST_COUNTS = {name: np.array(BIOTAC.sensors[name]["rest"], dtype=float) for name in BIOTAC.published}
 
 
 def counts_from_impedance(impedance: ArrayLike) -> np.ndarray:

@@ -82,7 +82,7 @@ class Sensor:
       ValueError: an invalid number.
     """
 
-    rest: tuple = tuple(BIOTAC.of_sensor("1")["rest"])
+    rest: tuple = tuple(BIOTAC.sensors["1"]["rest"])
     noise: tuple | None = None
     mixing: tuple = ()
     pdc_rest: float = PDC_REST

@@ -45,7 +45,7 @@ class PlainRecording:
       missing: (n,) rows that the file's clock says were dropped before each, or None without a clock.
       since: (n,) [s] of the file's clock since its first row, None without a clock.
       unit: of what was logged, one of `recordings.UNITS`; electrodes that are not "counts" stand on a rest
-        that was assumed (`tared.py`).
+        that was assumed (`recordings.recording.with_baseline`).
       joints: first rows of further series, where several of one sensor were put together.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 from ...geometry.design import designs
 from ...reading import reading
 from .names import is_time, place_of, unit_named
-from .streams import Stream, make_streams
+from .streams import SECONDS, Stream, make_streams
 
 _WHAT, _REMEDY = (
     "MATLAB file",
@@ -113,9 +113,7 @@ def _in_our_unit(name, value, unit):
     if not plain:
         return value, ""
     if is_time(name.rpartition("/")[2]):
-        factor = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.get(
-            plain.lower(), 1.0
-        )
+        factor = SECONDS.get(plain.lower(), 1.0)
         return (value * factor, f"{name} is read as {unit}") if factor != 1.0 else (value, "")
     if field.endswith("quat") and plain.lower() == "xyzw" and value.ndim == 2 and value.shape[1] == 4:
         return np.roll(value, 1, axis=1), f"{name} is read as x y z w"

@@ -24,7 +24,7 @@ _EPOCH = 1e11  # larger clocks count fractions of seconds since 1970 (1e11 s are
 # [Hz] row rates of BioTac logs; outside, the clock is not in seconds
 _SLOWEST, _FASTEST = 0.5, 1e4
 _USUAL = (20.0, 5e3)  # typical ones
-_SECONDS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
+SECONDS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
 # fractions of backward steps: one in five is not a restarted clock, and nearly all mean that the log is
 # reversed
 _SHUFFLED, _REVERSED = 0.2, 0.98
@@ -319,7 +319,7 @@ def _normalise(source, fields):
 def _seconds(time, name):
     """A clock in seconds: its unit is in its name, or it is an epoch in fractions of seconds."""
     factor = next(
-        (f for unit, f in _SECONDS.items() if re.sub("ecs?$", "", name.lower().rstrip("]) ")).endswith(unit)),
+        (f for unit, f in SECONDS.items() if re.sub("ecs?$", "", name.lower().rstrip("]) ")).endswith(unit)),
         1,
     )
     if factor == 1 and len(time) and np.nanmedian(time) > _EPOCH:
@@ -512,7 +512,7 @@ def _unnamed_unit(usual):
     one unit makes it plausible; (None, 1) otherwise."""
     fits = [
         (unit, f)
-        for unit, f in _SECONDS.items()
+        for unit, f in SECONDS.items()
         if 1 / usual < _SLOWEST and _USUAL[0] <= 1 / (usual * f) <= _USUAL[1]
     ]
     return fits[0] if len(fits) == 1 else (None, 1.0)
