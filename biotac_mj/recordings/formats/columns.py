@@ -128,11 +128,6 @@ def open_bytes(path: pathlib.Path | str) -> bytes:
     return content
 
 
-def read_table(path: pathlib.Path | str, needed: str = "columns of numbers") -> Table:
-    """See `parse_table`."""
-    return parse_table(path, open_bytes(path), needed)
-
-
 def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns of numbers") -> Table:
     """Parses text with columns of numbers, separated by blanks, tabs, commas, semicolons or bars. Lines that
     begin with # or % are comments. Numbers may have decimal commas, between commas if quoted.
@@ -236,7 +231,7 @@ def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
     range_ = f"{names[0]}..{names[-1]}" if len(names) > 3 else " ".join(names)
     if not pathlib.Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file; give a text file with {len(names)} columns, {range_}")
-    table = read_table(path, f"{len(names)} columns of numbers, {range_}")
+    table = parse_table(path, open_bytes(path), f"{len(names)} columns of numbers, {range_}")
     header = [name.lower() for name in table.names or ()]
     missing = [name for name in names if name.lower() not in header]
     if not missing and table.width != len(header):
