@@ -4,7 +4,7 @@
         [--tier condensed] [--skin coarse] [--self-touch] [--against DIR]
     python benchmarks/one_core.py --table OUT                                            # prints it again
 
-  ball     100 g rest on a pad that looks up, steps of 2 ms
+  ball     100 g fall on a pad that looks up, bounce and come to rest, steps of 2 ms
   fingers  a Shadow Hand; a ball follows, presses and rubs each of its five pads, as in hands.py --moving;
            steps of 4 ms
   grip     a Robotiq 2F-85 closes on a cube of 50 g, lifts it by 50 mm, holds it and shakes it at 8 Hz, steps
@@ -137,7 +137,7 @@ def _menagerie(*names):
 
 
 def ball_case(tier: str, skin: str, **_) -> dict:
-    """100 g at rest."""
+    """100 g that come to rest."""
     import biotac_mj
 
     spec = mujoco.MjSpec()
@@ -147,8 +147,8 @@ def ball_case(tier: str, skin: str, **_) -> dict:
     ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
     ball.add_geom(size=[5e-3, 0, 0], mass=0.1)
     handle = biotac_mj.attach(spec, site="tip", tier=tier, skin=skin)
-    rows = _follow(spec.compile(), [handle], 0.8)
-    return {"falls": _phase(rows, 0, 0.4), "at rest": _phase(rows, 0.4)}
+    rows = _follow(spec.compile(), [handle], 2.0)
+    return {"falls": _phase(rows, 0, 0.4), "bounces": _phase(rows, 0.4, 0.8), "at rest": _phase(rows, 1.4)}
 
 
 def fingers_case(tier: str, skin: str, **_) -> dict:

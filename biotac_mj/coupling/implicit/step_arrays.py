@@ -47,6 +47,8 @@ class StepArrays:
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
       stiffness: of the rows, see `Metric.record`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
+      find_energy, restrain, gains: functions that make the account and say whether the skin is greedy;
+        whether push on a body had to be withheld, which now is; whether bodies get more than they have.
       models: views of wrench0, tangent0, pos0 and mat0, in the last step and in this one.
     """
 
@@ -122,24 +124,10 @@ class StepArrays:
             forces,
         )
         marks = self._marks.struct
-        self._find_energy = row(
-            (energy.find_energy, 1, [*one, self._last, self._solid, r, self._greedy, marks])
-        )
-        self._restrain = row((energy.restrain, 1, [*one, self._model, self._compliance, r, marks]))
-        self._find_gain = row((energy.find_gain, 1, [*one, 0.0, r, marks]))
+        self.find_energy = self._marking(energy.find_energy, self._last, self._solid, r, self._greedy, marks)
+        self.restrain = self._marking(energy.restrain, self._model, self._compliance, r, marks)
+        self.gains = self._marking(energy.find_gain, 0.0, r, marks)
         self._conclude = row((energy.conclude, 1, [*one, self._reason, r, self._left_out]))
-
-    def find_energy(self) -> bool:
-        """Makes the account; whether the skin is greedy."""
-        return self._marked(self._find_energy)
-
-    def restrain(self) -> bool:
-        """Whether push on a body had to be withheld, which now is."""
-        return self._marked(self._restrain)
-
-    def gains(self) -> bool:
-        """Whether bodies get more energy than they have."""
-        return self._marked(self._find_gain)
 
     def conclude(self, converged: bool) -> np.ndarray:
         """(ngroup,) energy that is left to the bodies [J]."""
@@ -147,10 +135,16 @@ class StepArrays:
         self._conclude()
         return self.left_out.copy()
 
-    def _marked(self, run):
-        self._is_marked[0] = 0
-        run()
-        return bool(self._is_marked[0])
+    def _marking(self, kernel, *known):
+        """A function that runs a kernel and says whether it has marked the world."""
+        run, marked = row((kernel, 1, [self._one, *known])), self._is_marked
+
+        def find():
+            marked[0] = 0
+            run()
+            return bool(marked[0])
+
+        return find
 
 
 def _seen(array):
