@@ -253,8 +253,11 @@ def read_series(folder: pathlib.Path) -> tuple[list[np.ndarray], np.ndarray, np.
             sys.exit(f"sp_slips: {path.name} is no DIR_OBJECTn.csv, DIR one of {', '.join(COMPASS)}")
         series.append(log_impedance(load_one(path)[0].electrodes))
         direction.append(named[1]), thing.append(named[2])
-    if not series:
-        sys.exit(f"sp_slips: {folder} has no series: give the folder `slips`")
+    if len(set(thing) - set(PRACTICE)) == 0 or len(set(thing)) < 2:
+        sys.exit(
+            f"sp_slips: {folder} has {len(series)} series of {len(set(thing))} objects: give a folder with "
+            f"series of two objects or more, not all of {', '.join(PRACTICE)}"
+        )
     return series, np.array(direction), np.array(thing)
 
 
@@ -384,7 +387,8 @@ def main(argv: list[str] | None = None) -> None:
         **right((said == done)[judged]),
         "trained_on": f"{len(motion)} simulated series and their mirror images, {SENSORS} sensors each",
         "chance": 1 / len(MOTIONS),
-        "practice": right((said == done)[~judged]),
+        "practice": right((said == done)[~judged]) if not judged.all() else None,
+        "all_series": right(said == done),
         "trained_on_real_other_objects": right((own == done)[judged]),
         "real_to_simulated": float((classifier().fit(F, done).predict(X) == y).mean()),
         "within_simulation": float((within == y).mean()),
