@@ -3,7 +3,6 @@ counts."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +12,8 @@ from ...quality.fault import Fault
 from ...quality.log import Log
 from ...recordings.recording import CLOCKED
 from ..report.verdict import Gap
+from .detectors.trends import Trend
 from .recording import PlainRecording
-
-if TYPE_CHECKING:
-    from .detectors.trends import Trend
 
 KINDS = {effect.id: effect for effect in entries("log")}
 _MOST = 12  # electrodes: what more have is of the sensor
@@ -45,7 +42,7 @@ class Candidate(Fault):
     sudden: bool = False
     beside_load: bool = False
     delay: float = 0.0
-    trend: "Trend | None" = None
+    trend: Trend | None = None
     share: np.ndarray | None = None
     gap: Gap | None = None
     verified: bool | None = None

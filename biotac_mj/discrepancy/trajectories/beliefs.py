@@ -5,25 +5,22 @@ import dataclasses
 import itertools
 import json
 import pathlib
-import typing
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE, by_id
+from ...effects.effect import Effect
 from ...files import replacing
 from ..evidence import ODDS
 from .base.nuisance import Nuisance
 from .fitting import parameters, sizes
 from .model.sensor_file import load_simulator
 from .model.simulator import Simulator
+from .search import Search
 from .settings import SETTINGS
 from .trajectory import Trajectory, read_trajectories, write_trajectories
-
-if typing.TYPE_CHECKING:
-    from ...effects.effect import Effect
-    from .search import Search
-    from .whitening import Comparison
+from .whitening import Comparison
 
 _MOST = 6  # explanations, the likeliest ones
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
@@ -69,7 +66,7 @@ class Explanation:
             yield step / spread, [*self.effects[:k], moved, *self.effects[k + 1 :]], self.nuisance
 
     def residuals(
-        self, comparison: "Comparison", known: list[tuple[np.ndarray, np.ndarray]] | None = None
+        self, comparison: Comparison, known: list[tuple[np.ndarray, np.ndarray]] | None = None
     ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per trajectory (m,) what is left, and (m, k) by how much less of it one of each parameter makes it;
         squares are nats twice over. known: what the explanation without the last effect gave, whose columns
@@ -90,7 +87,7 @@ class Explanation:
             own = [np.hstack([columns, more]) for (_, columns), more in zip(known, own)]
         return list(zip(here, own))
 
-    def with_unseen(self, effect: "Effect", score: float) -> "Explanation":
+    def with_unseen(self, effect: Effect, score: float) -> "Explanation":
         """This one with an effect of a realistic size besides, of which the data say so much [nats], and
         nothing of its parameters."""
         theta = {**effect.default(), **effect.grid[len(effect.grid) // 2]}
@@ -257,7 +254,7 @@ def _effect(name, theta, extra, design):
     return effect if effect.params.keys() == theta.keys() else effect.only(list(theta))
 
 
-def believed(comparison: "Comparison", search: "Search", doubts: list[str], chosen: np.ndarray) -> Beliefs:
+def believed(comparison: Comparison, search: Search, doubts: list[str], chosen: np.ndarray) -> Beliefs:
     """Probabilities of the likeliest explanations that a search has tried, and of the base model alone.
 
     Args:

@@ -2,7 +2,6 @@
 whatever the parameters are."""
 
 import dataclasses
-import typing
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,11 +9,9 @@ import numpy as np
 from ..evidence import ODDS
 from .beliefs import Beliefs, Explanation
 from .contacts import Bounds, Contact, drawn, trajectory_of
+from .model.simulator import Simulator
+from .trajectory import Trajectory
 from .whitening import Comparison
-
-if typing.TYPE_CHECKING:
-    from .model.simulator import Simulator
-    from .trajectory import Trajectory
 
 _PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
 _BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
@@ -28,7 +25,7 @@ class Planned:
     """A contact of a plan: its trajectory, without readings, and why it is one."""
 
     contact: Contact
-    trajectory: "Trajectory"
+    trajectory: Trajectory
     reason: str
 
 
@@ -129,7 +126,7 @@ class Separation:
 
 def planned(
     beliefs: Beliefs,
-    sim: "Simulator",
+    sim: Simulator,
     bounds: Bounds,
     budget: int,
     candidates: int | list = 32,

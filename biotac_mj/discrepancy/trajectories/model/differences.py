@@ -18,10 +18,8 @@ from ....geometry.skins import load_skin
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import OTHER_MESH
+from ..trajectory import Trajectory
 from .fields import MAPS, Curve, Fields, stack, unstack
-
-if typing.TYPE_CHECKING:
-    from ..trajectory import Trajectory
 
 _SHIFT = 40e-6  # [m] of the poses for differences
 # [m] along the press: densest where errors of poses lie, since rows before the touch begin to touch there
@@ -47,7 +45,7 @@ class Solver(typing.Protocol):
     options: dict
     cache: typing.Any
 
-    def solve(self, trajectories: "list[Trajectory]", **changes: object) -> list:
+    def solve(self, trajectories: list[Trajectory], **changes: object) -> list:
         """Force, pressure and ln Z along trajectories, dicts of arrays."""
 
     def but(self, models: dict | None = None, **changes: object) -> "Solver":
@@ -57,7 +55,7 @@ class Solver(typing.Protocol):
         """SkinModel and FilmConduction."""
 
 
-def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
+def solved_fields(sim: Solver, trajectories: list[Trajectory], progress: bool = True) -> Fields:
     """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
     tier, beside one of the simulator's own; kept in `cache`."""
     spheres = any("sphere" in t.tool for t in trajectories)
@@ -172,7 +170,7 @@ def _stiffer(sim, trajectories, base, tick):
 
 def tacky(
     sim: Solver,
-    trajectories: "list[Trajectory]",
+    trajectories: list[Trajectory],
     base: list,
     work: float,
     tick: Callable[[], object] | None = None,
@@ -186,7 +184,7 @@ def tacky(
 
 def filled(
     sim: Solver,
-    trajectories: "list[Trajectory]",
+    trajectories: list[Trajectory],
     base: list,
     tick: Callable[[], object] | None = None,
 ) -> dict:
@@ -204,7 +202,7 @@ def filled(
 
 def sunk(
     sim: Solver,
-    trajectories: "list[Trajectory]",
+    trajectories: list[Trajectory],
     base: list,
     tick: Callable[[], object] | None = None,
 ) -> dict:
@@ -226,7 +224,7 @@ def inflated(sim: Solver) -> bool:
 
 def softer(
     sim: Solver,
-    trajectories: "list[Trajectory]",
+    trajectories: list[Trajectory],
     base: list,
     tick: Callable[[], object] | None = None,
 ) -> dict:
@@ -245,7 +243,7 @@ def softer(
     return {"modulus": _difference(by_it, base, _SOFTER)}
 
 
-def spots(trajectories: "list[Trajectory]") -> list[str]:
+def spots(trajectories: list[Trajectory]) -> list[str]:
     """Places at which the rubber may be another, as parameters of `Spots`: where most trajectories
     touch, the others of each left out, at least two each."""
     place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])

@@ -12,17 +12,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ....effects.effect import Effect, Run
 from ....effects.in_film import RoughFilm, drain, remaining_liquid
 from ....effects.in_skin import memory_of, moduli
-from .fields import stack, unlike
+from ....sensor.film import FilmConduction
+from ....skin.model import SkinModel
+from ..trajectory import Trajectory
+from .fields import Fields, stack, unlike
 from .simulator import Simulator, _impedance, placed
-
-if typing.TYPE_CHECKING:
-    from ....effects.effect import Effect, Run
-    from ....sensor.film import FilmConduction
-    from ....skin.model import SkinModel
-    from ..trajectory import Trajectory
-    from .fields import Fields
 
 FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that say what follows from the skin here
 _LITTLE = 0.01  # share below which nothing is solved
@@ -30,9 +27,9 @@ _ALIKE = 0.25  # of logarithms of share and shapes, within which another solutio
 
 
 def solve_with_memory(
-    model: "SkinModel",
-    film: "FilmConduction",
-    trajectories: "list[Trajectory]",
+    model: SkinModel,
+    film: FilmConduction,
+    trajectories: list[Trajectory],
     poses: list | None = None,
     progress: Callable[[], object] | None = None,
     loss: float = 0.0,
@@ -113,13 +110,13 @@ class InSkinSimulator(Simulator):
 
     def run(
         self,
-        trajectories: "list[Trajectory]",
-        fields: "Fields | None" = None,
+        trajectories: list[Trajectory],
+        fields: Fields | None = None,
         exact: bool | list = True,
         effects: list | None = None,
         *more: typing.Any,
         **kw: typing.Any,
-    ) -> "list[Run]":
+    ) -> list[Run]:
         """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
         effects = self.effects if effects is None else effects
         inside = memory_of(effects)
@@ -133,7 +130,7 @@ class InSkinSimulator(Simulator):
         return [runs[i] if i in listed else other for i, other in enumerate(others)]
 
 
-def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) -> bool:
+def remember(sim: Simulator, fields: Fields, effect: Effect, theta: dict) -> bool:
     """Solves the skin of all trajectories with rubber, or contact, that itself does what an effect's reduced
     form says of the load, and keeps with the fields what that form misses: late rubber in one place is held
     up by that around it, and the film follows. From then on fits with the effect are right near theta.
@@ -179,7 +176,7 @@ class _Remembering(Simulator):
 
     def solve(
         self,
-        trajectories: "list[Trajectory]",
+        trajectories: list[Trajectory],
         offset: list | None = None,
         log_radius: list | None = None,
         log_friction: float = 0.0,

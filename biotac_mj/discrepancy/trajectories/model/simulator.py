@@ -27,11 +27,9 @@ from ....sensor.presets import SENSORS, Sensor, read_sensor
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import BETWEEN, KNOWN, Nuisance, widen
+from ..trajectory import Trajectory
 from .differences import softer, solved_fields, tacky
 from .fields import Fields, apart, nearest, sizes, square, stack
-
-if typing.TYPE_CHECKING:
-    from ..trajectory import Trajectory
 
 TIERS = ("condensed", "full")
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
@@ -161,7 +159,7 @@ class Simulator:
 
     def solve(
         self,
-        trajectories: "list[Trajectory]",
+        trajectories: list[Trajectory],
         offset: list | None = None,
         log_radius: list | None = None,
         log_friction: float = 0.0,
@@ -259,7 +257,7 @@ class Simulator:
             )
         return model, store["film"]
 
-    def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
+    def fields(self, trajectories: list[Trajectory], progress: bool = True) -> Fields:
         """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
         tier, beside one of the simulator's own; kept in `cache`."""
         return solved_fields(self, trajectories, progress)
@@ -286,7 +284,7 @@ class Simulator:
 
     def run(
         self,
-        trajectories: "list[Trajectory]",
+        trajectories: list[Trajectory],
         fields: "Fields | None" = None,
         exact: bool | list = True,
         effects: list | None = None,
@@ -491,7 +489,7 @@ def _add(run, modulus, change):
     run.log_z = run.log_z + change[:, 4:]
 
 
-def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
+def placed(t: Trajectory, shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
     """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied
     by exp(grow), its tip kept."""
     tool, pos = t.tool, t.pos + (0.0 if shift is None else shift)
