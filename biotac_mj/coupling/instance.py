@@ -24,14 +24,6 @@ from .stepper import SkinResult
 from .structs import DataView, ModelView
 from .touches import Touches
 
-__all__ = [
-    "NO_CONTACT",
-    "NO_PASSIVE",
-    "NO_SENSOR",
-    "STAGES",
-    "Instance",
-]
-
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 # flag with which nothing in the model touches, the skin neither

@@ -18,27 +18,6 @@ import warp as wp
 
 from .types import mat33, real, vec3
 
-__all__ = [
-    "CONDENSED",
-    "FULL",
-    "GUESS",
-    "MEMORY",
-    "OUTCOME",
-    "ROOM",
-    "VARIABLES",
-    "WORK",
-    "SavedState",
-    "StateLayout",
-    "Variable",
-    "allocate",
-    "clear",
-    "declared",
-    "options_of",
-    "saved_variables",
-    "variables_of",
-    "zeros",
-]
-
 FULL, CONDENSED = "full", "condensed"  # tiers
 _BOTH = FULL, CONDENSED
 

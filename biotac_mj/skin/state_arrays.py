@@ -12,8 +12,6 @@ from .geoms import GeomSet
 from .state import FULL, SavedState, StateLayout, options_of, saved_variables, variables_of
 from .transfer import Transfer
 
-__all__ = ["StateArrays"]
-
 # indices of the six numbers of a symmetric 3 x 3 matrix, and back
 _ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
 

@@ -41,8 +41,6 @@ from .program import Launcher, Program, compile_ahead, compile_kernels
 from .rubber.element_forces import module_for_cuda
 from .types import mat33, vec3
 
-__all__ = ["SkinStep", "kernels_for_cuda", "launch_step", "prepare_step", "step"]
-
 _FREE = (
     "tolerance",
     "max_newton",

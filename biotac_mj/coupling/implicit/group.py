@@ -7,8 +7,6 @@ import numpy as np
 from .coupled import Coupled
 from .springs import Springs
 
-__all__ = ["SkinGroup"]
-
 
 class SkinGroup:
     """Skins of one step, none of them idle.

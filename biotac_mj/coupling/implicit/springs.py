@@ -13,8 +13,6 @@ from ..structs import DataView, ModelView
 from .compliance import factor
 from .kinematics import row
 
-__all__ = ["Springs"]
-
 _NEWTON = int(mujoco.mjtSolver.mjSOL_NEWTON)
 _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 _ENTRIES = "J", "J_colind"  # of the constraints' Jacobian; the others are of its rows

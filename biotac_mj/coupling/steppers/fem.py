@@ -23,8 +23,6 @@ from ..config import Config
 from ..shared import Shared
 from ..stepper import Geom, SkinResult
 
-__all__ = ["CLEAR", "PATIENT", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
-
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
 PATIENT = 4  # times that, for a skin whose last step failed and would fail again
