@@ -996,6 +996,28 @@ def test_what_a_skin_has_seen_before_changes_nothing(coarse):
     assert 20 < first < 30 and 5 < second < 20 and not third
 
 
+def test_candidates_of_earlier_steps_are_all_that_touch(coarse):
+    """A ball creeps over the skin and another one comes to it, by micrometres, so that most steps search for
+    nothing: each outcome is that of a skin that searches in each."""
+    start, inward = touch(coarse.geometry)
+    other, other_inward = touch(coarse.geometry, x=-3e-3)
+    along, memory, sought, loads = np.cross(inward, [0.0, 0.0, 1.0]), Memory.rest(2), set(), []
+
+    def new():
+        return CondensedSkin(coarse, GeomSet(["sphere"] * 2, [(RADIUS,)] * 2, [0.5] * 2))
+
+    old = new()
+    for i in range(40):
+        pos = np.stack([start + 4e-4 * inward + 2e-6 * i * along, other + (4e-6 * i + 3e-5) * other_inward])
+        kept, fresh = (skin.solve(memory, pos, np.repeat(EYE, 2, 0)) for skin in (old, new()))
+        for name in ("wrench", "tangent", "vert_xpos", "load_factor", "iterations"):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
+        memory = kept.memory
+        sought.add(old._step._scratch.sought_pos.numpy().tobytes())
+        loads.append((memory.contacts[:, 1] == 1).any())
+    assert len(sought) < 30 and 5 < sum(loads) < 35
+
+
 def test_a_skin_that_moves_far_finds_its_new_contacts(coarse):
     """It begins so far from a ball that does not move that no face is a candidate, and comes back to it."""
     center, inward = touch(coarse.geometry)

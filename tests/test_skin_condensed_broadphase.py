@@ -13,7 +13,6 @@ from biotac_mj.skin.condensed import LinearSkin
 from biotac_mj.skin.condensed.broadphase import _may_meet_core, _meets_core, may_be_touched
 from biotac_mj.skin.condensed.states import Increment
 from biotac_mj.skin.condensed.structs import Constants, Scratch
-from biotac_mj.skin.contact.faces import Contact
 from biotac_mj.skin.contact.meshes import mesh_distance
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.types import real, vec3
@@ -88,7 +87,6 @@ def ask(
     c: Constants,
     x: wp.array2d(dtype=vec3),
     geoms: Geoms,
-    touch: Contact,
     s: Scratch,
     may_out: wp.array(dtype=bool),
 ):
@@ -96,7 +94,7 @@ def ask(
     o = Increment()
     o.reach = real(1.0)
     o.fraction = share
-    may_out[w] = may_be_touched(w, 0, 1, o, geoms, x, touch, c, s)
+    may_out[w] = may_be_touched(w, 0, 1, o, geoms, x, c, s)
 
 
 def test_faces_that_come_to_the_core_unsought_were_candidates():
@@ -107,9 +105,9 @@ def test_faces_that_come_to_the_core_unsought_were_candidates():
     way = np.random.default_rng(2).standard_normal(last.shape)
     way *= np.linalg.norm(last - rest, axis=2, keepdims=True) / np.linalg.norm(way, axis=2, keepdims=True)
     x = last + share / 3**0.5 * np.where(np.arange(60) < 30, 0.999, 1.001)[:, None] * way
-    touch, may = Contact(), wp.zeros(60, dtype=bool, device="cpu")
-    nodes, touch.x_last = (wp.array(a, dtype=vec3, device="cpu") for a in (x, last))
-    wp.launch(ask, 60, [share, c, nodes, Geoms(), touch, Scratch()], [may], device="cpu")
+    s, may = Scratch(), wp.zeros(60, dtype=bool, device="cpu")
+    nodes, s.sought_x = (wp.array(a, dtype=vec3, device="cpu") for a in (x, last))
+    wp.launch(ask, 60, [share, c, nodes, Geoms(), s], [may], device="cpu")
     np.testing.assert_array_equal(may.numpy(), np.arange(60) >= 30)
     candidate, before, now = near_core(share, c, last)[0], near_core(0, c, last)[1], near_core(0, c, x)[1]
     assert (now > before).sum() > 20

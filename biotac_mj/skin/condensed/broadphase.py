@@ -12,7 +12,6 @@ from ..contact.broadphase import (
     motion_bound,
     sample_within,
 )
-from ..contact.faces import Contact
 from ..contact.meshes import TRILINEAR, smooth_distance
 from ..contact.penetration import geoms_core_clearance
 from ..contact.posed import SKIN, Geoms, face_radius
@@ -106,12 +105,19 @@ def forget_faces(
     w: int,
     t: int,
     threads: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
     kept: wp.array2d(dtype=int),
     c: Constants,
     s: Scratch,
     touching: wp.array2d(dtype=int),
 ):
     """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
+    for i in range(t, x.shape[0], threads):
+        s.sought_x[i, w] = x[i, w]
+    for g in range(t, geoms.count, threads):
+        s.sought_pos[g, w] = geoms.pos[g, w]
+        s.sought_mat[g, w] = geoms.mat[g, w]
     for f in range(t, c.face.shape[0], threads):
         s.near[w, f] = kept[f, w]
         s.close_to[w, f] = wp.int64(0)
@@ -309,16 +315,15 @@ def may_be_touched(
     o: Increment,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
-    touch: Contact,
     c: Constants,
     s: Scratch,
 ):
-    """Whether a face that was no candidate when the increment began may have come to a geom since, or an
-    inner one to the core, by how far nodes and near geoms have moved at most."""
+    """Whether a face that was no candidate when they were sought may have come to a geom since, or an inner
+    one to the core, by how far nodes and near geoms have moved at most."""
     nodes = real(0.0)
     for k in range(t, c.node.shape[0], threads):
         i = c.node[k]
-        nodes = wp.max(nodes, wp.length_sq(x[i, w] - touch.x_last[i, w]))
+        nodes = wp.max(nodes, wp.length_sq(x[i, w] - s.sought_x[i, w]))
     posed = real(0.0)
     for g in range(geoms.count):
         if has(o.near, g):
@@ -331,10 +336,35 @@ def may_be_touched(
     over = real(0.0)
     for k in range(t, c.inner.shape[0], threads):
         i = c.inner[k]
-        went = wp.length_sq(x[i, w] - touch.x_last[i, w])
-        before = wp.length_sq(touch.x_last[i, w] - c.rest[i, 0])
+        went = wp.length_sq(x[i, w] - s.sought_x[i, w])
+        before = wp.length_sq(s.sought_x[i, w] - c.rest[i, 0])
         over = wp.max(over, ROOT3 * ROOT3 * went - o.fraction * o.fraction * before)
     return block_max(over) > real(0.0)
+
+
+@wp.func
+def is_known(
+    w: int,
+    t: int,
+    threads: int,
+    o: Increment,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    kept: wp.array2d(dtype=int),
+    c: Constants,
+    s: Scratch,
+):
+    """Whether the candidates that were found last are all that can touch."""
+    other = real(0.0)
+    for f in range(t, c.face.shape[0], threads):
+        if kept[f, w] == 1 and s.near[w, f] == 0:
+            other = real(1.0)
+    for k in range(t, c.inner.shape[0], threads):
+        if s.core_force[w, k] != real(0.0) and s.core_place[w, k] < 0:
+            other = real(1.0)
+    if block_max(other) > real(0.0):
+        return 0
+    return wp.where(may_be_touched(w, t, threads, o, geoms, x, c, s), 0, 1)
 
 
 @wp.func

@@ -433,14 +433,14 @@ def add_row(
     ...
 
 
-# By one thread the sums of `dot_column` or `dot_columns` of many columns at once, in the same order: 512 of
-# them after the other, which stay near.
+# By one thread the sums of `dot_column` or `dot_columns` of many columns at once, in the same order: 4096 of
+# them after the other, which stay near, of rows that are read in long pieces.
 _SUMS = """
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = listed.data + (long long)world * listed.shape[1];
     const float* __restrict f = factor.data + (long long)world * factor.shape[1];
-    for (int first = 0; first < n; first += 512) {{
-        const int most = n - first < 512 ? n - first : 512;
+    for (int first = 0; first < n; first += 4096) {{
+        const int most = n - first < 4096 ? n - first : 4096;
         float* __restrict total = sum.data + (long long)world * sum.shape[1] + first;
         const {kind} *__restrict c0, *__restrict c1, *__restrict c2, *__restrict c3;
         for (int j = 0; j < most; ++j) total[j] = 0.0f;

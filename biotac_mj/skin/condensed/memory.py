@@ -8,8 +8,6 @@ import numpy as np
 
 from ..state import CONDENSED, ROOM, SavedState, StateLayout
 
-__all__ = ["MAX_CONTACTS", "MAX_FORCES", "Memory", "Outcome", "layout_of"]
-
 MAX_FORCES, MAX_CONTACTS = (ROOM[name][CONDENSED] for name in ("forces", "contacts"))
 
 

@@ -29,7 +29,6 @@ from .structs import Remembered
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["CondensedSkin"]
 
 _OF_BODIES = "compliance", "predicted", "origin", "arm", "spin"
 _VIEWS = 16  # stored views of the broad phase, for several BioTacs that share a skin

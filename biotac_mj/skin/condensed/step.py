@@ -227,6 +227,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.previous.begins = wp.zeros(nworld, dtype=int)
     s.pos, s.from_pos, s.held_pos, s.sought_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(4))
     s.mat, s.from_mat, s.held_mat, s.sought_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(4))
+    s.sought_x = wp.zeros((model.nvert, nworld), dtype=vec3)
     s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
     s.seen_mat = wp.zeros((room.views, ngeom, nworld), dtype=mat33)
     s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near

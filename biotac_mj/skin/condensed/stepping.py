@@ -18,6 +18,7 @@ from .broadphase import (
     find_nodes,
     forget_faces,
     is_deep,
+    is_known,
     largest_displacement,
     may_be_touched,
     measure_core,
@@ -131,6 +132,18 @@ def _begin_increment(p: LoadStepping, most: real):
 
 
 @wp.func
+def _next_increment(last: Increment):
+    """A new increment, which knows the candidates of the last one."""
+    o = Increment()
+    o.nface = last.nface
+    o.ncore = last.ncore
+    o.near = last.near
+    o.reach = last.reach
+    o.fraction = last.fraction
+    return o
+
+
+@wp.func
 def begin_step(
     w: int,
     t: int,
@@ -189,7 +202,7 @@ def begin_step(
     if t == 0:
         s.previous.begins[w] = 0
         s.solve.stepping[w] = _begin_increment(p, s.most[w])
-        s.solve.increment[w] = Increment()
+        s.solve.increment[w] = _next_increment(s.solve.increment[w])
         s.solve.phase[w] = SEARCH
 
 
@@ -245,6 +258,7 @@ def search(
     sync()
     first = wp.where(o.searches == 0, 1, 0)
     looking = int(1)
+    known = int(0)  # whether the candidates of an earlier increment are all that can touch
     moved = real(0.0)
     if first == 1:
         if p.again == 1:
@@ -252,7 +266,6 @@ def search(
             o = _begin_at(w, t, threads, o, at.balance, at.pos, at.mat, p.modulus, c, s, st)
         else:
             o = _begin_at(w, t, threads, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
-        forget_faces(w, t, threads, touch.kept, c, s, touch.touching)
         sum_forces(w, t, threads, geoms, x, touch, c, s)
         if p.at == real(0.0):  # where the step begins
             for h in range(t, s.bodies.begun.shape[0], threads):
@@ -260,29 +273,35 @@ def search(
             sync()
         place_bodies(w, t, threads, p.to, geoms, s)
         moved = wp.pow(real(0.5), real(o.halved - 1)) * _largest_motion(w, geoms)
-        for g in range(t, geoms.count, threads):
-            s.sought_pos[g, w] = geoms.pos[g, w]
-            s.sought_mat[g, w] = geoms.mat[g, w]
         view, travel, near = choose_view(w, t, threads, geoms, c, s)
+        if p.holds == 1:
+            o.solved = r.solved[w]
+        elif is_deep(w, t, threads, view, travel, near, geoms, c, s):
+            o.deep = 1
+            looking = 0
+        elif near & o.near == near:
+            known = is_known(w, t, threads, o, geoms, x, touch.kept, c, s)
         o.view = view
         o.travel = travel
         o.near = near
-        o.reach = _REACH + moved
-        if p.holds == 1:
-            o.solved = r.solved[w]
-            o.reach = real(-1.0)  # what touched
-        elif is_deep(w, t, threads, o.view, o.travel, o.near, geoms, c, s):
-            o.deep = 1
-            looking = 0
-    if looking == 1:
+        if known == 0:
+            forget_faces(w, t, threads, geoms, x, touch.kept, c, s, touch.touching)
+            o.reach = _REACH + moved
+            if p.holds == 1 or looking == 0:  # what touched
+                o.reach = real(-1.0)
+            o.nface = 0
+    if looking == 1 and known == 0:
         largest = largest_displacement(w, t, threads, x, c)
         reach = real(0.0)
         fraction = real(0.0)
         if first == 1:
+            o.fraction = real(0.0)
             if o.reach * largest > real(0.0):
                 o.fraction = wp.min(real(1.0), real(1.5) * o.reach / largest)
             reach = o.reach
             fraction = o.fraction
+        else:
+            o.reach = real(-1.0)  # which nodes have left
         nface, new = find_faces(w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, x, c, s)
         ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
         new += inner
@@ -291,17 +310,19 @@ def search(
         else:
             o.nface = nface
             o.ncore = ncore
-            nnode, nin = find_nodes(w, t, threads, nface, ncore, x, c, s)
-            o.nnode = nnode
-            o.nin = nin
-            if ncore > s.core_face.shape[1] or 3 * nnode + nin > s.coordinate.shape[1]:
-                if first == 1 and moved > _REACH:
-                    o.halved += 1
-                    if t == 0:
-                        s.solve.increment[w] = o
-                    return
-                looking = 0
-                o.ok = 0
+    if looking == 1:
+        nnode, nin = find_nodes(w, t, threads, o.nface, o.ncore, x, c, s)
+        o.nnode = nnode
+        o.nin = nin
+        if o.ncore > s.core_face.shape[1] or 3 * nnode + nin > s.coordinate.shape[1]:
+            o.reach = real(-1.0)  # not all are listed
+            if first == 1 and moved > _REACH:
+                o.halved += 1
+                if t == 0:
+                    s.solve.increment[w] = o
+                return
+            looking = 0
+            o.ok = 0
     if looking == 1:
         measure_core(w, t, threads, o.nnode, o.nin, o.ncore, x, c, s)
         find_groups(w, t, threads, o.nnode, geoms, x, touch, c, s)
@@ -455,7 +476,7 @@ def _conclude_pass(
         return o, NEWTON
     _store(w, t, threads, o.nnode, o.nin, c, s)
     if o.ok != CUT:
-        if may_be_touched(w, t, threads, o, geoms, x, touch, c, s):
+        if may_be_touched(w, t, threads, o, geoms, x, c, s):
             return o, SEARCH
     return o, BALANCED
 
@@ -533,7 +554,7 @@ def conclude_balance(
     if on == 1:
         if t == 0:
             s.solve.stepping[w] = _begin_increment(p, s.most[w])
-            s.solve.increment[w] = Increment()
+            s.solve.increment[w] = _next_increment(o)
             s.solve.phase[w] = SEARCH
         return
     for i in range(t, c.node.shape[0], threads):

@@ -143,7 +143,8 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
-    sought_pos: wp.array2d(dtype=vec3)  # where candidates were sought first
+    sought_x: wp.array2d(dtype=vec3)  # where nodes and geoms were when candidates were sought first
+    sought_pos: wp.array2d(dtype=vec3)
     sought_mat: wp.array2d(dtype=mat33)
     held_pos: wp.array2d(dtype=vec3)  # where they were at the balance from which another is foretold
     held_mat: wp.array2d(dtype=mat33)
