@@ -265,26 +265,26 @@ class Instance:
           end of the step.
         """
         self._pose, self.stays = (pos, mat), False
-        dt = self.model.opt.timestep
+        dt, stepper, before = self.model.opt.timestep, self.setup.skin.stepper, self._skin
         begin, also = {}, core
-        if getattr(self.setup.skin.stepper, "begins_near", False) and near is not None and near.converged:
+        if getattr(stepper, "begins_near", False) and near is not None and near.converged:
             begin, also = {"near": near}, (*core, *near.pose)
-        if getattr(self.setup.skin.stepper, "may_wait", False) and self._may_wait:
+        if getattr(stepper, "may_wait", False) and self._may_wait:
             begin["patient"] = True
-        if getattr(self.setup.skin.stepper, "counts_cost", False):
+        if getattr(stepper, "counts_cost", False):
             begin["spent"] = spent
         if bodies is not None:
             begin["bodies"] = bodies
             also = (*also, bodies.compliance, bodies.wrench)
         poses = [a.tobytes() for a in (pos, mat, *also)]
-        key = (dt, spent, tuple(begin), self.touching.parted, self._key(), *poses)
+        poses += self.parts[1].tobytes(), stepper.key(before) if hasattr(stepper, "key") else before.tobytes()
+        key = (dt, spent, tuple(begin), self.touching.parted, *poses)
         # solving is a function of the key, so a second mj_forward costs nothing
         result = self._solved.get(key)
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
-            skin, before = self.setup.skin, self._skin
-            with skin.lock:
-                result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
+            with self.setup.skin.lock:
+                result = stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
             fraction, path = self.touching.fraction, self.touching.path
             result = copy.copy(result)  # a stepper may keep it
             result.pose = (pos, mat) if bodies is None else self._came_to(result.state)
@@ -361,11 +361,6 @@ class Instance:
         they were to go; asked only with Runge-Kutta, whose status is written when the step ends."""
         rounds, settled, withheld, _, _, acting = self._outcome
         self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, ends, acting
-
-    def _key(self):
-        """Bytes of all in the plugin state that a solve depends on."""
-        models, skin, stepper = self.parts[1], self._skin, self.setup.skin.stepper
-        return models.tobytes(), stepper.key(skin) if hasattr(stepper, "key") else skin.tobytes()
 
     def _counts(self):
         if self._reading is None:

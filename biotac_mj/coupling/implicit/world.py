@@ -296,13 +296,12 @@ class World:
         self.data.qpos[:] = after
 
     def _solved(self, skin):
-        """Whether MuJoCo's constraint solver found what holds a skin's bodies."""
-        return self._rows_hold(skin) and self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
-
-    def _rows_hold(self, skin):
-        """Whether a skin's rows push what its model says."""
+        """Whether a skin's rows push what its model says, and MuJoCo's constraint solver found what holds its
+        bodies."""
         rows = np.abs(_SCALE * skin.excess).max(initial=0.0)
-        return not rows > SOLVED * np.abs(_SCALE * skin.arrays.acting).max(initial=0.0)
+        if rows > SOLVED * np.abs(_SCALE * skin.arrays.acting).max(initial=0.0):
+            return False
+        return self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
 
     def _find_balance(self, skins, outside):
         """Finds models of the skins that hold where these lead; returns how many rounds that took.
