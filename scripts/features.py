@@ -342,8 +342,8 @@ _COUPLING = (
     ("A skin that could not move for three steps begins anew from rest", "attach, condensed, batch"),
     ("Bodies move with the accelerations of MuJoCo's integrator (velocity products, joint damping), found "
      "for all skins of a world together", "attach, condensed, batch"),
-    ("With RK4 the skin and MuJoCo's constraints on what it touches are solved once a step, and their "
-     "forces act in all stages", "attach, condensed; refused in batches"),
+    ("With RK4 the skin and MuJoCo's contacts, limits and friction on what it touches are solved once a "
+     "step, and their forces act in all stages", "attach, condensed; refused in batches"),
     ("Energy is counted along the way that bodies went, along arcs where joints turn",
      "attach, condensed, batch"),
     ("Several skins on one body search for their balance together",
