@@ -307,3 +307,19 @@ def test_another_residual_film_is_that_of_a_film_made_with_it(sensor):
     assert own.residual_film == 50e-6 and not np.allclose(own.impedance(pressed), made.impedance(pressed))
     with pytest.raises(ValueError, match="residual_film is 0.0: pass a positive number"):
         own.with_residual_film(0.0)
+
+
+def test_a_skin_that_is_as_it_was_is_not_solved_again():
+    """What lays a film in between, or what is none, leaves no impedance behind."""
+    film, made = FilmConduction(load_skin("coarse")), []
+    film._solve_single = [lambda: made.append(0), *film._solve_single]
+    at_rest = film.geometry.vert
+    moved = at_rest + [0.0, 1e-5, 0.0]
+    first, rest = film.impedance(moved), film.impedance(at_rest)
+    assert len(made) == 2 and (first != rest).all()
+    assert (film.impedance(at_rest.copy()) == rest).all() and len(made) == 2
+    film.film(moved)
+    assert (film.impedance(moved) == first).all() and len(made) == 3
+    with pytest.raises(ValueError, match="not finite"):
+        film.impedance(np.full_like(moved, np.nan))
+    assert (film.impedance(moved) == first).all()

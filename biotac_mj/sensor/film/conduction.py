@@ -173,9 +173,10 @@ class FilmConduction:
             return out
         x, valid, impedance, local = self._views
         with self._lock:
-            x[:, 0] = vert_xpos
-            for launch in self._solve_single:
-                launch()
+            if not (valid[0] and np.array_equal(x[:, 0], vert_xpos)):  # else the skin is as it was
+                x[:, 0] = vert_xpos
+                for launch in self._solve_single:
+                    launch()
             if valid[0]:  # then all positions are finite
                 return impedance[0].copy()
             local = local[:, 0].copy()
@@ -221,7 +222,7 @@ class FilmConduction:
         vert_xpos = np.asarray(vert_xpos, dtype=float)
         self._check_finite(vert_xpos)
         with self._lock:
-            self._views[0][:, 0] = vert_xpos
+            self._views[0][:, 0], self._views[1][0] = vert_xpos, 0  # no impedance belongs to it
             self._single.lay(self._x, self._now)
             return self._single.middle.numpy()[:, 0].copy(), self._single.thickness.numpy()[:, 0].copy()
 
@@ -244,6 +245,7 @@ class FilmConduction:
         self._solve_single = self._single.recorded(self._x, self._now)
         arrays = self._x, self._single.valid, self._single.impedance, self._single.local
         self._views = [array.numpy() for array in arrays]
+        self._views[1][0] = 0
 
     def _set_mesh(self):
         """Film nodes, ordered for a small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed)
