@@ -4,7 +4,7 @@ others and from its own earlier blocks."""
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 
 from ...quality.clock import CLOCK_FAULT
 from ...quality.noise import noise_level, running_median
@@ -21,16 +21,6 @@ _SWINGS = 4.0
 _COMPARED = 400  # rows of the shortest recording in USUAL
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
 _FEW = 3  # samples that are sharp in a recording of any length
-_STILL, _QUIET = (
-    10,
-    5.0,
-)  # rows over which a finger stands still, and how far electrodes wander then, of noise
-# rows within which a finger stands still before it is touched or after it is let go; of the noise, how far
-# three electrodes move in a touch
-_NEAR, _TOUCHED = 20, 10.0
-# of sharp samples where no touch begins or ends: one, or this share of all, is chance; in one row a touch
-# makes six at most (simulated), rows that are put together from elsewhere 16
-_STRAY, _MANY = 0.01, 8
 
 
 @dataclasses.dataclass
@@ -139,10 +129,6 @@ def _of_rows(session):
     same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
     live = np.median(noise_level(x)) > 1.0
     number = int(sharp.sum())
-    # a hard touch is as sharp as what goes wrong, but a finger that stood still begins or ends to move there
-    touch = _touched(x) & (sharp.sum(1) <= _MANY)
-    if session.loaded and sharp[~touch].sum() <= max(1, _STRAY * number):
-        sharp, number = np.zeros_like(sharp), 0
     most = np.argsort(-sharp.sum(0))[:2]
     rhythm = f"a rhythm of {f[band][most_over]:.1f} Hz and up to {beats[most_over].max():.0f} counts"
     said = {"rhythm": rhythm} | dict.fromkeys(
@@ -172,27 +158,3 @@ def _spectrum(x, series, size, least):
     power = np.mean([np.abs(np.fft.rfft((y - project @ y) * window, axis=0)) ** 2 for y in parts], axis=0)
     power += least
     return power, np.log(power / running_median(power, 2 * max(4, size // 32) + 1, "nearest"))
-
-
-def _touched(x):
-    """(n - 1,) whether a touch begins or ends between two rows of x (n, nelectrode): at least three
-    electrodes move there, and before it or after it nearly all stand still. Electrodes that stand still on
-    both sides, at different values, were touched within few rows."""
-    half = _STILL // 2
-    near = np.concatenate([[0], np.cumsum(_still(x))])
-    i, n = np.arange(len(x) - 1), len(x)
-    before = near[np.clip(i - half, 1, n)] > near[np.clip(i - _NEAR, 0, n - 1)]
-    after = near[np.clip(i + _NEAR, 1, n)] > near[np.clip(i + 1 + half, 0, n - 1)]
-    far = _moved(x, 2 * _NEAR + 1)[:-1] > _TOUCHED * noise_level(x) + 4
-    return (before | after) & (far.sum(1) >= 3)
-
-
-def _moved(x: np.ndarray, rows: int) -> np.ndarray:
-    """(n, c) by how much x (n, c) changes within some rows around each."""
-    return maximum_filter1d(x, rows, axis=0) - minimum_filter1d(x, rows, axis=0)
-
-
-def _still(x: np.ndarray) -> np.ndarray:
-    """(n,) whether nearly all of the electrodes x (n, c) [counts] stand still."""
-    noise = noise_level(x)
-    return (_moved(uniform_filter1d(x, 3, axis=0), _STILL) < _QUIET * (noise + 0.5)).mean(1) > 0.9

@@ -31,8 +31,6 @@ _ROWS = 4000
 _AXES = 6  # principal components
 _P = 0.02
 _SOUND = 5  # delays that are tried within a frame
-_TAUS = np.geomspace(0.007, 0.4, 12)  # [s] of low-passes that a delay is compared with
-_TIE = 1.64  # standard errors, paired over blocks
 
 
 class ForceView:
@@ -77,12 +75,6 @@ class ForceView:
         """(blocks,) mean of `errors` over components where the electrodes are `delay` [s] late."""
         return self.errors(lambda x: shifted(x, self.time, -delay)).mean(1)
 
-    def at_low_pass(self, tau: float) -> np.ndarray:
-        """(blocks,) the same where they follow the force by a first-order low-pass of tau [s]."""
-        # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify noise
-        t, half = self.time, 0.5 * tau
-        return self.errors(lambda x: x + shifted(x, t, -half) - shifted(x, t, half)).mean(1)
-
 
 def force_view(session: Session, rows: np.ndarray) -> ForceView | None:
     """ForceView of contiguous rows (n,) bool, None where force and electrodes are not related."""
@@ -114,9 +106,6 @@ def delayed(session: Session) -> Candidate | None:
         _vertex(delays, table.mean(1)),
         *np.quantile([_vertex(delays, d) for d in draws], [0.025, 0.975]),
     )
-    rival = min((view.at_low_pass(t) for t in _TAUS if t > 0.4 / view.rate), key=np.mean)
-    lead = rival - table[best]
-    tied = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
     return Candidate(
         "latency",
         tuple(range(session.counts.shape[1])),
@@ -128,7 +117,6 @@ def delayed(session: Session) -> Candidate | None:
         nats=float(0.5 * 3 * gain.sum() * min(max(1.0, seconds / _BLOCKS), 20)),
         p=p,
         detector="late",
-        ties=("lowpass",) if tied else (),
         delay=delay,
         features={
             "gain": float(np.log(max(gain.mean(), 1e-4))),

@@ -27,8 +27,6 @@ _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
-_SHAPES = ("step", "smooth", "both")
-_ALL_SHAPES = (*_SHAPES, "walk")
 _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _WARMER = 0.05  # [K] by which the thermistor has to change
 _ALIKE = 0.9  # correlation of a trend with the thermistor's
@@ -44,26 +42,26 @@ def levels(session: Session, refused: set) -> Candidate | None:
     m = session.model()
     number = len(m.used)
     everyone = np.ones(number)
-    level, time = m.levels(m.shared(everyone))
-    best = trends(level, time)[0]
+    common, time = m.levels(m.shared(everyone))
+    best = trends(common, time)[0]
     finding = _beside(session, refused, best)
     if finding is not None:
         return finding
     weight = everyone @ m.given.precision[:number, :number] @ everyone
-    tried = [(_energy(best, time) * weight, None, level)]
+    tried = [(_energy(best, time) * weight, None, best, common)]
     alone, _ = m.levels(m.alone())
     for i, k in enumerate(m.used):
         best = trends(alone[:, i], time)[0]
-        tried.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), alone[:, i]))
+        tried.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), best, alone[:, i]))
     tried.sort(key=lambda o: -o[0])
-    size = {k: float(np.log(max(energy, 1e-12))) for energy, k, _ in tried}
+    size = {k: float(np.log(max(energy, 1e-12))) for energy, k, *_ in tried}
     tried = [o for o in tried if (o[1],) not in refused]
     # of single electrodes the levels wander with a load as well
-    for energy, k, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
-        trend = trends(level, time, thorough=True, kinds=_SHAPES if k is None else _ALL_SHAPES)[0]
+    for energy, k, trend, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
         if k is None and trend.kind == "step" and sharp(level, time, trend.onset) <= SHARP:
             # where the load's level changes all drift a little: a step that does not stand out is none
-            trend = trends(level, time, thorough=True, kinds=("smooth",))[0]
+            trend = trends(level, time, ("smooth",))[0]
+        trend = trend.continued(level, time)
         if trend.p > 0.02 or trend.nats < 6 or energy < 30:
             continue
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
@@ -71,8 +69,6 @@ def levels(session: Session, refused: set) -> Candidate | None:
             continue
         if k is not None and _own_share(session, trend, trend.size):
             continue
-        if k is None and trend.kind == "both":  # a jump of the supply beside a warm-up: one after the other
-            trend = trend.parts()[0]
         finding = _shared(session, trend) if k is None else _single(session, trend, k)
         finding.features["lead"] = _lead(size, k, designed(session.counts))
         return finding
@@ -188,8 +184,9 @@ def settle(session: Session) -> None:
                 trend = every.trend(int(place[0]))
             else:
                 series = m.shared(finding.share[m.used]) if common else m.alone()[:, int(place[0])]
-                kinds = _ALL_SHAPES if not common else (finding.trend.kind,)
-                trend = trends(*m.levels(series), thorough=True, kinds=kinds)[0]
+                kinds = (finding.trend.kind,) if common else ("step", "smooth")
+                levels_at = m.levels(series)
+                trend = trends(*levels_at, kinds)[0].continued(*levels_at)
             again = _shared(other, trend) if common else _single(other, trend, finding.channels[0])
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.message = again.nats, again.p, again.message

@@ -1,5 +1,5 @@
-"""Courses over time of one series of levels: a constant, a step, a smooth curve, or both, compared on
-blocks of time left out; and how a trend goes on beyond the last row fitted."""
+"""Courses over time of one series of levels: a constant, a step, or a smooth curve, compared on blocks of
+time left out; and how a trend goes on beyond the last row fitted."""
 
 import dataclasses
 import functools
@@ -8,7 +8,7 @@ import numpy as np
 
 from ...evidence import log_ratio, sign_flip
 
-__all__ = ["BLOCKS", "SHARP", "Trend", "compare", "trends", "goes_on", "hats", "sharp"]
+__all__ = ["BLOCKS", "SHARP", "Trend", "compare", "trends", "sharp"]
 
 BLOCKS = 16
 _KNOTS = (4, 7, 11)
@@ -21,9 +21,9 @@ class Trend:
     """A trend that was fitted to levels.
 
     Attributes:
-      kind: "step", "smooth", "both" or "walk", from cell to cell; onset [s] of the step, nan; knots [s],
-        values there without the step, jump: of the step; gain (blocks,) nats of each block left out against
-        a constant; p of their sign flips; tail: (rate per s, time constant [s]) with which it goes on.
+      kind: "step" or "smooth"; onset [s] of the step, nan; knots [s], values there without the step, jump: of
+        the step; gain (blocks,) nats of each block left out against a constant; p of their sign flips;
+        tail: (rate per s, time constant [s]) with which it goes on.
     """
 
     kind: str
@@ -41,25 +41,20 @@ class Trend:
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Values at times [s]."""
-        last = self.knots[-1]
         out = np.interp(time, self.knots, self.values) + self.jump * (time > self.onset)
         rate, tau = self.tail
         if rate:
-            late = np.maximum(time - last, 0)
+            late = np.maximum(time - self.knots[-1], 0)
             out = out + rate * (late if np.isinf(tau) else tau * (1 - np.exp(-late / tau)))
         return out
+
+    def continued(self, level: np.ndarray, time: np.ndarray) -> "Trend":
+        """It as it goes on beyond the levels (w,), at times (w,) [s], that it was fitted to."""
+        return dataclasses.replace(self, tail=_goes_on(level, time)) if self.kind == "smooth" else self
 
     def sampled(self) -> np.ndarray:
         """(100,) values over the rows fitted."""
         return self(np.linspace(self.knots[0], self.knots[-1], 100))
-
-    def parts(self) -> tuple["Trend", "Trend"]:
-        """The step and the smooth trend of both."""
-        zero = np.zeros_like(self.values)
-        return (
-            dataclasses.replace(self, kind="step", values=zero, tail=(0.0, 0.0)),
-            dataclasses.replace(self, kind="smooth", jump=0.0),
-        )
 
     @property
     def size(self) -> float:
@@ -89,15 +84,11 @@ def compare(null: np.ndarray, other: np.ndarray, block: np.ndarray, scale: float
     return log_ratio(*square, number, scale**2)
 
 
-def trends(
-    level: np.ndarray, time: np.ndarray, thorough: bool = False, kinds: tuple = ("step", "smooth", "both")
-) -> list[Trend]:
+def trends(level: np.ndarray, time: np.ndarray, kinds: tuple = ("step", "smooth")) -> list[Trend]:
     """Courses compared with a constant on blocks left out, the best first.
 
     Args:
-      level: (w,) means of cells; time: (w,) [s]; thorough: whether a step on a smooth trend is tried too,
-        and how it goes on; kinds: to choose from. A walk, of which each cell is left out alone and said by
-        the two beside it, is tried where nothing else is a trend, if asked for: a load's levels do as much.
+      level: (w,) means of cells; time: (w,) [s]; kinds: to choose from.
     """
     w = len(level)
     scale = max(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2), 0.01 * level.std(), 1e-9)
@@ -109,31 +100,15 @@ def trends(
         gain = compare(null, left_out @ level, block, scale)
         knots = np.linspace(time[0], time[-1], k)
         found.append(Trend("smooth", np.nan, knots, weights @ level, 0.0, gain, sign_flip(gain)))
-    smooth = max(found, key=lambda c: c.nats).knots
-    for knots in (time[[0, -1]], *([smooth] if thorough else [])):
-        basis = hats(time, knots) if len(knots) > 2 else np.ones((w, 1))
-        residual = np.empty(w)
-        for b in range(block[-1] + 1):
-            rest = block != b
-            onset, weights = _with_step(level, basis, time, rest)
-            said = basis @ weights[:-1] + weights[-1] * (time > onset)
-            residual[~rest] = (level - said)[~rest]
-        gain = compare(null, residual, block, scale)
-        onset, weights = _with_step(level, basis, time, np.ones(w, bool))
-        values = weights[:-1] if len(knots) > 2 else np.repeat(weights[0], 2)
-        kind = "both" if len(knots) > 2 else "step"
-        found.append(Trend(kind, onset, knots, values, float(weights[-1]), gain, sign_flip(gain)))
-    if "walk" in kinds and min(c.p for c in found) > 0.02:
-        near = np.r_[level[1], 0.5 * (level[2:] + level[:-2]), level[-2]]
-        gain = compare(null, level - near, block, scale)
-        found.append(Trend("walk", np.nan, time, level - level.mean(), 0.0, gain, sign_flip(gain)))
-    found = [c for c in found if c.kind in kinds]
-    found = [c for c in found if c.kind != "both" or sharp(level, time, c.onset) > SHARP]
-    found.sort(key=lambda c: -c.nats)
-    if thorough:
-        best = found[0]
-        best.tail = goes_on(level, time) if best.kind == "smooth" else (0.0, 0.0)
-    return found
+    residual = np.empty(w)
+    for b in range(block[-1] + 1):
+        rest = block != b
+        onset, before, jump = _with_step(level, time, rest)
+        residual[~rest] = (level - before - jump * (time > onset))[~rest]
+    gain = compare(null, residual, block, scale)
+    onset, before, jump = _with_step(level, time, np.ones(w, bool))
+    found.append(Trend("step", onset, time[[0, -1]], np.full(2, before), jump, gain, sign_flip(gain)))
+    return sorted((c for c in found if c.kind in kinds), key=lambda c: -c.nats)
 
 
 def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
@@ -152,21 +127,15 @@ def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
     return float(near / spread) if before + after <= _LASTS else 0.0
 
 
-def hats(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """(w, k) piecewise linear functions, one at each knot."""
-    return np.stack([np.interp(time, knots, row) for row in np.eye(len(knots))], axis=1)
-
-
-def _solve(A, y):
-    return np.linalg.solve(A.T @ A + 1e-3 * np.eye(A.shape[1]), A.T @ y)
-
-
 @functools.lru_cache(maxsize=64)
 def _left_out(w, k):
     """Matrix (w, w) from w levels to the residuals of each block, by least squares of the other blocks on k
     hats over even cells; and matrix (k, w) from levels to the weights of a fit to all."""
     cells = np.linspace(0, 1, w)
-    basis = hats(cells, np.linspace(0, 1, k)) if k > 1 else np.ones((w, 1))
+    knots = np.linspace(0, 1, k)
+    basis = (
+        np.stack([np.interp(cells, knots, row) for row in np.eye(k)], axis=1) if k > 1 else np.ones((w, 1))
+    )
     block = np.arange(w) * min(BLOCKS, w // 2) // w
     out = np.eye(w)
     small = 1e-3 * np.eye(k)
@@ -177,29 +146,17 @@ def _left_out(w, k):
     return out, np.linalg.solve(basis.T @ basis + small, basis.T)
 
 
-def _with_step(level, basis, time, rows):
-    """Onset [s] and weights of basis and step that explain some rows best."""
-    A, y, t = basis[rows], level[rows], time[rows]
-    q, steps, size = _steps(A.tobytes(), A.shape)
-    rest = y - q @ (q.T @ y)
-    explained = (steps.T @ rest) ** 2 / size
-    i = int(explained.argmax()) + 2
-    onset = float((t[i] + t[i + 1]) / 2)
-    return onset, _solve(np.column_stack([A, t > onset]), y)
+def _with_step(level, time, rows):
+    """Onset [s] of the step that explains some rows best, the level before it, and its size."""
+    y, t = level[rows], time[rows]
+    total, count = np.cumsum(y), np.arange(1, len(y) + 1)
+    before = total / count
+    after = (total[-1] - total) / np.maximum(len(y) - count, 1)
+    i = 2 + int((count * (len(y) - count) * (after - before) ** 2)[2:-3].argmax())
+    return float((t[i] + t[i + 1]) / 2), float(before[i]), float(after[i] - before[i])
 
 
-@functools.lru_cache(maxsize=256)
-def _steps(basis, shape):
-    """For a basis (cells, k), passed as bytes since all electrodes of a session share it: an orthonormal
-    basis, the steps (cells, candidates) orthogonal to it (one projection for all onsets), and their squared
-    norms."""
-    q = np.linalg.qr(np.frombuffer(basis).reshape(shape))[0]
-    steps = np.tri(shape[0], shape[0] - 1, -1)[:, 2:-2]
-    steps = steps - q @ (q.T @ steps)
-    return q, steps, np.maximum((steps**2).sum(0), 1e-2)
-
-
-def goes_on(level: np.ndarray, time: np.ndarray) -> tuple:
+def _goes_on(level: np.ndarray, time: np.ndarray) -> tuple:
     """(rate, time constant) of a damped trend (Gardner and McKenzie 1985) beyond the last cell, chosen by
     walking forward through the cells: at three earlier ends what came next is said from what was there."""
     span = time[-1] - time[0]
