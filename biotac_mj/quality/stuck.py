@@ -18,11 +18,9 @@ _BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
 # middle half of the channel's range; fraction of samples there that a low-pass makes constant: 0.45 to 0.61
 # for low-passes of three authors, 0 at limits (34 channels of five authors)
 _INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
-_STANDS = 8.0  # [counts] most jitter of a constant channel
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
 _ALIVE = 1.2  # [counts] of noise, four times that of rounding
-_STAYS_PUT = 0.8  # of the samples between the first and the last constant one
 
 
 def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
@@ -47,9 +45,8 @@ def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Finds channels that are constant for a time; a live one has noise in every row. A channel that returns
     again and again to a limit of its range is clipped, others are stuck."""
     known = {k for f in faults if f.step or f.silent for k in f.channels}
-    rows = np.flatnonzero(~log.masked.all(1) & ~log.repeated)
-    # repeated rows are constant anyway
-    if len(rows) < 4 * _WINDOW or any(f.held and f.mask is None for f in faults):
+    rows = np.flatnonzero(~log.masked.all(1) & ~log.repeated)  # repeated rows are constant anyway
+    if len(rows) < 4 * _WINDOW:
         return []
     quiet = _quiet(log, rows)
     fraction = quiet.mean(0)
@@ -63,22 +60,10 @@ def stuck_or_clipped(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     sure = _long_constant(log, log.read[rows])[before]
     found = []
     for k in np.flatnonzero(single | limited | sure.any(0)):
-        if k in known:
-            continue
-        at = np.zeros(len(rows), bool)
-        at[1:-1] = quiet[:, k] & (single | limited)[k]
-        at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of consecutive windows
-        still = at[before] | sure[:, k]
-        if not still.any():
-            continue
-        # equal readings are all constant or none: a window shows only the middle ones
-        run = np.cumsum(np.diff(log.read[:, k], prepend=np.nan) != 0)
-        still |= np.isin(run, run[still])
-        found += [
-            f
-            for f in _constant_faults(log, int(k), still, sure[:, k])
-            if single[k] or f.beyond or sure[:, k].any()
-        ]
+        if k not in known:
+            at = np.pad(quiet[:, k] & (single | limited)[k], 1)
+            some = _constant_faults(log, int(k), at[before] | sure[:, k], sure[:, k])
+            found += [f for f in some if single[k] or f.beyond or sure[:, k].any()]
     return found
 
 
@@ -134,7 +119,6 @@ def _constant_faults(log, k, still, sure):
     moving = ~still & ~log.masked.all(1)
     start, length = runs(still)
     values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
-    ranges = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
     on = np.flatnonzero(still)
     first = on[len(on) // 20]  # a limit may begin late, and a window may be quiet by chance
     if moving[first:].sum() > 0.2 * len(on):
@@ -147,15 +131,12 @@ def _constant_faults(log, k, still, sure):
     if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
         if still[inner].mean() > _FILTERED:
             return []
-    stays = still[on[0] : on[-1] + 1].mean() > _STAYS_PUT  # a limit is left when the load decreases
     low, high = _at_ends(values, ends)
     for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
         if side < 0 and not log.signed:  # its baseline
             continue
-        if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
+        if side and (mine.sum() < 2 or np.ptp(ends) < 20 * _ALIVE):
             continue
-        if not side and np.median(ranges[mine]) > _STANDS:
-            continue  # no noise but movement: low-pass or smaller gain
         if not side and (found or length.max() < _BRIEF * log.rate):
             continue
         one = _constant_fault(log, k, side, values[mine], start[mine], length[mine])
@@ -164,17 +145,8 @@ def _constant_faults(log, k, still, sure):
         if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
             if any(at.all() for at in (low, high, *_at_ends(values, ever))):
                 one.ties = ("saturate",)  # a single stay at a limit
-        found.append(_with_ties(one, mine.sum(), stays))
+        found.append(one)
     return found
-
-
-def _with_ties(fault, number, stays):
-    """A fault of a channel that is constant so often, or most of the time, and what it may be instead."""
-    if number > 8 and not stays:  # it moves in between: it does not respond there
-        fault.ties = ("gain",) if fault.beyond else ("gain", "saturate")
-    if fault.detector == "rail":  # a response of the wrong sign also drives levels to the converter's end
-        fault.ties = (*fault.ties, "flip")
-    return fault
 
 
 def _moving_range(moving):
