@@ -20,6 +20,7 @@ _BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
 _INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
+_STAYS_PUT = 0.8  # of the samples between the first and the last constant one
 _ALIVE = 1.2  # [counts] of noise, four times that of rounding
 
 
@@ -131,6 +132,7 @@ def _constant_faults(log, k, still, sure):
     if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
         if still[inner].mean() > _FILTERED:
             return []
+    stays = still[on[0] : on[-1] + 1].mean() > _STAYS_PUT
     low, high = _at_ends(values, ends)
     for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
         if side < 0 and not log.signed:  # its baseline
@@ -145,8 +147,17 @@ def _constant_faults(log, k, still, sure):
         if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
             if any(at.all() for at in (low, high, *_at_ends(values, ever))):
                 one.ties = ("saturate",)  # a single stay at a limit
-        found.append(one)
+        found.append(_with_ties(one, mine.sum(), stays))
     return found
+
+
+def _with_ties(fault, number, stays):
+    """A fault of a channel that is constant so often, or most of the time, and what it may be instead."""
+    if number > 8 and not stays:  # it moves in between: it does not respond there
+        fault.ties = ("gain",) if fault.beyond else ("gain", "saturate")
+    if fault.detector == "rail":  # a response of the wrong sign also drives levels to the converter's end
+        fault.ties = (*fault.ties, "flip")
+    return fault
 
 
 def _moving_range(moving):
