@@ -33,7 +33,6 @@ FEATURES = {
     "one": {"lead": 1, "apart": 1},
     "process": {"likelier": 1, "apart": 1},
     "jump": {"edge": 1, "alone": 1},
-    "order": {"nats": 1, "ratio": 1},
     "slip": {},
     "late": {"gain": 1, "size": 1},
     "lag": {"share": 1},

@@ -19,7 +19,7 @@ class Fault:
       correct: (counts (n, c), time (n,) [s]) -> counts without the fault, or None if it cannot be corrected.
       places: times of single events [s].
       beyond: side of the true value of masked samples: 1 above the recorded one, -1 below, 0 unknown.
-      silent: whether its channels do not respond to contact. held: whether rows repeat or jitter about the
+      silent: whether its channels do not respond to contact. held: whether rows repeat the
         one before (sample and hold).
       detector: key of `confidence.WEIGHTS`. features: inputs of its confidence.
       nats: log-likelihood ratio against chance. p: probability by chance. confidence: 0..1.
