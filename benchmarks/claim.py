@@ -34,11 +34,12 @@ from records import read_json, write_json
 from torch import nn
 
 from biotac_mj.files import replacing
+from biotac_mj.geometry.solid import farthest_points
 from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE, mlp
 from biotac_mj.learning.networks.heads import FromRest, LocalHead
 from biotac_mj.learning.networks.hierarchy import build_hierarchy
 from biotac_mj.learning.networks.mesh_vae import MeshVAE
-from biotac_mj.learning.networks.pointnet import PointNet, farthest_points
+from biotac_mj.learning.networks.pointnet import PointNet
 from biotac_mj.learning.protocol import paired_test, quartiles
 from biotac_mj.learning.training.arrays import join, load_arrays
 from biotac_mj.learning.training.config import LearningConfig

@@ -223,7 +223,7 @@ def fit(skin: str, material: str, indenters, depth: float):
     def residual(x):
         values = dict(zip(names, x * _SCALES, strict=True))
         correction.FITTED[law] = dataclasses.replace(start, **values)
-        setup.forget_skins()
+        setup._skins.forget()
         out = []
         for press_, wanted in zip(presses, full, strict=True):
             mine = run("condensed", skin, *press_, material, depth, _FIT_STEP)

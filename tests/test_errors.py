@@ -286,7 +286,7 @@ def test_a_skin_is_freed_with_its_last_model(tier):
     mujoco.mj_step(model, data)
     world = sys.modules["biotac_mj.plugin.engine"]._worlds[data._address]
     alive = weakref.ref(world.instances[0].setup.skin.stepper._model)
-    setup.forget_skins(), fem._models.forget()
+    setup._skins.forget(), fem._models.forget()
     assert alive() is not None
     gc.disable()
     try:

@@ -30,7 +30,7 @@ from .solid_contacts import SolidContacts
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-_ROUNDING = 1e-3  # of the most energy that a skin holds: accelerations are of single precision
+_ROUNDING = 1e-3  # of the most energy of a skin with such a push: accelerations are of single precision
 
 
 class Batch(Skins):
@@ -267,7 +267,7 @@ class Batch(Skins):
 
     def find_gain(self, taking_part: Marks, gains: Marks) -> None:
         """Marks worlds where withholding all does not help, after `evaluate`."""
-        self._settle(energy.find_gain, taking_part, [_ROUNDING], [gains.struct])
+        self._settle(energy.find_gain, taking_part, [_ROUNDING, self._solid], [gains.struct])
 
     def withdraw(self, d: "mjw.Data", gains: wp.array) -> None:
         """Lets the skins of those worlds not act in this step."""

@@ -26,7 +26,6 @@ __all__ = [
     "STARTED",
     "STAYED",
     "Setup",
-    "forget_skins",
     "reset_state",
     "skin_thickness",
     "state_size",
@@ -85,11 +84,6 @@ _asked = -1  # the instance that MuJoCo asked for last: it asks for a model's in
 def _skin(config, touching):
     key = (tuple(config.strings().items()), touching.key())
     return _skins.get(key, lambda: _Skin(config, touching.geoms))
-
-
-def forget_skins() -> None:
-    """Makes the next model build its skins anew; those of living models stay."""
-    _skins.forget()
 
 
 class Setup:

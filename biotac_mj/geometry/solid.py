@@ -183,6 +183,16 @@ def spread_points(vert: np.ndarray, face: np.ndarray, spacing: float, most: floa
     return points[np.sort(np.unique(np.floor(points / spacing), axis=0, return_index=True)[1])]
 
 
+def farthest_points(point: np.ndarray, count: int, first: int = 0) -> np.ndarray:
+    """(count,) indices of a farthest-point sampling of points (n, 3) that starts at `first`."""
+    keep = [first]
+    nearest = np.linalg.norm(point - point[first], axis=1)
+    for _ in range(count - 1):
+        keep.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(point - point[keep[-1]], axis=1))
+    return np.array(keep)
+
+
 def fills_hull(vert: np.ndarray, face: np.ndarray) -> bool:
     """Whether a closed mesh is convex: its volume is that of its convex hull to a thousandth."""
     hull = convex_hull(vert)

@@ -61,7 +61,7 @@ class Coupled:
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
         self.instance.stay_at_rest(*self.pose)
-        self.release()
+        self.instance.metric.release()
 
     # --- Newton's method on the pose at the end of the step ---
 
@@ -152,10 +152,6 @@ class Coupled:
         rows = self.instance.metric.excess(acceleration)
         rows -= (self.tangent @ moved[:, :, None])[:, :, 0]
         return self.correction + self.arrays.wrench + rows
-
-    def release(self) -> None:
-        """Takes the rows' stiffness away."""
-        self.instance.metric.release()
 
     # --- the energy that the skin can give ---
 

@@ -42,25 +42,22 @@ def most_energy(r: Rounds, force: real, solid: Solid, w: int):
 
 
 @wp.func
-def draws(r: Rounds, w: int, slack: real):
-    """Energy that the bodies of a skin lack together, and that they may give to each other [J]. slack:
-    fraction of the largest energy in the skin that each may get in addition."""
+def draws(r: Rounds, w: int):
+    """Energy that the bodies of a skin lack together, and that they may give to each other [J]."""
     lacks = real(0.0)
     spare = real(0.0)
     for g in range(r.pos.shape[0]):
         gets = given(r, g, w)
         spare += _spared(r.left[g, w], r.store[g, w], gets)
-        if slack > real(0.0):
-            gets -= slack * r.most[g, w]
         lacks += _lacking(r.store[g, w], gets)
     return wp.vec2d(lacks, spare)
 
 
 @wp.func
 def overdraws(r: Rounds, w: int, slack: real):
-    """Whether what acts gives bodies more energy than they have, or is no number."""
-    both = draws(r, w, slack)
-    return not both[0] <= both[1]
+    """Whether what acts gives bodies more energy than they have and a slack [J], or is no number."""
+    both = draws(r, w)
+    return not both[0] <= both[1] + slack
 
 
 @wp.kernel
@@ -139,15 +136,23 @@ def restrain(
 def find_gain(
     # In:
     taking_part: wp.array(dtype=int),
-    slack: real,
+    rounding: real,
+    solid: Solid,
     r: Rounds,
     # Out:
     gains: MarkedWorlds,
 ):
     """Marks worlds where a skin gives more than it has whatever is withheld, or what acts is no number.
-    slack: of the most that the skin holds, which the engine's rounding may give more."""
+    rounding: of the most that a skin holds which pushes with what acts, may be the engine's. A solve that
+    lost its way may leave a model so stiff and far off that what acts of it is rounding alone."""
     w = wp.tid()
-    if taking_part[w] == 1 and overdraws(r, w, slack):
+    if taking_part[w] == 0:
+        return
+    slack = real(0.0)
+    if rounding > real(0.0):
+        for g in range(r.acting.shape[0]):
+            slack += rounding * most_energy(r, force_of(r.acting[g, w]), solid, w)
+    if overdraws(r, w, slack):
         mark(gains, w)
 
 
@@ -191,7 +196,7 @@ def conclude(
     w = wp.tid()
     if taking_part[w] == 0:
         return
-    both = draws(r, w, real(0.0))
+    both = draws(r, w)
     passed = wp.min(both[0], both[1])  # from some bodies to others
     for g in range(r.pos.shape[0]):
         gets = given(r, g, w)

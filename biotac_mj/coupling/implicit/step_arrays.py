@@ -126,7 +126,7 @@ class StepArrays:
         marks = self._marks.struct
         self.find_energy = self._marking(energy.find_energy, self._last, self._solid, r, self._greedy, marks)
         self.restrain = self._marking(energy.restrain, self._model, self._compliance, r, marks)
-        self.gains = self._marking(energy.find_gain, 0.0, r, marks)
+        self.gains = self._marking(energy.find_gain, 0.0, self._solid, r, marks)
         self._conclude = row((energy.conclude, 1, [*one, self._reason, r, self._left_out]))
 
     def conclude(self, converged: bool) -> np.ndarray:

@@ -201,7 +201,7 @@ class World:
         except BaseException:
             self.data.qfrc_passive[:] = outside
             for skin in skins:
-                skin.release()
+                skin.instance.metric.release()
             raise
 
     def _newton(self, skins, outside):
@@ -219,7 +219,10 @@ class World:
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
-            self._hold(skins, outside, self._found)
+            if self.data.is_dual:  # its iterations would leave the rows open: forces act in their place
+                for skin in skins:
+                    skin.hold(self._found)
+                self._forces(skins, outside)
             self._group.find_frequencies()
             self._acting, self._now, self._began_with = skins, self.data.qpos.copy(), self.data.qvel.copy()
             if skins[0].instance.by_stages:
@@ -400,13 +403,6 @@ class World:
             group.correction[touching] = correction.reshape(-1, 6)
             self._forces(skins, outside)
             found = self.data.acceleration(again=True, primal=True)
-
-    def _hold(self, skins, outside, found):
-        """Lets forces act in place of rows that a dual solver would leave open."""
-        if self.data.is_dual:
-            for skin in skins:
-                skin.hold(found)
-            self._forces(skins, outside)
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside

@@ -8,19 +8,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
+from ...geometry.solid import farthest_points
 from .electrode_vae import mlp
 
 _POINTS, _NEIGHBOURS = (128, 32, 8), 16  # of the levels; in each group
-
-
-def farthest_points(point: np.ndarray, count: int) -> np.ndarray:
-    """(count,) indices of a farthest-point sampling of points (n, 3) that starts at 0."""
-    keep = [0]
-    nearest = np.linalg.norm(point - point[0], axis=1)
-    for _ in range(count - 1):
-        keep.append(int(np.argmax(nearest)))
-        nearest = np.minimum(nearest, np.linalg.norm(point - point[keep[-1]], axis=1))
-    return np.array(keep)
 
 
 class PointNet(nn.Module):

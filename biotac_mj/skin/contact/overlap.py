@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from ...geometry.solid import spread_points
+from ...geometry.solid import farthest_points, spread_points
 from ..geoms import GeomSet
 from ..types import real, vec3
 from .meshes import TRILINEAR, DistanceGrid, grid_value, mesh_distance
@@ -140,7 +140,8 @@ class Overlaps:
             points.pos = wp.array(np.concatenate(sets), dtype=vec3)
             owner = np.repeat(np.arange(len(sets)), [len(s) for s in sets])
             points.owner = wp.array(owner.astype(np.int32), dtype=int)
-            points.seed = wp.array(np.array([_seeds(s) for s in sets[: len(parts)]]), dtype=vec3, ndim=2)
+            seeds = [s[farthest_points(s, MOST, _outermost(s))] for s in sets[: len(parts)]]
+            points.seed = wp.array(np.array(seeds), dtype=vec3, ndim=2)
             self.wanted = wp.zeros(shape[::2], dtype=int)
             self.least = wp.zeros(shape[::2], dtype=real)
             self._deepest = wp.zeros(shape, dtype=wp.int64)
@@ -161,11 +162,6 @@ class Overlaps:
         wp.launch(describe_deepest, self.depth.shape, [*known, self._deepest], found, device=device)
 
 
-def _seeds(points):
-    """MOST of the points (n, 3), far from each other."""
-    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-    away = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < MOST:
-        chosen.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return points[chosen]
+def _outermost(points):
+    """Number of the point (n, 3) that is farthest from their mean."""
+    return int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
