@@ -53,7 +53,7 @@ def make(spec, data):
     if spec.name == "stuck":
         x[600:, 4] = x[600, 4]
     hidden = [KINDS["stuck"]] if spec.name == "stuck" else []
-    n = 100 if spec.name == "short" else 1500
+    n = 60 if spec.name == "short" else 1500
     case = dict(base="synthetic", counts=x[:n], rate=100.0, truth=hidden, channels=[[4]] * len(hidden))
     return case, clean[:n]
 """
@@ -89,7 +89,7 @@ def test_pieces_of_a_folder_are_scored_once(runner, folder, tmp_path, capsys, mo
     said = capsys.readouterr()
     assert "single effects named                           1 of 1" in said.out
     assert "falsely named where nothing is hidden          0 of 1" in said.out
-    assert "made_up ['short']: 100 rows are too few" in said.out + said.err
+    assert "made_up ['short']: 60 rows are too few" in said.out + said.err
     rows = {row["key"][0]: row for row in json.loads(out.read_text())["cases"]}
     assert [n["right"] for n in rows["stuck"]["named"] if n["channels"] == ["e5"]] == ["stuck"]
     before = out.read_text()
