@@ -136,6 +136,30 @@ def test_a_press_of_the_simulated_sensor_is_fitted(estimator, pressed):
     assert found.unexplained < 0.1
 
 
+def test_secants_correct_gradients_that_hide_a_small_one():
+    """Errors of a few percent in large gradients make the least known direction look far better known."""
+    draw = np.random.default_rng(0)
+    left, _, right = np.linalg.svd(draw.normal(size=(20, 5)), full_matrices=False)
+    true = left * [600, 500, 400, 300, 10] @ right
+    wrong = true + 10 * draw.normal(size=true.shape)
+    by = draw.normal(size=(7, 5))
+
+    def simulate(at):
+        missed = true @ at
+        return fitting._Press(at, None, None, by @ at, missed, missed @ missed)
+
+    def spread(press, gradient):
+        press = dataclasses.replace(press, outcome_by=by, missed_by=gradient)
+        return np.sqrt(np.diag(by @ press.spread @ by.T))[:4]
+
+    search = object.__new__(fitting._Search)
+    search._simulate = simulate
+    here = dataclasses.replace(simulate(np.zeros(5)), outcome_by=by, missed_by=wrong)
+    found = search._with_secants(here)
+    assert (spread(here, wrong) < 0.5 * spread(here, true)).all()
+    np.testing.assert_allclose(spread(here, found.missed_by), spread(here, true), rtol=0.1)
+
+
 def test_a_presss_own_settings_are_taken_from_its_file(tmp_path):
     """And only from the skin.h5 that has the same counts."""
     (one, _), (other, _) = (

@@ -15,7 +15,7 @@ import warp as wp
 from scipy.interpolate import RegularGridInterpolator
 from tqdm import tqdm
 
-from ...cache import Entry, cached
+from ...cache import cached
 from ...calibration import plan_indentation
 from ...calibration.forward import Steps, steps_of
 from ...calibration.indentation import Indentation
@@ -78,6 +78,12 @@ def capsule_of(geometry: SkinGeometry) -> Capsule:
     return Capsule(tip, base, radius, np.concatenate(ends), np.radians(np.linspace(-85, 85, 8)))
 
 
+def coarser(capsule: Capsule) -> Capsule:
+    """A third of the places: every second along, five around."""
+    around = np.linspace(capsule.around[0], capsule.around[-1], 5)
+    return dataclasses.replace(capsule, along=capsule.along[::2], around=around)
+
+
 def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
     """(7,) outcome of a press: ln of the force [N], the contact's centre [m], the force's direction.
 
@@ -137,7 +143,8 @@ class Presses:
     Args:
       skin: with one geom. geometry: of it. indenter: the geom, as in `biotac press --indenter`.
       progress: whether to show a bar while the table is made.
-      slopes: whether derivatives are computed too, which takes as long as the presses.
+      slopes: whether derivatives are computed too, which takes as long as the presses; without them the table
+        is for starts of a search, and has a third of the places.
 
     Attributes:
       at: (n, 3) along [m] and around [rad] the capsule, fraction of the deepest press there.
@@ -161,19 +168,19 @@ class Presses:
         self.skin, self.geometry, self._indenter, self._progress = skin, geometry, indenter, progress
         self._slopes = slopes
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
-        self._capsule = capsule = capsule_of(geometry)
+        self._capsule = capsule = capsule_of(geometry) if slopes else coarser(capsule_of(geometry))
         axes = capsule.along, capsule.around, _FRACTIONS
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
-        table = None if slopes else Entry("presses", inputs, code).load()
-        table = table or cached("presses" if slopes else "presses_alone", inputs, self._make, code)
+        table = cached("presses" if slopes else "presses_alone", inputs, self._make, code)
         along, around, fraction = (
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )
         fraction[0] = _LIGHTEST
         self.at = at = np.stack(np.meshgrid(along, around, fraction, indexing="ij"), -1).reshape(-1, 3)
         for name, values in table.items():
-            setattr(self, name, RegularGridInterpolator(axes, values, method="cubic")(at))
+            method = "cubic" if slopes else "linear"
+            setattr(self, name, RegularGridInterpolator(axes, values, method=method)(at))
         self.outcome[:, 0] += np.log(at[:, 2])
         self.deepest = at[:, 2] == fraction[-1]
         self.weight = np.log(np.cos(capsule.turn(at[:, 0])))
@@ -214,7 +221,8 @@ class Presses:
         places = list(itertools.product(enumerate(capsule.along), enumerate(capsule.around)))
         shown = self._progress
         if shown:
-            text = f"note: simulating {len(places)} presses all over the skin, once, minutes on one core"
+            each = 2.5 if self._slopes else 1
+            text = f"note: simulating {len(places)} presses all over the skin, once, {each} s each on one core"
             print(text, file=sys.stderr, flush=True)  # a bar is hidden where stderr is a file
         for (i, along), (j, around) in tqdm(places, "table, once", unit="press", disable=not shown or None):
             with self.skin.lock:

@@ -85,9 +85,10 @@ def estimate_verb(args: argparse.Namespace) -> None:
 
 
 def _is_the_simulated_one(args, pressed):
-    """Whether a press is of the simulated sensor itself: its own skin under its own geom, with readings by
-    physics and without effects."""
-    asked = [name for name in ("skin", "indenter", "material", "options", "known") if getattr(args, name)]
+    """Whether a press is of the simulated sensor itself: its own skin under its own geom, whether these are
+    given or not, with readings by physics and without effects."""
+    given = {name: getattr(args, name) for name in ("skin", "indenter", "material", "options", "known")}
+    asked = [name for name, value in given.items() if value not in (None, pressed.get(name))]
     added = [name for name in _ADDED if pressed.get(name) is not None]
     added += [f"options['{name}']" for name in ("readings", "modulus") if name in pressed["options"]]
     if pressed["tier"] != "full":
