@@ -121,10 +121,6 @@ def test_a_fit_explains_more_than_the_nearest_press(estimator, pressed, monkeypa
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="the search ends 0.87 mm beside this press, 21 % too light, and its interval leaves the truth out",
-    strict=True,
-)
 def test_a_press_of_the_simulated_sensor_is_fitted(estimator, pressed):
     """What it reads is explained to the noise; place and force are far better known than those of any
     sensor."""
