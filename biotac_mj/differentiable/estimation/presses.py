@@ -222,7 +222,7 @@ class Presses:
         shown = self._progress
         if shown:
             each = 2.5 if self._slopes else 1
-            text = f"note: simulating {len(places)} presses all over the skin, once, {each} s each on one core"
+            text = f"note: simulating {len(places)} presses all over the skin once, {each} s each on one core"
             print(text, file=sys.stderr, flush=True)  # a bar is hidden where stderr is a file
         for (i, along), (j, around) in tqdm(places, "table, once", unit="press", disable=not shown or None):
             with self.skin.lock:
