@@ -16,21 +16,6 @@ from .stepper import SkinResult, make_readings, make_stepper
 from .structs import ModelView
 from .touching import Touching, forget_notes
 
-__all__ = [
-    "CONVERGED",
-    "ENERGY",
-    "FAILED",
-    "FREQUENCY",
-    "OUT_OF_REACH",
-    "REACHED",
-    "STARTED",
-    "STAYED",
-    "Setup",
-    "reset_state",
-    "skin_thickness",
-    "state_size",
-]
-
 # head of the plugin state: steps that did not converge; whether the last committed step did, or less the
 # steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
 # reach of the skin in it

@@ -9,8 +9,6 @@ from ..instance import Instance
 from ..structs import DataView
 from .rules import FORETOLD, STILL
 
-__all__ = ["Coupled", "size"]
-
 # of what the solves of a step may cost together: what is left is not worth another one
 _MOST = 0.9
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going

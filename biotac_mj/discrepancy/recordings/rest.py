@@ -11,8 +11,6 @@ from ...quality.noise import noise_level, running_median
 from .confidence import NAMED, USUAL, farthest
 from .session import Session
 
-__all__ = ["Rest", "rest"]
-
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
 _LIVELY = 1.0

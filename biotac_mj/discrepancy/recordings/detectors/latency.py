@@ -22,8 +22,6 @@ from ..conditional import Components
 from ..recording import FORCE_MOVED
 from ..session import Session
 
-__all__ = ["ForceView", "delayed", "force_view"]
-
 _BLOCKS = 24
 _SMOOTH = 0.02  # [s]
 _RIDGE = 1e-4

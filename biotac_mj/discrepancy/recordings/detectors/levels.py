@@ -20,8 +20,6 @@ from .process import process
 from .together import ahead
 from .trends import BLOCKS, SHARP, Trend, compare, sharp, trends
 
-__all__ = ["levels", "settle"]
-
 _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 # of a shared drift's shares about their mean: 8-15 % seen in a real unloaded sensor
 _SHARES = 0.12

@@ -8,8 +8,6 @@ import numpy as np
 
 from ...evidence import log_ratio, sign_flip
 
-__all__ = ["BLOCKS", "SHARP", "Trend", "compare", "trends", "sharp"]
-
 BLOCKS = 16
 _KNOTS = (4, 7, 11)
 SHARP = 5.0  # robust standard deviations by which a step beside a smooth trend stands out
