@@ -1,6 +1,8 @@
 """The benchmarks run as documented, meet the bounds on stored cases and write the promised JSON."""
 
 import contextlib
+import copy
+import dataclasses
 import io
 import json
 import os
@@ -465,21 +467,29 @@ def test_much_friction_on_a_small_geom_finds_its_balance(repo, monkeypatch):
     assert row["most_N"] > 0.1 and row["steps"] > 20 and not row["failures"] and row["exception"] is None
 
 
-SLIDES = pytest.mark.xfail(strict=True, reason="four of its twelve steps find no balance")
+SLIDES = pytest.mark.xfail(strict=True, reason="one of its twelve steps takes 5082 units of work")
 
 
 @pytest.mark.slow  # quick: when skin creeps, and how deep in the core it may be
 @pytest.mark.parametrize(
-    "seed, number", [pytest.param(9001, 21, marks=SLIDES), (9002, 72), (5150, 10), (9001, 34)]
+    "seed, number, work",
+    [pytest.param(9001, 21, 1, marks=SLIDES), (9001, 21, 4), (9002, 72, 1), (5150, 10, 1), (9001, 34, 1)],
 )
-def test_hard_presses_find_their_balance(repo, monkeypatch, seed, number):
-    """A box that slides on all but incompressible rubber, where Newton's method went to and fro at four times
-    the tolerance; a mesh that is pressed with 1.8 kN, under which the core is met 0.3 mm deep; soft skin that
-    slips off a thin ellipsoid, where for 26 iterations the error does not fall; an ellipsoid that slides with
-    friction 0.94, where the tangent is not symmetric."""
+def test_hard_presses_find_their_balance(repo, monkeypatch, seed, number, work):
+    """A box that slides on all but incompressible rubber: one step takes twice the work that it may, and
+    another is lost where that one ended; with four times the work all settle. A mesh that is
+    pressed with 1.8 kN, under which the core is met 0.3 mm deep; soft skin that slips off a thin ellipsoid,
+    where for 26 iterations the error does not fall; an ellipsoid that slides with friction 0.94, where the
+    tangent is not symmetric."""
     monkeypatch.syspath_prepend(str(repo / "benchmarks"))
     import robustness
 
+    def with_work(*args, made=robustness.skin_model):
+        model = copy.copy(made(*args))
+        model.options = dataclasses.replace(model.options, max_work=work * model.options.max_work)
+        return model
+
+    monkeypatch.setattr(robustness, "skin_model", with_work)
     (row,) = robustness.press_batch("coarse", seed, "full", "cpu", 1, number)
     assert row["most_N"] > 1 and row["steps"] > 10 and not row["failures"] and row["exception"] is None
 
