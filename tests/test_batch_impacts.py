@@ -573,6 +573,6 @@ def test_the_integrator_is_corrected_for_where_bodies_spin_fast(integrator, monk
 
     monkeypatch.setattr(batches.batch.Batch, "finish", finish)
     in_batch(xml, qpos, np.c_[np.tile([0, 0, -0.3], (len(spin), 1)), spin], 2, TIP)
-    amiss, acting, correction = seen[0]
+    amiss, acting, correction = seen[-2]  # on CUDA attach goes through a step before, to compile its kernels
     assert acting[0] > 0.05 and amiss[0] < 3e-4 * acting[0], amiss / acting
     assert correction.max() > 1 and (amiss < 3e-4 * np.maximum(acting, correction)).all(), amiss / acting
