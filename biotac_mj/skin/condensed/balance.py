@@ -154,21 +154,6 @@ def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
 
 
 @wp.func
-def _error_bound(w: int, t: int, threads: int, nnode: int, n: int, l: Linear, c: Constants, s: Scratch):
-    """The error of the forces if contact had no stiffness, which makes it smaller: no system is solved."""
-    for j in range(t, n, threads):
-        s.vector[w, DF, j] = s.vector[w, G, j] - s.vector[w, F, j]
-    sync()
-    multiply(w, t, threads, nnode, n, DF, DU, 0, l, c, s)
-    own = vec3()
-    for j in range(t, n, threads):
-        own[0] += s.vector[w, DF, j] * s.vector[w, DU, j]
-        own[1] += s.vector[w, F, j] * s.vector[w, U, j]
-    total = block_sum(own)
-    return wp.sqrt(wp.abs(total[0]) / (wp.abs(total[1]) + real(1e-14)))
-
-
-@wp.func
 def _take_step(
     w: int,
     t: int,
@@ -194,13 +179,7 @@ def _take_step(
         steps = 0
         d.last = d.error
         good = int(0)
-        bound = real(wp.inf)
-        if d.foretold == 0 and d.most > real(0.0):
-            bound = _error_bound(w, t, threads, o.nnode, n, d.linear, c, s)
-        if bound < d.tolerance:
-            d.found = 1
-            d.error = bound
-        elif d.spent >= d.most and d.most > real(0.0) and d.foretold == 0:
+        if d.spent >= d.most and d.most > real(0.0) and d.foretold == 0:
             d.found = CUT
         elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.viscosity <= _FIXED:
             moved = wp.where(d.foretold > 0, 1, 0)
