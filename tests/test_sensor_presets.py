@@ -12,6 +12,7 @@ from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import Run
 from biotac_mj.effects.sensing import DeadTaxels
 from biotac_mj.effects.sensors import RANDOM, draw_effects, read_randomise, take_sensor, with_effects
+from biotac_mj.geometry.design import designs
 from biotac_mj.sensor.acquisition import Acquisition, BatchAcquisition
 from biotac_mj.sensor.channels import (
     PDC_REST,
@@ -230,3 +231,9 @@ def test_numbers_of_numpy_are_numbers():
     assert read_sensor(options["readings"]["sensor"]).pdc_rest == 900
     with pytest.raises(ValueError, match="holds <object"):
         Config(options={"readings": {"sensor": object()}}).strings()
+
+
+@pytest.mark.parametrize("design", designs(), ids=lambda design: design.name)
+def test_a_sensor_written_as_its_fields_is_read_again(design):
+    sensor = read_sensor(None, design=design)
+    assert sensor.mixing == () and read_sensor(dataclasses.asdict(sensor), design=design) == sensor

@@ -248,12 +248,14 @@ class Settings:
         if self.effects is None:
             return self
         from ..effects.amended import Model, amend
+        from ..geometry.skins import skin_of_design
 
         skin, contact, sensor = self.skin, self.contact, self.sensor
         for name, value in (("material", skin.material), ("sensor", sensor.individual)):
             if isinstance(value, (list, tuple)):
                 raise ValueError(f"{name} of each world beside effects: give one of them, or neither")
-        model = Model(skin.mesh, skin.material, self.options, sensor.individual, contact.friction)
+        mesh = skin.mesh if skin.design is None else skin_of_design(skin.design, skin.mesh)
+        model = Model(mesh, skin.material, self.options, sensor.individual, contact.friction)
         model = amend(model, self.effects)
         given = {"skin": model.skin, "material": model.material}
         if not sensor.left_out:

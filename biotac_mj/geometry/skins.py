@@ -43,14 +43,25 @@ def _loaded(name_or_path):
             f"skin is {short_repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
     path = _file(name_or_path)
-    state = path.stat() if path.exists() else None
-    return _read(path, state and (state.st_ino, state.st_mtime_ns, state.st_size))
+    files = [file.stat() for file in (path, path.parent / "design.json") if file.exists()]
+    return _read(path, tuple((f.st_ino, f.st_mtime_ns, f.st_size) for f in files))
 
 
 @functools.lru_cache(maxsize=2 * len(_SHIPPED))
 def _read(name_or_path, state):
-    """A skin from its file; state: tells a stored one from later ones of this path."""
-    return SkinGeometry.load(_file(name_or_path))
+    """A skin from its file; state: tells a stored one from later ones of this path. The sensors of a design
+    are those of the folder's design.json, where users write theirs."""
+    path = _file(name_or_path)
+    geometry, folder = SkinGeometry.load(path), path.parent
+    if name_or_path in _SHIPPED or not (folder / "design.json").is_file():
+        return geometry
+    design, stored = read_design(folder), geometry.design
+    if dataclasses.replace(design, sensors=stored.sensors, sensor=stored.sensor) != stored:
+        raise ValueError(
+            f"{folder / 'design.json'} is not the design that {path.name} was made of: change its sensors "
+            "alone, or make it anew with `biotac design new`"
+        )
+    return dataclasses.replace(geometry, design=design)
 
 
 def _file(name_or_path):

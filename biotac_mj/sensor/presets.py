@@ -289,7 +289,7 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
         if unknown:
             raise ValueError(f"a sensor has no {unknown[0]!r}: choose from like, {', '.join(known)}")
         for name, value in fields.items():
-            if name in _OF_ELECTRODES and np.ndim(value):
+            if name in _OF_ELECTRODES and np.ndim(value) and len(value):  # empty: as the design has it
                 check_nelectrode(design, len(value), f"{name} of a sensor")
         return dataclasses.replace(like, **fields)
     if isinstance(value, Sensor):

@@ -34,7 +34,9 @@ def _lacking(session):
         )
     if not r.signed:
         out["sign"] = "the electrodes have no sign"
-    if not session.model().parted:
+    if r.joints:
+        out["time"] = "series that were put together, which one clock does not go through"
+    elif not session.model().parted:
         least = math.ceil(LEAST / session.fit.mean())
         out["time"] = f"too short to tell touches from drift, record {least} s or more"
     elif not session.loaded and r.force is not None and r.force.std(0).max() > FORCE_MOVED:

@@ -32,6 +32,8 @@ _COUNTS = r"(?:_(?:counts?|bits?|raw))?"
 _UNITS = {
     "force": {
         "n": ("N", 1.0),
+        "newton": ("N", 1.0),
+        "newtons": ("N", 1.0),
         "mn": ("mN", 1e-3),
         "kn": ("kN", 1e3),
         "gf": ("gf", 9.80665e-3),
@@ -137,10 +139,10 @@ def refuse_unknown_unit(name: str) -> None:
     """Raises ValueError for a column of force, torque or position whose name has another unit in brackets
     than those known."""
     found = _BRACKETED.fullmatch(name)
-    place = place_of(found[1]) if found and place_of(name) is None else None
+    place, whole = (place_of(found[1]), place_of(name)) if found else (None, None)
     units = _UNITS.get(place.field.rpartition("_")[2]) if place else None
-    if units:
-        known = ", ".join(unit for unit, _ in units.values())
+    if units and (whole is None or whole.field != place.field):
+        known = ", ".join(dict.fromkeys(unit for unit, _ in units.values()))
         raise ValueError(
             f"column {name!r} has unit {found[2]}: {known} are known; convert the numbers and rename it"
         )

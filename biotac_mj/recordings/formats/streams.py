@@ -74,10 +74,10 @@ def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] |
     units, clock = {}, _clock_name(columns)
     for name, value in columns.items():
         place = place_of(name)
+        refuse_unknown_unit(name)
         if name == clock:
             time = _seconds(np.asarray(value, float).ravel(), name)
         elif place is None:
-            refuse_unknown_unit(name)
             unused.append(name)
         else:
             pieces = found.setdefault(place.sensor, {}).setdefault(place.field, {})

@@ -36,7 +36,10 @@ _MOSTLY = 0.6  # of a trend that what all do explains, which may be a share of i
 
 
 def levels(session: Session, refused: set) -> Candidate | None:
-    """The strongest trend over time that one electrode or all have, none of those refused."""
+    """The strongest trend over time that one electrode or all have, none of those refused. Series that were
+    put together have none: their levels differ by what is touched."""
+    if session.recording.joints:
+        return None
     m = session.model()
     number = len(m.used)
     everyone = np.ones(number)
