@@ -70,6 +70,20 @@ def test_a_dome_of_six_electrodes_feels_where_it_is_pressed(tmp_path):
     assert handle.read(data, "status")[0] == 1 and set(handle.read(data)) >= {"electrodes", "pac"}
 
 
+def test_sensors_written_into_a_pad_s_design_are_its_own(tmp_path):
+    new_design(tmp_path / "dome", DOME, SIX, GROUND)
+    path = tmp_path / "dome" / "design.json"
+    written = json.loads(path.read_text()) | {"sensor": "mine"}
+    written["sensors"]["mine"] = {"rest": [3000, 3100, 3200, 3100, 3000, 2900]}
+    path.write_text(json.dumps(written))
+    assert biotac_mj.load_skin(tmp_path / "dome").design == read_design(tmp_path / "dome")
+    handle, _, data = pushed(tmp_path / "dome", -20e-3, 0.0, readings={"noise": False})
+    np.testing.assert_allclose(handle.read(data, "electrodes"), written["sensors"]["mine"]["rest"], atol=2)
+    path.write_text(json.dumps(written | {"slots": written["slots"] + 2}))
+    with pytest.raises(ValueError, match="is not the design that default.npz was made of: .* sensors alone"):
+        biotac_mj.load_skin(tmp_path / "dome")
+
+
 def test_a_flat_pad_without_electrodes_gives_force_and_depth(tmp_path, capsys):
     assert (
         main(["design", "new", str(tmp_path / "flat"), "--block", "20mm", "20mm", "6mm", "--edge", "3mm"])
