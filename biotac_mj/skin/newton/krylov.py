@@ -55,11 +55,11 @@ def _follows(st: Worlds, w: int):
 
 @wp.func
 def _aim(tolerance: real, st: Worlds, w: int):
-    """Value of r . z with which a linear solve ends: its error is then 0.7 of the tolerance of Newton's
+    """Value of r . z with which a linear solve ends: its error is then half the tolerance of Newton's
     method."""
     aim = _LEAST
     if _follows(st, w):
-        ratio = real(0.7) * tolerance / st.error[w]
+        ratio = real(0.5) * tolerance / st.error[w]
         aim = wp.min(ratio * ratio, _MOST)
     return aim * wp.abs(st.start_rz[w])
 
