@@ -129,7 +129,7 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
         wp.launch(energy.restrain, n, [every, model, rigid, r, going.struct])
         assert r.push.numpy().tolist() == [[0, 1, 0]]
         r.push.fill_(1.0)
-        wp.launch(energy.find_gain, n, [every, 1e-3, r, gains.struct])
+        wp.launch(energy.find_gain, n, [every, 0.0, rounds.Solid(), r, gains.struct])
         assert gains.world.numpy().tolist() == [1, 0, 1] and gains.any.numpy()[0] == 1
         start = wp.array(np.full((n, 4), np.nan), dtype=float)
         wp.launch(energy.withdraw, n, [gains.world, model, r, correction, start])

@@ -483,7 +483,7 @@ class SkinStep:
     def _continue_solve(self):
         k, st = self.k, self.st
         self.M.apply(self._launcher, st, k.partial, k.r, self._forces.gradient, k.z, k.partial)
-        self._decide(krylov.choose_beta, [self.m.options.tolerance, k.partial, st])
+        self._decide(krylov.choose_beta, [k.partial, st])
         self._launch(self._krylov_kernels.next_direction, self.d.x.shape, [k.z, st, k.p])
         self._advance_solve(0)
 
@@ -496,8 +496,7 @@ class SkinStep:
         chunks, gradient = (k.nchunk, d.nworld), self._forces.gradient
         inputs = [k.chunk, k.p, k.q, k.viscous_work, gradient, m.wet_node, st.running]
         self._launch(kernels.measure_product, chunks, inputs, [k.partial, self._solve_on])
-        bounds = [m.options.max_cg, m.options.tolerance]
-        self._decide(krylov.choose_alpha, [*bounds, k.partial, st], [self._solve_on])
+        self._decide(krylov.choose_alpha, [m.options.max_cg, k.partial, st], [self._solve_on])
         inputs = [k.chunk, first, k.p, k.q, gradient, m.wet_node, st, k.dx, k.r]
         self._launch(kernels.update_solution, chunks, inputs, [k.partial])
 

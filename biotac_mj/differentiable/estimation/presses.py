@@ -172,7 +172,7 @@ class Presses:
         axes = capsule.along, capsule.around, _FRACTIONS
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
-        table = cached("presses" if slopes else "presses_alone", inputs, self._make, code)
+        table = cached("presses", [*inputs, slopes], self._make, code)
         along, around, fraction = (
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )

@@ -15,13 +15,6 @@ from .worlds import Worlds, total_of, totals_of
 
 wp.set_module_options({"enable_backward": False})
 
-# of r . z, to which a solve reduces it: at least to the first; Newton's method hardly follows one that goes
-# below the second
-_MOST, _LEAST = (wp.constant(wp.float64(x)) for x in (0.1, 0.01))
-# error, and share of the last one, above which Newton's method follows no exact solve: a step length that is
-# so near one is enough
-_FAR, _SLOW, _ABOUT = (wp.constant(wp.float64(x)) for x in (0.1, 0.5, 0.2))
-
 
 @wp.struct
 class Inertia:
@@ -47,31 +40,8 @@ def begin_solve(st: Worlds, any_active: wp.array(dtype=int)):
     st.predicted_pressure[w] = st.pressure[w]
 
 
-@wp.func
-def _follows(st: Worlds, w: int):
-    """Whether Newton's method converges the better, the better its linear solves are."""
-    return st.error[w] <= _FAR and st.error[w] <= _SLOW * st.last_error[w]
-
-
-@wp.func
-def _aim(tolerance: real, st: Worlds, w: int):
-    """Value of r . z with which a linear solve ends: its error is then half the tolerance of Newton's
-    method."""
-    aim = _LEAST
-    if _follows(st, w):
-        ratio = real(0.5) * tolerance / st.error[w]
-        aim = wp.min(ratio * ratio, _MOST)
-    return aim * wp.abs(st.start_rz[w])
-
-
 @wp.kernel
-def choose_alpha(
-    limit: int,
-    tolerance: real,
-    partial: wp.array3d(dtype=real),
-    st: Worlds,
-    any_active: wp.array(dtype=int),
-):
+def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
     """Step length of conjugate gradients in world w. partial: p . q, gradient . p, viscous work."""
     w, t = wp.tid()
     if st.running[w] == 0:
@@ -85,9 +55,6 @@ def choose_alpha(
     done = st.work[w]
     rz = st.rz[w]
     before = st.viscous_work[w]
-    reduction = st.beta[w]
-    aim = _aim(tolerance, st, w)
-    about = wp.where(_follows(st, w), real(0.0), _ABOUT)
     total = totals_of(partial, w, t)
     if t > 0:
         return
@@ -115,36 +82,28 @@ def choose_alpha(
     st.alpha[w] = alpha
     st.predicted_pressure[w] = st.predicted_pressure[w] - alpha * st.pressure_response[w]
     st.viscous_work[w] = before + wp.max(alpha * alpha * viscous_work, real(0.0))
-    # what is left is not measured where that would end the solve: an iteration reduces r . z as the one
-    # before it did, the first one as far as the preconditioner is as accurate as the tangent
-    if first:
-        reduction = wp.abs(alpha - real(1.0))
-        if reduction <= about:
-            reduction = real(0.0)
-    if reduction * wp.abs(rz) <= aim or iterations + 1 >= limit:
+    # a step length near one: the preconditioner is as accurate as the tangent
+    if wp.abs(alpha - real(1.0)) <= real(0.2) or iterations + 1 >= limit:
         st.running[w] = 0
     else:
         any_active[0] = 1
 
 
 @wp.kernel
-def choose_beta(tolerance: real, partial: wp.array3d(dtype=real), st: Worlds):
-    """Ends the linear solve of world w if its error lets Newton's method converge, or if it is small and the
-    next iteration would not do so either. partial: r . z."""
+def choose_beta(partial: wp.array3d(dtype=real), st: Worlds):
+    """Ends the linear solve of world w if it has reduced r . z to a hundredth. partial: r . z."""
     w, t = wp.tid()
     if st.running[w] == 0:
         return
-    little = _LEAST * wp.abs(st.start_rz[w])
-    aim = _aim(tolerance, st, w)
+    first = st.start_rz[w]
     before = st.rz[w]
     rz = total_of(partial, 0, w, t)
     if t > 0:
         return
-    beta = rz / before
-    if not (rz > aim) or (rz <= little and beta * rz > aim):
+    if not (rz > real(0.01) * wp.abs(first)):
         st.running[w] = 0
         return
-    st.beta[w] = beta
+    st.beta[w] = rz / before
     st.rz[w] = rz
 
 

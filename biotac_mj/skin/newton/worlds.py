@@ -236,7 +236,6 @@ def begin_worlds(
     st.deep[w] = 0
     st.least_error[w] = real(1.0e300)
     st.iterations[w] = 0
-    st.error[w] = real(1.0)  # not known
     st.work[w] = st.spent[w]
     st.friction_mode[w] = CURRENT
     begin_try(st, w, limit, max_work)
