@@ -239,6 +239,8 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
         new_design(tmp_path / "pad", PadShape(mesh=written(tmp_path / "two.tet", *pair)))
     shell = dome_shell((np.array([9.0, 9.0, 9.0]), 0.0), (np.array([7.5, 7.5, 7.5]), 0.0), 6)
     inside = PadShape(mesh=written(tmp_path / "shell.tet", shell.vert, shell.elem), core=(8.4, 8.4, 8.4))
+    with pytest.raises(ValueError, match="the mesh is a shell: give --core"):
+        new_design(tmp_path / "pad", PadShape(mesh=tmp_path / "shell.tet"))
     with pytest.raises(ValueError, match="the core reaches .* mm into the skin: no liquid fits"):
         new_design(tmp_path / "pad", inside, SIX, GROUND)
     core = tmp_path / "core.obj"
@@ -249,6 +251,11 @@ def test_meshes_that_are_no_pad_are_refused(tmp_path):
         ValueError, match="the core's largest dimension is 1.2e.04 mm, .* is it in millimetres"
     ):
         new_design(tmp_path / "pad", PadShape(mesh=tmp_path / "shell.tet", core=core), SIX, GROUND)
+    vert, face = dome_core((np.array([6.0, 6.0, 6.0]), 0.0), 12)
+    write_obj(core, 1e-3 * (vert + [0, 3, 0]), face)
+    with pytest.raises(ValueError, match="the core reaches 3 mm behind the plane y = 0: cut it there"):
+        new_design(tmp_path / "pad", PadShape(mesh=tmp_path / "shell.tet", core=core), SIX, GROUND)
+    assert not (tmp_path / "pad").exists()
 
 
 def test_a_mesh_of_any_outline_is_held_at_its_whole_rim(tmp_path):

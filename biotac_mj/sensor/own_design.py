@@ -108,10 +108,14 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
         vert, face = max(read_obj(shape.core), key=lambda body: abs(enclosed_volume(*body)))
         check_size(np.ptp(vert, axis=0).max(), "core", 1e-3)
         core = 1e3 * vert, face if enclosed_volume(vert, face) > 0 else face[:, ::-1]
+        if (behind := core[0][:, 1].max()) > 1e3 * FIXED_WITHIN:
+            raise ValueError(f"the core reaches {behind:.3g} mm behind the plane y = 0: cut it there")
     bodies = [(1e-3 * vert, face) for vert, face in ((core, backing) if len(core[1]) else (backing, EMPTY))]
     skin = assemble(design.name, TetMesh(1e-3 * mesh.vert, mesh.elem), *bodies, design=design)
     if shape.liquid and not len(skin.inner_face):
         raise ValueError("the mesh has no surface towards the core: mesh a shell, or leave --core out")
+    if len(skin.inner_face) and not shape.liquid:
+        raise ValueError("the mesh is a shell: give --core, under its liquid, or mesh a solid pad")
     if shape.liquid:
         free = np.setdiff1d(np.arange(skin.nvert), skin.fixed)
         room = 1e3 * CoreSurface(skin.core_vert, skin.core_face).closest(skin.vert[free])[0]
@@ -173,6 +177,7 @@ def new_design(
         rest = np.clip(counts_from_impedance(film.rest), 1.0, 4094.0).round(1).tolist()
         design = dataclasses.replace(design, sensors={"ideal": {"rest": rest}})
         skin = dataclasses.replace(skin, design=design)
+    skin.check(design.name)
     folder.mkdir(parents=True, exist_ok=True)
     skin.save(folder / "default.npz")
     write_json(folder / "design.json", json.loads(design.text))

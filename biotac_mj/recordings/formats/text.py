@@ -74,6 +74,11 @@ def _named(table, role):
     streams = make_streams(table.path.name, columns, notes)
     if role and not any(role in stream.fields for stream in streams):
         raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")
+    if role in ("force", "tdc"):  # beside the electrodes of another file
+        wanted = {role, "torque"} if role == "force" else {role}
+        for stream in streams:
+            stream.fields = {name: value for name, value in stream.fields.items() if name in wanted}
+        streams = [stream for stream in streams if stream.fields]
     return streams
 
 
