@@ -159,3 +159,12 @@ def test_a_native_log_of_an_sp_is_told_by_its_serial_number(tmp_path):
     text = (tmp_path / "log.btd").read_bytes().replace(b"SYNTHETIC01", b"BTSP050400018017")
     (tmp_path / "sp.btd").write_bytes(text)
     assert any(re.search(said, note) for note in load_one(tmp_path / "sp.btd")[0].notes)
+
+
+@pytest.mark.parametrize("count", [23, 18])
+def test_a_clock_is_no_electrode(tmp_path, count):
+    rng = np.random.default_rng(0)
+    counts = rng.integers(2000, 2100, (200, count))
+    np.savetxt(tmp_path / "log.txt", np.column_stack([0.01 * np.arange(200), counts]), fmt="%g")
+    with pytest.raises(ValueError, match=f"as a clock does, which leaves {count} electrodes"):
+        load(tmp_path / "log.txt")

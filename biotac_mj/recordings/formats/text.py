@@ -155,6 +155,12 @@ def read_matrix(table: Table, role: str | None = None) -> list[Stream]:
     if clock and n > 2 and value[0, 0] in (0, 1) and (np.diff(value[:, 0]) == 1).all():
         notes.append(f"{path.name}: the first column counts the rows: it was not taken for a clock")
         value, clock = value[:, 1:], False
+    if role == "electrodes" and width == len(names) and n > _LONG and (np.diff(value[:, 0]) > 0).all():
+        raise ValueError(
+            f"{path}: the first of {width} columns rises in every row, as a clock does, which leaves "
+            f"{width - 1} electrodes: give those of a {' or a '.join(design.title for design in designs())}, "
+            "or name the columns in a header"
+        )
     if role == "electrodes" and n == width == len(names):
         notes.append(f"{path.name} is {n} x {n}: its rows were taken for time")
     if more and width > len(names):
