@@ -131,7 +131,6 @@ def thrown_box(inertia="", places=(0.0, 0.15, 0.3), integrator="Euler"):
 
 
 @pytest.mark.slow  # quick: the same box in the plugin, by the same rules; skins without energy push nobody
-@pytest.mark.xfail(reason="its steps do not settle, and on CUDA and some processors end with other forces")
 def test_a_thrown_box_is_lent_nothing():
     """What a first step in touch may give is what was put into the skin, not all that it can hold."""
     _timestep, seen, store = thrown_box()
@@ -557,8 +556,7 @@ def test_a_light_box_gains_nothing_beside_a_press(tier):
 def test_the_integrator_is_corrected_for_where_bodies_spin_fast(integrator, monkeypatch):
     """These integrators turn free bodies by their velocity products, too. Where their answer was thought to
     be without these, forces grew from round to round, and a light body that a heavy one crushed gained energy
-    without bound. The step with the first of three spins settles. How much acts at the end of the others
-    hangs on a thousandth of the spin: there, what is amiss is compared with what is corrected, too."""
+    without bound."""
     body = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
     xml = scene(THROWN.format(APEX + 0.0062, body), 0.005, f'integrator="{integrator}"')
     spin = np.array([[30, 20, 40], [100, 60, 120], [200, 150, 300]])
@@ -567,12 +565,10 @@ def test_the_integrator_is_corrected_for_where_bodies_spin_fast(integrator, monk
 
     def finish(batch, end, after=batches.batch.Batch.finish):
         r = batch._of_step
-        arrays = r.amiss, r.acting, batch._correction_force
-        seen.append([np.abs(array.numpy()[0, :, :3]).max(1) for array in arrays])
+        seen.append([np.abs(array.numpy()[0, :, :3]).max(1) for array in (r.amiss, r.acting)])
         after(batch, end)
 
     monkeypatch.setattr(batches.batch.Batch, "finish", finish)
     in_batch(xml, qpos, np.c_[np.tile([0, 0, -0.3], (len(spin), 1)), spin], 2, TIP)
-    amiss, acting, correction = seen[-2]  # on CUDA attach goes through a step before, to compile its kernels
-    assert acting[0] > 0.05 and amiss[0] < 3e-4 * acting[0], amiss / acting
-    assert correction.max() > 1 and (amiss < 3e-4 * np.maximum(acting, correction)).all(), amiss / acting
+    amiss, acting = seen[-2]  # on CUDA attach goes through a step before, to compile its kernels
+    assert acting.min() > 0.05 and (amiss < 3e-4 * acting).all(), amiss / acting
