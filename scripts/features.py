@@ -356,6 +356,8 @@ _COUPLING = (
      "attach, condensed, batch"),
     ("Where the contact's force jumps (an edge of a mesh) a skin stays that has come as near to it as it "
      "can", "condensed, on all its paths"),
+    ("A skin whose bodies stay within 2 nm of where it was solved is not solved again, nor its film",
+     "attach, condensed; solved in batches and where coupling is one-way"),
 )  # fmt: skip
 
 
