@@ -66,7 +66,7 @@ def _noted(found: dict) -> Iterator[None]:
         if np.prod(dim):
             found[kernel.module, block_dim] = None
 
-    def suggest(kernel, *_, **__):  # who asks launches by as many threads as the module says
+    def suggest(kernel, *_, **__):  # the caller launches with the module's number of threads
         threads = kernel.module.options["block_dim"]
         note(kernel, 1, block_dim=threads)
         return threads, 1

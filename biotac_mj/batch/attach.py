@@ -88,7 +88,7 @@ def attach(
         `mj_forward` does, `mjw.make_data` with `njmax`.
       prefix: as given to `add`.
       settings, keywords: as for `biotac_mj.attach`, but for device, stepper and on_error; skin as given to
-        `add`. friction is that of core, nail and clamp in m too. `coupling.Settings` says what may differ by
+        `add`. friction is that of core, nail and clamp in m too. `coupling.Settings` lists what may differ by
         world: material, friction, seed, sensor, thermal and textures.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
         adhesion_hysteresis (`ContactLaw`), bulk_modulus [Pa], fill_volume [m^3] (`SkinData.set_liquid`), each
@@ -147,7 +147,7 @@ def make(
     **keywords: typing.Unpack[SettingKeywords],
 ) -> PoseBatch:
     """Step 2 of 2 in place of `attach`, where another simulator steps `mjm`: makes a skin for
-    each world, which you tell the bodies' poses after each step.
+    each world, to which you give the bodies' poses after each step.
 
     Args:
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.

@@ -1,15 +1,15 @@
 """The skins of a batch inside `mujoco_warp.step`: launches only, so that the step can be captured in a CUDA
 graph.
 
-Once per step, when mujoco_warp asks for passive forces, and as in `coupling/implicit/world.py` for one world:
+Once per step, when mujoco_warp computes passive forces, and as in `coupling/implicit/world.py` for one world:
 1. The linear models of the last step enter the dynamics, and mujoco_warp's own later stages predict where
    the bodies go.
 2. The skins are solved, while their bodies give way from there as their inertia lets them.
 3. Their new linear models take the old ones' place. Where that moved a body mujoco_warp predicts again, and
    the skins of worlds in which something else held it are solved again.
 4. Push is withheld where the skins would give more energy than was put into them, and mujoco_warp goes on.
-The readings are written when mujoco_warp asks for the velocity sensors. contact_force, which is what acts
-in the step, is written again when it asks for acceleration sensors, after its constraint solver."""
+The readings are written with mujoco_warp's velocity sensors. contact_force, the force that acts in the step,
+is written again with its acceleration sensors, after its constraint solver."""
 
 import functools
 import typing

@@ -2,7 +2,7 @@
 
 Arrays of the simulator lead with the world and are single precision; ours are [item, world] and double. A
 wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin,
-unless something else is said."""
+unless stated otherwise."""
 
 import warp as wp
 
@@ -88,9 +88,9 @@ def accept_models(
     # Out:
     model: Model,
 ):
-    """The linear models of skins that were asked for poses pos, mat: where their geoms came to; the last
-    step's, where they came nowhere; of the first one, which came from outside, where it was to end; no force
-    on what is nowhere."""
+    """Linear models of skins after a solve for poses pos, mat: about the poses that were reached. Where none
+    was reached: the last step's model, or in a first step one about the target poses. No force where poses
+    are not finite."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return

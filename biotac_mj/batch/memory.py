@@ -37,8 +37,8 @@ def arrays_of(roots: Iterable) -> Iterator[wp.array]:
 class Scratch:
     """Warp's allocator on one CUDA device while it is entered; on the CPU nothing changes.
 
-    What was freed is given again to whoever asks for as much: code that ran once outside of a loop finds
-    there all that it needs when it runs inside.
+    Freed memory is reused for requests of the same size: code that ran once outside of a loop allocates
+    nothing when it runs inside.
     """
 
     def __init__(self, device: wp.DeviceLike):

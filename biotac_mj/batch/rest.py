@@ -465,7 +465,7 @@ class Clearance:
 
     Attributes:
       ball: centre and radius [m] of a ball around the skin at rest.
-      known: (nworld,) wp.array int, 1 where the last `find` was asked, and all geoms have finite poses.
+      known: (nworld,) wp.array int, 1 where the last `find` ran, and all geoms have finite poses.
       found: (nworld,) wp.array vec2d, clearance from the skin, beyond the margin a bound of it, and from the
         core [m]; infinite where no geom is close. Where the skin is touched it is that of any touch.
     """
@@ -541,8 +541,8 @@ class Rest:
     # --- a step ---
 
     def begin_step(self, taking_part: Marks) -> None:
-        """Finds who takes part in the step, with the geoms where they go without acceleration; writes the
-        skins' `wanted`, and marks their worlds. Launches only."""
+        """Finds the skins that take part in the step, from the geoms' poses at its end without acceleration;
+        writes the skins' `wanted`, and marks their worlds. Launches only."""
         skin, st = self._skin, self._skin.data.worlds
         if not self.sleeps:
             st.wanted.fill_(1)
@@ -575,8 +575,8 @@ class Rest:
     def end_step(
         self, model: Model, settled: wp.array, rounds: wp.array, failed: wp.array, began: wp.array
     ) -> None:
-        """Finds who sleeps from now on; counts steps that `failed`, and writes which skins `began`, (nworld,)
-        each. Launches only."""
+        """Finds the skins that sleep from now on; counts steps that `failed`, and writes which skins `began`,
+        (nworld,) each. Launches only."""
         st, sleeps = self._skin.data.worlds, int(self.sleeps)
         known = [sleeps, model, settled, rounds, self._near, self._at_rest, self.awake, st, failed, began]
         written = [self.stays, self._undeformed, self._resting, self._constants, self._seen]

@@ -42,7 +42,7 @@ class BatchSkin:
       worlds: in what the worlds differ besides, see `skin.per_world.make_worlds`.
       twin: the model on the CPU, of skins of the condensed tier; None: of the full one.
 
-    Attributes (wp.arrays on the model's device, double precision where nothing else is said):
+    Attributes (wp.arrays on the model's device, double precision unless stated otherwise):
       data: the SkinData: positions, materials and liquids.
       pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before
         `solve_skins`.

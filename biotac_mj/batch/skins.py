@@ -1,5 +1,5 @@
-"""The BioTacs of many worlds: skins, liquid and sensors. They are told where things are, so it does not
-matter who steps the bodies."""
+"""The BioTacs of many worlds: skins, liquid and sensors. Poses are an input, so any simulator can step the
+bodies."""
 
 import types
 
@@ -215,8 +215,8 @@ class PoseBatch(Skins):
     `biotac_mj.batch.make`.
 
     The forces act in the simulator's next step, explicitly: with a touched mass m the step must stay below
-    some 0.8 sqrt(m / k), k the contact's stiffness (docs/lab/coupling.md). Poses that are prescribed know no
-    such limit.
+    some 0.8 sqrt(m / k), k the contact's stiffness (docs/lab/coupling.md). Prescribed poses have no such
+    limit.
 
     Attributes:
       xfrc_applied: (nworld, nbody, 6) wp.array float, force and torque [N, N m] on every body at its centre

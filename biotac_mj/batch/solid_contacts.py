@@ -111,7 +111,8 @@ def _appending():
         kind: wp.array(dtype=int),
         adhesion: wp.array(dtype=float),
     ):
-        """Adds what `Overlaps` found to mujoco_warp's contacts, as far as there is room, which it says."""
+        """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; `count` goes on beyond
+        it, which shows the overflow."""
         pair, s, w = wp.tid()
         if found_depth[pair, s, w] <= real(0.0):
             return

@@ -50,7 +50,7 @@ def attach(
       slots: how many bodies may touch two-way. None: as many as are in `spec`, and 64 more.
       settings: what the BioTac is made with, for code that gives the same to several functions: Settings, a
         dict of its fields, or a .json file of them.
-      keywords: the same by name, on top of `settings`; `coupling.Settings` says what each may be. Skin:
+      keywords: the same by name, on top of `settings`; see `coupling.Settings` for their values. Skin:
         `design` ("biotac", "biotac_sp", a folder), `skin` ("coarse", "default", "fine", a file), `material`,
         `liquid`, `tier` ("full", "condensed"), `stepper`. Contact: `coupling` ("two-way", "one-way"),
         `geoms`, `rounding`, `friction`, `priority`. Sensor: `readings`, `signal`, `sensor`, `randomise`,

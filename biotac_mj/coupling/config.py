@@ -60,7 +60,7 @@ class Config:
       seed: of the sensor's noise, and of what is drawn. name: of the sensor; sensors of one seed that have
         other names are drawn apart.
       device: Warp device of the skin.
-      options: what the keyword `options` says by part: "skin", "modulus" (a list, or a .npy file), "film",
+      options: of the keyword `options`, by part: "skin", "modulus" (a list, or a .npy file), "film",
         "readings" with the sensor in it, "loss", "rounds" and "threads". In two-way coupling a skin is
         solved at most "rounds" times in a step (default: 16). A smaller number limits the cost of a step; if
         bodies and skin then do not reach an equilibrium, the last model acts. `mj_step` solves several skins

@@ -108,7 +108,7 @@ class Handle:
           seed: which one, 0 .. 2**64 - 1.
 
         Returns:
-          its numbers; None where the readings know none.
+          its parameters; None if the readings have no individual sensors.
 
         Raises:
           ValueError: a seed that cannot be, or model or data without this BioTac. TypeError: no MjModel and

@@ -357,8 +357,8 @@ class Instance:
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
     def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
-        """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
-        they were to go; asked only with Runge-Kutta, whose status is written when the step ends."""
+        """Corrects the outcome by the poses that the integrator has reached. near: whether they are close to
+        the predicted ones; used with Runge-Kutta only, whose status is written when the step ends."""
         rounds, settled, withheld, _, _, acting = self._outcome
         self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, ends, acting
 

@@ -19,7 +19,7 @@ from .touching import deformable
 def check_place(
     spec: mujoco.MjSpec, site: str | None, body: str | None, prefix: str, pos: ArrayLike, quat: ArrayLike
 ) -> None:
-    """Raises what `attach` says of a spec, place or prefix that cannot be."""
+    """Raises the errors of `attach` about a spec, place or prefix."""
     if not isinstance(spec, mujoco.MjSpec):
         raise TypeError(f"spec is {type(spec).__name__}: pass a mujoco.MjSpec, before it is compiled")
     if site is None and body is None:
@@ -60,7 +60,7 @@ def _listed(value, size):
 
 def check_touching(spec: mujoco.MjSpec, wanted: Iterable[str], geoms: Iterable[str] | None) -> None:
     """Raises ValueError for a name that no geom of the model has, and for a flex that collides with a
-    BioTac for which `geoms` does not say what may touch."""
+    BioTac whose `geoms` is not given."""
     flexes = [repr(flex.name) for flex in spec.flexes if geoms is None and collides(flex)]
     if flexes:
         raise ValueError(deformable(flexes))

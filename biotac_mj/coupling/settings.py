@@ -32,7 +32,7 @@ class SkinSettings:
 
     Attributes:
       design: which fingertip: "biotac" (None), "biotac_sp", or a folder made by `biotac design new`; see
-        `geometry.design`. A mesh in a file knows its own.
+        `geometry.design`. A mesh in a file contains its design.
       mesh: of it, "coarse", "default" (None), "fine", a file that `biotac lab mesh` wrote, or a
         SkinGeometry. As a keyword it is `skin`.
       material: rubber, filling and electrodes: a preset's name, a dict of Material's fields, a .json file of
@@ -42,7 +42,7 @@ class SkinSettings:
       tier: "full" finite elements, or "condensed", fast and less exact, for hands and control.
       options: SkinOptions or a dict of its fields; as a keyword `options["skin"]`.
       modulus: a factor on Young's modulus for each element (nelem,), a .npy file of them, or a function of
-        positions (n, 3) [m], asked at the elements' centroids; as a keyword `options["modulus"]`.
+        positions (n, 3) [m], called with the elements' centroids; as a keyword `options["modulus"]`.
     """
 
     design: str | pathlib.Path | None = None
@@ -193,12 +193,13 @@ class Settings:
 
         Args:
           settings: Settings, a dict of its fields, a JSON text of it or a file; None is all by default.
-          keywords: each takes the place of what `settings` says, but for a None that says nothing.
-          call: who is called. without: keywords that it does not take. also: what else it takes.
+          keywords: each replaces the value in `settings`; None is ignored.
+          call: name of the function in errors. without: keywords that it does not take. also: further ones
+            that it takes.
 
         Raises:
-          TypeError: a keyword that is not known. ValueError: one thing is said twice, and not alike; a value
-            of a wrong type. FileNotFoundError: no such file.
+          TypeError: unknown keyword. ValueError: two different values of one setting; a value of a wrong
+            type. FileNotFoundError: no such file.
         """
         keywords = dict(keywords or {})
         try:
@@ -233,7 +234,7 @@ class Settings:
 
     @property
     def keywords(self) -> dict:
-        """The same as keywords."""
+        """The settings as keywords of `attach`: {keyword: value}."""
         return {name: self._keyword(name) for name in _KEYWORDS}
 
     def _keyword(self, name):
@@ -269,10 +270,10 @@ class Settings:
 
         Args:
           name: of the sensor. mesh, geometry: see `geometry.skins.skin_reference`; a function for the modulus
-            is asked on the geometry.
+            is evaluated on the geometry.
 
         Raises:
-          ValueError: a value that cannot be.
+          ValueError: invalid value.
         """
         from ..skin.settings import plain, read_material
 
@@ -326,7 +327,7 @@ class Settings:
         return getattr(getattr(self, stage) if stage else self, field)
 
     def _with(self, changes):
-        """The settings with {(stage or "", field): value} instead; None says nothing where it is the
+        """The settings with {(stage or "", field): value} instead; None is ignored where it is the
         default."""
         changes = {
             place: value
@@ -340,16 +341,16 @@ class Settings:
         return dataclasses.replace(self, **own)
 
     def _with_options(self, options):
-        """The settings with what the keyword `options` says in its places."""
+        """The settings with the values of the keyword `options` in their places."""
         own = {name: value for name, value in options.items() if name not in _OPTIONS}
         changes = {_OPTIONS[name]: value for name, value in options.items() if name in _OPTIONS}
         return self._with(changes | ({("", "more"): own} if own else {}))
 
 
 class SettingKeywords(typing.TypedDict, total=False):
-    """Settings as keywords, each as the stage of `Settings` says that it belongs to.
+    """Settings as keywords; each belongs to a stage of `Settings`.
 
-    Of one name in two places, such as `sensor` beside `readings={"sensor": ...}`, both have to say the same.
+    A name that is given in two places, such as `sensor` and `readings={"sensor": ...}`, must have one value.
 
     Attributes:
       design, skin, material, liquid, tier: see `SkinSettings`.
@@ -403,7 +404,7 @@ for _stage, _kind in (*_STAGES.items(), ("", Settings)):
 
 
 def _sensor_said_once(keywords, options):
-    """Keywords and options with what `readings` and options["readings"] say of the sensor in its places."""
+    """Keywords and options with the sensor's settings of `readings` and options["readings"] moved to them."""
     signal, readings = keywords.get("signal"), keywords.get("readings")
     if signal is not None and not isinstance(signal, (str, pathlib.Path)):
         raise ValueError(
@@ -417,7 +418,7 @@ def _sensor_said_once(keywords, options):
     for where, given, of_sensor in places:
         if given is None:
             continue
-        if not isinstance(given, dict):  # what reads it says so
+        if not isinstance(given, dict):  # its reader raises the error
             return keywords, options
         for name in of_sensor:
             keywords[name] = either(name, keywords.get(name), given, where)

@@ -60,10 +60,10 @@ def skin_thickness(geometry: SkinGeometry) -> float:
     return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
 
 
-# MuJoCo asks a model that it compiles for the size of its states and lets go of it: the skins of a hand
-# should last until its mjData is made, but those of the models before it are many megabytes
+# MuJoCo calls `nstate` of a model that it compiles and then frees it: the skins of a hand should last until
+# its mjData is made, but those of the models before it are many megabytes
 _skins = Shared(keep=8)
-_asked = -1  # the instance that MuJoCo asked for last: it asks for a model's in their order
+_asked = -1  # the instance of MuJoCo's last call: its calls are in the order of the instances
 
 
 def _skin(config, touching):
@@ -147,7 +147,7 @@ def state_size(model: ModelView, index: int) -> int:
 
 
 def reset_state(model: ModelView, address: int, index: int, setup: Setup | None = None) -> None:
-    """Writes the rest state at an address, as mj_resetData asks, of a setup that is known there."""
+    """Writes the rest state of an instance at an address, for mj_resetData."""
     setup = setup or Setup(model, index)
     buffer = (ctypes.c_double * int(model.plugin_statenum[index])).from_address(address)
     state = np.frombuffer(buffer, np.float64)

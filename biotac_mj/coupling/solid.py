@@ -17,7 +17,7 @@ def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) 
     and in that frame; and whether MuJoCo's solver finds them, on these dofs, to `SOLVED`.
 
     For when all passive forces are known and accelerations are not: where anything touches, MuJoCo's
-    constraint solver is asked what it will find.
+    constraint solver runs in advance.
     """
     out = np.zeros(6)
     if not data.ncon:

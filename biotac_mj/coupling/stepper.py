@@ -75,9 +75,9 @@ class SkinResult:
 
 
 class SkinStepper(Protocol):
-    """A skin. Making one must be cheap: MuJoCo asks for `nstate` while it compiles, when contact exclusions
-    are not yet known, perhaps with more geoms than there will be (so more geoms may not need less state).
-    Heavy work belongs into the first `reset` or `solve_skin`."""
+    """A skin. Making one must be cheap: MuJoCo reads `nstate` while it compiles, when contact exclusions are
+    not yet known, perhaps with more geoms than there will be (so more geoms may not need less state). Heavy
+    work belongs into the first `reset` or `solve_skin`."""
 
     nstate: int
 
@@ -102,11 +102,11 @@ class SkinStepper(Protocol):
         """(nvert, 3) nodes [m] of a state, for showing."""
 
     def touched_area(self, state: np.ndarray) -> np.ndarray:
-        """(ngroup,) area of the skin that each body touches in a state [m^2]; asked where heat counts."""
+        """(ngroup,) area of the skin that each body touches in a state [m^2]; used by sensors with heat."""
 
     def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds; needed of a stepper whose
-        results may be short of the poses asked for."""
+        results may not reach the target poses."""
 
     # A stepper may have the methods below. With the first, bodies that were placed have not slid there; with
     # the others a skin that rests, or stays as it is, costs next to nothing.
@@ -241,8 +241,8 @@ def make_readings(
     check the settings.
 
     Raises:
-      ValueError: the name is unknown, or `config` asks for heat or vibration that the readings or the stepper
-        do not know.
+      ValueError: the name is unknown, or `config` has heat or vibration, which the readings or the stepper do
+        not support.
     """
     check_names(config)
     try:

@@ -230,7 +230,7 @@ def _is_core(model, geom):
 
 
 def _is_met(model, core):
-    """Whether other BioTacs meet the skin of BioTac `core`, which they know by its core and what is shown."""
+    """Whether other BioTacs meet the skin of BioTac `core`: they find it by the geoms of its core."""
     return any(
         _has_skin(model, core, g) and _skin_of(model, g) for g in np.flatnonzero(model.geom_bodyid == core)
     )

@@ -368,7 +368,8 @@ def stop(x: np.ndarray, limit: float | np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=8)  # force, pressure and electrodes of a run share it
 def _decay_matrix(time, tau):
-    """(n, n - 1) remaining fraction of each change between times at each time; times (n,) [s], as bytes."""
+    """(n, n - 1) fraction of the change between times j and j + 1 that remains at time i; time: (n,) [s], as
+    bytes, so that it can be a cache key."""
     t = np.frombuffer(time)
     wait = np.diff(t) / tau
     weight = np.where(

@@ -279,7 +279,7 @@ def load_forward(path: pathlib.Path | str, geometry: SkinGeometry) -> ForwardMod
 
 
 def check_forward(path: pathlib.Path | str, geometry: SkinGeometry) -> None:
-    """Raises like `load_forward` if the header of a file says that it does not fit this skin."""
+    """Raises like `load_forward` if a file's header is of another skin."""
     _refuse_other(describe(path), path, geometry, "forward")
 
 

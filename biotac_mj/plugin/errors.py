@@ -20,7 +20,7 @@ import mujoco
 
 _lock = threading.Lock()
 _first = None  # the first error since the last `check`
-_doors = set()  # code of the outermost Python functions of callbacks: what is raised there, C throws away
+_doors = set()  # code of the outermost Python functions of callbacks: C discards exceptions raised there
 
 
 def guarded(
@@ -28,11 +28,11 @@ def guarded(
     raises: Callable[..., bool] = lambda *_: False,
     abandon: Callable[..., None] = lambda *_: None,
 ) -> Callable:
-    """Makes a function a callback of C that lets nothing out.
+    """Makes a function a callback of C that never raises.
 
     Args:
-      failed: what C gets after an error.
-      raises: whether an error is raised later, asked with the callback's arguments.
+      failed: returned to C after an error.
+      raises: called with the callback's arguments; whether an error is raised after MuJoCo has returned.
       abandon: called with them after an error.
     """
 

@@ -28,7 +28,7 @@ _FRACTION = 0.8  # least fraction of overflows among changes of more than half a
 
 
 def coarse(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Finds channels that skip codes which their noise should reach: every second one, say, or others."""
+    """Finds channels that skip codes which their noise should reach, for example every second one."""
     if not log.whole:
         return []
     x = log.counts.astype(int)

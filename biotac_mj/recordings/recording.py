@@ -265,7 +265,7 @@ def designed(counts: np.ndarray) -> Design:
 
 def rest_correlation(counts: np.ndarray) -> float:
     """Correlation of the median ln Z of counts (n, nelectrode) with the mean pattern of known sensors, over
-    the electrodes that change, if any does: dead ones say nothing of a sensor."""
+    the electrodes that change, if any does: dead ones carry no information."""
     alive = np.nanmax(counts, axis=0) > np.nanmin(counts, axis=0)
     alive |= not alive.any()
     here, published = (log_impedance(of)[..., alive] for of in (counts, designed(counts).rest_counts))

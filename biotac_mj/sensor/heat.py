@@ -444,7 +444,7 @@ class Heat:
       device: Warp device.
 
     Attributes:
-      state: (nworld, nstate) wp.array float64, laid out as this module's constants say; temperatures in [C].
+      state: (nworld, nstate) wp.array float64, laid out by this module's constants; temperatures in [C].
       area: (nworld, ngroup) wp.array float64, contact area of each body [m^2]; write it before `advance`.
       force: (nworld, ngroup) wp.array float64, the normal force of each [N]; likewise.
       nstate: length of a sensor's state.

@@ -74,7 +74,7 @@ _NUMBERS = "dict(effusivity=, temperature=)"  # of heat, instead of a name
 
 
 def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
-    """The material in a name: the longest phrase that the table knows, among equals the last.
+    """The material in a name: the longest phrase of the table that it contains, among equals the last.
 
     Case, digits, underscores and plurals are ignored: "acrylic_211", "Steel Vase" and "car_sponges" are
     found. A material has precedence over an object: a glass bottle is of glass, a bottle of polyethylene.

@@ -72,9 +72,9 @@ def find_energy(
     greedy_out: wp.array(dtype=int),
     damped: MarkedWorlds,
 ):
-    """Finds the energy that each body has in the skin: that of the last step, and what those have put in who
-    have moved it since. Skins that would give more are greedy while they have not yet made backward Euler's
-    step, which gives less: their worlds are marked."""
+    """Finds the energy that each body has in the skin: that of the last step, and the work of what has moved
+    the body since. Skins that would give more are greedy while they have not yet made backward Euler's step,
+    which gives less: their worlds are marked."""
     w = wp.tid()
     greedy_out[w] = 0
     if taking_part[w] == 0:
@@ -85,10 +85,10 @@ def find_energy(
         before = wp.dot(last.wrench0[g, w], jump)
         now = wp.dot(acts, jump)
         pushes = force_of(acts)
-        # a solve that lost its way knows little of the force that was there before it
+        # the force of a failed solve may be far below the one before it
         most = most_energy(r, wp.max(force_of(last.wrench0[g, w]), pushes), solid, w)
         store = _in_store(r.left[g, w], before, now, most)
-        if r.placed[g, w] == 1:  # who puts bodies into a skin puts in what it pushes with, elsewhere nothing
+        if r.placed[g, w] == 1:  # placing a body in a skin does the work of its push; outside it does none
             store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
         r.most[g, w] = most
         r.store[g, w] = store

@@ -2,7 +2,7 @@
 in double precision, those of mujoco_warp in single, which lead with the world.
 
 Ours are [group, world] and double. A wrench or a small motion has its linear part first. Everything is in the
-BioTac frame, about its origin, unless something else is said."""
+BioTac frame, about its origin, unless stated otherwise."""
 
 from typing import Any
 

@@ -36,8 +36,8 @@ class Rounds:
     """A coupled step of every world.
 
     Poses of the bodies: when the step begins; where the skins are solved, without acceleration and with it;
-    where the skins are asked for; where they would go without the skins' wrenches; where the last step left
-    them.
+    the target poses of the skins' solves; where they would go without the skins' wrenches; where the last
+    step left them.
     """
 
     here_pos: wp.array2d(dtype=vec3)
@@ -134,8 +134,9 @@ def wrenches(
     # Out:
     wrench_out: wp.array2d(dtype=vec6),
 ):
-    """On each group without acceleration, without what is withheld. Ways are measured as the rows do: what
-    acts where the bodies come is what the skin says there. Finds `acting`, too, after `follow`."""
+    """On each group without acceleration, without what is withheld. Displacements are measured as in the
+    constraint rows, so that the wrench at the bodies' new poses is that of the skin's linear model there.
+    Finds `acting`, too, after `follow`."""
     g, w = wp.tid()
     total = vec6()
     if is_finite(r.start_pos[g, w], r.start_mat[g, w]):

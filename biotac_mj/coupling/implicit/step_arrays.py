@@ -47,8 +47,8 @@ class StepArrays:
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
       stiffness: of the rows, see `Metric.record`.
       off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
-      find_energy, restrain, gains: functions that make the account and say whether the skin is greedy;
-        whether push on a body had to be withheld, which now is; whether bodies get more than they have.
+      find_energy, restrain, gains: functions that do the energy balance. They return whether the skin is
+        greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
       models: views of wrench0, tangent0, pos0 and mat0, in the last step and in this one.
     """
 
@@ -136,7 +136,7 @@ class StepArrays:
         return self.left_out.copy()
 
     def _marking(self, kernel, *known):
-        """A function that runs a kernel and says whether it has marked the world."""
+        """A function that runs a kernel and returns whether it has marked the world."""
         run, marked = row((kernel, 1, [self._one, *known])), self._is_marked
 
         def find():

@@ -3,8 +3,8 @@
 A step of length h must satisfy p = x + (gamma - 1/2) h v + beta h^2 a(W(p)), with W the skin's wrench at the
 pose p, a the accelerations with which MuJoCo's integrator then moves the bodies (`integrator`), and gamma and
 beta Newmark's (`rules`; docs/design.md, "A step in time"). Newton's method finds p. In every round MuJoCo
-gives the accelerations with the skins' linear models in force (`metric`). They say where the bodies go, and
-the skins are solved there while these give way as their inertia, and what else holds them, lets them
+gives the accelerations with the skins' linear models in force (`metric`). The skins are solved at the poses
+that follow, while the bodies yield by the compliance of their inertia and of their other constraints
 (`SkinGroup.find_compliance`). That gives new linear models. The first round has the models of the last step.
 One round is enough, at impacts too, unless what else holds a body changes within it: a joint's friction
 begins to slip, another skin lets go.
@@ -32,7 +32,7 @@ from .springs import Springs
 
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
-# [m] from where a skin was solved: there Runge-Kutta's stages may lead its bodies, other than the first says
+# [m] largest distance between the pose at which a skin was solved and the one that Runge-Kutta's stages reach
 ASTRAY = 1e-4
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
 _RESETS = {
@@ -45,7 +45,7 @@ class World:
 
     Attributes:
       tolerance: [m] how far bodies may go from where the skins were solved for them.
-      begins, last: instances that MuJoCo asks for first and last.
+      begins, last: instances that MuJoCo computes first and last.
     """
 
     def __init__(self, model: ModelView, data: DataView, indices: list[int]):
@@ -281,8 +281,8 @@ class World:
         self._weights = None
 
     def _finish(self):
-        """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
-        acts may have been predicted badly, so that this is not quite where each skin was solved."""
+        """After the step: gives the skins the poses that their bodies have reached. These differ from where
+        each skin was solved: joints move in arcs, and other forces may have been predicted badly."""
         skins, self._acting = self._acting, ()
         if not skins:
             return

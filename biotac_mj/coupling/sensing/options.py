@@ -1,5 +1,5 @@
-"""`ReadingsOptions`: where the counts of the electrodes come from, said once for MuJoCo, dm-control, batches
-and stored motions."""
+"""`ReadingsOptions`: where the counts of the electrodes come from, in MuJoCo, dm-control, batches and stored
+motions."""
 
 import dataclasses
 
@@ -13,8 +13,8 @@ from ...sensor.signals import read_signal
 class ReadingsOptions:
     """Settings of a BioTac's readings, from the deformed skin to counts; not a sensor itself.
 
-    For one BioTac `attach(signal=, sensor=, randomise=, readings={...})` says the same. This is for code that
-    gives the same settings to several functions:
+    For one BioTac these are the arguments of `attach(signal=, sensor=, randomise=, readings={...})`. This is
+    for code that gives the same settings to several functions:
 
         options = ReadingsOptions(signal="learned", noise=False)
         biotac_mj.attach(spec, site="tip", **options.settings())  # so tasks.BioTac

@@ -32,7 +32,7 @@ CLEAR = 1e-3
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0
-_SHORT = 5e-4  # [m] a way to the skin of which friction may know all, as it does in batches
+_SHORT = 5e-4  # [m] longest approach to the skin over which friction sees the whole motion, as in batches
 _REACH = 0.02  # [m] from the BioTac's frame to its skin
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 

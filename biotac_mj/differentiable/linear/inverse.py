@@ -179,8 +179,8 @@ def solve_by_gmres(
     """Solutions of A x = right of all worlds, each with its own A, and the number of products.
 
     The residual is preconditioned, so that `precision` refers to x: a skin is a million times stiffer against
-    some motions than against others, so a small plain residual says little. The basis has the precision of
-    the inverse's result.
+    some motions than against others, so a small plain residual bounds no error. The basis has the precision
+    of the inverse's result.
 
     Args:
       product, inverse: A and its approximate inverse times a tensor (n, nworld, 3).

@@ -93,9 +93,8 @@ def electrodes_on(
     """The design's electrodes projected onto a core mesh: positions (n, 3) [m], unit outward normals (n, 3).
 
     Lin et al.'s table for the BioTac lies about 0.245 mm under the surface (the core there is 5.08 mm in
-    radius). The normal is a
-    mean over the faces around the point (area times a Gaussian of 0.25 mm), because one small face of a
-    tessellated core says little."""
+    radius). The normal is a mean over the faces around the point (area times a Gaussian of 0.25 mm), because
+    the normals of single faces of a tessellated core scatter."""
     if not design.nelectrode:
         return np.zeros((0, 3)), np.zeros((0, 3))
     point = design.in_biotac_frame(electrode_positions(design)) * 1e-3

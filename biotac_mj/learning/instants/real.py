@@ -243,7 +243,7 @@ def _unjudged(models, force, ntrain):
 
 
 def _useless(predicted, force, ntrain):
-    """A note if the blocks of unseen rows do not tell that the model is better than the mean."""
+    """A note if the model is not significantly better than the mean on blocks of unseen rows."""
     error, mean = (y[ntrain:] - force[ntrain:] for y in (predicted, force[:ntrain].mean(axis=0) + 0 * force))
     block = blocks(len(force))[ntrain:]
     better = [is_better(error[:, k : k + 1], mean[:, k : k + 1], block) for k in range(3)]

@@ -178,7 +178,7 @@ def mirror_matrix(geometry: SkinGeometry) -> csr_matrix:
 
 def mirror_order(geometry: SkinGeometry) -> np.ndarray | None:
     """(nelectrode,) electrode that is the mirror image of each one in z = 0; None for a fingertip that is
-    not symmetric, whose mirrored touches say nothing of it."""
+    not symmetric."""
     flip = np.array([1, 1, -1])
     off, order = cKDTree(geometry.electrode_pos).query(geometry.electrode_pos * flip)
     beside = np.linalg.norm(mirror_matrix(geometry) @ geometry.vert - geometry.vert * flip, axis=1)

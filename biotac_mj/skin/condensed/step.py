@@ -160,7 +160,7 @@ class CondensedStep:
         launcher.launch_blocks(conclude, [d.nworld], known, found, block_dim=self._block)
 
     def recall(self, launcher: Launcher) -> None:
-        """Computes positions of the nodes from `remembered`. Launches only, on the CPU."""
+        """Computes positions of the nodes from `remembered`, on the CPU."""
         d = self._data
         known = [self._model.law, self._constants, d.worlds, self.remembered]
         launcher.launch(recall, d.nworld, known, [self._scratch, d.x])

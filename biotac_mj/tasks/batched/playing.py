@@ -1,4 +1,4 @@
-"""Policies that play: scores with intervals, and the worlds that a policy's card tells of."""
+"""Evaluation of policies: scores with intervals, in the environment that a policy's card describes."""
 
 import importlib.resources
 import pathlib

@@ -162,7 +162,7 @@ class BatchTask(abc.ABC):
             self.prepare_held()
         self.reset()
 
-    # what a task says
+    # what a task defines
 
     @abc.abstractmethod
     def _scene(self, skin):

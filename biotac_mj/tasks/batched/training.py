@@ -218,9 +218,9 @@ def _now(env):
 
 
 def _study(learners, lessons, acted, progress):
-    """Imitation for a fraction (`Numbers.study`) of the time of acting [s]; progress: elapsed fraction of the
-    teacher's time. Each lesson draws new errors of encoders and model, because a policy would recognise the
-    few states by these errors."""
+    """Trains by imitation for `Numbers.study` times the time spent on acting, `acted` [s]; progress: elapsed
+    fraction of the phase with a teacher. Each lesson draws new errors of encoders and model, because a policy
+    would recognise the few states by these errors."""
     numbers, begin = learners[0].learner.numbers, time.perf_counter()
     for _ in range(numbers.lessons):
         for run in learners:
