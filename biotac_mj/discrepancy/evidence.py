@@ -50,7 +50,8 @@ def further_off(before: np.ndarray, after: np.ndarray, chance: np.ndarray | None
 
     Args:
       before, after: (units, groups) squares of errors of blocks of time or of trajectories.
-      chance: (groups,) standard deviation of the change of their sums; None: as the units say, at least two.
+      chance: (groups,) standard deviation of the change of their sums; None: estimated from the units, at
+        least two.
     """
     change = np.subtract(after, before)
     if chance is None:
@@ -76,7 +77,7 @@ def max_t(statistic: np.ndarray, draws: int = 2000, seed: int = 0) -> tuple[np.n
 
     Args:
       statistic: (units, cells), one number for each trajectory or block and cell, symmetric about zero under
-        the null; nan where a unit has nothing to say about a cell.
+        the null; nan where a unit has no data on a cell.
 
     Returns:
       t (cells,), p (cells,) adjusted.

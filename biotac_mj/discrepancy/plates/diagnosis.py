@@ -1,6 +1,6 @@
 """Simulation in the loop for recordings of flat presses: the pose of every row is fitted, then models with
-one number more say in which stage the rest disagrees, and several sensors whether it is theirs or the base
-model's."""
+one further parameter show in which stage the residual lies, and several sensors whether it is theirs or the
+base model's."""
 
 import dataclasses
 import itertools
@@ -71,7 +71,7 @@ class Tested:
     Attributes:
       gain: (blocks,) [nats] by which the larger model makes each block likelier.
       rms: "worst" or "all" electrodes -> (smaller, larger) [counts]; locked: the same on held-out rows,
-        None where that was not asked.
+        None without held-out rows.
       value: of the parameter by the constants of either half; modulus: their mean Young's modulus [Pa].
     """
 

@@ -21,14 +21,14 @@ _MOST = 12  # electrodes: what more have is of the sensor
 
 @dataclasses.dataclass(eq=False, kw_only=True)
 class Candidate(Fault):
-    """An effect that the search has found: a fault of the log, or what else acts on electrodes, with what the
-    search needs to go on. A `report.verdict.Finding` is what is said of it.
+    """An effect that the search has found: a fault of the log, or another effect on electrodes, with what the
+    search needs to continue. The report has it as a `report.verdict.Finding`.
 
     Attributes:
-      id: of KINDS; ties: ids that the evidence does not part; p: sign flips of blocks left out.
-      of_log: whether it is a fault of the log itself, told by its own rows and those beside them.
-      sudden: whether it happens between two rows and is told by these rows alone: several of one row are one
-        event, and held-out rows say nothing more of it.
+      id: of KINDS; ties: ids that the evidence does not separate; p: sign flips of blocks left out.
+      of_log: whether it is a fault of the log itself, detected in its own rows and their neighbours.
+      sudden: whether it happens between two rows and is detected in them alone: several of one row are one
+        event, and held-out rows have no further evidence.
       beside_load: whether an electrode was compared with the others while a load moves them.
       delay: [s] by which the electrodes follow the force later.
       trend: of levels over time, or None; share: (nelectrode,) of it that each electrode has, None of a

@@ -1,10 +1,10 @@
 """One electrode given the others: ln Z of all electrodes, and products of its principal components, as one
 Gaussian.
 
-The place of a load bends what electrodes have to do with each other; products of principal components follow
-the bend. With the precision P of all columns, an electrode less what all others say of it is (P y)_k / P_kk,
-with a standard deviation of 1 / sqrt(P_kk); and a pattern p that all share is seen at p'P y / p'P p, where
-the rest disturbs it least."""
+How electrodes depend on each other changes with the place of the load; products of principal components model
+this. With the precision P of all columns, the residual of an electrode given all others is (P y)_k / P_kk,
+with a standard deviation of 1 / sqrt(P_kk); and the amplitude of a common pattern p has the minimum-variance
+estimate p'P y / p'P p."""
 
 import functools
 
@@ -57,19 +57,19 @@ class Conditional:
 
     @property
     def noise(self) -> np.ndarray:
-        """(c,) standard deviation of an electrode beside what the others say of it."""
+        """(c,) standard deviation of an electrode given the others."""
         return 1 / np.sqrt(np.diag(self.precision)[: self.number])
 
     @functools.cached_property
     def weights(self) -> np.ndarray:
-        """(c, q) by which all columns say each electrode, none by itself."""
+        """(c, q) coefficients that predict each electrode from all other columns."""
         P = self.precision[: self.number]
         weights = -P / np.diag(P)[:, None]
         np.fill_diagonal(weights, 0.0)
         return weights
 
     def residual(self, rows: np.ndarray) -> np.ndarray:
-        """(n, c) electrodes of rows (n, q) less what all others say of them."""
+        """(n, c) residuals of the electrodes of rows (n, q), given all other columns."""
         return rows @ self.precision[:, : self.number] * self.noise**2
 
     def along(self, pattern: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from .conditional import Components, Conditional
 _BIN = 0.1  # [s]: load moves by hand, below 10 Hz
 _CELLS = 48  # of the rows fitted, whose levels are compared
 WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
-CHANGES = 1.5  # [s] within which an electrode's changes are compared with what the others say of them
-LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
+CHANGES = 1.5  # [s] within which an electrode's changes are compared with their prediction from the others
+LEAST = 16.0  # [s] fitted, in which load and drift can be separated: eight windows
 _MOVED = 6.0  # [counts] within windows, of the six liveliest electrodes
 _DIMENSIONS = 8  # of the load at most
 _FLOOR = 0.02  # variance of a product that no load makes
@@ -62,7 +62,7 @@ class Model:
         x = x - self.mean
         sample = noise_level(counts[rows][:, self.used])
         self.noise = sample / self.slope / np.sqrt(max(1.0, self.width * fresh))
-        last = np.zeros(x.shape, int)  # a hole takes the bin before it, then what the others say
+        last = np.zeros(x.shape, int)  # a gap takes the bin before it, then the prediction from the others
         last[self.known] = np.nonzero(self.known)[0]
         last = np.maximum.accumulate(last, axis=0)
         first = np.argmax(self.known, axis=0)
@@ -105,7 +105,7 @@ class Model:
         return bool(self.inside.sum() * self.period >= LEAST)
 
     def alone(self, value: np.ndarray | None = None) -> np.ndarray:
-        """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: less what all do alike.
+        """(m, c) residual of every electrode given the others [ln Z]; unloaded: less the common change.
         value: (m, c) other levels than the model's own."""
         if not self.dimensions:
             value = self.value if value is None else value

@@ -16,7 +16,7 @@ from .session import Session
 _BLOCKS = 8  # of the held-out rows, whose errors are compared
 
 _FEWEST = 5  # samples
-_TURNS = 0.3  # logarithm of way over range: how a trend goes on that has turned nobody knows
+_TURNS = 0.3  # logarithm of path length over range: a trend that has turned cannot be extrapolated
 _NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 
 
@@ -24,7 +24,7 @@ def prove(session: Session, finding: Candidate) -> None:
     """Fills `gap`, `verified` and `written` of a finding: its number on rows that took no part in any fit,
     without and with it, and whether all electrodes are no further off there with it."""
     if finding.of_log:
-        finding.verified = True  # what is wrong with a log is told by its own samples
+        finding.verified = True  # its own samples are the evidence
     if finding.delay:
         gap = _force(session, finding)
     elif finding.correct is None and finding.mask is None:
@@ -58,7 +58,8 @@ def _aside_from(session):
 
 
 def _counts(session, without, finding):
-    """RMS of the finding's electrodes about what the others, or for a shared effect their own level, say."""
+    """RMS of the finding's electrodes about their prediction from the others, or for a common effect about
+    their own level."""
     m, aside = _aside(session)
     bare = without.model()
     mine = np.flatnonzero(np.isin(m.used, finding.channels))
@@ -82,14 +83,14 @@ def _counts(session, without, finding):
     # beside a load the level against the others wanders by itself
     if not better and (finding.beside_load or finding.features.get("turns", 0.0) > _TURNS):
         return None
-    if not finding.sudden:  # that is told in its own rows
+    if not finding.sudden:  # its evidence is in its own rows
         finding.verified = better
     return Gap("counts", before, after, floor, f"RMS of {what} in the part fitted")
 
 
 def _samples(session, finding):
-    """RMS by which the finding's samples miss what the other electrodes say, as they were logged and without
-    it: those that are no measurement against those that are."""
+    """RMS error of the finding's samples against their prediction from the other electrodes, as logged and
+    without it: samples that are no measurement against those that are."""
     m, late = session.model(), ~session.fit
     said = counts_from_log_impedance(m.value - m.alone() + m.mean)
     time, number = session.recording.time[late], session.counts.shape[1]
@@ -118,15 +119,15 @@ def _force(session, finding):
         return None
     each = [view.errors().mean(1), view.at_delay(finding.delay)]
     out, worse = [float(np.exp(0.5 * e.mean())) for e in each], each[1] - each[0]
-    if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
+    if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # not significant on these rows
         return None
     floor = float(np.mean(noise_level(session.recording.force[session.fit], None, _NOISELESS)))
     return Gap("N", *out, floor, "RMS error of force from electrodes, by blocks of that part")
 
 
 def views(session: Session) -> dict[str, Gap]:
-    """Numbers that the whole model says of the held-out part without having been given them, before and
-    after the findings that are written."""
+    """Errors of the whole model's predictions of the held-out part, before and after the findings that are
+    written."""
     bare = session.without(*session.findings)
     session = session.without(*(f for f in session.findings if not f.written))
     out = {}
@@ -139,8 +140,8 @@ def views(session: Session) -> dict[str, Gap]:
     else:
         out["electrodes at rest"] = _view("the electrodes at rest", each, sample)
     if session.recording.force is not None and session.recording.force.std(0).max() > FORCE_MOVED:
-        # a drift that load has blurred may be right for the electrodes and wrong for the force, whose own
-        # trend it resembles: the last rows fitted choose, said from those before them
+        # a drift under load may be right for the electrodes and wrong for the force, whose own trend it
+        # resembles: the last fitted rows, predicted from those before them, choose
         fit = np.flatnonzero(session.fit)
         late = fit[int(0.7 * len(fit)) :]
         still = session.without(*(f for f in session.findings if f.trend is not None))

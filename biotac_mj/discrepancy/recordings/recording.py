@@ -20,8 +20,8 @@ from ...sensor.channels import check_counts, check_force
 
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
-# rows for each electrode: to tell one from all others takes as many coefficients as there are electrodes, and
-# each of two parts, fitted and held out, must leave as many degrees of freedom as that spends
+# rows for each electrode: to predict one from all others takes as many coefficients as there are electrodes,
+# and each of two parts, fitted and held out, must leave as many degrees of freedom
 ROWS_PER_ELECTRODE = 4
 _APART = 1.0  # [s] between two series that are put together, as after a clock that starts anew
 _SAME_RATE = 0.05  # difference of the rates of series of one logger
@@ -116,7 +116,7 @@ class PlainRecording:
 
     @property
     def signed(self) -> bool:
-        """Whether the electrodes say which way they go."""
+        """Whether the electrodes' changes have a sign."""
         return not self.unit.endswith("without sign")
 
     @property
@@ -215,7 +215,7 @@ def _joined(series):
 
 
 def as_plain(found: Recording | PlainRecording) -> PlainRecording:
-    """A recording without its poses, its gaps and units said in words; a plain one as it is.
+    """A recording without its poses, with notes on its gaps and units; a plain one as it is.
 
     Where the force is not there in some rows, as before its logger began, the longest run of rows that have
     it is taken; where that is less than half of them, all rows are, without force.
@@ -245,7 +245,7 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
 
 
 def _with_force(found):
-    """Rows of a recording whose force is whole, and what to say of the others."""
+    """Rows of a recording whose force is complete, and notes on the others."""
     if found.force is None or (there := np.isfinite(found.force).all(1)).all():
         return found, []
     edges = np.flatnonzero(np.diff(np.pad(there.astype(int), 1)))

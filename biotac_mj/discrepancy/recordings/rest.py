@@ -14,7 +14,7 @@ from .session import Session
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
 _LIVELY = 1.0
-# of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
+# of a load that is too short to be separated from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
 _COMPARED = 400  # rows of the shortest recording in USUAL
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
@@ -98,9 +98,8 @@ def _contradicted(session):
 
 
 def _of_rows(session):
-    """Features that no model of the load is needed for, of the recording less what was named: rhythms, sharp
-    changes, rows that come again, and what is more than noise where noise is all there should be. And what
-    they say, in words."""
+    """Features of the recording without the named effects that need no model of the load: rhythms, sharp
+    changes, repeated rows, and more than noise where only noise is expected. And their description."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh

@@ -166,7 +166,7 @@ def _proved(session):
         prove(session, finding)
     tested = [*session.findings, *session.weak]
     enough = discoveries([f.p for f in tested])
-    # what is wrong with the log is said whatever else was tested
+    # faults of the log are reported whatever else was tested
     chance = [f for f, yes in zip(session.findings, enough) if not (yes or f.of_log)]
     contradicted = [f for f in session.findings if f.verified is False or f in chance]
     if contradicted:
@@ -186,14 +186,14 @@ def _checkup(session, protocol, named):
             for fault in more:
                 fault.confidence = confidence(fault)
             some += as_candidates([f for f in more if clear(f, named)])[0]
-        # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
+        # at rest a filtered electrode is constant, too: only the whole log shows one that is always constant
         found += [moved(f, rows, r) for f in some if not f.kind.silent]
     enough = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
     for finding, yes in zip(found, enough):
         if not yes or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
         elif not any(f.id == finding.id and _alike(f, finding) for f in session.findings):
-            session.accept(finding)  # no other stretch has said it
+            session.accept(finding)  # the first stretch with it
 
 
 def _alike(one, other):

@@ -70,8 +70,8 @@ class Session:
         return self.model().dimensions >= 2
 
     def filled(self) -> np.ndarray:
-        """(n, nelectrode) counts without the effects; samples that are no measurement as the other
-        electrodes say them."""
+        """(n, nelectrode) counts without the effects; samples that are no measurement are predicted from the
+        other electrodes."""
         from ...sensor.channels import counts_from_log_impedance
 
         if not self.masked.any():
@@ -84,7 +84,7 @@ class Session:
             if hole.all():
                 continue
             out[hole, k] = np.interp(rows[hole], rows[~hole], self.counts[~hole, k])
-            # longer than a few bins the line says less than the others do, where they are measurements
+            # across more than a few bins the other electrodes predict better than a line does
             edge = np.flatnonzero(np.diff(np.concatenate([[False], hole, [False]])))
             place = np.flatnonzero(m.used == k)
             for first, last in zip(edge[::2], edge[1::2]):

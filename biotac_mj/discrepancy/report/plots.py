@@ -1,4 +1,4 @@
-"""Figures of reports. They take arrays and say nothing of how these were found."""
+"""Figures of reports, made from arrays."""
 
 import dataclasses
 from collections.abc import Sequence

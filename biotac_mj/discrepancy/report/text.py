@@ -12,7 +12,7 @@ _HIDDEN = {"id", "stage", "unit", "attach"}  # columns of tables that are for pr
 
 def summary(verdict: Verdict) -> str:
     """The headline, effects, the proof on held-out data, where it disagrees, and what the data cannot
-    tell."""
+    decide."""
     v = verdict
     lines = [v.headline, "", f"{v.name}: {v.data}"]
     lines += [f"warning: {line}" for line in v.warnings]

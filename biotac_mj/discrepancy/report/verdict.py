@@ -129,8 +129,8 @@ class Finding:
     """An effect that was found.
 
     Attributes:
-      id, name, stage (of `STAGES`), physics: of the effect. confusable: id -> experiment that would tell it
-        from that one.
+      id, name, stage (of `STAGES`), physics: of the effect. confusable: id -> experiment that would
+        distinguish it from that one.
       channels: numbers from 0 of the electrodes that have it; empty where it is not of single electrodes.
       parameters: name -> Estimate.
       evidence: mean log likelihood that data left out gain by it [nats], nan where it is not so measured.
@@ -160,7 +160,7 @@ class Finding:
 
     @classmethod
     def of(cls, effect: "Effect", **said: object) -> "Finding":
-        """Finding of an effect, the catalogue's or a user's own, with what else is said of it."""
+        """Finding of an effect, the catalogue's or a user's own; said: its other attributes."""
         own = {name: getattr(effect, name) for name in ("id", "name", "stage", "physics", "confusable")}
         return cls(**own, **said)
 
@@ -186,7 +186,7 @@ class Finding:
 
     @property
     def apart(self) -> dict[str, str]:
-        """Name -> what would tell it from those that it ties with."""
+        """Name of each effect that it ties with -> experiment that would distinguish them."""
         return {name: self.confusable.get(i, "no experiment is known") for i, name in self.ties.items()}
 
     @property
@@ -254,7 +254,8 @@ class Verdict:
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
-      notes: what the data cannot tell. next_experiment: what would. next_command: the command that begins it.
+      notes: what the data cannot decide. next_experiment: one that would. next_command: the command that
+        begins it.
       amended: lines on sensor_amended.yaml.
       details: what is known of this kind of data alone, as further keys of verdict.json.
     """
@@ -306,8 +307,7 @@ class Verdict:
 
     @property
     def headline(self) -> str:
-        """The verdict for somebody who has never seen a report: the largest gap, what closes it, by how
-        much."""
+        """The verdict in one line: the largest gap, what closes it, by how much."""
         gap = self.leading
         size = f"{gap.before:.3g} {gap.unit} RMS"
         size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""

@@ -88,8 +88,8 @@ class Explanation:
         return list(zip(here, own))
 
     def with_unseen(self, effect: Effect, score: float) -> "Explanation":
-        """This one with an effect of a realistic size besides, of which the data say so much [nats], and
-        nothing of its parameters."""
+        """This one with a further effect of a realistic size, whose evidence is `score` [nats] and whose
+        parameters have their prior."""
         theta = {**effect.default(), **effect.grid[len(effect.grid) // 2]}
         signs = np.random.default_rng(0).choice([-1.0, 1.0], len(effect.free))
         for (name, size), sign in zip(sizes(effect), signs if len(signs) > 1 else [1.0]):
@@ -155,7 +155,8 @@ class Beliefs:
 
     @property
     def decided(self) -> bool:
-        """Whether nothing more has to be asked: nor is it likely that something is there besides."""
+        """Whether no further contact is needed: explanations are distinguished, and a further effect is
+        unlikely."""
         return self.told_apart and self.beside < SETTINGS.rate
 
     @property
@@ -270,7 +271,7 @@ def believed(comparison: Comparison, search: Search, doubts: list[str], chosen: 
         information = np.eye(len(parameters(fit.effects)))
         for i, (_, columns) in enumerate(one.residuals(comparison)):
             if i in chosen:
-                # where the fit leaves more than noise, a trajectory says less of it
+                # a trajectory whose residual exceeds noise carries less information
                 information += columns.T @ columns / max(square[i], 1.0)
         out.append(dataclasses.replace(one, information=information))
     probable = weights([one.score for one in out], [len(one.effects) for one in out])

@@ -22,7 +22,7 @@ _LONGEST = 60.0  # hold, in times that a press takes
 _SLIDE = 2e-3  # [m], at most, of half of the contacts
 _LEAST = 0.15  # of the depth that the bounds allow
 _ROWS = {"press": 6, "hold": 5, "slide": 5, "release": 5}
-_SAFE = 0.9  # of the largest force: effects may add to what the base model says
+_SAFE = 0.9  # of the largest force: effects may add to the base model's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,8 +85,8 @@ def drawn(
     sim: "Simulator", bounds: Bounds, count: int, seed: int = 0
 ) -> list[tuple[Contact, np.ndarray, np.ndarray]]:
     """Contacts that spread over all that the bounds allow, each with the place (3,) of its first touch [m]
-    and its attitude (3, 3), whose +y axis is the heading. A depth is so much less than the bound as the base
-    model's force asks for.
+    and its attitude (3, 3), whose +y axis is the heading. A depth is reduced until the base model's force is
+    within its bound.
 
     Raises:
       ValueError: no contact is possible within the bounds.
@@ -122,7 +122,7 @@ def drawn(
         found.append((contact, begin + travel * heading, mat, _LEAST + (1 - _LEAST) * u[9]))
     if not found:
         raise ValueError("no tool meets the skin within these bounds: give another --reach, or a larger one")
-    # straight presses to the bound tell how deep a force goes
+    # straight presses to the bound give force over depth
     n = sim.design.nelectrode
     probes = [
         trajectory_of(dataclasses.replace(c, slide=0.0, presses=1), at, mat, 0.0, f"probe{k}", n)
@@ -150,7 +150,7 @@ def _between(limits, share):
 def trajectory_of(
     contact: Contact, at: np.ndarray, mat: np.ndarray, clock: float, name: str, nelectrode: int
 ) -> Trajectory:
-    """Poses of a contact over time from just before first touch, with counts that say nothing yet.
+    """Poses of a contact over time from just before first touch; its counts are placeholders.
 
     Args:
       at: (3,) of the object's frame at first touch [m]. mat: (3, 3) its attitude. clock: of the session [s].

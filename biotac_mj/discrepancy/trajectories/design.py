@@ -1,5 +1,5 @@
-"""The next experiment: of contacts within bounds those that are expected to tell explanations apart best,
-whatever the parameters are."""
+"""The next experiment: of contacts within bounds those that are expected to discriminate best between
+explanations, averaged over their parameters."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ from .whitening import Comparison
 
 _PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
 _BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
-_REPEATS = 2  # of a contact: of a law of another form more of the same tells less than it is expected to
-_LIKELY = 0.01  # probability from which on it is said what cannot be told from an explanation
-_NOTHING = 1e-3  # [nats] below which a further contact tells nothing
+_REPEATS = 2  # of a contact: where the true law has another form, repeats give less than expected
+_LIKELY = 0.01  # probability from which on explanations that cannot be distinguished are reported
+_NOTHING = 1e-3  # [nats] below which a further contact is useless
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Plan:
 
     Attributes:
       contacts. nats: {(name, other): by how much all of them together are expected to favour the first where
-        it is true}. alike: (name, other) that no number of contacts within the budget tells apart.
+        it is true}. alike: (name, other) that no number of contacts within the budget distinguishes.
     """
 
     contacts: list[Planned]
@@ -115,8 +115,8 @@ class Separation:
         return out
 
     def alike(self, budget: int) -> list[tuple[int, int]]:
-        """Pairs (a, b) of what data show, both likely, that no contact, made `budget` times, tells apart by
-        `ODDS`."""
+        """Pairs (a, b) of explanations, both likely, that no contact, repeated `budget` times, distinguishes
+        by `ODDS`."""
         most = np.max([self.nats(budget * one) for one in np.eye(len(self.gram))], axis=0)
         most = np.maximum(most, most.T)
         likely = np.flatnonzero(self.weight[: self.seen] > _LIKELY)
@@ -133,7 +133,7 @@ def planned(
     seed: int = 0,
     progress: bool = True,
 ) -> Plan:
-    """The contacts within bounds, at most `budget`, that are expected to tell most.
+    """The contacts within bounds, at most `budget`, with the largest expected information.
 
     Args:
       sim: the simulator that was compared. candidates: how many contacts to choose from, or these, as

@@ -82,9 +82,8 @@ class Fit:
 @dataclasses.dataclass
 class _Point:
     """Parameters and offsets (trajectories, 3) of poses, the residual (n, width) there, in eigenvectors, and
-    each parameter's distance from its prior's mean in standard deviations; done: what each effect does;
-    errors: what errors of poses do there, and then those of laws; y: the residual as it would be with poses
-    as they are said to be."""
+    each parameter's distance from its prior's mean in standard deviations; done: the contribution of each
+    effect; errors: derivatives by errors of poses, then of laws; y: the residual at the recorded poses."""
 
     effects: list
     nuisance: Nuisance
@@ -128,7 +127,7 @@ def fit_effects(
     Args:
       keep: trajectories to use (indices), None all. start: Fit whose nuisance, offsets and errors of laws to
         start from.
-      known: names of the nuisance that is as the base model says.
+      known: names of the nuisance parameters that are fixed at the base model's values.
     """
     chosen = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
     model = _Model(comparison, likelihood.of(comparison, chosen), effects, known)

@@ -1,14 +1,14 @@
 """Likelihood of data under a model that is nearly right.
 
-Measured less predicted is noise, the error of every trial's pose, what the laws of effects lack, and what the
-model misses: a Gaussian process per channel over where and how deep an object presses, for how long it has
-touched, and the session's clock (Kennedy and O'Hagan 2001). In the eigenvectors of its kernel noise and
-process are diagonal, whatever the process's amplitude, which is a parameter with a prior as all others are.
+The residual, measured less predicted, is the sum of noise, the error of every trial's pose, errors of the
+effects' laws, and the model's discrepancy: a Gaussian process per channel over place, depth, time since touch
+and the session's clock (Kennedy and O'Hagan 2001). In the eigenvectors of its kernel noise and process are
+diagonal, whatever the process's amplitude, which is a parameter with a prior as all others are.
 
-The true law of an effect is another one than the catalogue's: what it does in truth is what the catalogue's
-does, times one and a Gaussian process over depth, time since touch and the session's clock, the same for all
-channels. The standard deviation of this process is the effect's law error, one number with a prior whose
-median is `SETTINGS.law`; data say the rest.
+The true law of an effect differs from the catalogue's: its contribution is the catalogue's times one plus a
+Gaussian process over depth, time since touch and the session's clock, the same for all channels. The standard
+deviation of this process is the effect's law error, one parameter with a prior whose median is
+`SETTINGS.law`.
 """
 
 import typing

@@ -114,8 +114,7 @@ def _around(size, row, column):
 
 def _stays(x):
     """(n, nelectrode) by how much the mean of the rows after each row of x (n, nelectrode) lies above that of
-    the rows before it, less what the same of the other electrodes says of it: the load may have moved
-    meanwhile."""
+    the rows before it, given the same change of the other electrodes: the load may have moved meanwhile."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
     at = np.arange(len(x))
     a, b = np.maximum(at - _STAYS, 0), np.minimum(at + 1 + _STAYS, len(x))
@@ -124,7 +123,7 @@ def _stays(x):
     change = after - before
     change[[*at[:2], *at[-2:]]] = 0
     scale = np.maximum(1.4826 * np.median(np.abs(change), axis=0), 0.3)
-    y = np.clip(change / scale, -_CLEAR, _CLEAR)  # no jump says what electrodes have in common
+    y = np.clip(change / scale, -_CLEAR, _CLEAR)  # jumps do not enter the correlation
     given = Conditional(y.T @ y / len(y), np.full(y.shape[1], 0.05))
     return change + (given.residual(y) - y) * scale
 
@@ -200,8 +199,8 @@ def jumped(session: Session) -> list[Candidate]:
 
 
 def _gains(session, k, since):
-    """Ids of what a jump of electrode k at a time [s] may be besides a level: a change of what it makes of
-    the load from then on, against what the others say of its changes within windows."""
+    """Ids of what a jump of electrode k at a time [s] may be besides a level: a change of its gain from then
+    on, relative to its conditional prediction within windows."""
     m = session.model()
     if not m.dimensions or k not in m.used:
         return ()  # nothing moves: an offset; a gain would have no effect

@@ -1,8 +1,8 @@
 """An electrode that follows the load later than the others do: a filter, or a converter of its own.
 
-What the others say of an electrode within a touch is compared with what it reads; where it is late by a time,
-the difference is that time's share of the change that they say. Every electrode of a sound sensor is late by
-some milliseconds to either side of the others, which explains little of what it differs by."""
+Within a touch each electrode is compared with its prediction from the others. A delay tau adds -tau times the
+rate of the prediction to the residual. On a sound sensor, too, electrodes are some milliseconds earlier or
+later than the others, which explains little of their residual."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -14,12 +14,12 @@ from ..conditional import Conditional
 from ..session import Session
 
 _BAND = (0.015, 0.25)  # [s] of smoothing between which touches move: noise is faster, drift slower
-_OWN = 1e-3  # of an electrode's variance that no other tells
-_LEAST = 0.05  # of what an electrode differs by: 0.13 at most in 35 pieces of sound sensors
+_OWN = 1e-3  # fraction of an electrode's variance that no other predicts
+_LEAST = 0.05  # fraction of the residual's variance
 
 
 def lagging(session: Session) -> Candidate | None:
-    """The electrode whose lag explains most of what it differs by from what the others say."""
+    """The electrode whose delay explains most of its residual given the others."""
     if not session.loaded:
         return None
     r = session.recording
@@ -55,14 +55,14 @@ def lagging(session: Session) -> Candidate | None:
 
 
 def _lag(product, square, total):
-    """Lag [s] (c,) and the share (c,) that it explains of a sum of squares."""
+    """Delay [s] (c,) and the fraction (c,) that it explains of a sum of squares."""
     return product / np.maximum(square, 1e-30), product**2 / np.maximum(square * total, 1e-30)
 
 
 def _parts(session, rows, used):
-    """By blocks of some rows (n,) and electrodes used (c,): products (blocks, c) of what each electrode lacks
-    with the change that the others say of it, squares of that change, and the sum (c,) of squares lacking;
-    None of too few rows."""
+    """By blocks of some rows (n,) and electrodes used (c,): products (blocks, c) of each electrode's residual
+    with the rate of its prediction, squares of that rate, and the sum (c,) of squared residuals; None of too
+    few rows."""
     r = session.recording
     rows = np.flatnonzero(rows & ~r.repeated & ~session.masked[:, used].any(1))
     if len(rows) < BLOCKS * len(used) or r.rate * session.fresh * _BAND[0] < 1:

@@ -1,12 +1,12 @@
 """Delay of the electrodes behind the force that is logged beside them.
 
-The force is regressed on what the electrodes say (ln Z and products of its principal components: they know
-the place of the contact, force alone does not) by ridge regression on blocks of time left out. A delay acts
-on the electrodes' side of the regression, so that it never changes what has to be explained. Both sides are
-smoothed alike, by 20 ms, which takes the electrodes' noise out of the comparison.
+The force is regressed on the electrodes (ln Z and products of its principal components, because they depend
+on the place of the contact, which force alone does not contain) by ridge regression, cross-validated on
+blocks of time. The regressors are delayed, never the force, so that the variance to be explained stays the
+same. Both sides are smoothed by 20 ms, which takes the electrodes' noise out of the comparison.
 
-A log's electrodes are of the bus's last frame and its force is of now, so every log is late by up to a frame.
-Delays of a frame are therefore part of the model that a latency is compared with."""
+A log's row has the electrodes of the bus's last frame and the force of the moment, so electrodes are late by
+up to a frame in every log. Delays of a frame are therefore part of the null model."""
 
 from collections.abc import Callable
 

@@ -202,7 +202,7 @@ def settle(session: Session) -> None:
 
 
 def _features(session, trend):
-    # under load what all share is told from it only where there is time for both
+    # under load a common drift is separable only in recordings long enough for both
     seconds = session.fit.sum() / session.recording.rate
     return {
         "nats": trend.nats / len(trend.gain),
@@ -354,7 +354,7 @@ def _by_temperature(session, finding, trend, ties):
         return [*ties, "thermal"] if alike else ties
     if gain.sum() <= _TOLD * finding.nats:
         return [*ties, "thermal"]
-    finding.detector = Thermal.detector  # another channel tells it, whatever its cause
+    finding.detector = Thermal.detector  # another channel predicts it, whatever its cause
     slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
     spread = float(np.sqrt(np.mean(out**2)) / (np.std(warm) * np.sqrt(len(warm))))
     alpha = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}

@@ -1,10 +1,10 @@
 """Change of one electrode over time under load, by a Gaussian process of the other electrodes and of time.
 
-An electrode is a linear map of the others, a smooth function of where the load is (their principal
-components), a memory of about a second, and noise; what a load does comes back where the load does. A drift
-is a smooth function of time besides, which does not. How much of each there is the likelihood of the whole
-recording says (type II maximum likelihood; Rasmussen and Williams 2006, 5.4), so that no share of the rows
-has to be left out, and the drift is judged by how much likelier it makes the electrode."""
+An electrode is the sum of a linear map of the others, a smooth function of the load's place (their principal
+components), a memory of about a second, and noise. These return to the same value with the same load; a
+drift, a smooth function of time, does not. The amplitudes maximise the likelihood of the whole recording
+(type II maximum likelihood; Rasmussen and Williams 2006, 5.4), so that no rows have to be left out, and the
+evidence of the drift is the gain in log-likelihood."""
 
 import functools
 
@@ -19,13 +19,13 @@ _CELLS = 250  # of time, at most
 _FEWEST = 60
 _AXES = np.array([1, 0.8, 0.6, 0.5, 0.4, 0.3])  # weights of principal components, where a load is
 _LEAST_AXIS = 0.02  # of the first component, what weight a further one has in a linear map at least
-# amounts tried, over the electrode's variance: a linear map; a function of where the load is and over what
-# distance it changes [standard deviations of the first component]; memory; a trend over time
+# amplitudes tried, over the electrode's variance: a linear map; a function of the load's place and its length
+# scale [standard deviations of the first component]; memory; a trend over time
 _LINEAR = (1.0, 10.0)
 _CURVED = ((0.0, 1.0), (0.03, 1.0), (0.3, 1.0), (0.1, 2.0), (1.0, 2.0))
 _MEMORY, _SECONDS = (0.001, 0.01), 1.5
-_DRIFT, _SMOOTH = (0.003, 0.03, 0.3), 0.2  # and over what share of the recording it changes
-_LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of what the others say, about which answers may change
+_DRIFT, _SMOOTH = (0.003, 0.03, 0.3), 0.2  # and its time scale, as a fraction of the recording
+_LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of the prediction about which a gain may change
 _NOISE = 0.001
 _LEVEL = 10.0
 _FASTER = (1, 9, 36, 144)  # squares of how much faster a trend may change
@@ -33,8 +33,8 @@ _KNOTS = 81
 
 
 class Process:
-    """Electrodes used (c,) of a model as Gaussian processes of all its bins. drifting: numbers of electrodes
-    that say nothing of others."""
+    """Each used electrode of a model as a Gaussian process over all its bins. drifting: numbers of electrodes
+    that do not predict others."""
 
     def __init__(self, model: Model, drifting: frozenset = frozenset()):
         self._silent = np.isin(model.used, list(drifting))
@@ -49,11 +49,11 @@ class Process:
         self._fits: dict[int, tuple] = {}
 
     def nats(self, i: int) -> float:
-        """By which a smooth trend over time makes used electrode i likelier."""
+        """Gain in log-likelihood of used electrode i by a smooth trend over time."""
         return self._of(i)[0]
 
     def answers(self, i: int) -> float:
-        """Nats by which a change of what it makes of the load does, about the load about which it does most:
+        """Gain in log-likelihood [nats] by a gain that changes over time, about the load where it is largest:
         a gain moves levels, too."""
         nats, without, y, _, _, K, load = self._of(i)
         said, best = load @ np.linalg.solve(K, y), -np.inf
@@ -102,7 +102,7 @@ class Process:
         _, _, y, scale, amount, K, _ = self._of(i)
         both = K + amount * self._smooth
         n = max(2, int((self._time <= self._model.time[self._model.inside][-1]).sum()))
-        # how fast it changes the bins fitted say
+        # the fitted bins choose how fast it changes
         shapes = [a * self._smooth[:n, :n] ** q for q in _FASTER for a in (amount, 10 * amount)]
         shape = max(shapes, key=lambda k: _log_likelihood(K[:n, :n] + k, y[:n]))
         values = scale * shape @ np.linalg.solve(K[:n, :n] + shape, y[:n])

@@ -156,7 +156,7 @@ def _with_step(level, time, rows):
 
 def _goes_on(level: np.ndarray, time: np.ndarray) -> tuple:
     """(rate, time constant) of a damped trend (Gardner and McKenzie 1985) beyond the last cell, chosen by
-    walking forward through the cells: at three earlier ends what came next is said from what was there."""
+    forward validation: at three earlier ends the cells that follow are predicted from those before."""
     span = time[-1] - time[0]
     ends = [int(f * len(level)) for f in (0.55, 0.7, 0.85)]
     taus = [0.0, *(span * f for f in (0.1, 0.25, 0.5, 1.0)), np.inf]

@@ -41,7 +41,7 @@ def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Excha
     _, reads = linear_sum_assignment(-fits.mean(0))
     row = np.arange(len(reads))
     gain = fits[:, row, reads] - fits[:, row, row]
-    # A contact that one electrode does not feel says nothing of it, but of the others in its ring.
+    # A contact that changes one electrode little is still evidence on the others in its ring.
     moved = []
     for ring in _rings(reads):
         if gain[:, ring].mean(0).min() > _SWAPPED and signed_root_t(gain[:, ring].sum(1)) < _SWAP_CHANCE:
