@@ -146,7 +146,7 @@ class Hook:
 
     def _look_ahead(self, m, d, moving):
         """Predicts the bodies' poses with the linear models of the last step and, in worlds whose skins act
-        or are touched there, finds the balance."""
+        or are touched there, finds the equilibrium."""
         going, taking_part = self._going, self._taking_part
         going.copy(taking_part)
         _begin_dynamics(m, d)

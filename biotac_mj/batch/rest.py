@@ -326,7 +326,7 @@ def give_up(
     resets_out: wp.array(dtype=bool),
     any_out: wp.array(dtype=int),
 ):
-    """After the solve: which skins without a balance come to rest, since nothing touches them there, and
+    """After the solve: which skins without equilibrium come to rest, since nothing touches them there, and
     which begin anew, since they have not moved on for too long."""
     w = wp.tid()
     anew = bool(False)
@@ -412,10 +412,10 @@ def end_step(
     wrench_out: wp.array2d(dtype=vec6),
     tangent_out: wp.array2d(dtype=mat66),
 ):
-    """Counts the steps that found no balance, of skin or of skin and bodies, and those in a row in which the
-    skin stayed where it was; puts untouched skins in balance to sleep. A released one with a geom nearby
-    stays awake: when the geom leaves, it comes to rest. Those that slept touch nothing, whatever the solves
-    of other worlds wrote."""
+    """Counts the steps that reached no equilibrium, of skin or of skin and bodies, and consecutive ones in
+    which the skin did not move; puts untouched skins in equilibrium to sleep. A released one with a geom
+    nearby stays awake: when the geom leaves, it comes to rest. Those that slept touch nothing, whatever the
+    solves of other worlds wrote."""
     w = wp.tid()
     if st.reason[w] != NOT_FINITE:
         began[w] = 1

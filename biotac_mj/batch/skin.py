@@ -142,9 +142,9 @@ class BatchSkin:
         may be captured in a CUDA graph. After `rest.begin_solve`, before
         `rest.come_to_rest`.
 
-        A world without a balance there comes as far as it can (`data.worlds.load_factor`); one whose poses
+        A world without equilibrium there comes as far as it can (`data.worlds.load_factor`); one whose poses
         are not finite stays as it was. One that nothing touches any more comes to rest, and so does one that
-        has not moved on for some steps: then without a balance."""
+        has not moved on for some steps: then without equilibrium."""
         self.begin_solve()
         solve_group([self], Fork(self.model.device, wanted=False))
         self.end_solve()

@@ -40,7 +40,7 @@ def begin_near(
     # Out:
     begins_out: wp.array(dtype=int),
 ):
-    """Lets solves of the wanted worlds begin where the previous one of the step has found a balance."""
+    """Lets solves of the wanted worlds begin where the previous one of the step has found an equilibrium."""
     w = wp.tid()
     begins_out[w] = wp.where(wanted[w] == 1 and reason[w] == CONVERGED and not reset[w], 1, 0)
 

@@ -32,7 +32,7 @@ class Skins:
 
     Attributes:
       nworld: number of worlds.
-      failed: (nworld,) wp.array int, steps that found no balance since the reset.
+      failed: (nworld,) wp.array int, steps that reached no equilibrium since the reset.
       model: `Model`, linear models in force: of the skin ON each touching body in the BioTac frame.
       began: (nworld,) wp.array int, whether a step was made since the reset.
       rest: `rest.Rest` of the skin, which skins take part in the step.

@@ -22,7 +22,7 @@ class Coupled:
       arrays: `StepArrays` of the instance, where the step stands.
       off: [m] how far the bodies go from where the skin was last solved.
       touching: numbers of the bodies that the skin holds: it has a stiffness against them.
-      may_act: whether another solve is worth its cost: not after one that found no balance, which took long.
+      may_act: whether another solve is worth its cost: not after one that reached no equilibrium.
       amiss: (n, 6) what the correction of the integrator's accelerations still lacks: it acts on the bodies
         too.
       excess: (n, 6) what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts

@@ -206,7 +206,7 @@ def conclude(
             left -= passed * _spared(r.left[g, w], r.store[g, w], gets) / both[1]
         left = wp.min(left, r.most[g, w])
         unknown = wp.isinf(r.left[g, w]) or (r.placed[g, w] == 1 and r.inside[w] == 1)
-        if unknown and reason[w] != CONVERGED:  # what was put in is not known before a balance is found
+        if unknown and reason[w] != CONVERGED:  # what was put in is not known before an equilibrium is found
             left = real(wp.inf)
         left_out[g, w] = left
 

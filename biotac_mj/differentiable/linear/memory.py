@@ -233,7 +233,7 @@ class LinearMemory:
 
     def pull(self, after: Memory, balance: np.ndarray) -> tuple[Memory, np.ndarray, dict]:
         """Cotangents of the old memory, of the memory's constants (c,), and, by name, of mu and lam (those
-        that `LinearStep` lacks), from those of the new memory and from the balance."""
+        that `LinearStep` lacks), from those of the new memory and from the equilibrium."""
         force = torch.from_numpy(-self._volume[:, None, None] * self._gradient_of(balance))
         parts = zip(self._pull(0, after.tensors(), range(1, 8)), self._pull(1, [force], range(1, 8)))
         *memory, constants, mu, lam = ((a + b).numpy() for a, b in parts)

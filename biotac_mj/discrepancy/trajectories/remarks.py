@@ -17,8 +17,8 @@ if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
-# Mean square of one alone beyond what another balance at an edge makes of it: at most 5.2 in 41 contacts of
-# sensors with nothing hidden, 28 where one of eleven presses was deep enough for rubber that stiffens.
+# Mean square of one trajectory that another equilibrium at an edge does not explain: at most 5.2 in 41
+# contacts of sensors with no effect, 28 where one of eleven presses was deep enough for rubber that stiffens.
 _FAR = 10.0
 _OFF = 2.5  # mean square from which on a trajectory is off
 

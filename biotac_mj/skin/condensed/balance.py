@@ -88,8 +88,8 @@ def newton_from(foretold: int, before: Linear, l: Linear, most: real, tolerance:
     contact there with a symmetric tangent. Where it may cost nothing it finds the contact of the forces as
     they are.
 
-    Where it is `foretold`, vector[F] is a balance of the skin as it was `before` with the geoms where they
-    are held, and Newton's first step goes from there. 2: contact has been evaluated there, at vector[U]."""
+    Where it is `foretold`, vector[F] is an equilibrium of the skin as it was `before` with the geoms at
+    `held_pos`, and Newton's first step starts there. 2: contact has been evaluated there, at vector[U]."""
     d = Newton()
     d.foretold = foretold
     d.before = before

@@ -115,8 +115,8 @@ class CondensedSkin:
           allowed: fraction of the limit by `patience`.
           bodies: compliance of the geoms' bodies; the outcome is then valid for the poses in its memory, to
             which its wrenches move the bodies. None: poses are prescribed.
-          near: a balance that was found from the same memory for poses not far from these, at which Newton's
-            method begins; with `bodies` alone.
+          near: an equilibrium for similar poses, found from the same memory, at which Newton's method begins;
+            with `bodies` alone.
 
         Raises:
           ValueError: NaN in a pose.
@@ -202,7 +202,7 @@ class CondensedSkin:
         v["node_force"][:] = 0.0
 
     def _begin_at(self, near):
-        """Lets the next solve begin at a balance."""
+        """Lets the next solve begin at an equilibrium."""
         v, outer = self._previous, near.coordinate < 3 * len(self.linear.node)
         v["force"][:] = v["core_force"][:] = 0.0
         v["force"].reshape(-1)[near.coordinate[outer]] = near.force[outer]

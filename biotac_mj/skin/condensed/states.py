@@ -97,7 +97,7 @@ class Newton:
     at_low: real
     at_high: real
     caught: real  # how long the piece of the last step is in which the residual turned round
-    before: Linear  # the skin of the balance from which the first step goes
+    before: Linear  # the skin of the equilibrium from which the first step goes
     linear: Linear
 
 

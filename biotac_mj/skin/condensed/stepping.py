@@ -220,8 +220,8 @@ def _begin_at(
     s: Scratch,
     st: Worlds,
 ):
-    """Begins an increment at a balance with geoms at these poses: its forces, pressure and linear skin, the
-    softening after it, and where geoms are held."""
+    """Begins an increment at an equilibrium with geoms at these poses: its forces, pressure and linear skin,
+    the softening after it, and where geoms are held."""
     for i in range(t, c.node.shape[0], threads):
         s.force[w, i] = r.force[i, w]
     for i in range(t, c.inner.shape[0], threads):
@@ -434,7 +434,7 @@ def _conclude_pass(
     if o.ok == CUT:
         if o.error < real(1.0) - p.at:
             _bound(w, t, threads, o.nnode, o.nin, s)
-        else:  # further from a balance than where the path began
+        else:  # further from an equilibrium than where the path began
             o.ok = 0
     if count_contacts(w, t, threads, o.nface, touch, c, s) > s.most_contacts:
         o.ok = 0

@@ -75,13 +75,13 @@ class Constants:
 @wp.struct
 @declared("condensed")
 class Remembered:
-    """A balance of the skin [item, world], see `state.VARIABLES`: that of the last step is remembered."""
+    """An equilibrium of the skin [item, world], see `state.VARIABLES`; the last step's is kept."""
 
 
 @wp.struct
 class Previous:
-    """What the previous solve has found: the balance, with the geoms where they were then [geom, world]; no
-    geoms where bodies do not give way."""
+    """Result of the previous solve: the equilibrium and the geoms' poses in it [geom, world]; no geoms where
+    poses are prescribed."""
 
     balance: Remembered
     pos: wp.array2d(dtype=vec3)
@@ -146,7 +146,7 @@ class Scratch:
     sought_x: wp.array2d(dtype=vec3)  # where nodes and geoms were when candidates were sought first
     sought_pos: wp.array2d(dtype=vec3)
     sought_mat: wp.array2d(dtype=mat33)
-    held_pos: wp.array2d(dtype=vec3)  # where they were at the balance from which another is foretold
+    held_pos: wp.array2d(dtype=vec3)  # where they were at the equilibrium from which another is foretold
     held_mat: wp.array2d(dtype=mat33)
     # of `broadphase.choose_view` [view, geom, world]: where geoms were when it was taken; [world, view]: how
     # far faces of the resting skin were from them at least [m], which geoms were near each; how deep they

@@ -309,7 +309,7 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                         fn = push[0]
                         K = push[1] * wp.outer(normal, normal)
                 # K leaves out how a smooth surface turns the normal: with it the tangent is not definite, and
-                # Newton's method finds balances that are not stable
+                # Newton's method finds equilibria that are not stable
                 force = fn * normal
                 if friction_mode == RECORDED and mu > real(0.0):
                     c.bound[i, w] = wp.max(mu * fn, real(0.0))
