@@ -6,7 +6,7 @@ geom and yields at mu k d."""
 
 import numpy as np
 
-from biotac_mj.coupling import SkinResult, register_stepper
+from biotac_mj.coupling import SkinResult, SkinStepper, register_stepper
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 HEIGHT = -0.008
@@ -74,8 +74,8 @@ def _depth(geom, point):
     return np.full(len(point), -1.0), np.tile([0.0, 0.0, 1.0], (len(point), 1))
 
 
-class SpringSkin:
-    """A SkinStepper. State of a node: geom it touches (0: none, i + 1), then its anchor in that geom's
+class SpringSkin(SkinStepper):
+    """State of a node: geom it touches (0: none, i + 1), then its anchor in that geom's
     frame."""
 
     def __init__(self, config, geometry, geoms):
@@ -92,7 +92,7 @@ class SpringSkin:
     def vert_xpos(self, state):
         return state[4 * len(self.vert) :].reshape(-1, 3)
 
-    def solve_skin(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
         n = len(self.vert)
         new = state.copy()
         memory, moved = new[: 4 * n].reshape(n, 4), self.vert.copy()

@@ -29,8 +29,8 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 class Tearing(spring_skin.SpringSkin):
     """Raises once it is pressed with more than 1 N."""
 
-    def solve_skin(self, state, geom_pos, geom_mat, dt):
-        result = super().solve_skin(state, geom_pos, geom_mat, dt)
+    def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
+        result = super().solve_skin(state, geom_pos, geom_mat, dt, **more)
         if abs(result.wrench).max(initial=0.0) > 1.0:
             raise ArithmeticError("the skin tore")
         return result
@@ -115,10 +115,10 @@ def test_a_kept_error_does_not_keep_the_model():
         pass
 
     class Holding(Tearing):
-        def solve_skin(self, state, geom_pos, geom_mat, dt):
+        def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
             local = Big()
             alive.append(weakref.ref(local))
-            return super().solve_skin(state, geom_pos, geom_mat, dt)
+            return super().solve_skin(state, geom_pos, geom_mat, dt, **more)
 
     alive = []
     register_stepper("holding", Holding)

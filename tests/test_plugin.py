@@ -15,7 +15,7 @@ import pytest
 import spring_skin
 
 import biotac_mj
-from biotac_mj.coupling import SkinResult, attach, register_stepper, structs
+from biotac_mj.coupling import SkinResult, SkinStepper, attach, register_stepper, structs
 from biotac_mj.coupling.setup import Setup
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -267,7 +267,7 @@ def test_rollout_with_two_threads_equals_the_loop(model):
             assert np.array_equal(sensors[i, k], data.sensordata)
 
 
-class _Free:
+class _Free(SkinStepper):
     """A linear spring that costs next to nothing, with a state as large as the real skin's."""
 
     nstate = 15000
@@ -281,7 +281,7 @@ class _Free:
     def vert_xpos(self, state):
         return self.vert
 
-    def solve_skin(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
         return SkinResult(
             state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert
         )
@@ -293,8 +293,8 @@ register_stepper("free", _Free)
 class _Breaking(spring_skin.SpringSkin):
     """Does not converge, or raises, once it is pressed with more than 1 N."""
 
-    def solve_skin(self, state, geom_pos, geom_mat, dt):
-        result = super().solve_skin(state, geom_pos, geom_mat, dt)
+    def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
+        result = super().solve_skin(state, geom_pos, geom_mat, dt, **more)
         result.iterations, result.residual = 7, 0.5
         if abs(result.wrench).max() > 1.0:
             if "raise" in self.options:
@@ -349,10 +349,10 @@ def test_an_exception_is_kept_warned_of_and_raised_on_request():
 
 def test_an_interrupt_inside_a_solve_is_raised_by_the_step():
     class Interrupted(_Free):
-        def solve_skin(self, state, geom_pos, geom_mat, dt):
+        def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
             if geom_pos[0, 1] > -0.0178:
                 raise KeyboardInterrupt
-            return super().solve_skin(state, geom_pos, geom_mat, dt)
+            return super().solve_skin(state, geom_pos, geom_mat, dt, **more)
 
     register_stepper("interrupted", Interrupted)
     model, _ = two_biotacs(1, "interrupted", "none")

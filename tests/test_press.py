@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from matplotlib.image import imread
 
-from biotac_mj.coupling import SkinResult, register_stepper, stepper
+from biotac_mj.coupling import SkinResult, SkinStepper, register_stepper, stepper
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.files import replacing
 from biotac_mj.geometry import load_skin
@@ -31,7 +31,7 @@ from biotac_mj.view import offscreen
 STIFFNESS = 40.0  # of a node's spring [N/m]
 
 
-class NodeSprings:
+class NodeSprings(SkinStepper):
     """Every outer node gives way to a sphere along its normal, held by a spring: forces are known by hand."""
 
     def __init__(self, config, geometry, geoms):
@@ -44,7 +44,7 @@ class NodeSprings:
     def vert_xpos(self, state):
         return state.reshape(-1, 3)
 
-    def solve_skin(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt, **more):
         x = self.geometry.vert.copy()
         away = x[self.outer] - geom_pos[0]
         distance = np.linalg.norm(away, axis=1)

@@ -1,9 +1,11 @@
 """The test double itself: its tangent is the derivative of its wrench."""
 
 import numpy as np
+import pytest
 import spring_skin
 
-from biotac_mj.coupling import Config, Geom
+from biotac_mj.coupling import Config, Geom, register_stepper
+from biotac_mj.coupling.stepper import make_stepper
 from biotac_mj.geometry.rigid import displace
 
 
@@ -30,3 +32,17 @@ def test_tangent_is_the_derivative_of_the_wrench():
             rtol=0.02,
             atol=0.02 * abs(result.tangent[0][:, i]).max(),
         )
+
+
+def test_a_skin_derives_from_the_base_class():
+    class Other:
+        def __init__(self, config, geometry, geoms):
+            pass
+
+    register_stepper("other", Other)
+    with pytest.raises(ValueError, match="stepper 'other' makes Other: derive it from .*SkinStepper"):
+        make_stepper(Config(stepper="other"), spring_skin.pad_geometry(), [])
+    made = make_stepper(Config(stepper="springs"), spring_skin.pad_geometry(), [])
+    state = np.ones(made.nstate)
+    assert made.key(state) == state.tobytes() and made.came_to(state) is None
+    assert not made.resting(state) and made.pressure(state) is None and made.put(state, *[None] * 3) is None

@@ -175,7 +175,7 @@ class Handle:
             differ from theirs.
 
         Returns:
-          None of a stepper of one's own without `contact_force(state)`, or for faces `contact_push(state)`.
+          None of a skin of one's own that does not say (`SkinStepper.contact_force`, `contact_push`).
 
         Raises:
           ValueError: another `of`.
@@ -184,11 +184,11 @@ class Handle:
             raise ValueError(f"of is {short_repr(of)}: pass 'nodes' or 'faces'")
         setup, (_, _, state, _) = self._parts(model, data)
         stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
-        push = getattr(stepper, "contact_force" if of == "nodes" else "contact_push", None)
-        if push is None:
-            return None
+        push = stepper.contact_force if of == "nodes" else stepper.contact_push
         with setup.skin.lock:
             force = push(state)
+        if force is None:
+            return None
         across = face_areas(stepper.vert_xpos(state), face)
         if of == "faces":
             return force / np.linalg.norm(across, axis=1)

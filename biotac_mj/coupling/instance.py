@@ -175,7 +175,7 @@ class Instance:
         arrays.begin()
         self.touching.check(arrays.start_pos, arrays.start_mat)
         placed = (arrays.placed > 0) & ~(self.touching.by_mocap & (head[STARTED] != 0.0))
-        if placed.any() and hasattr(self.setup.skin.stepper, "put"):
+        if placed.any():
             here = self.touching.geom_pose(arrays.here_pos, arrays.here_mat)
             with self.setup.skin.lock:
                 self.put = self.setup.skin.stepper.put(self._skin, placed[self.touching.group], *here)
@@ -202,22 +202,19 @@ class Instance:
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
         """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
         that is not known."""
-        skin = self.setup.skin
-        if not hasattr(skin.stepper, "is_clear"):
-            return None
-        with skin.lock:
-            return skin.stepper.is_clear(*self.touching.geom_pose(pos, mat))
+        with self.setup.skin.lock:
+            return self.setup.skin.stepper.is_clear(*self.touching.geom_pose(pos, mat))
 
     @property
     def inertial(self) -> bool:
         """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
-        return getattr(self.setup.skin.stepper, "inertial", False)
+        return self.setup.skin.stepper.inertial
 
     def is_out_of_reach(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not
         reach it within the step."""
         stepper, skin = self.setup.skin.stepper, self.parts[2]
-        if not hasattr(stepper, "is_out_of_reach") or not stepper.resting(skin):
+        if not stepper.resting(skin):
             return False
         self._geom_pose = self.touching.geom_pose(pos, mat)
         with self.setup.skin.lock:
@@ -236,7 +233,7 @@ class Instance:
         the same, if that solve left the skin as it was. None: it did not, or a solve is needed for more."""
         reach, skin, state = self.parts[0][STARTED], self.setup.skin, self.parts[2]
         changes = self.put is not None or self.touching.parted or self.setup.config.textures is not None
-        known = abs(reach) == STAYED and not changes and hasattr(skin.stepper, "pressure")
+        known = abs(reach) == STAYED and not changes
         pressure = skin.stepper.pressure(state) if known else None
         if pressure is None:
             return None
@@ -266,25 +263,23 @@ class Instance:
         """
         self._pose, self.stays = (pos, mat), False
         dt, stepper, before = self.model.opt.timestep, self.setup.skin.stepper, self._skin
-        begin, also = {}, core
-        if getattr(stepper, "begins_near", False) and near is not None and near.converged:
-            begin, also = {"near": near}, (*core, *near.pose)
-        if getattr(stepper, "may_wait", False) and self._may_wait:
-            begin["patient"] = True
-        if getattr(stepper, "counts_cost", False):
-            begin["spent"] = spent
-        if bodies is not None:
-            begin["bodies"] = bodies
-            also = (*also, bodies.compliance, bodies.wrench)
-        poses = [a.tobytes() for a in (pos, mat, *also)]
-        poses += self.parts[1].tobytes(), stepper.key(before) if hasattr(stepper, "key") else before.tobytes()
-        key = (dt, spent, tuple(begin), self.touching.parted, *poses)
+        near = near if near is not None and near.converged else None
+        more = {"near": near, "patient": self._may_wait, "spent": spent}
+        if stepper.inertial:
+            more["core_pos"], more["core_mat"] = core
+        if stepper.gives_way:
+            more["bodies"] = bodies
+        begun = () if near is None else near.pose
+        given = () if bodies is None else (bodies.compliance, bodies.wrench)
+        poses = [a.tobytes() for a in (pos, mat, *core, *begun, *given)]
+        flags = near is None, bodies is None, more["patient"], self.touching.parted
+        key = (dt, spent, *flags, *poses, self.parts[1].tobytes(), stepper.key(before))
         # solving is a function of the key, so a second mj_forward costs nothing
         result = self._solved.get(key)
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
             with self.setup.skin.lock:
-                result = stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
+                result = stepper.solve_skin(before, *geom_pose, dt, **more)
             fraction, path = self.touching.fraction, self.touching.path
             result = copy.copy(result)  # a stepper may keep it
             result.pose = (pos, mat) if bodies is None else self._came_to(result.state)
@@ -315,21 +310,23 @@ class Instance:
         return bool(skins) and head[CONVERGED] <= 0.0 and bool(models[skins, :6].any())
 
     def _came_to(self, state):
-        """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies for which a skin's state holds."""
-        return self.touching.body_pose(*self.setup.skin.stepper.came_to(state))
+        """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies for which a skin's state holds; None where the skin
+        does not know."""
+        ends = self.setup.skin.stepper.came_to(state)
+        return ends and self.touching.body_pose(*ends)
 
     def _as_far_as_known(self, result, before):
         """Result of a solve that did not converge: the end of its load path, or the last step's model."""
         stepper = self.setup.skin.stepper
-        if result.load_factor > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
-            return dataclasses.replace(result, pose=self._came_to(result.state))
+        if result.load_factor > 0.0 and (pose := self._came_to(result.state)):  # maybe on a way from outside
+            return dataclasses.replace(result, pose=pose)
         if not self.parts[0][STARTED]:  # the first step
             return result
         wrench, tangent, *last = self.last_model()
         state = before.copy()
         if self.parts[0][CONVERGED] <= -PATIENCE:
             stepper.reset(state)
-            if not (hasattr(stepper, "resting") and stepper.resting(state)):  # it has more to lose
+            if not stepper.resting(state):  # it has more to lose
                 state[:] = before
         return dataclasses.replace(
             result,
@@ -447,10 +444,12 @@ class Instance:
         found, skin, result = self._touches, self.setup.skin, self._result
         found.wrench[:], found.kept[:] = wrench, 0
         known = by_place and result is not None and result.state is not None
-        if known and hasattr(skin.stepper, "touched_faces"):
-            with skin.lock:
-                face, geom, push = skin.stepper.touched_faces(result.state)
+        with skin.lock:
+            touched = skin.stepper.touched_faces(result.state) if known else None
+            if touched is not None:
                 found.x[:] = skin.stepper.vert_xpos(result.state)
+        if touched is not None:
+            face, geom, push = touched
             corner = found.x[skin.geometry.outer_face[face]]
             normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
             normal /= np.linalg.norm(normal, axis=1)[:, None]
@@ -545,7 +544,7 @@ class Instance:
         if self.touching.parted:  # what is in the skin when contact is back was put there, as at the start
             head[STARTED] = 0.0
             stepper = self.setup.skin.stepper
-            if hasattr(stepper, "resting") and stepper.resting(skin):
+            if stepper.resting(skin):
                 stepper.reset(skin)
         readings_state[:] = readings
         self._solved.clear()

@@ -92,7 +92,7 @@ class Setup:
         self.touching = Touching(model, self.core, self.config, compiling)
         self.skin = _skin(self.config, self.touching)
         self.ngroup = len(self.touching.body)
-        self.surface_energy = getattr(self.skin.stepper, "surface_energy", 0.0)
+        self.surface_energy = self.skin.stepper.surface_energy
 
     @property
     def thickness(self) -> float:

@@ -74,61 +74,109 @@ class SkinResult:
     cost: float = 0.0
 
 
-class SkinStepper(Protocol):
-    """A skin. Making one must be cheap: MuJoCo reads `nstate` while it compiles, when contact exclusions are
-    not yet known, perhaps with more geoms than there will be (so more geoms may not need less state). Heavy
-    work belongs into the first `reset` or `solve_skin`."""
+class SkinStepper:
+    """Base class of skins. A skin has `nstate`, `reset`, `solve_skin` and `vert_xpos`; the other methods are
+    optional, and their docstrings say what their defaults mean.
+
+    Making one must be cheap: MuJoCo reads `nstate` while it compiles, when contact exclusions are not yet
+    known, perhaps with more geoms than there will be (so more geoms may not need less state). Heavy work
+    belongs into the first `reset` or `solve_skin`.
+
+    Attributes:
+      nstate: size of its state.
+      inertial: whether `solve_skin` needs the motion of the core.
+      gives_way: whether `solve_skin` takes `bodies`; the state then holds for the poses to which its own
+        wrenches bring them.
+      surface_energy: the most that adhesion gives to bodies that come near [J].
+      vibrates: whether it has the attributes that `sensing.vibration.Shaking` reads, for sensors that feel
+        vibration.
+    """
 
     nstate: int
+    inertial = gives_way = vibrates = False
+    surface_energy = 0.0
 
     def reset(self, state: np.ndarray) -> None:
         """Writes the rest state into state (nstate,)."""
+        raise NotImplementedError
 
     def solve_skin(
-        self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float
+        self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float, **more: object
     ) -> SkinResult:
         """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its
-        arguments alone, which keeps `state` as it is. A stepper with a true attribute `inertial` gets
-        core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac frame in the world at the start and at the
-        end of the step. One with a true attribute `begins_near` gets near: a converged result of the same
-        step for poses not far from these, or None, from which Newton's method begins. One with a true
-        attribute `may_wait` gets patient=True for a step that may be dear, since the last one was in vain.
-        One with a true attribute `counts_cost` gets spent: the share of what a step may cost that its
-        earlier solves took, and takes no more than what is left. One with a true attribute `gives_way` gets
-        bodies (`skin.bodies.BodyMotion`) where what touches moves: the state then holds for the poses to
-        which its own wrenches bring the bodies."""
+        arguments alone, which keeps `state` as it is.
+
+        Args:
+          more: further facts about the step; a skin may ignore them. near: a converged result of the same
+            step for poses not far from these, or None; Newton's method may begin from it. patient: whether
+            the step may cost more, because the last one failed. spent: fraction of a step's largest cost that
+            earlier solves of it took; the skin spends at most the rest. core_pos (2, 3), core_mat (2, 3, 3),
+            if `inertial`: the BioTac frame in the world at the start and at the end of the step. bodies
+            (`skin.bodies.BodyMotion`), if it `gives_way`: motion of the touching bodies, or None.
+        """
+        raise NotImplementedError
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
+        raise NotImplementedError
 
-    def touched_area(self, state: np.ndarray) -> np.ndarray:
-        """(ngroup,) area of the skin that each body touches in a state [m^2]; used by sensors with heat."""
+    def key(self, state: np.ndarray) -> bytes:
+        """All of a state that a solve depends on."""
+        return state.tobytes()
 
-    def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds; needed of a stepper whose
-        results may not reach the target poses."""
-
-    # A stepper may have the methods below. With the first, bodies that were placed have not slid there; with
-    # the others a skin that rests, or stays as it is, costs next to nothing.
+    def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds; needed where results may
+        not reach the target poses. None: they do."""
+        return None
 
     def put(
         self, state: np.ndarray, placed: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
-    ) -> np.ndarray:
+    ) -> np.ndarray | None:
         """The state after the user placed some geoms, (ngeom,) of bool, at poses (ngeom, 3), (ngeom, 3, 3):
         they have no contact, and their path begins there, or where they just leave the skin at rest if they
-        are inside it. A skin that nothing else touches is at rest, unless it has inertia or memory."""
+        are inside it. A skin that nothing else touches is at rest, unless it has inertia or memory. None: the
+        state as it is; bodies that were placed have slid there."""
+        return None
 
     def resting(self, state: np.ndarray) -> bool:
-        """Whether the state is exactly that of the skin at rest."""
+        """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
+        return False
 
-    def pressure(self, state: np.ndarray) -> float | None:
-        """Pressure of the liquid in a state [Pa], None where the skin changes while nothing moves."""
+    def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool | None:
+        """Whether geoms at (ngeom, 3), (ngeom, 3, 3) leave the skin at rest alone; None where it is not
+        known."""
+        return None
 
     def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
-        """Whether the skin rests and no geom at these poses reaches it by a step's acceleration."""
+        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they
+        come in a step: it then costs next to nothing."""
+        return False
 
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         """Makes `state`, of a skin that is out of reach, what `solve_skin` would return."""
+        raise NotImplementedError
+
+    def pressure(self, state: np.ndarray) -> float | None:
+        """Pressure of the liquid in a state [Pa]: a skin that says it is not solved again while bodies stay.
+        None: the skin changes while nothing moves."""
+        return None
+
+    def touched_area(self, state: np.ndarray) -> np.ndarray:
+        """(ngroup,) area of the skin that each body touches in a state [m^2]; used by sensors with heat."""
+        raise NotImplementedError
+
+    def touched_faces(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Numbers (k,) of the geometry's outer faces that something touches in a state, the geom on each, and
+        its normal push [N]. None: contacts are shown on the axis of the wrench."""
+        return None
+
+    def contact_force(self, state: np.ndarray) -> np.ndarray | None:
+        """Contact forces (nvert, 3) on the nodes in a state [N], for `Handle.contact_pressure`."""
+        return None
+
+    def contact_push(self, state: np.ndarray) -> np.ndarray | None:
+        """Normal contact forces (nface,) on the geometry's outer faces in a state [N], likewise."""
+        return None
 
 
 class Readings(Protocol):
@@ -185,8 +233,8 @@ _readings = {
 
 
 def register_stepper(name: str, factory: Callable) -> None:
-    """Makes factory(config, geometry, geoms) -> SkinStepper known under a name that `attach(stepper=...)`
-    takes."""
+    """Makes factory(config, geometry, geoms) -> SkinStepper, or the class itself, known under a name
+    that `attach(stepper=...)` takes."""
     _steppers[name] = factory
 
 
@@ -226,12 +274,18 @@ def make_stepper(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> S
     """The skin that `config.stepper` names, of the tier that `config.tier` names.
 
     Raises:
-      ValueError: the name is unknown.
+      ValueError: the name is unknown, or its factory makes something else.
     """
     check_names(config)
     if config.tier in _tiers:
         return _factory(_tiers, config.tier)(config, geometry, geoms)
-    return _factory(_steppers, config.stepper)(config, geometry, geoms)
+    made = _factory(_steppers, config.stepper)(config, geometry, geoms)
+    if not isinstance(made, SkinStepper):
+        raise ValueError(
+            f"stepper {config.stepper!r} makes {type(made).__name__}: derive it from "
+            "biotac_mj.coupling.SkinStepper"
+        )
+    return made
 
 
 def make_readings(
@@ -258,9 +312,7 @@ def make_readings(
             raise ValueError(f"{_named(config)} knows no heat: leave thermal out")
         readings.feel_heat(geoms)
     if config.textures is not None:
-        if not (
-            hasattr(readings, "feel_vibration") and (stepper is None or hasattr(stepper, "contact_rows"))
-        ):
+        if not (hasattr(readings, "feel_vibration") and (stepper is None or stepper.vibrates)):
             raise ValueError(
                 f"{_named(config)} on stepper {config.stepper!r} knows no vibration: leave textures out"
             )

@@ -85,7 +85,7 @@ class Coupled:
     def solve(self) -> None:
         """Solves the skin where its bodies go, which give way from there."""
         arrays, target = self.arrays, self.target
-        if not getattr(self.instance.setup.skin.stepper, "gives_way", False):  # it takes poses only
+        if not self.instance.setup.skin.stepper.gives_way:  # it takes poses only
             self._solve(target)
             return
         spin = arrays.drift[:, 3:] + arrays.moved[:, 3:]

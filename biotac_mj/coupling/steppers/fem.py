@@ -21,7 +21,7 @@ from ...skin.state import FULL, SavedState, StateLayout, options_of
 from ...skin.state_arrays import StateArrays
 from ..config import Config
 from ..shared import Shared
-from ..stepper import Geom, SkinResult
+from ..stepper import Geom, SkinResult, SkinStepper
 
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
@@ -37,12 +37,12 @@ _REACH = 0.02  # [m] from the BioTac's frame to its skin
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
-class FemStepper:
+class FemStepper(SkinStepper):
     """Finite elements (`biotac_mj.skin`) for one BioTac; those with the same settings share one model.
 
     The state holds what `skin.state.VARIABLES` has of the full tier."""
 
-    begins_near = may_wait = counts_cost = gives_way = True
+    gives_way = vibrates = True
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
@@ -175,29 +175,24 @@ class FemStepper:
         return self._model.outer.area.numpy() / nsample, nsample
 
     def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds."""
         return self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3)
 
     def touched_area(self, state: np.ndarray) -> np.ndarray:
-        """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
+        """Of the shape at rest."""
         group = np.array([g.group for g in self._geoms], int)
         geom = self.contact_rows(state)[:, 1].astype(int)
         area = self.sample_area[0][self._touched_faces(state)]
         return np.bincount(group[geom], area, minlength=1 + max(group, default=-1))
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
-        """Contact forces (nvert, 3) on the nodes in a state [N]."""
         self._unpack(state)
         prepare_step(self._model, self._data, self._geom_set).evaluate_forces()
         return self._data.contact_force[0]
 
     def contact_push(self, state: np.ndarray) -> np.ndarray:
-        """Normal contact forces (nface,) on the geometry's outer faces in a state [N]."""
         return self._push(state).reshape(len(self._geometry.outer_face), -1).sum(axis=1)
 
     def touched_faces(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers (k,) of the geometry's outer faces that something touches in a state, the geom on each, and
-        its normal push [N]."""
         push = self.contact_push(state)
         parts = self._model.outer.face.shape[0] // len(push)  # of a face, with more nodes than the geometry's
         face, first = np.unique(self._touched_faces(state) // parts, return_index=True)
@@ -301,7 +296,6 @@ class FemStepper:
         return ProximityQuery(self._model, self._geom_set)
 
     def resting(self, state: np.ndarray) -> bool:
-        """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
         return bool(self._part(state, "resting")[0])
 
     def pressure(self, state: np.ndarray) -> float | None:
@@ -310,8 +304,6 @@ class FemStepper:
         return float(self._part(state, "last_pressure")[0]) - self._model.rest.pressure
 
     def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
-        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they
-        come in a step [BioTac frame]."""
         return (
             self.resting(state)
             and not self._model.device.is_cuda
@@ -319,20 +311,17 @@ class FemStepper:
         )
 
     def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool | None:
-        """Whether geoms at (ngeom, 3), (ngeom, 3, 3) [BioTac frame] leave the skin at rest alone; None where
-        it is not known."""
         if self._model.device.is_cuda:
             return None
         return self._proximity.clear(geom_pos, geom_mat, self._reach)
 
     @property
     def surface_energy(self) -> float:
-        """The most [J] that adhesion gives to bodies that come near: its energy over the whole skin."""
+        """Adhesion's energy over the whole skin [J]."""
         law, area = self._options.contact_law, self._model.outer.area
         return 0.0 if law is None else law.adhesion * law.adhesion_hysteresis * float(area.numpy().sum())
 
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
-        """Advances a skin at rest that no geom at these poses touches: writes `state` after the step."""
         moved = np.ravel(geom_pos) - self._part(state, "geom_pos")
         self._part(state, "motion")[:] = moved if self._part(state, "started")[0] else 0.0
         self._place_geoms(state, geom_pos, geom_mat)
@@ -383,7 +372,6 @@ class FemStepper:
         return SkinResult(new, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.vert_xpos(new))
 
     def key(self, state: np.ndarray) -> bytes:
-        """All that a solve depends on: a state is mostly unused."""
         return self._layout.key(state)
 
     # --- the state as numbers  ---
