@@ -50,7 +50,6 @@ if typing.TYPE_CHECKING:
     from .coupling.attachment import attach as attach
     from .coupling.handle import Handle as Handle
     from .coupling.handle import handles as handles
-    from .coupling.sensing.options import ReadingsOptions as ReadingsOptions
     from .geometry import SkinGeometry as SkinGeometry
     from .geometry import import_mesh as import_mesh
     from .geometry import load_skin as load_skin
@@ -63,7 +62,6 @@ __version__ = "0.3.0"
 
 __all__ = [
     "Handle",
-    "ReadingsOptions",
     "SkinData",
     "SkinGeometry",
     "SkinModel",

@@ -16,8 +16,8 @@ __all__ = ["SECTIONS", "api"]
 PAGE = pathlib.Path(__file__).parents[1] / "docs" / "api.md"
 SECTIONS = {
     "The sensor in a model": """attach attach_to_hand Handle handles coupling.Settings coupling.SkinSettings
-        coupling.ContactSettings coupling.SensorSettings coupling.SettingKeywords coupling.Config tasks.Mount
-        ReadingsOptions""",
+        coupling.ContactSettings coupling.SensorSettings coupling.SettingKeywords coupling.Config
+        tasks.Mount""",
     "One press": """press.press press.PressResult press.PressOptions press.PressRecord press.write_readings
         press.write_skin press.report""",
     "Skin and geometry": """load_skin import_mesh SkinGeometry SkinModel SkinData step skin.SkinOptions

@@ -379,8 +379,10 @@ def test_readings_are_left_out_or_set_as_in_a_batch():
     assert config(readings=True) == config() == config(readings="biotac")
     quiet = {"noise": False, "film_every_step": True}
     assert config(readings=quiet) == config(options={"readings": quiet}) != config()
-    options = biotac_mj.ReadingsOptions(sensor="epfl_f1", noise=False)
-    assert config(readings=options.batch()) == config(**options.settings())
+    nested = SensorSettings(individual="epfl_f1", options={"noise": False})
+    told = config(sensor="epfl_f1", readings={"noise": False})
+    assert config(readings={"sensor": "epfl_f1", "noise": False}) == told
+    assert config(settings=Settings(sensor=nested)) == told
     both = config(readings={"noise": False}, options={"readings": {"film_every_step": True}}, sensor="2")
     assert both.options["readings"] == quiet | {"sensor": "2"}
     for wrong, said in (

@@ -342,12 +342,6 @@ def calls_of_sensors():
     yield row("temperature of the readings is 'a': pass", lambda: PhysicsReadings(skin, temperature="a"))
     yield row("seed is 'a': pass an integer", lambda: PhysicsReadings(skin, seed="a"))
     yield row("geometry is int and film NoneType: pass", lambda: PhysicsReadings(5))
-    sensor = biotac_mj.ReadingsOptions
-    yield row("signal is 5: give one of physics, latent_projection", lambda: sensor(signal=5))
-    yield row("weights is array([0., 0., 0.]): give", lambda: sensor(signal="learned", weights=ARRAY))
-    yield row("noise of ReadingsOptions is 5: pass true or false", lambda: sensor(noise=5))
-    yield row("sensor is 'f9': pass one of", lambda: sensor(sensor="f9"))
-    yield row("cannot randomise 'gremlins': choose from", lambda: sensor(randomise=["gremlins"]))
 
 
 TABLES = (

@@ -180,8 +180,9 @@ def test_a_networks_film_takes_no_settings_of_the_film():
         GenerateOptions(signal=NAME, options={"film": {"residual_film": 1e-4}})
     with pytest.raises(ValueError, match="unknown signal 'telepathy'"):
         GenerateOptions(signal="telepathy")
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
     with pytest.raises(ValueError, match="take signal='learned'"):
-        biotac_mj.ReadingsOptions(signal=NAME, weights="other.safetensors")
+        biotac_mj.attach(spec, site="tip", signal=NAME, readings={"weights": "other.safetensors"})
 
 
 def test_pointnets_weights_know_no_way_back(tmp_path, points):

@@ -34,6 +34,7 @@ from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains,
 from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
+from biotac_mj.sensor import PhysicsReadings  # noqa: E402
 from biotac_mj.sensor.acquisition import BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.acquisition_kernels import SAMPLED, SAMPLED_PDC  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
@@ -250,9 +251,9 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         <geom name="ball" type="sphere" size="0.0035"/></body>
         </worldbody></mujoco>"""
     )
-    sensor = biotac_mj.ReadingsOptions(signal="learned", weights=str(weights), noise=False)
+    readings = {"signal": "learned", "weights": str(weights), "noise": False}
     handle = biotac_mj.attach(
-        spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings()
+        spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", readings=readings
     )
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -263,7 +264,8 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         mujoco.mj_step(model, data)
     u = handle.vert_xpos(model, data) - load_skin("coarse").vert
     assert np.abs(u).max() > 3e-4
-    network = sensor.readings(load_skin("coarse"))
+    skin = load_skin("coarse")
+    network = PhysicsReadings(skin, film=NetworkFilm(skin, weights), noise=False)
     state = np.zeros(network.nstate)
     network.reset(state)
     for k in range(6):
@@ -274,10 +276,8 @@ def test_network_counts_in_a_step_of_mujoco(weights):
     assert (
         change.max() <= 0.15 * np.abs(got - REST_COUNTS["1"]).max() + 1
     )  # the held last step against a motion: nearly the same skin
-    with pytest.raises(ValueError, match="unknown signal"):
-        biotac_mj.ReadingsOptions(signal="telepathy")
     with pytest.raises(ValueError, match="weights"):
-        biotac_mj.ReadingsOptions(weights="a")
+        biotac_mj.attach(spec, site="tip", prefix="b_", readings={"weights": "a"})
 
 
 def test_attach_takes_the_file_of_a_model(weights):

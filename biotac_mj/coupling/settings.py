@@ -91,8 +91,10 @@ class SensorSettings:
       readings: False leaves the electrodes and the other channels out (force and status remain). As a keyword
         it may be a dict of `options` below. Or the name of readings of your own, see
         `biotac_mj.coupling.stepper`; not in batches.
-      signal: where the electrodes come from: "physics", "latent_projection", "learned", or a file of
-        weights, *.safetensors; see `ReadingsOptions`.
+      signal: where the electrodes come from: "physics", conduction in the liquid film; "latent_projection",
+        the networks of Narang et al. (ICRA 2021), for every skin of the BioTac; "learned", a network on film
+        and strain over each electrode, for the default skin (both trained on synthetic data, see
+        docs/lab/learning.md); or a file of weights that `biotac learn train` wrote, *.safetensors.
       individual: whose rest counts, noise and levels: a name of the design's `sensors` ("epfl_f1"), "random"
         (drawn by seed and prefix), or a dict of fields of `sensor.presets.Sensor`. None: the design's own. As
         a keyword it is `sensor`.
@@ -289,7 +291,8 @@ class Settings:
             )
         more = {"sensor": sensor.individual, "randomise": sensor.randomise}
         if sensor.signal is not None:
-            signal, more["weights"] = read_signal(sensor.signal)
+            weights = sensor.options.get("weights") if isinstance(sensor.options, dict) else None
+            signal, more["weights"] = read_signal(sensor.signal, weights)
             readings = "biotac" if signal == "physics" else signal
         more = {key: value for key, value in more.items() if value is not None}
         material, options = plain(skin.material), plain(self.options, geometry)
