@@ -14,13 +14,21 @@ torch = pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[
 SMALL = dict(mesh_channels=(4,) * 4, mesh_first=4, mesh_last=4, mesh_hidden=8, mesh_latent=8, pod=8)
 
 
-@pytest.fixture
-def claim(monkeypatch):
-    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent.parent / "benchmarks"))
-    import claim
+@pytest.fixture(scope="module")
+def claim():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(pathlib.Path(__file__).parent.parent / "benchmarks"))
+        import claim
 
-    yield claim
+        patch.setattr(claim, "RATES", (1e-2, 3e-3, 1e-3))
+        yield claim
     sys.modules.pop("claim", None)
+
+
+@pytest.fixture(scope="module")
+def whole(claim, tmp_path_factory):
+    """A training that is not stopped."""
+    return _training(claim, tmp_path_factory.mktemp("whole"))
 
 
 def _training(claim, folder, seconds=600.0, stop=None):
@@ -49,9 +57,8 @@ def _training(claim, folder, seconds=600.0, stop=None):
     return found, [p.detach().clone() for p in net.parameters()]
 
 
-def test_it_ends_when_the_error_no_longer_falls(claim, tmp_path, monkeypatch):
-    monkeypatch.setattr(claim, "RATES", (1e-2, 3e-3, 1e-3))
-    found, _ = _training(claim, tmp_path)
+def test_it_ends_when_the_error_no_longer_falls(claim, whole, tmp_path):
+    found, _ = whole
     assert found["converged"] and found["ended"] == ["flat"] * 3
     errors = [error for _, _, error in found["curve"]]
     assert min(errors) == pytest.approx(0.5, abs=5e-3)
@@ -60,19 +67,16 @@ def test_it_ends_when_the_error_no_longer_falls(claim, tmp_path, monkeypatch):
     first = [error for _, rate, error in found["curve"] if rate == 1e-2]
     assert min(first[-claim.PATIENCE :]) >= claim.GAIN * min(first[: -claim.PATIENCE])
     assert first[0] > 1.0
-    (tmp_path / "short").mkdir()
-    short, _ = _training(claim, tmp_path / "short", seconds=0.0)
+    short, _ = _training(claim, tmp_path, seconds=0.0)
     assert short["ended"] == ["time"] * 3 and not short["converged"]
 
 
-def test_it_goes_on_where_it_was_stopped(claim, tmp_path, monkeypatch):
-    monkeypatch.setattr(claim, "RATES", (1e-2, 3e-3, 1e-3))
-    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    whole, weights = _training(claim, tmp_path / "a")
+def test_it_goes_on_where_it_was_stopped(claim, whole, tmp_path):
+    found, weights = whole
     with pytest.raises(KeyboardInterrupt):
-        _training(claim, tmp_path / "b", stop=3)
-    again, same = _training(claim, tmp_path / "b")
-    assert again["curve"] == whole["curve"]
+        _training(claim, tmp_path, stop=3)
+    again, same = _training(claim, tmp_path)
+    assert again["curve"] == found["curve"]
     for one, other in zip(weights, same, strict=True):
         assert torch.equal(one, other)
 
