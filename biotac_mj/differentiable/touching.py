@@ -9,7 +9,7 @@ import typing
 import torch
 import warp as wp
 
-from ..skin.contact.posed import Geoms, meet
+from ..skin.contact.posed import MESH, Geoms, meet
 from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
@@ -206,7 +206,7 @@ def _leaves_other_side(
     i = wp.tid()
     g = geom[i]
     reach = spacing[i]
-    if geoms.kind[g] == 7:  # for a mesh the distance is exact only near its surface
+    if geoms.kind[g] == MESH:  # for a mesh the distance is exact only near its surface
         reach = wp.min(reach, real(0.4) * geoms.grids.spacing[geoms.grid[g]])
     kind, size, rounding, grid = geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grid[g]
     here = distance(kind, size, rounding, geoms.grids, grid, local[i])

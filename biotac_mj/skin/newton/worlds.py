@@ -6,6 +6,7 @@ import warp as wp
 from ..block import block_sum
 from ..contact.posed import Geoms, LoadPath
 from ..contact.touch import CURRENT
+from ..rubber.law import Law
 from ..types import real, vec3
 
 wp.set_module_options({"enable_backward": False})
@@ -152,7 +153,7 @@ def begin_try(st: Worlds, w: int, limit: int, max_work: int):
 def modulus_of(law: int, m: real, l: real):
     """Young's modulus [Pa] from the two constants of a law."""
     E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         E = real(9.0) * l * m / (real(3.0) * l + m)
     return E
 

@@ -14,6 +14,7 @@ body."""
 import warp as wp
 
 from ..types import mat33, real
+from .law import Law
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,10 +33,10 @@ def symmetric(A: mat33):
 def strain(law: int, F: mat33):
     """The strain A; only its deviator acts."""
     eye = wp.identity(n=3, dtype=real)
-    if law == 3:
+    if law == Law.LINEAR:
         return symmetric(F) - eye
     C = wp.transpose(F) * F
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         C = wp.pow(wp.determinant(F), -real(2.0) / real(3.0)) * C
     return real(0.5) * (C - eye)
 
@@ -43,10 +44,10 @@ def strain(law: int, F: mat33):
 @wp.func
 def strain_change(law: int, F: mat33, dF: mat33):
     """Directional derivative of `strain`."""
-    if law == 3:
+    if law == Law.LINEAR:
         return symmetric(dF)
     dE = symmetric(wp.transpose(F) * dF)
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         third = wp.ddot(wp.transpose(wp.inverse(F)), dF) / real(3.0)
         return wp.pow(wp.determinant(F), -real(2.0) / real(3.0)) * (dE - third * wp.transpose(F) * F)
     return dE
@@ -55,10 +56,10 @@ def strain_change(law: int, F: mat33, dF: mat33):
 @wp.func
 def push_forward(law: int, F: mat33, Q: mat33):
     """First Piola stress P for Q, with P : dF = Q : dA."""
-    if law == 3:
+    if law == Law.LINEAR:
         return Q
     P = F * Q
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         third = wp.ddot(F, P) / real(3.0)  # Q : C
         return wp.pow(wp.determinant(F), -real(2.0) / real(3.0)) * (P - third * wp.transpose(wp.inverse(F)))
     return P
@@ -67,10 +68,10 @@ def push_forward(law: int, F: mat33, Q: mat33):
 @wp.func
 def push_forward_change(law: int, F: mat33, Q: mat33, dF: mat33, dQ: mat33):
     """Directional derivative of `push_forward`."""
-    if law == 3:
+    if law == Law.LINEAR:
         return dQ
     dP = dF * Q + F * dQ
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         G = wp.transpose(wp.inverse(F))
         P = F * Q
         third = wp.ddot(F, P) / real(3.0)

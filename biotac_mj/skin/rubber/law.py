@@ -16,6 +16,7 @@ which is zero above with two derivatives, and unbounded below. Newton's method m
 J = 0.02, f and J^(-2/3) continue as parabolas, so that it can return.
 """
 
+import enum
 import typing
 
 import warp as wp
@@ -27,7 +28,17 @@ wp.set_module_options({"enable_backward": False})
 COMPRESSED = wp.constant(wp.float64(0.2))  # J0
 _FLAT = wp.constant(wp.float64(0.02))  # J below which the parabolas continue
 
-LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
+
+class Law(enum.IntEnum):
+    """Numbers of the laws in kernels."""
+
+    COROTATIONAL = 0
+    SVK = 1
+    NEO_HOOKEAN = 2
+    LINEAR = 3
+
+
+LAWS = {law.name.lower(): int(law) for law in Law}
 
 
 @wp.func
@@ -183,13 +194,13 @@ def isochoric(J: real):
 def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
     """W(F) [J/m^3]; for neo_hookean `lam` is the bulk modulus."""
     eye = wp.identity(n=3, dtype=real)
-    if law == 0:
+    if law == Law.COROTATIONAL:
         tr = wp.trace(wp.transpose(R) * F) - real(3.0)
         return mu * wp.ddot(F - R, F - R) + real(0.5) * lam * tr * tr
-    if law == 1:
+    if law == Law.SVK:
         E = real(0.5) * (wp.transpose(F) * F - eye)
         return real(0.5) * lam * wp.trace(E) * wp.trace(E) + mu * wp.ddot(E, E)
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         J = wp.determinant(F)
         shear = isochoric(J)[0] * wp.ddot(F, F) - real(3.0)
         return real(0.5) * (mu * shear + lam * (J - real(1.0)) * (J - real(1.0)))
@@ -201,12 +212,12 @@ def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
 def stress(law: int, mu: real, lam: real, F: mat33, R: mat33):
     """First Piola-Kirchhoff stress P = dW/dF [Pa]."""
     eye = wp.identity(n=3, dtype=real)
-    if law == 0:
+    if law == Law.COROTATIONAL:
         return real(2.0) * mu * (F - R) + lam * (wp.trace(wp.transpose(R) * F) - real(3.0)) * R
-    if law == 1:
+    if law == Law.SVK:
         E = real(0.5) * (wp.transpose(F) * F - eye)
         return F * (lam * wp.trace(E) * eye + real(2.0) * mu * E)
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         J = wp.determinant(F)
         a = isochoric(J)
         return mu * a[0] * F + (real(0.5) * mu * a[1] * wp.ddot(F, F) + lam * (J - real(1.0))) * cofactor(F)
@@ -218,7 +229,7 @@ def stress(law: int, mu: real, lam: real, F: mat33, R: mat33):
 def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33):
     """Directional derivative of the stress, dP = (d2W/dF2) : dF [Pa]."""
     eye = wp.identity(n=3, dtype=real)
-    if law == 0:
+    if law == Law.COROTATIONAL:
         Rt = wp.transpose(R)
         S = Rt * F
         A = Rt * dF
@@ -226,7 +237,7 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
         w = wp.inverse(trace_s * eye - S) * axial(A)
         dR = R * wp.skew(w)
         return real(2.0) * mu * (dF - dR) + lam * (wp.trace(A) * R + (trace_s - real(3.0)) * dR)
-    if law == 1:
+    if law == Law.SVK:
         Ft = wp.transpose(F)
         E = real(0.5) * (Ft * F - eye)
         A = Ft * dF
@@ -234,7 +245,7 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
         return dF * (lam * wp.trace(E) * eye + real(2.0) * mu * E) + F * (
             lam * wp.trace(dE) * eye + real(2.0) * mu * dE
         )
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         J = wp.determinant(F)
         a = isochoric(J)
         I1 = wp.ddot(F, F)
@@ -252,11 +263,11 @@ def dilatation(law: int, F: mat33, R: mat33):
     """The measure theta of volume change that multiplies `lam` in the energy: W = W(lam = 0) + lam/2
     theta^2."""
     eye = wp.identity(n=3, dtype=real)
-    if law == 0:
+    if law == Law.COROTATIONAL:
         return wp.trace(wp.transpose(R) * F) - real(3.0)
-    if law == 1:
+    if law == Law.SVK:
         return real(0.5) * (wp.ddot(F, F) - real(3.0))
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         return wp.determinant(F) - real(1.0)
     return wp.trace(F - eye)
 
@@ -264,11 +275,11 @@ def dilatation(law: int, F: mat33, R: mat33):
 @wp.func
 def dilatation_gradient(law: int, F: mat33, R: mat33):
     """d theta / dF."""
-    if law == 0:
+    if law == Law.COROTATIONAL:
         return R
-    if law == 1:
+    if law == Law.SVK:
         return F
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         return cofactor(F)
     return wp.identity(n=3, dtype=real)
 
@@ -276,13 +287,13 @@ def dilatation_gradient(law: int, F: mat33, R: mat33):
 @wp.func
 def dilatation_hessian(law: int, F: mat33, R: mat33, dF: mat33):
     """Directional derivative of `dilatation_gradient`, (d2 theta / dF2) : dF."""
-    if law == 0:
+    if law == Law.COROTATIONAL:
         Rt = wp.transpose(R)
         S = Rt * F
         return R * wp.skew(wp.inverse(wp.trace(S) * wp.identity(n=3, dtype=real) - S) * axial(Rt * dF))
-    if law == 1:
+    if law == Law.SVK:
         return dF
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         return cofactor_change(F, dF)
     return mat33()
 
@@ -305,7 +316,7 @@ def barrier(J: typing.Any):
 def barrier_stress(law: int, mu: real, F: mat33):
     """First Piola stress of the barrier [Pa]."""
     J = wp.determinant(F)
-    if law == 3 or J >= COMPRESSED:
+    if law == Law.LINEAR or J >= COMPRESSED:
         return mat33()
     return mu * barrier(J)[1] * cofactor(F)
 
@@ -314,7 +325,7 @@ def barrier_stress(law: int, mu: real, F: mat33):
 def barrier_derivative(law: int, mu: typing.Any, F: typing.Any, dF: typing.Any):
     """Directional derivative of the barrier's stress [Pa], in the precision of F."""
     J = wp.determinant(F)
-    if law == 3 or J >= type(J)(COMPRESSED):
+    if law == Law.LINEAR or J >= type(J)(COMPRESSED):
         return F - F
     f = barrier(J)
     G = cofactor(F)

@@ -12,7 +12,7 @@ from ..program import Launcher
 from ..state import allocate
 from ..types import mat33, real, vec3
 from .friction import deviator, sticking_fraction, strain
-from .law import polar
+from .law import Law, polar
 from .material import Material
 from .points import Mesh, Rubber, deformation_of, point_functions
 
@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def pull_back(law: int, F: mat33, P: mat33):
     """Second Piola stress from the first."""
-    if law == 3:
+    if law == Law.LINEAR:
         return P
     S = wp.inverse(F) * P
     return real(0.5) * (S + wp.transpose(S))
@@ -81,7 +81,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
     def relaxing_stress(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
         """Second Piola stress that relaxes [Pa], at the largest energy density `worst`."""
         R = mat33()
-        if rubber.law == 0:
+        if rubber.law == Law.COROTATIONAL:
             R = polar(F)
         S = pull_back(rubber.law, F, at.remembered(rubber, e, w, mu, lam, F, R))
         if wp.static(has["mullins"]):
@@ -95,7 +95,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         if wp.static(not has["mullins"]):
             return worst
         R = mat33()
-        if rubber.law == 0:
+        if rubber.law == Law.COROTATIONAL:
             R = polar(F)
         return wp.max(worst, at.remembered_energy(rubber, e, w, mu, lam, F, R))
 
@@ -183,7 +183,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
         R = mat33()
-        if rubber.law == 0:
+        if rubber.law == Law.COROTATIONAL:
             R = polar(F)
         stress_out[i, w] = at.remembered(rubber, e, w, mu, lam, F, R)
         change_out[i, w] = at.remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])

@@ -30,7 +30,7 @@ import warp as wp
 from ..state import declared
 from ..types import mat33, real, vec3
 from .friction import deviator, push_forward, push_forward_change, sticking_fraction, strain, strain_change
-from .law import energy_density, stress, stress_derivative
+from .law import Law, energy_density, stress, stress_derivative
 from .stiffening import added_derivative, added_energy, added_stress
 
 wp.set_module_options({"enable_backward": False})
@@ -84,7 +84,7 @@ def deformation_of(corners: int) -> wp.Function:
 @wp.func
 def remembering(law: int, lam: real):
     """Constant lambda of the part of the law with history."""
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         return real(0.0)
     return lam
 
@@ -157,7 +157,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
         P = factor * remembered(rubber, e, w, mu, lam, F, R) - own
         if wp.static(has["prony"]):
             H = rubber.past[i, w]
-            if rubber.law != 3:
+            if rubber.law != Law.LINEAR:
                 H = F * H
             P += H
         if wp.static(has["hysteresis"]):
@@ -186,7 +186,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
             dP = soft[0] * dP + (soft[1] * wp.ddot(P, dF)) * P
         dP = factor * dP - own
         if wp.static(has["prony"]):
-            if rubber.law != 3:  # for `linear`, H is a constant stress
+            if rubber.law != Law.LINEAR:  # for `linear`, H is a constant stress
                 dP += dF * rubber.past[i, w]
         if wp.static(has["hysteresis"]):
             A = strain(rubber.law, F)

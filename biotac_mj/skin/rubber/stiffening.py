@@ -13,7 +13,7 @@ exponent 1/2 is the smallest for which Knowles's law stays elliptic."""
 import warp as wp
 
 from ..types import mat33, real
-from .law import energy_density, stress, stress_derivative
+from .law import Law, energy_density, stress, stress_derivative
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def unit_lame(law: int):
     """Second constant with which a law's energy at mu = 1 is q / 2, without volume change."""
-    if law == 2:
+    if law == Law.NEO_HOOKEAN:
         return real(0.0)
     return -real(2.0) / real(3.0)
 
