@@ -21,7 +21,7 @@ def read_outputs(
     pressure_out: wp.array(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
 ):
-    """Pressure, and of the wrench on each group the share that this skin answers for."""
+    """Pressure, and of the wrench on each group the fraction that this skin answers for."""
     w = wp.tid()
     if has_liquid == 1:
         pressure_out[w] = st.pressure[w] - rest_pressure[w]

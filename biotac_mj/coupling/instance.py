@@ -345,7 +345,7 @@ class Instance:
         Args:
           rounds: through MuJoCo's solver and the skin.
           settled: whether the skin was solved where the bodies go.
-          withheld: share of the skin's push on a body that was, for lack of energy.
+          withheld: fraction of the skin's push on a body that was, for lack of energy.
           energy: (ngroup,) left to each body in the skin at most [J].
           ends: poses (ngroup, 3), (ngroup, 3, 3) where the step leaves the bodies.
           acting: wrenches (ngroup, 6) that the bodies get in this step; where it did not settle or push was

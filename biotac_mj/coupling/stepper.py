@@ -55,7 +55,7 @@ class SkinResult:
         are deeper in the core than one fits.
       pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
       load: (k,) size of the force on each contact that the state holds [N], where somebody may want it.
-      cost: of the solve, as a share of what a hard one may cost.
+      cost: of the solve, as a fraction of what a hard one may cost.
       measured: False where an approximate tier leaves the range in which its error was measured.
     """
 

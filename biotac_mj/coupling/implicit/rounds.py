@@ -72,7 +72,7 @@ class Rounds:
     placed: wp.array2d(dtype=int)  # a body was put where it is from outside
     inside: wp.array(dtype=int)  # and one of them into the skin
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
-    push: wp.array2d(dtype=real)  # share of its wrench that a body gets
+    push: wp.array2d(dtype=real)  # fraction of its wrench that a body gets
     withheld: wp.array2d(dtype=vec6)  # by which its wrench without acceleration is less
     left: wp.array2d(dtype=real)  # [J] energy that the last step left a body in the skin at most, or inf
     store: wp.array2d(dtype=real)  # [J] and with what was put into it since

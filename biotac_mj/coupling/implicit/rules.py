@@ -72,7 +72,7 @@ def share_within(store: Any, without: Any, own: Any) -> Any:
 
     Args:
       without: [J] work of the whole wrench on the way that the body goes without it. own: on the way by
-        which it moves the body itself, which goes with the square of the share.
+        which it moves the body itself, which goes with the square of the fraction.
     """
     most = max(store, type(store)(0.0))
     root = math.sqrt(without * without + type(store)(4.0) * own * most)
@@ -92,7 +92,7 @@ def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> An
 
 
 def stayed(before: Any, reached: Any) -> Any:
-    """Steps in a row in which a skin has stayed where it was, after one that went a share `reached` of its
+    """Steps in a row in which a skin has stayed where it was, after one that went a fraction `reached` of its
     way; before: of the steps before it."""
     if reached > type(reached)(0.0):
         return type(before)(0)

@@ -36,7 +36,7 @@ def amended_sensor(session: Session) -> SensorFile:
     sensor = {"like": design.sensor, "rest": rest, "noise": noise}
     if not r.absolute:  # the rest is the one that was assumed
         del sensor["rest"]
-    if drifts:  # whatever its cause: by its trend, and each electrode's share of it
+    if drifts:  # whatever its cause: by its trend, and each electrode's fraction of it
         sensor |= {name: own[name] for name in ("warm_up", "warm_time", "warm_share")}
     if (mixing != np.eye(len(mixing))).any():
         sensor["mixing"] = mixing

@@ -32,7 +32,7 @@ class Model:
 
     Args:
       counts: (n, nelectrode); good: (n, nelectrode) bool, samples that are measurements; fit: (n,) bool,
-        contiguous from row 0; rate: [Hz]; fresh: share of the rows that are no repetition.
+        contiguous from row 0; rate: [Hz]; fresh: fraction of the rows that are no repetition.
 
     Attributes:
       used (c,) electrode numbers; time (m,) [s]; value (m, c) ln Z about the mean of the rows fitted;

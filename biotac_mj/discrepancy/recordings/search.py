@@ -42,14 +42,14 @@ def diagnose_recording(
 
     Args:
       recording: with electrodes; force and TDC take part where they are there, poses do not.
-      locked: share of the rows at the end that takes no part; None: 0.4 without force, 0.3 with force.
+      locked: fraction of the rows at the end that takes no part; None: 0.4 without force, 0.3 with force.
       progress: whether to show a bar.
       named: confidence from which a finding is named.
       protocol: when what was done with the sensor: each stretch in which it was touched, or not, is then
         searched by itself too.
 
     Raises:
-      ValueError: a share that leaves too little on one side; a recording without electrodes, or with too few
+      ValueError: `locked` leaves too little on one side; a recording without electrodes, or with too few
         rows. TypeError: no recording.
     """
     recording = as_plain(recording)

@@ -143,7 +143,7 @@ def plates(
     Args:
       sensors: names (s,). worst: electrodes of each that are furthest off, in words. rms: (n,) error of each
         [counts]. missing: share (n,) of the change and its standard error, of each.
-      tried: names (t,) of models. closed: (t,) shares of the squared error, of each sensor.
+      tried: names (t,) of models. closed: (t,) fractions of the squared error, of each sensor.
     """
     from matplotlib.figure import Figure
 

@@ -95,7 +95,7 @@ class Likelihood:
 
     Attributes:
       chosen: their indices. courses: (k, n) of errors of laws. size: (width,) by how much the base model is
-        expected to be off [counts, N] under the deepest press; expected: (n,) share of it in each row.
+        expected to be off [counts, N] under the deepest press; expected: (n,) fraction of it in each row.
     """
 
     def __init__(self, comparison: "Comparison", chosen: np.ndarray):

@@ -25,7 +25,7 @@ class Proof:
       fit: Fit that they do not contradict: with effects, with the base model's constants alone, or the base
         model as it was given. before, after: of the model without effects and of that one the mean square of
         each trajectory and RMS of groups and channels. residuals: (before, after), of each trajectory
-        (n, width), its pose's most probable error taken out. closed: share of the root mean square of
+        (n, width), its pose's most probable error taken out. closed: fraction of the root mean square of
         what effects act on that they take away (a modulus where there is none of them), nan without both.
     """
 
@@ -39,8 +39,8 @@ class Proof:
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
     """Whether held-out trajectories are likelier by `ODDS` with one Fit than with another that has fewer
     effects, whether the sensor that is written with it is nearer to them, and whether its further effects
-    close the share of the gap that a name is for. The skin solved again, parameters as they were fitted. By
-    the one likelihood: what the law of an effect lacks does not contradict it."""
+    close as much of the gap as a name needs. The skin is solved again, with the fitted parameters. Both use
+    the one likelihood: errors of an effect's law do not contradict it."""
     first, last = (_density(comparison, fit, aside) for fit in (smaller, larger))
     if last - first <= np.log(ODDS):
         return False
@@ -155,11 +155,11 @@ def _independent(comparison, i):
 
 
 def _closed(comparison, before, after, law, aside):
-    """Share of the root mean square of what effects act on that they take away; law: share of what they
-    change by which their laws may be off.
+    """Fraction of the root mean square residual in the readings that effects act on which they remove; law:
+    relative error of their laws.
 
-    What they leave beyond noise is what their laws lack and what the base model is off by, each as much as is
-    expected of it: that share, and the model's resolution, which the base is off by at most."""
+    The remainder beyond noise is expected to be this error and that of the base model, at most the model's
+    resolution."""
     (_, first, begun), (_, last, left) = before, after
     change = sum((((a - b) / comparison.noises) ** 2).mean(1).sum() for a, b in zip(first, last))
     base = sum(

@@ -21,7 +21,7 @@ if typing.TYPE_CHECKING:
 _SOLVED, _FURTHER = 2, 4  # times that the skin is solved for an effect that moves the object; and again
 _WORTH, _MUCH = 5.0, 30.0  # [nats] of evidence that is worth it; that solving the rubber is worth
 _SETTLED = 1.0  # [nats] that a solution changes where a fit has found its end
-_KINS, _SOME = 2, 0.15  # effects whose rubber is solved for, and their share of the best one's evidence
+_KINS, _SOME = 2, 0.15  # effects whose rubber is solved for, and their fraction of the best one's evidence
 _ELECTRODES = 5  # at most; where more have it, all may
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 

@@ -14,10 +14,10 @@ class Settings:
     resolution: of the largest changes of a group of channels, by which the base model is expected to be off
       (mesh, tier, film: docs/lab/condensed.md).
     spread, own: standard deviations of the logarithm of how far a group, and a channel of it, is off.
-    law: share of what an effect does, by which its true law is another: median of the prior; the standard
+    law: fraction of what an effect does, by which its true law is another: median of the prior; the standard
       deviation of its logarithm is `own`.
     wide: standard deviation of a parameter, in units of `Param.scale`.
-    rate: of false discoveries. explained: share of its gap on held-out trajectories that an effect with a
+    rate: of false discoveries. explained: fraction of its gap on held-out trajectories that an effect with a
       name closes. beyond: times as much as is expected of a model, from which on it misses something.
     most, refit: effects of an explanation; effects that are refitted after the screen.
     """

@@ -49,7 +49,7 @@ class Signatures:
 
 
 def isolability(comparison: "Comparison", current: "Fit", usable: list, chosen: np.ndarray) -> dict:
-    """matrix[i, j]: share of effect i's signature that effect j cannot mimic, on these trajectories; nats
+    """matrix[i, j]: fraction of effect i's signature that effect j cannot mimic, on these trajectories; nats
     that i makes at a realistic size, per trajectory; notes."""
     signatures = Signatures(comparison, current, chosen)
     columns = [signatures.columns(e, e.grid[len(e.grid) // 2]) for e in usable]

@@ -95,12 +95,12 @@ def diagnose(
 
     Args:
       sim: Simulator. data: list of Trajectory. effects: the catalogue to choose from.
-      repeatability: standard deviation of a pose from trial to trial [m]. locked: share of the trajectories
-        opened once, at the end.
+      repeatability: standard deviation of a pose from trial to trial [m]. locked: fraction of
+        trajectories opened once, at the end.
       seed: of the split. fields: what `sim.fields(data)` gave, to use again.
 
     Raises:
-      ValueError: too few trajectories, or a share that leaves none.
+      ValueError: too few trajectories, or a fraction that leaves none.
     """
     for one in data:
         check_nelectrode(sim.design, one.electrodes.shape[1], f"trajectory {one.id!r}")

@@ -69,7 +69,7 @@ def correct(
     c: Constants,
     s: Scratch,
 ):
-    """Softening and swelling (`correction.Correction`) of the skin as it is; and by which share it is
+    """Softening and swelling (`correction.Correction`) of the skin as it is; and by which fraction it is
     squeezed, how far its forces are spread [m^2]."""
     own = real(0.0)
     mean = vec3()

@@ -59,7 +59,7 @@ class Constants:
     inner_gap: wp.array2d(dtype=real)  # these gaps by the core's spline, and the least of each face [m]
     inner_far: wp.array(dtype=real)
     inner_slope: wp.array2d(dtype=vec3)  # their slopes
-    inner_bend: wp.array(dtype=real)  # by which share of a motion at most that is off which they foretell
+    inner_bend: wp.array(dtype=real)  # by which fraction of a motion at most that is off which they foretell
     inner_mean_slope: wp.array(dtype=vec3)  # of each face, and how far its slopes are from it at most
     inner_spread: wp.array(dtype=real)
     # of `correction.Correction`

@@ -226,8 +226,8 @@ def end_path(keeps_iterate: int, st: Worlds, any_short: wp.array(dtype=int)):
     increment converged.
 
     keeps_iterate: 1 where bodies give way: there a step ends with the iterate at the end of its path whose
-    error was least, if that is less than the share of the path that the increments did not go. Its forces are
-    those of the contact law where the bodies go, and so push."""
+    error was least, if that is less than the remaining fraction of the path. Its forces are those of the
+    contact law at the bodies' target poses, and so push."""
     w = wp.tid()
     f = st.load_factor[w]
     st.cut_off[w] = 0

@@ -32,7 +32,7 @@ _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
 _NATS = 12.0  # of a drift beside a load
 _ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
-_MOSTLY = 0.6  # of a trend that what all do explains, which may be a share of it
+_MOSTLY = 0.6  # least fraction of a trend that a multiple of the common one explains
 
 
 def levels(session: Session, refused: set) -> Candidate | None:
@@ -87,8 +87,8 @@ def _lead(size, k, design):
 
 
 def _beside(session, refused, common):
-    """The electrode that drifts beside a load most plainly, of those that were not refused, none whose drift
-    may be its share of what all do (common: a trend [ln Z])."""
+    """The electrode that drifts most clearly under load, of those that were not rejected, without those whose
+    drift may be part of the common one (common: a trend [ln Z])."""
     m = session.model()
     drifting = _drifting(session)
     every = process(m, drifting)
@@ -118,8 +118,8 @@ def _drifting(session):
 
 
 def _own_share(session, trend, size, *common):
-    """Whether a trend of a size [ln Z] is mostly what all do, or have done, times something: an own share
-    may be four standard deviations off."""
+    """Whether a trend of a size [ln Z] is mostly a multiple of a common trend, found or new: the multiple may
+    be four standard deviations from the mean."""
     found = [f.trend for f in session.findings if f.share is not None]
     y = trend.sampled() - trend.sampled().mean()
     for all_do in (*common, *found):
@@ -198,7 +198,7 @@ def settle(session: Session) -> None:
             session.replay()
 
 
-# --- a drift that all share, each with a share of its own
+# --- a drift that all share, each with a fraction of its own
 
 
 def _features(session, trend):
@@ -284,7 +284,7 @@ def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarr
         )
         A = g @ g / worse * marginal + np.diag(pull)
         share = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(share))
-    if not m.dimensions:  # unloaded: a share that far off is a change of that electrode alone
+    if not m.dimensions:  # unloaded: a fraction that far off is a change of that electrode alone
         own = own | (np.abs(share - np.median(share)) > _ALONE)
     place = electrode_positions(design)[m.used]
     for i in np.flatnonzero(own):

@@ -32,10 +32,10 @@ OTHER_MESH = {
 
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
-    """log_modulus, log_friction: logs of factors; footprint: share of an electrode's ln Z that its
+    """log_modulus, log_friction: logs of factors; footprint: fraction of an electrode's ln Z that its
     neighbourhood shows; mesh: 0 this mesh, 1 the other; tier: 0 full, 1 condensed, where the skin is of the
     full tier; log_film: log of the factor on the film's least thickness; age: of the electrodes at their
-    row's time, in frames of the bus; stands_off: share of what its rests differ by that is no matter of
+    row's time, in frames of the bus; stands_off: fraction of what its rests differ by that is no matter of
     impedance, so that electrodes answer as if they rested as the model's."""
 
     log_modulus: float = 0.0

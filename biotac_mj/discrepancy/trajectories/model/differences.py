@@ -188,7 +188,7 @@ def filled(
     base: list,
     tick: Callable[[], object] | None = None,
 ) -> dict:
-    """Difference by the share of its liquid that the fingertip has lost or won, the film as it was."""
+    """Difference by the fraction of its liquid that the fingertip has lost or won, the film as it was."""
     model, film = sim.skin_and_film(0.0, 0.0)
     settings = read_settings(sim.material, sim.options)[1]
     if not model.has_liquid or settings.rest_pressure:

@@ -29,7 +29,7 @@ class Fields:
     logarithm of the film's least thickness changes, about rest.
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: what slopes miss there of all of them together}, {parameter: the same of how that changes
-    with it})], see `Simulator.bend`: of a share s of these parameters they miss s^2 of it, and s of the
+    with it})], see `Simulator.bend`: of a fraction s of these parameters they miss s^2 of it, and s of the
     changes by what lies beside that share. All that were solved are kept, since several fits hold on to
     theirs. remembered: ids of effects of the rubber -> [(their parameters, what their reduced form misses
     of rubber that does so itself [(n, nelectrode + 4) per trajectory])], see `in_skin.remember`."""
@@ -102,7 +102,7 @@ class Fields:
 
     def recalled(self, effect: Effect, theta: dict, i: int) -> np.ndarray | None:
         """(n, nelectrode + 4) that the effect's reduced form misses in trajectory i, where the skin was
-        solved with it; it grows with the effect's first parameter, its share."""
+        solved with it; it grows with the effect's first parameter, its fraction."""
         if effect.id not in self.remembered:
             return None
         there, missed = min(self.remembered[effect.id], key=lambda one: unlike(effect, theta, one[0]))

@@ -42,8 +42,7 @@ def solve_with_memory(
     Args:
       model: SkinModel; film: FilmConduction.
       poses: [(tool, pos (n, 3))] to use instead of the trajectories' own.
-      loss: of liquid, as a share of what there was at first [1/h]; before: the share that was gone as the
-        session began.
+      loss: of liquid, as a fraction of the initial amount [1/h]; before: the fraction lost before the data.
 
     Returns:
       per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n,
