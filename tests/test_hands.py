@@ -288,6 +288,9 @@ def test_fingers_share_settings_and_have_seeds_of_their_own():
 
 def test_a_hand_of_a_batch_leaves_the_rest_to_its_attach():
     assert list(attach_to_hand(small_hand(), mounts(), batch=True, skin="coarse")) == ["a", "b"]
+    hand = small_hand()
+    attach_to_hand(hand, mounts(), batch=True, settings={"skin": {"design": "biotac_sp", "mesh": "coarse"}})
+    assert {site.name for site in hand.sites} >= {"biotac_a_e24", "biotac_b_e24"}
     with pytest.raises(TypeError, match="attach_to_hand with batch=True has 'options'"):
         attach_to_hand(small_hand(), mounts(), batch=True, options={})
 

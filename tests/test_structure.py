@@ -146,6 +146,30 @@ def test_no_kernel_has_tiles_of_warp():
     assert not any(tiles.values()), {name: found for name, found in tiles.items() if found}
 
 
+def repeats(sources, length=12):
+    """{where: where} of runs of lines that stand in two places of sources {name: text}, without imports,
+    comments and empty lines."""
+    first, found = {}, {}
+    for name, text in sources.items():
+        lines = [
+            (number, line.strip())
+            for number, line in enumerate(text.splitlines(), 1)
+            if line.strip() and not line.strip().startswith(("#", "import ", "from "))
+        ]
+        for k in range(len(lines) - length + 1):
+            run, here = tuple(line for _, line in lines[k : k + length]), f"{name}:{lines[k][0]}"
+            if first.setdefault(run, here) != here:
+                found[here] = first[run]
+    return found
+
+
+def test_no_run_of_twelve_lines_stands_twice():
+    text = "\n".join(f"x{i} = {i}" for i in range(12))
+    assert repeats({"a": text, "b": f"y = 0\n{text}"}) == {"b:2": "a:1"}
+    assert not repeats({"a": text, "b": text[:-2]})
+    assert not repeats({name: path.read_text() for name, path in modules().items()})
+
+
 def test_names_of_tests_have_at_most_60_characters():
     tests = {
         path.name: re.findall(r"^ *(?:async )?def (test_\w+)", path.read_text(), re.M)

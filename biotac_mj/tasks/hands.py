@@ -91,8 +91,8 @@ def attach_to_hand(
         Shadow's BioTac fingers, whose last joint is fixed: the joint, its own actuators and sensors, and the
         keyframes are removed.
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
-      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); of the settings only skin,
-        coupling and geoms are then used.
+      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); of the settings only
+        design, skin, coupling and geoms are then used.
       prefix: each finger's names begin with link_prefix + prefix + finger + "_".
       slots: number of bodies that may touch each BioTac with two-way coupling; None: number of those outside
         the hand, and 64 more.
@@ -125,7 +125,8 @@ def attach_to_hand(
     own = ("hand", "mount", "link_prefix", "fingers", "variant", "self_touch", "batch", "prefix", "slots")
     chosen = Settings.of(settings, keywords, "attach_to_hand", also=own)
     if batch:  # other settings are arguments of `batch.attach`
-        others = [one for one in SettingKeywords.__annotations__ if one not in ("skin", "coupling", "geoms")]
+        used = ("design", "skin", "coupling", "geoms")
+        others = [one for one in SettingKeywords.__annotations__ if one not in used]
         Settings.of(None, keywords, "attach_to_hand with batch=True", others)
     if mount is not None:
         hand = read_mounts(mount)
@@ -213,6 +214,7 @@ def _add(spec, links, mounts, prefix, own, chosen, mask):
             pos=mounts[finger].pos,
             quat=mounts[finger].quat,
             prefix=f"{prefix}{finger}_",
+            design=chosen.skin.design,
             skin=chosen.skin.mesh,
             coupling=chosen.contact.coupling,
             geoms=touching,
