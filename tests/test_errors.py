@@ -206,6 +206,24 @@ def test_compiling_is_announced(monkeypatch, tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_kernels_of_every_skin_are_compiled_beside_each_other(monkeypatch):
+    """A module that is not in the list any more would be compiled alone, by the first launch."""
+    import warp as wp
+
+    import biotac_mj.coupling.implicit.poses
+    import biotac_mj.coupling.steppers.fem
+    import biotac_mj.sensor.film.conduction  # noqa: F401
+    from biotac_mj.skin import program
+
+    loaded = []
+    monkeypatch.setattr(program, "_compiling", {})
+    monkeypatch.setattr(wp, "load_module", lambda module, *_, **__: loaded.append(module.name))
+    program.compile_for_skin("cpu")
+    program.finish_compiling()
+    listed = {f"biotac_mj.{name}" for name in (*program._MAKING, *program._STEPPING)}
+    assert listed == set(loaded)
+
+
 def test_a_handler_of_the_users_stays():
     seen = []
     before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))

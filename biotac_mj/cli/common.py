@@ -1,9 +1,10 @@
 """Arguments that several verbs share."""
 
 import argparse
+import importlib
 from collections.abc import Callable
 
-from ..arguments import SEED, device
+from ..arguments import SEED, check_device, device
 from .names import MATERIALS, SKINS, TIERS
 
 
@@ -19,12 +20,24 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def add_verb(
-    verbs: argparse._SubParsersAction, name: str, run: Callable[[argparse.Namespace], None], text: str
+    verbs: argparse._SubParsersAction, name: str, run: Callable[[argparse.Namespace], None] | str, text: str
 ) -> argparse.ArgumentParser:
-    """A verb that calls run(args)."""
+    """A verb that calls run(args); as text, run is a function's module and name in this package, which is
+    imported then, after a look at the device."""
     verb = verbs.add_parser(name, help=text, description=text, formatter_class=_Formatter)
-    verb.set_defaults(run=run)
+    verb.set_defaults(run=_imported(run) if isinstance(run, str) else run)
     return verb
+
+
+def _imported(place):
+    module, _, function = place.rpartition(".")
+
+    def run(args):
+        if getattr(args, "ray", None) is None and hasattr(args, "device"):  # a cluster has its own devices
+            check_device(args.device)
+        getattr(importlib.import_module(f"biotac_mj.{module}"), function)(args)
+
+    return run
 
 
 def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise") -> None:

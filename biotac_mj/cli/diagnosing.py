@@ -119,7 +119,7 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "next",
-        _next,
+        "discrepancy.verbs.next_verb",
         "Plan contacts that separate the explanations left by a diagnosis; writes poses over time.",
     )
     verb.add_argument(
@@ -154,7 +154,7 @@ def add_checkup(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "checkup",
-        _checkup,
+        "discrepancy.verbs.checkup_verb",
         "Print the steps of a checkup of a sensor, three minutes by hand, and write them as a protocol.",
     )
     verb.add_argument("--against", metavar="NAME", help="object that the sensor will be pressed on")
@@ -162,18 +162,6 @@ def add_checkup(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--out", type=out, default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
     )
-
-
-def _checkup(args):
-    from ..discrepancy import verbs
-
-    verbs.checkup_verb(args)
-
-
-def _next(args):
-    from ..discrepancy import verbs
-
-    verbs.next_verb(args)
 
 
 def _diagnose(args):

@@ -182,7 +182,7 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "estimate",
-        _estimate,
+        "differentiable.estimation.verbs.estimate_verb",
         "Find the contact, its place and force with intervals, that makes the simulated electrodes read what "
         "a recording says.",
     )
@@ -231,9 +231,3 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         "--out", type=output_file(), default="out/estimate.csv", metavar="FILE", help=".csv or .json"
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
-
-
-def _estimate(args):
-    from ..differentiable.estimation import verbs
-
-    verbs.estimate_verb(args)

@@ -302,7 +302,7 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "mount",
-        _mount,
+        "tasks.mounting.mount_verb",
         "Find the pose of a BioTac on a hand's link, for attach_to_hand(mount=FILE), and draw it.",
     )
     verb.add_argument("hand", metavar="HAND.xml", help="MJCF of the hand")
@@ -324,12 +324,6 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
     picture = output_file(picture=True)
     verb.add_argument("--picture", type=picture, metavar="PNG", help="the link before and after")
-
-
-def _mount(args):
-    from ..tasks.mounting import mount_verb
-
-    mount_verb(args)
 
 
 def add_import_mesh(verbs: argparse._SubParsersAction) -> None:

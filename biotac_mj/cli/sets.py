@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import SEED, add_ray, check_device, output_folder, quantity, real, whole
+from ..arguments import SEED, add_ray, output_folder, quantity, real, whole
 from .common import add_sensor, add_skin, add_verb
 from .names import INTERACTIONS, OBJECTS
 
@@ -12,7 +12,7 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "generate",
-        _generate,
+        "data.verbs.generate_verb",
         "Make a synthetic data set of random interactions; continues an interrupted run.",
     )
     verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="interactions")
@@ -84,14 +84,6 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
-def _generate(args):
-    from ..data import verbs
-
-    if args.ray is None:  # a cluster has its own devices
-        check_device(args.device)
-    verbs.generate_verb(args)
-
-
 def add_data(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb to the command line."""
     from ..recordings.verbs import add_load_arguments
@@ -99,7 +91,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "import",
-        _import_data,
+        "data.verbs.import_verb",
         "Read recordings of real sensors, any file of `biotac recording import`, into a set.",
     )
     verb.add_argument("files", nargs="+", metavar="FILE", help="each becomes a shard")
@@ -120,7 +112,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "export",
-        _export_data,
+        "data.verbs.export_verb",
         "Write a set in the layout of LeRobotDataset v3.0, or as models, states and sensor data of MuJoCo.",
     )
     verb.add_argument("set", metavar="SET", help="folder of shards")
@@ -139,15 +131,3 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     folder = output_folder(new="")
     verb.add_argument("--out", type=folder, required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
-
-
-def _import_data(args):
-    from ..data import verbs
-
-    verbs.import_verb(args)
-
-
-def _export_data(args):
-    from ..data import verbs
-
-    verbs.export_verb(args)

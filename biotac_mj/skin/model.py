@@ -25,6 +25,7 @@ from .contact.penetration import rest_gap
 from .geoms import GeomSet
 from .precondition.block_inverse import DissectedInverse
 from .precondition.supernodal import SupernodalFactor, elimination_of
+from .program import compile_for_skin
 from .rubber.law import LAWS
 from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
@@ -246,6 +247,7 @@ class SkinModel:
         self.options = filled(options or SkinOptions(), self.material)
         self.device = wp.get_device(device)
         announce_compilation(self.device)
+        compile_for_skin(self.device)
         self._cores, self._rest = {}, None
         self._elimination = None
         self.law = LAWS[self.material.law]

@@ -7,7 +7,6 @@ more time to pack the arguments of a launch than many of the kernels need to run
 import concurrent.futures
 import ctypes
 import functools
-import os
 import threading
 import types
 from collections.abc import Callable, Iterable, Sequence
@@ -15,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 import warp as wp
 
 from ..launches import in_a_row, recorded, repeated
+from ..threads import cores
 
 
 class Launcher:
@@ -104,6 +104,36 @@ class _Modules(Launcher):
 # future of each module's compilation: to query Warp takes longer than to record a step
 _compiling: dict[tuple, concurrent.futures.Future] = {}
 
+# Warp modules that every skin needs on the CPU: those of its geometry and sensor, which are launched before a
+# step is prepared, and those of the steps
+_MAKING = """
+    skin.contact.meshes skin.contact.penetration.rest_gap skin.contact.meshes.compare geometry.closest
+    geometry.core_surface sensor.film.kernels sensor.film.systems.solve_sheet coupling.implicit.poses
+""".split()
+_STEPPING = """
+    skin.contact.penetration skin.contact.proximity skin.contact.broadphase skin.newton.load_path
+    skin.precondition.supernodal sensor.acquisition_kernels skin.contact.faces skin.contact.faces.sum_wrench
+    skin.newton.nodes skin.newton.worlds skin.newton.convergence skin.newton.krylov skin.newton.line_search
+    skin.liquid launches
+""".split()
+
+
+def compile_for_skin(device: wp.DeviceLike) -> None:
+    """Compiles in parallel the modules that every skin needs on the CPU, of those that are imported. When it
+    returns, those of geometry and sensor are compiled, and those of the steps in the background, for
+    `compile_kernels`. Does nothing for CUDA."""
+    device = wp.get_device(device)
+    if device.is_cuda:
+        return
+    package = __name__.partition(".")[0]
+    making, stepping = (
+        [(module, 1) for name in names if (module := wp.get_module(f"{package}.{name}")).kernels]
+        for names in (_MAKING, _STEPPING)
+    )
+    for module, threads in making[:1]:  # in this thread, whose headers the others use
+        wp.load_module(module, device, block_dim=threads)
+    finish_compiling(_compile(device, making + stepping)[: len(making)])
+
 
 def compile_ahead(
     device: wp.DeviceLike, modules: Iterable[tuple[types.ModuleType | wp.Module, int]]
@@ -131,7 +161,7 @@ def _compile(device, modules):
         # a module may have got more kernels since
         wanted[module, len(module.kernels), device.alias, threads] = module, threads
     share = functools.partial(_share_headers, threading.get_ident())
-    pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count(), initializer=share)
+    pool = concurrent.futures.ThreadPoolExecutor(cores(), initializer=share)
     for key, (module, threads) in wanted.items():
         if key not in _compiling:
             _compiling[key] = pool.submit(wp.load_module, module, device, block_dim=threads)

@@ -369,7 +369,7 @@ def _eliminate_band(world: int, nblock: int, reach: int, system: wp.array2d(dtyp
 
 
 # launched with its own block size: in this module all kernels would be compiled for both sizes
-@wp.kernel(module="unique", enable_backward=False, launch_bounds=(THREADS, 4))
+@wp.kernel(module=f"{__name__}.solve_sheet", enable_backward=False, launch_bounds=(THREADS, 4))
 def solve_sheet(
     # In:
     due: wp.array(dtype=int),
