@@ -127,7 +127,7 @@ def run(task, args):
         began = time.process_time()
         report = diagnose(sim, data, progress=False)
         record = _record(report, time.process_time() - began)
-        if report.effects:
+        if report.effects and sensor["effects"]:  # of nothing hidden there is no share
             aside = {data[i].id for i in report.locked}
             # the base is the sensor's own
             amended = report.apply(sim)

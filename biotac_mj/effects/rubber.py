@@ -32,6 +32,7 @@ _LOOP = 0.2e-3  # [m] of depth over which the branch changes, if the effect give
 # m [J/m^3] and, if the effect has no width, beta of Ogden and Roxburgh: W_max is of order kJ/m^3
 _ENERGY, _WIDTH = (1.0, 0.6)
 _AS_MUCH = 1.25  # ratio to the rubber's relaxation: a larger one of the pressure has another cause
+SPOT = "at_"  # begins the name of a modulus at a place
 
 
 class Relaxation(Effect):
@@ -365,7 +366,7 @@ class Spots(Inhomogeneity):
         self.params = {name: Param("1", -1.5, 1.5, "worn, glued or cut: CHOSEN", 0.3) for name in places}
 
     def given(self, names: Sequence[str]) -> "Spots":
-        return Spots([name for name in names if name.startswith("at_")])
+        return Spots([name for name in names if name.startswith(SPOT)])
 
     solved = given
 
@@ -377,7 +378,8 @@ def modulus_of(theta: dict) -> Callable[[np.ndarray], np.ndarray]:
     """Function from positions (n, 3) [m] to factors (n,) on Young's modulus, for `Inhomogeneity` or
     `Spots`."""
     along, across = theta.get("along", 0.0), theta.get("across", 0.0)
-    spots = [(np.array([float(v) for v in name.split("_")[1:]]), name) for name in theta if name[:3] == "at_"]
+    names = [name for name in theta if name.startswith(SPOT)]
+    spots = [(np.array([float(v) for v in name.split("_")[1:]]), name) for name in names]
 
     def modulus(at):
         factor = np.maximum(1 + along * 100 * (at[:, 0] + 8e-3) + across * 100 * at[:, 2], 0.1)

@@ -255,7 +255,7 @@ def _effect(name, theta, extra, design):
     return effect if effect.params.keys() == theta.keys() else effect.only(list(theta))
 
 
-def believed(comparison: Comparison, search: Search, doubts: list[str], chosen: np.ndarray) -> Beliefs:
+def believed(comparison: Comparison, search: Search, doubts: list[str]) -> Beliefs:
     """Probabilities of the likeliest explanations that a search has tried, and of the base model alone.
 
     Args:
@@ -264,18 +264,11 @@ def believed(comparison: Comparison, search: Search, doubts: list[str], chosen: 
     some = sorted(search.fits.values(), key=lambda fit: -fit.score)[:_MOST]
     if all(fit.effects for fit in some):
         some[-1] = search.fits[frozenset()]
-    out = []
-    for fit in some:
-        one = Explanation(fit.effects, fit.nuisance, fit.score, np.zeros((0, 0)))
-        square = fit.mean_square(comparison)
-        information = np.eye(len(parameters(fit.effects)))
-        for i, (_, columns) in enumerate(one.residuals(comparison)):
-            if i in chosen:
-                # a trajectory whose residual exceeds noise carries less information
-                information += columns.T @ columns / max(square[i], 1.0)
-        out.append(dataclasses.replace(one, information=information))
-    probable = weights([one.score for one in out], [len(one.effects) for one in out])
-    out = [dataclasses.replace(one, weight=float(w)) for one, w in zip(out, probable)]
+    probable = weights([fit.score for fit in some], [len(fit.effects) for fit in some])
+    out = [
+        Explanation(fit.effects, fit.nuisance, fit.score, fit.information, float(weight))
+        for fit, weight in zip(some, probable)
+    ]
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     out.sort(key=lambda one: -one.weight)
     unseen, hidden = _unseen(out, search), {effect.id for effect in search.hidden}
@@ -288,7 +281,7 @@ def _unseen(explanations, search):
     """The likeliest explanation with each effect of the catalogue that none of the others adds to it."""
     first, known = explanations[0], {frozenset(one.ids) for one in explanations}
     out = []
-    for gain, effect in [*search.unseen, *((0.0, effect) for effect in search.hidden)]:
+    for gain, effect, _ in [*search.unseen, *((0.0, effect, 0.0) for effect in search.hidden)]:
         if effect.wiring or effect.id in first.ids or frozenset([*first.ids, effect.id]) in known:
             continue
         weight = first.weight * float(np.exp(min(gain, 0.0))) / len(CATALOGUE)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...effects.rubber import SPOT
 from ..evidence import ODDS
 from .beliefs import Beliefs, Explanation
 from .contacts import Bounds, Contact, drawn, trajectory_of
@@ -64,47 +65,53 @@ class Separation:
         explanations = [*explanations, *unseen]
         self.weight = np.array([one.weight for one in explanations])
         self.weight /= self.weight.sum()
-        self.known = [one.information for one in explanations]
-        contacts, k = range(len(comparison.trajectories)), range(len(explanations))
+        # those with fewer parameters have further ones that do nothing
+        most = max(len(one.information) for one in explanations)
+        self.known = np.array([_filled(one.information, most) for one in explanations])
         # of every contact: (true, other) x'x; of each other its S'x (k, true), and its S'S
-        left = [np.stack([one[u][0] for one in shown]) for u in contacts]
-        self.square = np.array([((r[:, None] - r) ** 2).sum(2) for r in left])
-        self.pull = [[shown[b][u][1].T @ (left[u][b] - left[u]).T for b in k] for u in contacts]
-        self.gram = [[shown[b][u][1].T @ shown[b][u][1] for b in k] for u in contacts]
+        self.square, self.pull, self.gram = [], [], []
+        for parts in zip(*shown):
+            left = np.stack([residual for residual, _ in parts])
+            columns = np.stack([np.pad(own, ((0, 0), (0, most - own.shape[1]))) for _, own in parts])
+            apart = left[:, None] - left
+            self.square.append((apart**2).sum(2))
+            self.pull.append(np.einsum("bmk,bam->bka", columns, apart))
+            self.gram.append(np.einsum("bmk,bml->bkl", columns, columns))
+
+    def _sums(self, times):
+        """x'x, S'x and L + S'S of contacts made so many `times` (contacts,)."""
+        square, pull, gram = (np.tensordot(times, one, 1) for one in (self.square, self.pull, self.gram))
+        return square, pull, self.known + gram
 
     def nats(self, times: np.ndarray) -> np.ndarray:
         """(true, other) expected evidence of contacts made so many `times` (contacts,)."""
-        some, count = np.flatnonzero(times), len(self.weight)
-        out = np.zeros((count, count))
-        if not len(some):
-            return out
-        square = np.tensordot(times[some], self.square[some], 1)
-        for b in range(count):
-            known = self.known[b] + sum(times[u] * self.gram[u][b] for u in some)
-            pull = sum(times[u] * self.pull[u][b] for u in some)
-            out[:, b] = 0.5 * np.maximum(square[:, b] - (pull * np.linalg.solve(known, pull)).sum(0), 0.0)
-        return out
+        return self._nats(*self._sums(times))
+
+    def _nats(self, square, pull, known):
+        taken = (pull * np.linalg.solve(known, pull)).sum(1).T
+        return 0.5 * np.maximum(square - taken, 0.0)
 
     def worth(self, times: np.ndarray) -> float:
         """Expected log odds of what is true, and a little of what is learnt about the base model's
         parameters."""
-        nats, w = self.nats(times), np.maximum(self.weight, 1e-6)
+        return self._worth(*self._sums(times))
+
+    def _worth(self, square, pull, known):
+        nats, w = self._nats(square, pull, known), np.maximum(self.weight, 1e-6)
         others = np.where(np.eye(len(w), dtype=bool), 0.0, w * np.exp(-nats)).sum(1)
         odds = float(w @ (np.log(w) - np.log(np.maximum(others, 1e-300)))) if len(w) > 1 else 0.0
-        learnt = 0.0
-        for b, known in enumerate(self.known):
-            more = known + sum(times[u] * self.gram[u][b] for u in np.flatnonzero(times))
-            learnt += w[b] * 0.5 * (np.linalg.slogdet(more)[1] - np.linalg.slogdet(known)[1])
-        return odds + _BASE * learnt
+        more, before = (np.linalg.slogdet(one)[1] for one in (known, self.known))
+        return odds + _BASE * float(w @ (0.5 * (more - before)))
 
     def chosen(self, budget: int) -> list[int]:
         """Contacts, one after another that which is worth most beside those before it."""
         times, out = np.zeros(len(self.gram)), []
         now = self.worth(times)
         while len(out) < budget:
+            sums = self._sums(times)
             gains = [
-                self.worth(times + one) - now if times @ one < _REPEATS else -np.inf
-                for one in np.eye(len(times))
+                self._worth(*(a + b for a, b in zip(sums, more))) - now if made < _REPEATS else -np.inf
+                for made, *more in zip(times, self.square, self.pull, self.gram)
             ]
             best = int(np.argmax(gains))
             if gains[best] < _NOTHING:
@@ -122,6 +129,13 @@ class Separation:
         likely = np.flatnonzero(self.weight[: self.seen] > _LIKELY)
         pairs = [(a, b) for a in likely for b in likely if a < b]
         return [(a, b) for a, b in pairs if most[a, b] < np.log(ODDS)]
+
+
+def _filled(information, count):
+    """(count, count) information about parameters, of which further ones have their prior's alone."""
+    out = np.eye(count)
+    out[: len(information), : len(information)] = information
+    return out
 
 
 def planned(
@@ -151,7 +165,9 @@ def planned(
     for k, (contact, at, mat) in enumerate(some):
         trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}", n))
         clock += float(trajectories[-1].time[-1]) + _BETWEEN
-    fields = quick.fields(trajectories, progress)
+    explained = [*beliefs.rivals, *beliefs.unseen]
+    spots = sorted({n for one in explained for _, th in one.effects for n in th if n.startswith(SPOT)})
+    fields = quick.fields(trajectories, progress, spots)
     able = [one for one in beliefs.rivals if _solved(one, fields)]
     unseen = [
         one for one in beliefs.unseen if able[:1] == beliefs.rivals[:1] and _shows(one, trajectories, fields)

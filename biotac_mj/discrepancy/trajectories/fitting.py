@@ -34,7 +34,9 @@ class Fit:
       score: log evidence of the data for these effects [nats]. amplitude: (width,) by how many times more
       than `size` (width,) [counts, N], which is what is expected of a base model, the model with them is off;
       off: (width,) the same beside what the laws of the effects may lack.
-      modulus_error: standard error of the logarithm of the modulus. missed: see `Likelihood.missed`.
+      modulus_error: standard error of the logarithm of the modulus.
+      information: (k, k) of data and priors about all `parameters` of the effects, in standard deviations of
+      the priors.
       y, columns: (n, width), (m, n, width) of the linear model about this fit, in the likelihood's
       eigenvectors. offsets: (trajectories, 3) most probable errors of poses [m].
     """
@@ -49,7 +51,7 @@ class Fit:
     off: np.ndarray | None = None
     law_errors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     modulus_error: float = float("nan")
-    missed: float = 0.0
+    information: np.ndarray | None = None
     y: np.ndarray | None = None
     columns: np.ndarray | None = None
     offsets: np.ndarray | None = None
@@ -307,7 +309,11 @@ class _Model:
         _, _, factor = likelihood.evidence(y, whole, variance)
         score = log + likelihood.prior(amplitude, law_errors)
         score += np.log(np.diag(alone)).sum() - np.log(np.diag(factor)).sum()
-        covariance = np.linalg.inv(factor @ factor.T)[errors:, errors:] * np.outer(self.spread, self.spread)
+        marginal = np.linalg.inv(factor @ factor.T)[errors:, errors:]
+        every = [p[:2] for p in parameters(point.effects)]
+        at, information = [every.index(p[:2]) for p in self.parameters], np.eye(len(every))
+        information[np.ix_(at, at)] = np.linalg.inv(marginal)
+        covariance = marginal * np.outer(self.spread, self.spread)
         own = [i for i, p in enumerate(self.parameters) if p[0] is not None]
         scale = np.ones(len(own))
         for j, i in enumerate(own):
@@ -326,7 +332,7 @@ class _Model:
             amplitude * size / expected,
             law_errors,
             float("nan") if modulus is None else float(np.sqrt(covariance[modulus, modulus])),
-            likelihood.missed(amplitude, size),
+            information,
             y,
             whole,
             point.offsets,

@@ -213,11 +213,6 @@ class Likelihood:
                     best, out[group] = value, _FACTORS[each.argmax(0)]
         return out
 
-    def missed(self, amplitude: np.ndarray, size: np.ndarray) -> float:
-        """Mean logarithm of how much larger than noise alone data are that a model misses so much of."""
-        beyond = self.variance(amplitude, size).mean(0) / self.noise**2
-        return float(np.mean([np.log(beyond[group]).mean() for group in self.groups]))
-
 
 def of(comparison: "Comparison", chosen: np.ndarray) -> Likelihood:
     """The Likelihood of the chosen trajectories of a Comparison, which keeps it."""

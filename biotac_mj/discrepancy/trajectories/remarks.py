@@ -7,12 +7,12 @@ import numpy as np
 
 from ...effects.catalogue import CATALOGUE
 from .base.nuisance import OTHER_MESH
-from .signatures import SEEN
 from .where import phases
 
 if typing.TYPE_CHECKING:
     from ..report.verdict import Finding
     from .fitting import Fit
+    from .search import Search
     from .trajectory import Trajectory
     from .whitening import Comparison
 
@@ -20,6 +20,7 @@ _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 # Mean square of one trajectory that another equilibrium at an edge does not explain: at most 5.2 in 41
 # contacts of sensors with no effect, 28 where one of eleven presses was deep enough for rubber that stiffens.
 _FAR = 10.0
+_SEEN = 3.0  # [nats] of all trajectories together, with which an effect can be seen
 _OFF = 2.5  # mean square from which on a trajectory is off
 
 
@@ -76,7 +77,7 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
         notes.append(
             f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data"
         )
-    poses = comparison.poses(fit.effects, nuisance)[chosen]
+    poses = fit.offsets[chosen]
     mean, error = poses.mean(0), poses.std(0, ddof=1) / np.sqrt(len(chosen))
     if (np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))).any():
         notes.append(
@@ -123,18 +124,24 @@ def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
     return notes
 
 
-def next_experiment(effects: "list[Finding]", isolability: dict, unknown: bool, tier: str) -> str:
+def of_search(search: "Search") -> list[str]:
+    """Remark on the effects that these data would hardly show."""
+    names = ", ".join(effect.name for _, effect, shown in search.unseen if shown < _SEEN)
+    return [f"too small to show in these data at a realistic size: {names}"] if names else []
+
+
+def next_experiment(effects: "list[Finding]", names: dict, unknown: bool, tier: str) -> str:
     """Recommends the next experiment.
 
     Args:
       effects: Findings, the one that explains most first.
-      isolability: see `isolability`.
+      names: id -> name of the effects that were looked for.
       unknown: whether something is left that no effect explains.
       tier: of the skin with which the recording was compared.
     """
     pairs = [(e, t) for e in effects for t in e.ties]
     if not pairs:
-        pairs = [(e, next((o for o in e.confusable if o in isolability["ids"]), None)) for e in effects[:1]]
+        pairs = [(e, next((o for o in e.confusable if o in names), None)) for e in effects[:1]]
     out = []
     if tier == "condensed" and (effects or unknown):
         out.append("compare again with --tier full: what the condensed skin lacks may be taken for an effect")
@@ -144,17 +151,9 @@ def next_experiment(effects: "list[Finding]", isolability: dict, unknown: bool, 
         text = effect.confusable.get(other) or next(
             (e.confusable.get(effect.id) for e in CATALOGUE if e.id == other), None
         )
-        ids, own = isolability["ids"], ""
-        if effect.id in ids and other in ids:
-            i, j = ids.index(effect.id), ids.index(other)
-            share = isolability["matrix"][i][j]
-            count = int(np.ceil(SEEN / max(share * isolability["nats"][i], 1e-3)))
-            own = f" (here {share:.0%} of what it does is its own" + (
-                f": about {count} trajectories like these are needed)" if count > 1 else ")"
-            )
         name = next((e.name for e in CATALOGUE if e.id == other), other)
         how = text or "vary load, speed and hold together less"
-        out.append(f"to tell {effect.name} from {name}: {how}{own}")
+        out.append(f"to tell {effect.name} from {name}: {how}")
     if unknown and not effects:
         out.append("repeat some trajectories unchanged: what does not come again is no effect of the sensor")
     return "; ".join(out) or "none needed: nothing is tied, and nothing is left"

@@ -62,7 +62,8 @@ class Search:
     Attributes:
       fit: Fit with all effects. found: Candidates in their order. rounds: lists of Candidate, best first.
       fits: of every explanation that was tried, by the ids of its effects. unseen: [(evidence beside what was
-      found, by straight lines [nats], effect)] of the last round. hidden: effects that the data cannot show.
+      found, by straight lines, effect, what one of a realistic size would make [nats])] of the last round.
+      hidden: effects that the data cannot show.
     """
 
     fit: Fit
@@ -129,15 +130,15 @@ def _round(comparison, search, usable, chosen, bar):
     same = {one.id for one in known}.union(*(one.equivalents for one in known))
     effects = [e for e in usable if e.id not in same and not same & {*e.equivalents}]
     ranked = screened(comparison, current, effects, chosen)
-    search.unseen = [(gain, effect) for gain, effect, _ in ranked]
+    search.unseen = [(gain, effect, shown) for gain, effect, _, shown in ranked]
     short = [r for r in ranked[: SETTINGS.refit] if r[0] > 0]
     # differences do not reach far where poses are moved
     short += [r for r in ranked if r not in short and r[1].pose_offset and not known]
-    beside = {name for _, effect, _ in short for name in effect.refit_with}
+    beside = {name for _, effect, *_ in short for name in effect.refit_with}
     short += [r for r in ranked if r not in short and r[1].id in beside]
     bar.total += len(short)
     out = []
-    for expected, effect, start in short:
+    for expected, effect, start, _ in short:
         fit = _fitted(comparison, effect, start, expected, current, chosen)
         plain = next(e for e in effects if e.id == effect.id)
         if effect is not plain and effect.rejection_reason(fit.effects[-1][1]):
@@ -249,16 +250,17 @@ def _remembered(comparison, one, current, chosen):
 
 def screened(
     comparison: "Comparison", current: Fit, effects: "list[Effect]", chosen: np.ndarray
-) -> list[tuple[float, "Effect", dict]]:
+) -> list[tuple[float, "Effect", dict, float]]:
     """By straight lines about a fit: evidence of each effect beside it [nats], the effect, parameters where a
-    fit may start; best first."""
+    fit may start, and the evidence that one of a realistic size would make; best first."""
     signatures = Signatures(comparison, current, chosen)
     y = signatures.own(current.y.reshape(1, -1) / signatures.sd)[0]
     best = {}
     for effect, shape in [(e, s) for one in effects for e in _variants(one) for s in e.grid]:
-        prior = [[SETTINGS.wide * effect.params[name].scale / size] for name, size in sizes(effect)]
-        columns = signatures.columns(effect, shape) * np.array(prior)
+        prior = np.array([[SETTINGS.wide * effect.params[name].scale / size] for name, size in sizes(effect)])
+        columns = signatures.columns(effect, shape) * prior
         precision = np.eye(len(columns)) + columns @ signatures.own(columns).T
+        shown = 0.5 * float(((np.diag(precision) - 1) / prior[:, 0] ** 2).max())
         pull = columns @ y
         some = _few(precision, pull) if effect.per_channel else []
         if some:
@@ -268,7 +270,7 @@ def screened(
         gain, weights = _gained(precision, pull), np.linalg.solve(precision, pull)
         gain -= len(some) * np.log(len(columns))
         if effect.id not in best or gain > best[effect.id][0]:
-            best[effect.id] = gain, effect, _begin(effect, shape, weights)
+            best[effect.id] = gain, effect, _begin(effect, shape, weights), shown
     return sorted(best.values(), key=lambda one: -one[0])
 
 

@@ -12,8 +12,6 @@ if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
-SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
-
 
 class Signatures:
     """Signatures of effects beside a fit, in the likelihood's eigenvectors and divided by the standard
@@ -46,27 +44,3 @@ class Signatures:
         """Columns (m, rows) without the part that can be mimicked: its products with any columns equal those
         of the remaining parts."""
         return columns - (columns @ self._weights.T) @ self._weights
-
-
-def isolability(comparison: "Comparison", current: "Fit", usable: list, chosen: np.ndarray) -> dict:
-    """matrix[i, j]: fraction of effect i's signature that effect j cannot mimic, on these trajectories; nats
-    that i makes at a realistic size, per trajectory; notes."""
-    signatures = Signatures(comparison, current, chosen)
-    columns = [signatures.columns(e, e.grid[len(e.grid) // 2]) for e in usable]
-    own = [signatures.own(c) for c in columns]
-    squares = [c @ o.T for c, o in zip(columns, own)]
-    loudest = [int(np.argmax(np.diag(s))) for s in squares]
-    size = np.array([max(s[k, k], 1e-30) for s, k in zip(squares, loudest)])
-    matrix = np.ones((len(usable), len(usable)))
-    for i, (c, k) in enumerate(zip(columns, loudest)):
-        for j, (other, square) in enumerate(zip(own, squares)):
-            along = other @ c[k]
-            matrix[i, j] -= along @ np.linalg.pinv(square, hermitian=True) @ along / size[i]
-    unseen = [e.name for e, s in zip(usable, size) if 0.5 * s < SEEN]
-    notes = [f"too small to show in these data at a realistic size: {', '.join(unseen)}"] if unseen else []
-    return {
-        "ids": [e.id for e in usable],
-        "matrix": np.clip(matrix, 0.0, 1.0).tolist(),
-        "nats": (0.5 * size / len(chosen)).tolist(),
-        "notes": notes,
-    }

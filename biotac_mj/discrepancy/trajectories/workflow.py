@@ -20,10 +20,9 @@ from .fitting import Fit, fit_effects
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import Proof, borne_out, proved
-from .remarks import few_off, next_experiment, of_base, of_data, strays
+from .remarks import few_off, next_experiment, of_base, of_data, of_search, strays
 from .search import found
 from .settings import SETTINGS
-from .signatures import isolability
 from .trajectory import FEWEST, measurement_noise
 from .where import left_over, where
 from .whitening import REPEATABILITY, Comparison
@@ -259,7 +258,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         doubts.append("a part of what is missed has no name")
     if refuted:
         doubts.append(_refuted(refuted))
-    beliefs = believed(comparison, search, doubts, chosen)
+    beliefs = believed(comparison, search, doubts)
     gaps = _gaps(comparison, proof)
     effects = [_described(item, current, _sure(beliefs, item, item is not found[0]), names) for item in found]
     effects = [_proved(one, proof, gaps) for one in effects]
@@ -275,9 +274,8 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         stray = stray or _refuted(refuted) or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
-    table = isolability(comparison, current, usable, chosen)
     more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
-    notes = [*notes, *of_base(comparison, current, chosen), *table.pop("notes")]
+    notes = [*notes, *of_base(comparison, current, chosen), *of_search(search)]
     before, after = (dict(zip(("level", "peak"), _off(comparison, fit))) for fit in (null, current))
     trace = {
         "before": before,
@@ -314,11 +312,10 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         ],
         tried_note="evidence of each cause alone over the base model, its parameters marginalised",
         notes=notes,
-        next_experiment=f"{beliefs.text}; {next_experiment(effects, table, more, comparison.sim.tier)}",
+        next_experiment=f"{beliefs.text}; {next_experiment(effects, names, more, comparison.sim.tier)}",
         next_command="" if beliefs.decided else "biotac next REPORT --budget 20 --out plan.csv",
         amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
-            "isolability": table,
             "mean_square": {
                 "before": proof.before["mean_square"],
                 "after": proof.after["mean_square"],

@@ -5,14 +5,14 @@ import contextlib
 import dataclasses
 import pathlib
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import tqdm
 
 from ....effects.contact import TACKY, Adhesion
 from ....effects.in_skin import memory_of, moduli
-from ....effects.rubber import Stiffening, modulus_of
+from ....effects.rubber import SPOT, Stiffening, modulus_of
 from ....geometry.rigid import across
 from ....geometry.skins import load_skin
 from ....skin.contact.law import GridTooCoarse
@@ -55,14 +55,23 @@ class Solver(typing.Protocol):
         """SkinModel and FilmConduction."""
 
 
-def solved_fields(sim: Solver, trajectories: list[Trajectory], progress: bool = True) -> Fields:
+def solved_fields(
+    sim: Solver, trajectories: list[Trajectory], progress: bool = True, places: Sequence[str] | None = None
+) -> Fields:
     """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
-    tier, beside one of the simulator's own; kept in `cache`."""
+    tier, beside one of the simulator's own; kept in `cache`.
+
+    Args:
+      places: at which the rubber may be another (see `spots`), of contacts that are not made yet: nothing is
+        fitted to these, so curves are straight lines about their middle. None finds them in the data."""
+    fitted = places is None
+    places = spots(trajectories) if fitted else places
+    deeper, thick = (_DEEPER, _FILM) if fitted else (_DEEPER[2:7:2], _FILM[4:13:4])
     spheres = any("sphere" in t.tool for t in trajectories)
     # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
     with tqdm.tqdm(
-        total=(20 + len(spots(trajectories)) + spheres + inflated(sim) + 4 * (quick is not sim))
+        total=(12 + len(deeper) - 1 + len(places) + spheres + inflated(sim) + 4 * (quick is not sim))
         * len(trajectories),
         desc="skin",
         disable=not progress or None,
@@ -82,12 +91,12 @@ def solved_fields(sim: Solver, trajectories: list[Trajectory], progress: bool = 
         if sim.skin in OTHER_MESH:
             there = quick.but(skin=OTHER_MESH[sim.skin]).solve(trajectories, progress=tick)
             slopes["mesh"] = _about_rest(_difference(there, here))
-        film = _films(quick, trajectories, here, tick)
-        slopes |= _uneven(quick, trajectories, here, tick)
+        film = _films(quick, trajectories, here, thick, tick)
+        slopes |= _uneven(quick, trajectories, here, places, tick)
         slopes |= filled(quick, trajectories, here, tick)
         slopes |= sunk(quick, trajectories, here, tick)
         slopes |= softer(quick, trajectories, here, tick)
-        deeper = _deeper(quick, trajectories, here, tick)
+        deeper = _deeper(quick, trajectories, here, deeper, tick)
         slopes |= _shifts(quick, trajectories, here, deeper, tick)
         if spheres:
             slopes["radius"] = _difference(
@@ -103,14 +112,14 @@ def solved_fields(sim: Solver, trajectories: list[Trajectory], progress: bool = 
     return Fields(base, slopes, trajectories, here, deeper=deeper, film=film)
 
 
-def _deeper(sim, trajectories, base, tick):
+def _deeper(sim, trajectories, base, displacements, tick):
     """Changes by displacements along the press: load rises faster than depth, and starts at first contact."""
     changes = []
-    for by in _DEEPER:
+    for by in displacements:
         offset = [np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories]
         solved = sim.solve(trajectories, offset=offset, progress=tick) if by else base
         changes.append([stack(one) - stack(here) for one, here in zip(solved, base)])
-    return Curve(_DEEPER, [np.array(of) for of in zip(*changes)])
+    return Curve(displacements, [np.array(of) for of in zip(*changes)])
 
 
 def _shifts(sim, trajectories, base, deeper, tick):
@@ -130,14 +139,14 @@ def _shifts(sim, trajectories, base, deeper, tick):
     return out
 
 
-def _films(sim, trajectories, base, tick):
+def _films(sim, trajectories, base, logs, tick):
     """Changes by another minimum thickness of the film, about the baseline. It does not act on the skin,
     which is solved once for all of them."""
     from ....effects.in_film import SeveralFilms
 
     model, own = sim.skin_and_film(0.0, 0.0)
     given = read_dict(sim.options, "options").get("film") or {}
-    thick = [float(by * own.residual_film) for by in np.exp(_FILM)]
+    thick = [float(by * own.residual_film) for by in np.exp(logs)]
     films = SeveralFilms([own.with_residual_film(one) for one in thick])
     options = sim.options | {"film": {**given, "residual_film": thick}}
     several = sim.but({0.0: model, "film": films}, options=options)
@@ -145,16 +154,16 @@ def _films(sim, trajectories, base, tick):
     for solved, here in zip(several.solve(trajectories, progress=tick), base):
         n, electrodes = here["log_z"].shape
         log_z = solved["log_z"].reshape(n, -1, electrodes) - here["log_z"][:, None]
-        log_z = np.broadcast_to(log_z - log_z[0], (n, len(_FILM), electrodes))  # alike where there is no film
+        log_z = np.broadcast_to(log_z - log_z[0], (n, len(logs), electrodes))  # alike where there is no film
         changes.append(np.pad(np.swapaxes(log_z, 0, 1), ((0, 0), (0, 0), (4, 0))))
-    return Curve(_FILM, changes)
+    return Curve(logs, changes)
 
 
-def _uneven(sim, trajectories, base, tick):
+def _uneven(sim, trajectories, base, places, tick):
     """Differences by a modulus that varies along and across the finger."""
     given = read_settings(sim.material, sim.options).modulus
     geometry, out = load_skin(sim.skin), {}
-    for way in (*MAPS, *spots(trajectories)):
+    for way in (*MAPS, *places):
         by = _UNEVEN if way in MAPS else _SPOT
         other = sim.but(options=sim.options | {"modulus": moduli(given, modulus_of({way: by}), geometry)})
         out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
@@ -251,7 +260,7 @@ def spots(trajectories: list[Trajectory]) -> list[str]:
     out, left = [], np.ones(len(place), bool)
     while len(out) < _SPOTS and (near & left).sum(1).max() > 1:
         at = int(np.argmax((near & left).sum(1)))
-        out.append("at_" + "_".join(f"{1e3 * v:.1f}" for v in place[near[at] & left].mean(0)))
+        out.append(SPOT + "_".join(f"{1e3 * v:.1f}" for v in place[near[at] & left].mean(0)))
         left &= ~near[at]
     return out
 

@@ -9,9 +9,10 @@ from scipy.interpolate import CubicHermiteSpline
 from ....effects.catalogue import CATALOGUE
 from ....effects.contact import TACKY
 from ....effects.effect import Effect, Run
+from ....effects.rubber import SPOT
 from ....sensor.channels import temperature_from_counts
 
-_SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
+_SEVERAL = SPOT, TACKY  # the same, of which there are several, by what follows in their names
 
 MAPS = "along", "across"  # of a modulus that varies with place
 _ANSWERS = {name for effect in CATALOGUE for name in effect.answers}  # that effects after the skin use

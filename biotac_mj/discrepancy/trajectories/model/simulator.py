@@ -9,7 +9,7 @@ import copy
 import dataclasses
 import pathlib
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -257,10 +257,11 @@ class Simulator:
             )
         return model, store["film"]
 
-    def fields(self, trajectories: list[Trajectory], progress: bool = True) -> Fields:
-        """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
-        tier, beside one of the simulator's own; kept in `cache`."""
-        return solved_fields(self, trajectories, progress)
+    def fields(
+        self, trajectories: list[Trajectory], progress: bool = True, places: Sequence[str] | None = None
+    ) -> Fields:
+        """The skin along the trajectories and its differences, see `solved_fields`."""
+        return solved_fields(self, trajectories, progress, places)
 
     def stick(self, fields: "Fields", work: float, near: float = _NEAR) -> bool:
         """Solves the skin with a contact of so much work of joining [J/m2], as `Adhesion` says it, and keeps
