@@ -237,10 +237,9 @@ def test_an_offset_is_what_poses_are_off_by_along_their_headings():
         for t, r in zip(tilted, sim.run(tilted, fields, False, [hidden]))
     ]
     wide = Comparison(sim, seen, fields, measurement_noise(seen), 3e-4)
-    known = [field.name for field in dataclasses.fields(Nuisance)]
-    along = [pose @ t.heading for pose, t in zip(fit_effects(wide, [], known=known).offsets, seen)]
+    along = [pose @ t.heading for pose, t in zip(wide.poses([], Nuisance()), seen)]
     np.testing.assert_allclose(along, -2e-4, atol=0.6e-4)
-    assert np.abs(fit_effects(wide, [hidden], known=known).offsets).max() < 1e-5
+    assert np.abs(wide.poses([hidden], Nuisance())).max() < 1e-5
 
 
 def test_softening_by_work_stays_at_every_load():

@@ -1,6 +1,7 @@
 """The likelihood of data under a model that is nearly right, against densities that are computed whole."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from biotac_mj.discrepancy.evidence import asked
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.likelihood import kernel, of
 from biotac_mj.discrepancy.trajectories.model.fields import Curve
+from biotac_mj.discrepancy.trajectories.remarks import of_search
 from biotac_mj.discrepancy.trajectories.search import found, screened
 from biotac_mj.discrepancy.trajectories.settings import SETTINGS
 from biotac_mj.discrepancy.trajectories.signatures import Signatures
@@ -118,6 +120,17 @@ def test_a_fit_with_an_effect_more_is_hardly_less_likely(plain, name, size):
     far = {**effect.default(), main: -size if effect.params[main].low < 0 else size}
     fit = _fitted(comparison, effect, far, 0.0, null, chosen)
     assert fit.score > null.score - 10
+
+
+def test_what_would_hardly_show_is_said(plain):
+    comparison, null, chosen = plain
+    effect = by_id("latency")
+    signatures = Signatures(comparison, null, chosen)
+    (column,) = signatures.columns(effect, effect.grid[0])
+    ((*_, shown),) = screened(comparison, null, [effect], chosen)
+    assert shown == pytest.approx(0.5 * signatures.own(column[None])[0] @ column)
+    (line,) = of_search(types.SimpleNamespace(unseen=[(0.0, effect, shown), (0.0, by_id("relax"), 0.1)]))
+    assert by_id("relax").name in line and effect.name not in line
 
 
 def test_a_second_law_of_the_same_is_no_second_effect():

@@ -13,10 +13,11 @@ from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.beliefs import Beliefs, Explanation, _effect, pooled, weights
 from biotac_mj.discrepancy.trajectories.contacts import Bounds, drawn, trajectory_of
-from biotac_mj.discrepancy.trajectories.design import Separation, planned
+from biotac_mj.discrepancy.trajectories.design import Separation, _solved, planned
 from biotac_mj.discrepancy.trajectories.plan_files import COLUMNS, write_plan
 from biotac_mj.discrepancy.trajectories.trajectory import read_trajectories
 from biotac_mj.effects.catalogue import CATALOGUE, by_id
+from biotac_mj.effects.rubber import SPOT, Spots
 
 BOUNDS = Bounds(force=1.2, depth=1.2e-3, tools=("sphere_7mm", "sphere_14mm"))
 
@@ -152,6 +153,16 @@ def test_a_plan_tells_more_than_random_contacts(first, tmp_path):
     assert len(documents) == 6 and len(documents[0]["points"]) == len(t.time)
     last = documents[0]["points"][-1]["time_from_start"]
     assert last["sec"] + 1e-9 * last["nanosec"] == pytest.approx(t.time[-1])
+
+
+def test_a_plan_solves_what_its_explanations_use():
+    """A spot that earlier contacts touched, and of each curve its middle: nothing is fitted to a plan."""
+    data, spot = measured([], n=4), "at_-8.0_-6.5_0.0"
+    fields, fitted = Springs().fields(data, False, [spot]), Springs().fields(data, False)
+    assert [name for name in fields.slopes if name.startswith(SPOT)] == [spot]
+    assert len(fields.deeper.solved) == len(fields.film.solved) == 3 < len(fitted.deeper.solved)
+    one = Explanation([(Spots([spot]), {spot: 0.3})], Nuisance(), 0.0, np.eye(1))
+    assert _solved(one, fields) and not _solved(one, fitted)
 
 
 def test_beliefs_are_the_same_after_saving(first, tmp_path):

@@ -165,8 +165,8 @@ def planned(
     for k, (contact, at, mat) in enumerate(some):
         trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}", n))
         clock += float(trajectories[-1].time[-1]) + _BETWEEN
-    explained = [*beliefs.rivals, *beliefs.unseen]
-    spots = sorted({n for one in explained for _, th in one.effects for n in th if n.startswith(SPOT)})
+    used = {name for one in beliefs.rivals for _, theta in one.effects for name in theta}
+    spots = sorted(name for name in used if name.startswith(SPOT))
     fields = quick.fields(trajectories, progress, spots)
     able = [one for one in beliefs.rivals if _solved(one, fields)]
     unseen = [

@@ -77,7 +77,7 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
         notes.append(
             f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data"
         )
-    poses = fit.offsets[chosen]
+    poses = comparison.poses(fit.effects, nuisance)[chosen]
     mean, error = poses.mean(0), poses.std(0, ddof=1) / np.sqrt(len(chosen))
     if (np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))).any():
         notes.append(

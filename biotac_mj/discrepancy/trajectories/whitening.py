@@ -130,6 +130,14 @@ class Comparison:
         """The same about a base model whose modulus was fitted."""
         return dataclasses.replace(self, modulus=nuisance.modulus)
 
+    def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
+        """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""
+        out = []
+        for i, r in enumerate(self.raw(effects, nuisance)):
+            _, s, v = self._basis[i]
+            out.append(self.repeatability * v.T @ (s / (1 + s**2) * self._split(i, r)[0]))
+        return np.array(out)
+
     def predict(self, runs: list) -> list:
         """Per trajectory (n, width) about rest."""
         rest = np.mean([r.counts[0] for r in runs], axis=0)
