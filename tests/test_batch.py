@@ -450,7 +450,14 @@ def thrown(speeds, spins, mass, timestep, steps, neighbours=0, **settings):
     yield 0.5 * (weight * d.qvel.numpy().astype(float) ** 2).sum(axis=1), mjm, d, velocity
 
 
-@pytest.mark.parametrize("middle, fastest", [(0.15, 0.25), (0.15, 0.4), (0.3, 0.5), (0.15, 0.6), (0.3, 0.6)])
+@pytest.mark.parametrize(
+    "middle, fastest",
+    [
+        *(pytest.param(0.15, fast, marks=pytest.mark.slow) for fast in (0.25, 0.4)),
+        *(pytest.param(0.3, fast, marks=pytest.mark.slow) for fast in (0.5, 0.6)),
+        (0.15, 0.6),
+    ],
+)
 def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest):
     speeds, timestep, steps = [0.05, middle, fastest], 2e-3, 14
     rounds = []
@@ -662,6 +669,7 @@ def test_memory_and_liquids_of_worlds_equal_single_worlds():
     np.testing.assert_allclose(got[0], expected, atol=2e-3 * abs(expected).max())
 
 
+@pytest.mark.slow  # quick: two fingers hold a ball in test_batch_together.py
 def test_a_ball_between_two_biotacs_feels_both():
     spec = ball_spec()
     spec.option.gravity = [0, 0, 0]

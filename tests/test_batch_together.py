@@ -269,7 +269,10 @@ def tumbling(tier, throws):
     return np.array(out), np.array(rounds)
 
 
-@pytest.mark.parametrize("tier, throws", [("condensed", TUMBLING), ("full", TUMBLING[:3])])
+@pytest.mark.parametrize(
+    "tier, throws",
+    [("condensed", TUMBLING), pytest.param("full", TUMBLING[:3], marks=pytest.mark.slow)],  # quick: the lost
+)
 def test_a_world_is_the_same_to_the_bit_beside_any_others(tier, throws):
     """Whether its skin settles at once, sleeps until a box comes, or needs rounds of its own: what the others
     of the batch still do changes nothing in it."""

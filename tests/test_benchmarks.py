@@ -71,6 +71,7 @@ def test_models_are_freed(repo, tmp_path):
     assert len(found["memory_mb"]) == 21 and found["growth_mb"] < 50
 
 
+@pytest.mark.slow  # quick: test_skin_shipped.py, test_skin_contact.py
 def test_accuracy_of_stored_cases(repo, shared, tmp_path):
     cases = tmp_path / "cases"
     cases.mkdir()
@@ -347,6 +348,7 @@ def test_standard_path_starts_at_first_touch(repo, accuracy):
     assert direction[1] > 0.9  # from the pad towards the nail
 
 
+@pytest.mark.slow  # a script of benchmarks/
 @pytest.mark.filterwarnings("ignore")  # of pyplot
 def test_peers_are_compared_at_equal_work(repo, tmp_path):
     """Three steps, ours and MuJoCo's flex on the CPU: rows, where it goes on, table and picture."""

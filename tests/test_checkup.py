@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from grids import first
 from scipy.ndimage import gaussian_filter1d
 
 from biotac_mj import cli
@@ -53,6 +54,7 @@ def drifting_at_rest(x, touched):
     return x[:, 4] + np.where(touched, 0, 25 * np.minimum(np.arange(len(x)) / RATE / 15, 1))
 
 
+@pytest.mark.slow  # quick: spikes, and the CLI below
 def test_a_checkup_names_what_the_plain_log_does_not_tell():
     """In the stretch that shows it, and there alone."""
     recording = PlainRecording(session(put(4, drifting_at_rest)), rate=RATE)
@@ -119,7 +121,7 @@ def test_a_checkup_finds_spikes_while_nothing_touches():
     assert found.of_all and found.end < REST
 
 
-@pytest.mark.parametrize("live", [0, 1, 2])
+@pytest.mark.parametrize("live", first([0, 1, 2]))
 def test_a_stretch_in_which_electrodes_stand_still_is_diagnosed(live):
     def stand(x, touched):
         return np.where(touched[:, None] | (np.arange(19) < live), x, x[0])

@@ -94,6 +94,7 @@ def test_mesh_vaes_come_first_and_only_those_that_rows_need(claim, splits):
     assert set(vaes) <= every - {f"mesh_vae {splits[0]}"} and set(rows) == set(of_code[1:])
 
 
+@pytest.mark.slow  # a script of benchmarks/: quick are its parts
 def test_a_run_has_every_row_and_goes_on(claim, tmp_path, monkeypatch):
     """Synthetic: 30 touches that mean nothing, networks of two steps; a row that is there stays."""
     from biotac_mj.learning.training.arrays import Arrays

@@ -668,7 +668,9 @@ def test_runge_kutta_does_not_throw_what_is_light(mass, timestep, stiffness):
     assert np.abs(data.qvel).max() < 1e-6 and handle.read(data, "status")[0] == 1
 
 
-@pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
+@pytest.mark.parametrize(
+    "integrator", ["RK4", pytest.param("Euler", marks=pytest.mark.slow), "implicitfast"]
+)
 def test_a_smooth_press_is_of_second_order(integrator):
     """1 kg on a slide is pressed smoothly, but for the springs that it meets: against steps of 0.2 ms."""
 
@@ -765,7 +767,7 @@ BESIDE = """<geom type="plane" size="1 1 .1" pos="0 0 -.1"/>
 CONNECT = '<equality><connect body1="whirls" body2="world" anchor="0 0 .1"/></equality>'
 
 
-@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+@pytest.mark.parametrize("jacobian", first(["dense", "sparse"]))
 def test_what_no_skin_touches_moves_as_in_mujocos_runge_kutta(jacobian):
     """A constraint force that is held over a step does not turn with the body: a pendulum on a connect gained
     a third of its energy in two seconds while a ball lay on the pad."""

@@ -113,10 +113,9 @@ def check_weight(mass, timestep, **settings):
     assert np.sqrt(np.mean(np.square(speed))) < 5e-5
 
 
-# the ends of both; all of both on the default skin are slow
-@pytest.mark.parametrize(
-    "mass, timestep", [pytest.param(0.001, 0.0005, marks=pytest.mark.slow), (1.0, 0.004)]
-)
+# the ends of both; all of both on the default skin follow
+@pytest.mark.slow  # quick: the pinch below, and weights in test_coupling.py and test_skin_condensed.py
+@pytest.mark.parametrize("mass, timestep", [(0.001, 0.0005), (1.0, 0.004)])
 def test_a_ball_reads_its_weight(mass, timestep):
     check_weight(mass, timestep)
 
@@ -416,7 +415,9 @@ def test_a_geom_deep_in_the_core_is_told_and_survived():
     assert handle.read(data, "contact_force")[1] > 0.1
 
 
-@pytest.mark.parametrize("back", [8, pytest.param(3, marks=pytest.mark.xfail(strict=True))])
+@pytest.mark.parametrize(
+    "back", [8, pytest.param(3, marks=[pytest.mark.slow, pytest.mark.xfail(strict=True)])]
+)
 def test_an_unconverged_step_goes_on_from_its_iterate(back):
     """back: steps after which the skin is as before; 3 where an unconverged step kept the last state.
     What acts is the contact law there, but no more than the skin balances: 2.2 mm deeper than a touch that is

@@ -40,7 +40,7 @@ def ball(tier, **keywords):
     return model, data, handle
 
 
-@pytest.mark.parametrize("tier", STEPPERS)
+@pytest.mark.parametrize("tier", [pytest.param("full", marks=pytest.mark.slow), "condensed"])
 def test_a_skin_under_a_ball_at_rest_is_not_solved_again(tier, solves):
     """Its readings go on; a copy goes on to the same bits; what moves the ball is felt at once."""
     model, data, handle = ball(tier)

@@ -107,7 +107,7 @@ def test_what_is_not_there_is_refused():
 
 
 def test_forwards_is_backwards():
-    skin, given = ball(element="linear", liquid=False), worlds(2, 9)
+    skin, given = ball(element="linear", liquid=False), worlds(2, 5)
     draw = torch.Generator().manual_seed(3)
     ways = {n: torch.randn(v.shape, generator=draw, dtype=torch.float64) for n, v in given.items()}
     ways = {name: STEPS[name] * way for name, way in ways.items()}
