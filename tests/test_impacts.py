@@ -353,6 +353,41 @@ def test_thrown_bodies_settle_with_all_integrators(integrator):
     assert lost <= 1
 
 
+@pytest.mark.parametrize("seed", [2, 20, 47, 51])
+def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
+    """They come 4 to 7 mm a step: where they begin, half a step ahead of the positions, they are in the skin,
+    and MuJoCo's contact with the core begins in one of the stages. What is reported is what acts."""
+    rng = np.random.default_rng([77, seed])
+    timestep, radius, mass = (
+        rng.choice([0.002, 0.004, 0.005, 0.008]),
+        rng.uniform(1.2e-3, 2e-3),
+        10 ** rng.uniform(-3, -1),
+    )
+    step, place, gap, tilt, turn = (
+        rng.uniform(3e-3, 9e-3),
+        rng.uniform(-4e-3, 4e-3, 2),
+        *rng.uniform(0, [1, 0.6, 6.28]),
+    )
+    friction, spin = rng.uniform(0, 1.5), rng.normal(size=3) * 30
+    way = step * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+    pos = np.array([place[0] - 1.8e-3, place[1], 8.6e-3 + radius]) - gap * way
+    ball = f'<body name="ball" pos="{pos[0]} {pos[1]} {pos[2]}"><freejoint/>'
+    ball += f'<geom size="{radius}" mass="{mass}" friction="{friction}"/></body>'
+    model, data, handle = finger_under(ball, timestep, integrator="RK4", skin="coarse", tier="condensed")
+    data.qvel[:] = *way / timestep, *spin
+    mujoco.mj_forward(model, data)
+    start, touched, force = kinetic(model, data), 0, np.zeros(3)
+    for _ in range(round(0.04 / timestep)):
+        before = data.qvel[:3].copy()
+        mujoco.mj_step(model, data)
+        mujoco.mju_rotVecQuat(force, handle.read(data, "contact_force")[:3], np.array(PAD_UP))
+        touched += force.any()
+        lost = mass * (before - data.qvel[:3]) / timestep
+        np.testing.assert_allclose(force, lost, rtol=0, atol=1e-8 * (1 + np.abs(lost).max()))
+        assert kinetic(model, data) <= start * (1 + 1e-12)
+    assert touched > 1
+
+
 def test_a_tool_that_jumps_into_the_condensed_skin_is_followed():
     """Nothing can give way: where a step was in vain the next one may take four times as much. Without that
     none settled in so many."""

@@ -30,7 +30,7 @@ NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.
 NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 # how a step went in which bodies and skin do not meet: see `concluded`
-_ALONE = 1, True, 0.0, 0.0, None, None
+_ALONE = 1, True, 0.0, 0.0, None
 _RK4, _DISCRETE = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("RK4", "DISCRETE"))
 NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
@@ -87,20 +87,13 @@ class Instance:
             )
         self.state = data.plugin_state[start : start + setup.nstate]
         self.parts, self.state_address = setup.parts(self.state), self.state.ctypes.data
-        self._result = self._reading = self._pose = self._geom_pose = None
-        self.put, self._solved, self.sensed, self.stays = None, {}, False, False
-        self._error, self._outcome = False, _ALONE
-        self.step_gamma, self.frequency = np.full(setup.ngroup, EULER), None
+        self._pose, self._geom_pose, self._solved = None, None, {}
+        self._forget()
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
         self.skins_met, self.number, self.springs = (), -1, None
         self._stages = []  # of Runge-Kutta: what acted, and where
         self._shown = None
-
-    @property
-    def horizon(self) -> float:
-        """Time until the poses at which the skin is solved [s]: to the end of the step."""
-        return self.model.opt.timestep
 
     @property
     def lead(self) -> float:
@@ -136,14 +129,18 @@ class Instance:
         none."""
         self.refuse_foreign_state()
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
-        self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
-        self.put, self.sensed, self.stays = None, False, False
-        self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
+        self._forget()
         if self.two_way and self.model.opt.integrator == _DISCRETE:
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
                 "choose implicitfast, implicit or Euler, or coupling='one-way'"
             )
+
+    def _forget(self):
+        self._error, self._result, self._reading = False, None, None
+        self._outcome, self._ends = _ALONE, None
+        self.put, self.sensed, self.stays = None, False, False
+        self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
 
     def last_model(self) -> tuple:
         """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3),
@@ -165,21 +162,29 @@ class Instance:
     def begin_arrays(self) -> StepArrays:
         """The arrays of a coupled step that begins: the linear model in force is that of the last step."""
         arrays, (head, models, *_) = self._arrays, self.parts
-        arrays.record(self.horizon, 0.5 * self.by_stages)
+        arrays.record(self.model.opt.timestep, 0.5 * self.by_stages)
         self._begun = self._frame()
         for (last, now), part in zip(arrays.models, self.last_model()):
             last[:] = now[:] = part
         arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)
         arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
-        arrays.began[0], arrays.passed[0] = head[STARTED] != 0.0, head[STARTED] == OUT_OF_REACH
+        arrays.began[0] = head[STARTED] != 0.0
         arrays.begin()
         self.touching.check(arrays.start_pos, arrays.start_mat)
-        placed = (arrays.placed > 0) & ~(self.touching.by_mocap & (head[STARTED] != 0.0))
-        if placed.any():
-            here = self.touching.geom_pose(arrays.here_pos, arrays.here_mat)
-            with self.setup.skin.lock:
-                self.put = self.setup.skin.stepper.put(self._skin, placed[self.touching.group], *here)
+        if arrays.placed.any():
+            self._take_placed(arrays)
         return arrays
+
+    def _take_placed(self, arrays):
+        """Bodies that were placed begin where they were put, which may lie behind where the step begins."""
+        where = self.touching.geom_pose(*self.kinematics.predict(-self.lead))
+        placed = (arrays.placed > 0) & ~(self.touching.by_mocap & (self.parts[0][STARTED] != 0.0))
+        stepper = self.setup.skin.stepper
+        with self.setup.skin.lock:
+            if stepper.is_clear(*where):
+                arrays.inside[0] = 0
+            if placed.any():
+                self.put = stepper.put(self._skin, placed[self.touching.group], *where)
 
     def _frame(self):
         core = self.touching.core
@@ -187,23 +192,12 @@ class Instance:
 
     def seen(self, wrench: np.ndarray) -> np.ndarray:
         """Wrenches (n, 6) in the BioTac frame with which the step began, in that of now."""
-        if not self.lead:
-            return wrench.copy()
-        (begun, before), (origin, frame) = self._begun, self._frame()
-        force, torque = wrench[:, :3] @ before.T, wrench[:, 3:] @ before.T
-        torque += np.cross(begun - origin, force)
-        return np.concatenate([force @ frame, torque @ frame], axis=1)
+        return _carried(wrench, self._begun, self._frame()) if self.lead else wrench.copy()
 
     @property
     def _skin(self):
         """The skin's state when the step begins, after bodies were placed."""
         return self.parts[2] if self.put is None else self.put
-
-    def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
-        """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
-        that is not known."""
-        with self.setup.skin.lock:
-            return self.setup.skin.stepper.is_clear(*self.touching.geom_pose(pos, mat))
 
     @property
     def inertial(self) -> bool:
@@ -338,7 +332,7 @@ class Instance:
         )
 
     def concluded(
-        self, rounds: int, settled: bool, withheld: float, energy: np.ndarray, ends: tuple, acting: np.ndarray
+        self, rounds: int, settled: bool, withheld: float, energy: np.ndarray, acting: np.ndarray
     ) -> None:
         """Keeps for the readings and `commit_step` how the coupled step went.
 
@@ -347,17 +341,22 @@ class Instance:
           settled: whether the skin was solved where the bodies go.
           withheld: fraction of the skin's push on a body that was, for lack of energy.
           energy: (ngroup,) left to each body in the skin at most [J].
-          ends: poses (ngroup, 3), (ngroup, 3, 3) where the step leaves the bodies.
           acting: wrenches (ngroup, 6) that the bodies get in this step; where it did not settle or push was
             withheld, not those of the skin's last solve.
         """
-        self._outcome = rounds, settled, withheld, energy, ends, acting
+        self._outcome = rounds, settled, withheld, energy, acting
 
-    def arrived(self, energy: np.ndarray, ends: tuple, near: bool) -> None:
+    def settle(self, energy: np.ndarray, near: bool) -> None:
         """Corrects the outcome by the poses that the integrator has reached. near: whether they are close to
         the predicted ones; used with Runge-Kutta only, whose status is written when the step ends."""
-        rounds, settled, withheld, _, _, acting = self._outcome
-        self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, ends, acting
+        rounds, settled, withheld, _, acting = self._outcome
+        self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, acting
+
+    def arrive(self) -> None:
+        """Keeps the poses of the bodies at the end of the step: a body that the next step finds elsewhere was
+        moved by others. MuJoCo's poses must be those with which that begins."""
+        if not self._error and self._result is not None:
+            self._ends = self.kinematics.predict(0.0)
 
     def _counts(self):
         if self._reading is None:
@@ -393,10 +392,7 @@ class Instance:
             if name in self.sensor:
                 out[self.sensor[name]] = counts
         rounds, _, withheld, *_ = self._outcome
-        if self._stages:
-            wrench, good = self._stages[0][:2]
-        else:
-            wrench, good = self._acting()
+        wrench, good = self._stages[0] if self._stages else self._acting()
         if "contact_force" in self.sensor:
             out[self.sensor["contact_force"]] = wrench
         if "status" in self.sensor:
@@ -430,7 +426,7 @@ class Instance:
         after an error."""
         if self._error or self._result is None:
             return np.zeros((self.setup.ngroup, 6))
-        acting = self._outcome[5]
+        acting = self._outcome[-1]
         return self._result.wrench if acting is None else acting
 
     @functools.cached_property
@@ -458,28 +454,26 @@ class Instance:
 
     def _push_on(self, other, group):
         """(6,) of this skin on another BioTac, its touching body `group`, in the frame of that one."""
-        acting = self._outcome[5]
+        acting = self._outcome[-1]
         if acting is None:
             acting = np.zeros((group + 1, 6)) if self._result is None else self._result.wrench
-        wrench = acting[group]
-        if not wrench.any():
-            return wrench
-        pos, mat = (
-            getattr(self.data, name)[[self.touching.core, other.touching.core]] for name in ("xpos", "xmat")
-        )
-        (from_, to), offset = mat.reshape(2, 3, 3), pos[0] - pos[1]
-        force, torque = from_ @ wrench[:3], from_ @ wrench[3:]
-        return np.concatenate([force @ to, (torque + np.cross(offset, force)) @ to])
+        return _carried(acting[[group]], self._frame(), other._frame())[0]
 
     def end_stage(self, first: bool, held: bool) -> None:
         """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
-        and bodies get all four. held: what acted in the first acts in this one."""
+        and bodies get all four. held: what acted in the first acts in this one, besides contacts that have
+        begun since."""
         if self._error:
             return
+        if first:
+            self._stages, self._first = [], self._frame()
         if held:
-            self._stages.append(self._stages[0])
-            return
-        self._stages = [*(() if first else self._stages), (*self._acting(), *self._frame())]
+            wrench, good = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
+            before, settled = self._stages[0]
+        else:
+            (wrench, good), before, settled = self._acting(), 0.0, True
+        wrench = before + _carried(wrench[None], self._frame(), self._first)[0]
+        self._stages.append((wrench, good and settled))
 
     def _sum_up(self, settled):
         """Writes what acted over the stages of a step, in the frame of its start; whether all settled, and
@@ -492,12 +486,8 @@ class Instance:
                 "under RK4 MuJoCo's mj_step2 makes Euler's step, for which the skin was not solved: call "
                 'mj_step, or set <option integrator="Euler"/>'
             )
-        settled, (_, _, origin, frame) = settled and all(good for _, good, *_ in stages), stages[0]
-        total = np.zeros(6)
-        for fraction, (wrench, _, at, turned) in zip(STAGES, stages):
-            force, torque = turned @ wrench[:3], turned @ wrench[3:]
-            total[:3] += fraction * (force @ frame)
-            total[3:] += fraction * ((torque + np.cross(at - origin, force)) @ frame)
+        settled = settled and all(good for _, good in stages)
+        total = sum(fraction * wrench for fraction, (wrench, _) in zip(STAGES, stages))
         if not self.model.opt.disableflags & NO_SENSOR:
             out = self.data.sensordata
             if "contact_force" in self.sensor:
@@ -524,14 +514,14 @@ class Instance:
             return
         readings, _ = self._counts()
         head, models, skin, readings_state = self.parts
-        _, settled, _, energy, ends, _ = self._outcome
+        _, settled, _, energy, acting = self._outcome
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
-        reach = REACHED if ends else OUT_OF_REACH
+        reach = OUT_OF_REACH if acting is None else REACHED
         if good and self.stays:
             reach = STAYED if result.measured else -STAYED
         head[:] = head[FAILED] + (not good), good - steps, reach
-        n, ends = self.setup.ngroup, ends or self._pose
+        n, ends = self.setup.ngroup, self._ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
         models[:, 54:57], models[:, 57:66], models[:, ENERGY] = ends[0], ends[1].reshape(n, 9), energy
@@ -557,3 +547,11 @@ class Instance:
         if self._shown is None:
             self._shown = Shown(self)
         self._shown.update()
+
+
+def _carried(wrench, before, now):
+    """Wrenches (n, 6) in a frame and about its origin (3,), (3, 3), in another one."""
+    (at, turned), (origin, frame) = before, now
+    force, torque = wrench[:, :3] @ turned.T, wrench[:, 3:] @ turned.T
+    torque += np.cross(at - origin, force)
+    return np.concatenate([force @ frame, torque @ frame], axis=1)

@@ -36,7 +36,7 @@ class Coupled:
         self.instance, self.data = instance, data
         self.touching, self.idle = _touching(instance.last_model()[1]), False
         if not len(self.touching):  # maybe nothing is near
-            self.pose = instance.kinematics.predict(instance.horizon)
+            self.pose = instance.kinematics.predict(instance.model.opt.timestep - instance.lead)
             self.idle = instance.is_out_of_reach(*self.pose)
         if self.idle:
             return
@@ -48,8 +48,6 @@ class Coupled:
         self.touching = _touching(arrays.tangent0)  # without bodies that were placed
         self.square, self.tangent, self.moved = arrays.square, arrays.tangent0, arrays.moved
         self.compliance = arrays.compliance
-        if arrays.inside[0] and instance.is_clear(arrays.here_pos, arrays.here_mat):
-            arrays.inside[0] = 0
 
     def use_euler(self) -> None:
         """Makes the bodies' step that of backward Euler."""
@@ -114,7 +112,7 @@ class Coupled:
     def _core_motion(self):
         if not self.instance.inertial:
             return ()
-        step = self.instance.horizon
+        step = self.instance.model.opt.timestep
         with self.data.ahead(self.instance.lead):
             return self.instance.kinematics.core_motion(step, step**2, self.acceleration)
 
@@ -158,17 +156,16 @@ class Coupled:
         arrays, withheld = self.arrays, 1.0 - self.arrays.push.min(initial=1.0)
         left = arrays.conclude(self.result.converged)
         acting = self.instance.seen(arrays.acting)
-        self.instance.concluded(rounds, self.settled, withheld, left, self.target, acting)
+        self.instance.concluded(rounds, self.settled, withheld, left, acting)
         self.instance.step_gamma, self.instance.frequency = arrays.gamma.copy(), arrays.frequency.copy()
 
-    def arrived(self, moved: np.ndarray, near: float) -> None:
+    def settle(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when MuJoCo's poses are those of now. moved: (nv,) displacement of the degrees
         of freedom by their mean velocity in the step. near: [m] from where they were to go."""
-        arrays = self.arrays
-        ends, travel = self.instance.kinematics.predict(0.0), self.jacobian @ moved
+        arrays, travel = self.arrays, self.jacobian @ moved
         error = size(travel - arrays.travel)
         arrays.travel[:] = travel
-        self.instance.arrived(arrays.conclude(self.result.converged), ends, error < near)
+        self.instance.settle(arrays.conclude(self.result.converged), error < near)
 
 
 def _touching(tangent):

@@ -22,7 +22,7 @@ from ...threads import run_in_threads
 from ..instance import NO_PASSIVE, NO_SENSOR, Instance
 from ..loads import Loads
 from ..solid import SOLVED
-from ..solid_contacts import SolidContacts
+from ..solid_contacts import SolidContacts, contacts_of
 from ..structs import MINVAL, DataView, ModelView
 from .coupled import Coupled
 from .group import SkinGroup
@@ -66,7 +66,7 @@ class World:
         for number, t in enumerate(self.coupled):
             t.number, t.springs = number, self._springs
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
-        self._acting = ()  # skins whose bodies are under way
+        self._acting, self._now = (), None  # skins whose bodies are under way, and from where
         self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
         self._loads = None
         self._solids = [SolidContacts(model, one.touching) for one in self.instances.values()]
@@ -164,7 +164,7 @@ class World:
             self._refuse_reset()
         if not instance.two_way:
             instance.forget_last_solve()
-            bodies, step = instance.kinematics, instance.horizon
+            bodies, step = instance.kinematics, self.model.opt.timestep
             core = bodies.core_motion(step, 0.0, np.zeros(self.model.nv)) if instance.inertial else ()
             instance.solve_for_pose(*bodies.predict(step), core)
         elif instance.index == self.first:
@@ -191,6 +191,7 @@ class World:
 
     def _step(self):
         self._acting, self._weights = (), None
+        self._now, self._began_with = self.data.qpos.copy(), self.data.qvel.copy()
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
         with self.data.ahead(self.coupled[0].lead):
@@ -213,7 +214,7 @@ class World:
         if not skins:
             return
         self._group = SkinGroup(skins, self._springs)
-        if skins[0].instance.horizon > 0 and self.model.nv > 0:
+        if self.model.opt.timestep > 0 and self.model.nv > 0:
             rounds = self._find_balance(skins, outside)
             rounds += self._damp(skins, outside)
             self._restrain(skins, outside)
@@ -224,7 +225,7 @@ class World:
                     skin.hold(self._found)
                 self._forces(skins, outside)
             self._group.find_frequencies()
-            self._acting, self._now, self._began_with = skins, self.data.qpos.copy(), self.data.qvel.copy()
+            self._acting = skins
             if skins[0].instance.by_stages:
                 self._held_trees, self._ties = self._touched_trees(skins), self._force_of_ties()
         else:
@@ -239,10 +240,17 @@ class World:
             skin.conclude(rounds)
 
     def _touched_trees(self, skins):
-        """(ntree,) kinematic trees that skins touch, and those that constraints link to them."""
+        """(ntree,) kinematic trees that skins touch, or core, nail and clamp, and those that constraints link
+        to them."""
         tree, trees = self.model.dof_treeid, np.zeros(self.model.ntree, bool)
         for skin in skins:
             trees[tree[skin.jacobian[skin.touching].any(axis=(0, 1))]] = True
+        contacts = contacts_of(self.data)
+        pairs = contacts["geom"][contacts["efc_address"] >= 0]
+        bodies = self.model.geom_bodyid[pairs[(pairs >= 0).all(axis=1)]]  # -1: a flex
+        solid = np.isin(bodies, [skin.instance.touching.core for skin in skins]).any(axis=1)
+        touched = self.model.body_treeid[bodies[solid]]
+        trees[touched[touched >= 0]] = True
         return self.data.linked_trees(trees)
 
     def _force_of_ties(self):
@@ -283,18 +291,21 @@ class World:
     def _finish(self):
         """After the step: gives the skins the poses that their bodies have reached. These differ from where
         each skin was solved: joints move in arcs, and other forces may have been predicted badly."""
-        skins, self._acting = self._acting, ()
-        if not skins:
+        before, self._now = self._now, None
+        if before is None:  # MuJoCo has not called the skins
             return
+        skins, self._acting = self._acting, ()
         if self._weights is not None:
             self._leave_constraint_forces()
         moved = 0.5 * self.model.opt.timestep * (self._began_with + self.data.qvel)
         after = self.data.qpos.copy()
-        self.data.go_on(skins[0].instance.lead)
+        self.data.go_on(self.coupled[0].lead)
         self.data.find_poses()
         for skin in skins:
-            skin.arrived(moved, ASTRAY)
-        self.data.qpos[:] = self._now
+            skin.settle(moved, ASTRAY)
+        for t in self.coupled:
+            t.arrive()
+        self.data.qpos[:] = before
         self.data.find_poses()  # those that MuJoCo leaves after a step
         self.data.qpos[:] = after
 

@@ -157,7 +157,7 @@ class Bodies:
             mujoco.mj_comPos(self.model, data)
             mujoco.mj_comVel(self.model, data)
             bodies = self._kinematics[self.instances.index(one)]
-            return one.touching.geom_pose(*bodies.predict(one.horizon))
+            return one.touching.geom_pose(*bodies.predict(one.model.opt.timestep))
 
         def slopes_of(one, gamma):
             weight = {"qvel": 1.0}  # of velocities in the pose of the solve

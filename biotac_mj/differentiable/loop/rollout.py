@@ -275,7 +275,7 @@ class _Run:
                     bases.append(None),
                 )
                 continue
-            one = s.linear(before[i], k, s.instance.horizon)
+            one = s.linear(before[i], k, s.instance.model.opt.timestep)
             pushed = wrenches[i].ravel() + by_wrench[i].T @ end
             linear.append(one)
             base.append(one.pull(skins[i], pushed.reshape(-1, 6)))
