@@ -259,6 +259,12 @@ def test_room_for_more_bodies_must_be_there():
         (dict(stepper=None), r"stepper is None: give its name"),
         (dict(options=[]), r"options is \[\]: give a dict"),
         (FEM | dict(coupling="one-way", options={"rounds": 4}), "rounds of options is of coupling='two-way'"),
+        *(
+            (FEM | dict(options={"rounds": n}), f"rounds of options is {n!r}: give a")
+            for n in (0, 2.5, "4", 1001)
+        ),
+        (FEM | dict(options={"readings": 3}), r"options\['readings'\] is 3: a dict is needed"),
+        (FEM | dict(options={"readings": {"temperature": -280.0}}), r"is -280.0 C: give a finite number"),
         (
             FEM | dict(options={"effects": 1}),
             r"options has 'effects': choose from skin, modulus, film, readings, rounds",

@@ -9,14 +9,12 @@ import os
 import pathlib
 import shutil
 
-import mujoco
 import numpy as np
 import pytest
 from bad_rows import Row, h5, replaced
 from good_input import ROWS as NROW
 from good_input import make_files
 
-import biotac_mj
 from biotac_mj import cli
 from biotac_mj.learning.training.config import LearningConfig
 from biotac_mj.recordings.formats.text import RUPPEL as RUPPEL_COLUMNS
@@ -1073,31 +1071,6 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
     assert row.text in said and said.startswith("biotac: error: ") and said.count("\n") == 1, said[-2000:]
     assert code == 2
     assert everything(tmp_path) == before
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"effects": []}, "options has 'effects': choose from skin, modulus, film, readings, rounds"),
-        ({"rounds": 0}, "rounds of options is 0: give a whole number from 1 to 1000"),
-        ({"rounds": 2.5}, "rounds of options is 2.5: give a whole number from 1 to 1000"),
-        ({"rounds": "4"}, "rounds of options is '4': give a whole number from 1 to 1000"),
-        ({"rounds": 1001}, "rounds of options is 1001: give a whole number from 1 to 1000"),
-        ({"skn": {}}, "options has 'skn': did you mean 'skin'?"),
-        ({"skin": {"sample": 3}}, r"options\['skin'\] has 'sample': did you mean 'samples'?"),
-        ({"skin": {"samples": 2.5}}, "samples is 2.5: pass a whole number"),
-        ({"skin": {"contact_law": {"adhesn": 1}}}, "contact_law has 'adhesn': did you mean 'adhesion'?"),
-        ({"readings": {"nose": True}}, r"options\['readings'\] has 'nose': did you mean 'noise'?"),
-        ({"readings": {"noise": 1}}, r"noise of options\['readings'\] is 1: pass true or false"),
-        ({"readings": 3}, r"options\['readings'\] is 3: a dict is needed"),
-        ({"readings": {"temperature": -280.0}}, "temperature is -280.0 C: give a finite number above -273"),
-        ({"modulus": "nowhere.npy"}, "no modulus at nowhere.npy"),
-        ({"modulus": [1.0, -1.0]}, "pass a positive factor"),
-    ],
-)
-def test_attach_refuses_options_that_nothing_reads(options, said):
-    with pytest.raises((ValueError, FileNotFoundError), match=said):
-        biotac_mj.attach(mujoco.MjSpec(), body="world", skin="coarse", options=options)
 
 
 @pytest.mark.parametrize(("name", "said"), [("counts", "simulated"), ("measured_counts", "measured")])
