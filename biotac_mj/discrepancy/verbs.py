@@ -66,7 +66,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
 
 
 def _reported(verdict: "Verdict", folder: pathlib.Path) -> None:
-    """Writes a report and prints what it says."""
+    """Writes a report and prints its summary."""
     from .report.files import write_report
     from .report.text import summary
 

@@ -52,7 +52,7 @@ class Cells:
 
     def tested(self, statistic: np.ndarray, fewest: int = 2) -> tuple[np.ndarray, np.ndarray]:
         """t and family-wise p (conditions, channels) of a statistic (units, conditions, channels), by flips
-        of whole units; nan where fewer units know it."""
+        of whole units; nan where fewer units have data."""
         known = np.isfinite(statistic).sum(0) >= fewest
         t, p = np.full((2, *known.shape), np.nan)
         if known.any():

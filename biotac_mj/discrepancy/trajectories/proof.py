@@ -94,7 +94,7 @@ def _share(comparison, smaller, larger, aside):
 
 
 def _begun(comparison, fit, aside):
-    """The Fit, or the model as it was given where the Fit is worse, and what `_measured` says of it."""
+    """The Fit, or the model as it was given where the Fit is worse, and its result of `_measured`."""
     given = dataclasses.replace(fit, effects=[], names=[], nuisance=Nuisance())
     ends = [_measured(comparison, one, aside) for one in (given, fit)]
     return (given, ends[0]) if _worse(comparison, *ends, aside) else (fit, ends[1])
@@ -106,7 +106,7 @@ def _nearer(comparison, before, after, aside) -> bool:
 
 
 def _measured(comparison, fit, rows):
-    """Numbers of a model as it is written, its residuals, as `Proof` has them, and what `_compared` says."""
+    """Numbers of a model as it is written, its residuals, see `Proof`, and its result of `_compared`."""
     written = dataclasses.replace(fit, nuisance=fit.nuisance.written)
     raw, residual, beyond = _compared(comparison, written, rows)
     out = {"mean_square": [float(np.sum(comparison.vector(i, raw[i]) ** 2)) for i in rows]}

@@ -28,7 +28,7 @@ def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[
     contact are kept, evenly by travel and time, after one row of the approach in which nothing touches.
 
     Args:
-      skin: whose resting surface tells what is a touch.
+      skin: a touch begins at its undeformed surface.
 
     Raises:
       ValueError: no pose, no name of the object, no raw counts, or no touch; the text names the remedy.

@@ -92,7 +92,7 @@ def found(
         step = _round(comparison, out, usable, chosen, bar)
         out.rounds.append(step)
         able = [c for c in step if not c.refused]
-        little = [c for c in step if c.refused == ["evidence"]]  # others are not what their names say
+        little = [c for c in step if c.refused == ["evidence"]]  # others contradict their names
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         if not able:
             break
@@ -142,7 +142,7 @@ def _round(comparison, search, usable, chosen, bar):
         fit = _fitted(comparison, effect, start, expected, current, chosen)
         plain = next(e for e in effects if e.id == effect.id)
         if effect is not plain and effect.rejection_reason(fit.effects[-1][1]):
-            # its rare parameters, or so few electrodes, are not what its name says
+            # its rare parameters, or so few electrodes, contradict its name
             effect, start = plain, {name: start.get(name, v) for name, v in plain.default().items()}
             fit = _fitted(comparison, effect, start, expected, current, chosen)
         fit = _solved(comparison, fit, effect, current, chosen)
@@ -159,10 +159,11 @@ def _round(comparison, search, usable, chosen, bar):
 
 
 def _fitted(comparison, effect, start, expected, current, chosen):
-    """Fit of an effect beside others; expected: evidence by straight lines, which lead to `start`.
+    """Fit of an effect in addition to others; expected: evidence of the linear model, whose optimum is
+    `start`.
 
-    From no effect, step by step: what was fitted without it has put into poses and nuisance what it has to
-    take back. From `start`, with poses as they are said to be, where that leads to less than is expected."""
+    It starts from no effect and its current poses and nuisance, which have absorbed part of the effect. If
+    that ends below the expected evidence, it starts again from `start` and the recorded poses."""
     none = {n: v if effect.params[n].shape else effect.params[n].start for n, v in start.items()}
     fit = fit_effects(comparison, [*current.effects, (effect, none)], chosen, current)
     if fit.score - current.score >= expected:

@@ -214,8 +214,8 @@ def measurement_noise(trajectories: list[Trajectory]) -> dict:
 
 
 def _still(t):
-    """(n - 1,) whether the object stands still from row to row: a pose that is measured trembles, by as much
-    as its smallest steps say."""
+    """(n - 1,) whether the object stands still from row to row: its smallest steps are the noise of the
+    measured pose."""
     step = np.abs(np.diff(t.pos, axis=0)).max(1)
     least, most = _STILL
     most = max(most, _CREEP * np.median(step))

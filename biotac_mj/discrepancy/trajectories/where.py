@@ -13,8 +13,8 @@ if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
 TRENDS = "along finger", "across finger", "clock", "temperature"  # over trajectories
-_FEWEST = 5  # trajectories that know a cell
-_SAID = 3  # cells that are said of what has no name
+_FEWEST = 5  # trajectories with data on a cell
+_SAID = 3  # cells that are listed for an unknown effect
 
 
 def phases(t: "Trajectory") -> dict:
@@ -87,8 +87,8 @@ def residual_cells(
 def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dict]:
     """Cells channel x condition that stand out; family-wise p by sign flips of whole trajectories.
 
-    All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times
-    that, a trend 0.3 sigma."""
+    All trajectories share the error of the rest levels, which sign flips do not cover: a mean has to be three
+    times that, a trend 0.3 sigma."""
     cells = residual_cells(comparison, null, chosen, channel_groups(comparison))
     t, p = cells.tested(cells.mean * np.sqrt(cells.rows)[:, :, None], _FEWEST)
     trend = np.array([name in TRENDS for name in cells.conditions])

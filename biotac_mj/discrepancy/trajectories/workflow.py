@@ -239,7 +239,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     _tie_aliases(current, found, names)
     fitted = current
     current, found, refuted = _upheld(comparison, null, current, found, search, chosen, aside)
-    if refuted:  # what held-out trajectories refute explains nothing that another experiment could tell
+    if refuted:  # by held-out trajectories: no experiment has to distinguish it from others
         gone = {one.effect.id for one in refuted}
         some = {ids: fit for ids, fit in search.fits.items() if not ids & gone}
         search.fits = {k: fit for k, fit in some.items() if not k or borne_out(comparison, null, fit, aside)}

@@ -1,5 +1,5 @@
 """The skin along trajectories, solved once and once more for each small change: these differences make every
-effect cheap to fit (`Fields`). The settings of a `Simulator` say what is solved."""
+effect cheap to fit (`Fields`). The settings of a `Simulator` decide what is solved."""
 
 import contextlib
 import dataclasses

@@ -26,14 +26,14 @@ class Fields:
     mesh, "tier": of the condensed tier, "modulus": per log of the modulus, beyond a factor on force and
     pressure (where the liquid stands under pressure at rest).
 
-    deeper: what shifts along the heading change [m], None where x, y and z say that too. film: what the
-    logarithm of the film's least thickness changes, about rest.
+    deeper: changes by displacements along the heading [m], None where x, y and z contain them. film: changes
+    by the logarithm of the film's least thickness, about rest.
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
-    {trajectory: what slopes miss there of all of them together}, {parameter: the same of how that changes
-    with it})], see `Simulator.bend`: of a fraction s of these parameters they miss s^2 of it, and s of the
-    changes by what lies beside that share. All that were solved are kept, since several fits hold on to
-    theirs. remembered: ids of effects of the rubber -> [(their parameters, what their reduced form misses
-    of rubber that does so itself [(n, nelectrode + 4) per trajectory])], see `in_skin.remember`."""
+    {trajectory: error of the slopes there with all of them}, {parameter: derivative of that error})], see
+    `Simulator.bend`: at a fraction s of these parameters the error is s^2 of it, its derivative s. All
+    solutions are kept, since several fits use theirs. remembered: ids of effects of the rubber -> [(their
+    parameters, error of their reduced form against the effect inside the rubber [(n, nelectrode + 4) per
+    trajectory])], see `in_skin.remember`."""
 
     base: list
     slopes: dict

@@ -3,8 +3,8 @@
     sim = InSkinSimulator(skin="coarse", tier="full")
     sim.run(trajectories, effects=[(by_id("relax"), {"g": 0.3, "tau": 2.0})])  # the skin itself relaxes
 
-It takes the place of a Simulator wherever the skin is solved anew (`exact`); with `exact=False` it is one.
-`docs/lab/discrepancy.md` says how much the reduced forms differ."""
+It replaces a Simulator wherever the skin is solved anew (`exact`); with `exact=False` it is one.
+`docs/lab/discrepancy.md` has the errors of the reduced forms."""
 
 import dataclasses
 import typing
@@ -21,9 +21,9 @@ from ..trajectory import Trajectory
 from .fields import Fields, stack, unlike
 from .simulator import Simulator, _impedance, placed
 
-FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that say what follows from the skin here
-_LITTLE = 0.01  # share below which nothing is solved
-_ALIKE = 0.25  # of logarithms of share and shapes, within which another solution would say the same
+FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that the solved skin makes needless
+_LITTLE = 0.01  # size of an effect below which nothing is solved
+_ALIKE = 0.25  # of logarithms of size and shapes, within which a solution is used again
 
 
 def solve_with_memory(
@@ -116,7 +116,7 @@ class InSkinSimulator(Simulator):
         *more: typing.Any,
         **kw: typing.Any,
     ) -> list[Run]:
-        """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
+        """See `Simulator.run`; where the skin is solved anew, the effects of `memory_of` act inside it."""
         effects = self.effects if effects is None else effects
         inside = memory_of(effects)
         if exact is False or inside.rest == list(effects):  # nothing is inside
@@ -130,9 +130,9 @@ class InSkinSimulator(Simulator):
 
 
 def remember(sim: Simulator, fields: Fields, effect: Effect, theta: dict) -> bool:
-    """Solves the skin of all trajectories with rubber, or contact, that itself does what an effect's reduced
-    form says of the load, and keeps with the fields what that form misses: late rubber in one place is held
-    up by that around it, and the film follows. From then on fits with the effect are right near theta.
+    """Solves the skin of all trajectories with an effect inside the rubber or contact, and stores in the
+    fields the error of the effect's reduced form, which acts on the load alone. From then on fits with the
+    effect are right near theta.
 
     Returns: whether that was needed and could be: in the full tier, of the effects that remember, and not
     where it was solved near theta already."""

@@ -1,8 +1,8 @@
 """The simulator as stages and effects: where objects are, skin, transduction, acquisition; saved as YAML.
 
-Poses go in, what the sensor would read comes out. The skin is solved for the poses as they are (`fields`),
-and once more for each small change of them: these differences make every effect of the set-up affordable, and
-what uses them says so (`exact=False`). `exact=True` solves the skin anew with the effects in place.
+Poses are the input, readings the output. The skin is solved for the recorded poses (`fields`), and once more
+for each small change of them: these differences make every effect of the set-up affordable, and are used with
+`exact=False`. `exact=True` solves the skin anew with the effects in place.
 """
 
 import copy
@@ -34,7 +34,7 @@ from .fields import Fields, apart, nearest, sizes, square, stack
 TIERS = ("condensed", "full")
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
 _STEP = 0.3  # of a parameter's scale, for the change by it where the skin is solved with effects
-_SURE = 0.02  # of them, where the skin itself is asked for
+_SURE = 0.02  # of them, with `exact`
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
 # what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
@@ -112,7 +112,7 @@ class Simulator:
         """A copy with other fields.
 
         Args:
-          models: its skins by bubble, and its "film", where they are made; None makes them when asked for.
+          models: its skins by bubble, and its "film", where they are made; None makes them on first use.
         """
         other = copy.copy(self)
         other.__dict__.update(changes, _models={} if models is None else models)
@@ -208,7 +208,7 @@ class Simulator:
 
         model, film = self.skin_and_film(log_friction, bubble)  # kept: made once
         longest = max(len(pos) for _, _, pos, _, _, _ in todo)
-        # who has arrived waits there
+        # shorter trajectories wait at their end
         rows = [np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _, _ in todo]
         motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _, _) in zip(rows, todo)]
         times = [_waiting(time, longest) for *_, time, _ in todo]
@@ -264,8 +264,8 @@ class Simulator:
         return solved_fields(self, trajectories, progress, places)
 
     def stick(self, fields: "Fields", work: float, near: float = _NEAR) -> bool:
-        """Solves the skin with a contact of so much work of joining [J/m2], as `Adhesion` says it, and keeps
-        with the fields what that changes: pull-off is no straight line of the work.
+        """Solves the skin with a contact of this work of adhesion [J/m2], see `Adhesion`, and stores its
+        effect in the fields: pull-off is not linear in the work.
 
         Returns: whether that was needed and could be; not where it was solved near it (by `near` of it)
         already, nor where the contact reaches farther than the distance to a tool's mesh is exact: the
