@@ -124,6 +124,8 @@ def _starts(presses, signal, noise):
     return chosen
 
 
+# scipy.optimize.least_squares takes no scale of the noise that is estimated with the fit, and no step that
+# cannot be simulated
 class _Search:
     """Search from one press of the table."""
 

@@ -68,6 +68,8 @@ def sparse_product(pair: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tenso
     return _Product.apply(flat, *pair).reshape(-1, *x.shape[1:])
 
 
+# torch_geometric's ChebConv takes the edges of a graph at each call and gathers along them; the mesh is
+# constant, so that one sparse matrix serves all calls and their gradients
 class ChebConv(nn.Module):
     """y = sum over k < K of T_k(L) x W_k + b on a graph; L the scaled Laplacian, T_k Chebyshev polynomials
     (Defferrard et al., 2016).

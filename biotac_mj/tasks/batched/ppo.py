@@ -9,6 +9,8 @@ import torch
 from .policy import Network, Policy
 
 
+# RSL-RL and skrl, for which `libraries` has adapters, train one policy in all worlds of an environment and
+# have no imitation of a teacher; here policies of several kinds of touch share the worlds of one batch
 @dataclasses.dataclass(frozen=True)
 class Numbers:
     """Settings of both methods.
