@@ -11,7 +11,7 @@ import numpy as np
 
 from ..geometry.indenters import INDENTERS
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix, quaternion_from_y
-from ..press.indenter import Indenter, make_indenter
+from ..press.indenter import Indenter, make_indenter, solid
 from ..skin.contact.meshes import DistanceGrid, bake_distance_grid
 from ..triangles import trimesh
 
@@ -33,26 +33,13 @@ OBJECTS = (*INDENTERS, *PEGS, *TABLE)
 
 def _box(name, half, turn):
     """A rounded box, rotated about its centre and shifted so that its foremost point is at the origin."""
-    half, inner = np.array(half), np.array(half) - _EDGE
     quat = (
         UPRIGHT
         if turn is None
         else quaternion_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
     )
-    rotation = matrix(quat)
-    reach = np.abs(rotation[1]) @ inner + _EDGE
-    pos = np.array([0.0, -reach, 0.0])
-    mesh = trimesh.creation.box(extents=2 * half)  # for rays and pictures, with sharp edges
-    return Indenter(
-        name, "box", tuple(half), _EDGE, pos, quat, mesh.vertices @ rotation.T + pos, np.asarray(mesh.faces)
-    )
-
-
-def _cylinder(name, radius):
-    pos = np.array([0.0, -_LENGTH / 2, 0.0])
-    mesh = trimesh.creation.cylinder(radius=radius, height=_LENGTH, sections=96)
-    vert = mesh.vertices @ matrix(Z_TO_Y).T + pos
-    return Indenter(name, "cylinder", (radius, _LENGTH / 2), _EDGE, pos, Z_TO_Y, vert, np.asarray(mesh.faces))
+    reach = np.abs(matrix(quat)[1]) @ (np.array(half) - _EDGE) + _EDGE
+    return solid(name, "box", half, quat, np.array([0.0, -reach, 0.0]), _EDGE)
 
 
 def _prism(name, corners, width):
@@ -84,13 +71,12 @@ def make_object(name: str) -> Indenter:
             f"choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
         )
     if name in TABLE:
-        half = 3 * [_TABLE]
-        return _box(
-            name, half, {"table_surface": None, "table_edge": (0, 1, 1), "table_corner": (1, 1, 1)}[name]
-        )
+        turn = {"table_surface": None, "table_edge": (0, 1, 1), "table_corner": (1, 1, 1)}[name]
+        return _box(name, (_TABLE, _TABLE, _TABLE), turn)
     kind, width = name.split("_")[1], float(name.split("_")[2][:-2]) * 1e-3
     if kind == "round":
-        return _cylinder(name, width / 2)
+        pos = np.array([0.0, -_LENGTH / 2, 0.0])
+        return solid(name, "cylinder", (width / 2, _LENGTH / 2), Z_TO_Y, pos, _EDGE)
     if kind == "square":
         return _box(name, (width / 2, _LENGTH / 2, width / 2), None)
     return _prism(name, {"hexagon": 6, "triangle": 3}[kind], width)

@@ -67,6 +67,19 @@ def _surface(kind, size):
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
+def solid(
+    name: str,
+    kind: str,
+    size: tuple,
+    quat: np.ndarray,
+    pos: np.ndarray = np.zeros(3),  # noqa: B008 - never written to
+    rounding: float = 0.0,
+) -> Indenter:
+    """An indenter that is a MuJoCo geom; its surface has sharp edges."""
+    vert, face = _surface(kind, size)
+    return Indenter(name, kind, size, rounding, pos, quat, vert @ matrix(quat).T + pos, face)
+
+
 def _from_geom(text):
     kind, _, sizes = text.partition(":")
     if kind not in _SIZES:
@@ -91,8 +104,7 @@ def _from_geom(text):
         )
     if kind != "plane":
         check_size(2 * max(size), f"indenter geom:{text}", _SMALLEST, _LARGEST)
-    vert, face = _surface(kind, size)
-    return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), Z_TO_Y, vert @ matrix(Z_TO_Y).T, face)
+    return solid(f"geom:{text}", kind, size, Z_TO_Y)
 
 
 def _from_file(path):
