@@ -73,6 +73,7 @@ def _features(touch):
     return np.concatenate([np.ones((len(touch), 1)), shape, shape[:, i] * shape[:, j], touch], axis=1)
 
 
+# not `learning.instants.linear`: its fits need scikit-learn, which tasks do without
 @dataclasses.dataclass(frozen=True)
 class Estimator:
     """Ridge regression of hidden quantities on one BioTac's touch and quadratic features of its shape.
