@@ -57,11 +57,11 @@ DESIGN_ROWS = {
     "every feature of skin and sensor above": ("yes", "yes", "yes; film and liquid where there is a core"),
     "effects of a running sensor, `randomise`": ("yes", "yes", "yes"),
     'sensors as measured; `"random"`': ("eight; yes", "three; yes", "one, what the film conducts; no"),
-    "`import`, `show`, `diagnose` of logs": ("yes", "yes", "no: logs are told by 19 or 24 electrodes"),
+    "`import`, `show`, `diagnose` of logs": ("yes", "yes", "no: logs are recognised by 19 or 24 electrodes"),
     "calibrate (forces alone)": ("yes", "yes", "yes"),
     "compare": ("yes", "no: the paper's configurations are of a BioTac", "no, likewise"),
     "data sets (`generate`, LeRobot), `estimate`": ("yes", "yes", "yes, where it has electrodes"),
-    "`data import`, `resimulate`": ("yes", "yes", "no: recordings are told by 19 or 24 electrodes"),
+    "`data import`, `resimulate`": ("yes", "yes", "no: recordings are recognised by 19 or 24 electrodes"),
     "models and states of MuJoCo (`data export --form mujoco`)": (
         "yes",
         "no: the model is a BioTac",
@@ -313,8 +313,9 @@ _READINGS = (
 
 # How `mj_step` and `mujoco_warp.step` find the force of a skin and the motion of bodies together.
 _COUPLING = (
-    ("`status` tells how the step went: tier, steps without a balance, rounds, share of the bodies' way, "
-     "share of the push on a body that was withheld", "attach, condensed, batch; generate keeps `converged`"),
+    ("`status` of a step: tier, steps without equilibrium, rounds, fraction of the bodies' motion that was "
+     "reached, fraction of the push on a body that was withheld",
+     "attach, condensed, batch; generate keeps `converged`"),
     ("Two-way, skin and bodies are solved in rounds until they agree. A skin that cannot be solved where the "
      "bodies go is solved on the way there. Core, nail and clamp are solid. No blow gives back more energy "
      "than it put in", "attach, condensed, batch"),
@@ -327,13 +328,13 @@ _COUPLING = (
      "resimulate)"),
     ("The round that came closest counts. At first touch a skin lends no energy",
      "attach, condensed, batch"),
-    ("A round that went too far goes back. Where MuJoCo's solver is a dual one (PGS, noslip) the balance is "
-     "found with its Newton solver and acts as forces", "attach, condensed; mujoco_warp has no PGS"),
+    ("A round that went too far goes back. Where MuJoCo's solver is a dual one (PGS, noslip) the equilibrium "
+     "is found with its Newton solver and acts as forces", "attach, condensed; mujoco_warp has no PGS"),
     ("A skin at rest is first solved where a geom begins to touch it, and then as deep as the core allows. "
-     "The energy in a skin into which a body was put is unknown until a balance is found",
+     "The energy in a skin into which a body was put is unknown until an equilibrium is found",
      "attach (on the CPU), condensed, batch; attach on CUDA: as deep as the force on the way allows"),
     ("Where a body is too deep for any skin to fit, the skin goes along the core with it", "condensed"),
-    ("All solves of a step share one bound on their work. After a step without a balance in which no body "
+    ("All solves of a step share one bound on their work. After a step without equilibrium in which no body "
      "could give way, or another BioTac's skin did, the next one may do four times as much",
      "attach, condensed; batch: bounds of its own, by iterations"),
     ("A try that comes no nearer has 40 iterations before it is given up. Where friction makes the tangent "
@@ -346,7 +347,7 @@ _COUPLING = (
      "step, and their forces act in all stages", "attach, condensed; refused in batches"),
     ("Energy is counted along the way that bodies went, along arcs where joints turn",
      "attach, condensed, batch"),
-    ("Several skins on one body search for their balance together",
+    ("Several skins on one body search for their equilibrium together",
      "attach, condensed; batch: each by itself"),
     ("`<flag contact=\"disable\"/>`: the skin touches nothing either",
      "attach, condensed, looked at in every step; batch, when it is attached"),
@@ -414,7 +415,7 @@ _GRADIENTS = [
     ("place and force of a contact from electrodes, with intervals", "`biotac lab estimate`, `Estimator`",
      "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
      "labelled touches of the sensor by `--known`"),
-    ("kinks and jumps: first touch, stick and slip, rubber's memory, sharp edges, no balance",
+    ("kinks and jumps: first touch, stick and slip, rubber's memory, sharp edges, no equilibrium",
      "`Pressed.changes`, `Pressed.counts`", "counted in every step"),
     ("first touch, and the change from stick to slip, smoothed", "`press(smoothing=)`",
      "yes, of what touches the skin; contact with the core keeps its kinks"),
