@@ -114,7 +114,7 @@ def import_recordings(
     Args:
       paths: files. out: folder of the set; it must not contain one.
       seed: of the split. block: see `interactions`. options: of `recordings.load`.
-      say: gets doubts about a recording, line by line.
+      say: called with each remark on a recording.
 
     Returns:
       number of interactions.

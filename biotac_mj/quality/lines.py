@@ -124,10 +124,10 @@ def _peak(x, size, rate):
     every = list(range(x.shape[1]))
     best = None
     many = [(every, common * 3)] if len(every) > 1 else []
-    for who, score in [*many, *(([k], ratio[:, k]) for k in every)]:
+    for channels, score in [*many, *(([k], ratio[:, k]) for k in every)]:
         i = int(np.argmax(np.where(inside, score, 0)))
         if best is None or score[i] > best[0]:
-            best = float(score[i]), float(f[i]), who
+            best = float(score[i]), float(f[i]), channels
     score, frequency, channels = best
     if score < _LEAST:
         return None

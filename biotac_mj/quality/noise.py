@@ -54,8 +54,8 @@ def noisy(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         return []
     law = sound_noise(np.median(x, axis=0))
     level = np.log([noise_level(part) for part in np.array_split(x, BLOCKS)])
-    beside = (r - np.median(r[:, sound], axis=1, keepdims=True) for r in (level, level - np.log(law)))
-    more = np.minimum(*beside)
+    residuals = (r - np.median(r[:, sound], axis=1, keepdims=True) for r in (level, level - np.log(law)))
+    more = np.minimum(*residuals)
     edges = np.linspace(0, len(x) - 1, BLOCKS + 1).astype(int)
     found = []
     for k in np.flatnonzero(sound):

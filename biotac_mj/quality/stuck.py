@@ -90,8 +90,8 @@ def _quiet(log, rows):
     lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
     usual, loud = (_middle(values, lively) for values in (size, law))
     law, size = _noise(x)
-    heard = usual[~np.isnan(usual)]
-    others = np.median(heard) if heard.size else 0.0  # of a log in which nothing has noise
+    noisy = usual[~np.isnan(usual)]
+    others = np.median(noisy) if noisy.size else 0.0  # of a log in which nothing has noise
     # ignore spikes, bursts, and channels that jittered from the start
     usual = np.where(usual > _QUIET * others, np.minimum(usual, others), others)
     # without noise a constant reading is no evidence

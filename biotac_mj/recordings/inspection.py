@@ -18,7 +18,7 @@ _ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or 
 
 def findings(recording: Recording) -> list[str]:
     """Findings, one line each: first the content, last the importer's notes. Lines that begin with "warning:
-    " come from `faults` and `doubts`.
+    " come from `faults` and `remarks`.
 
     Raises:
       TypeError: not a Recording.
@@ -38,7 +38,7 @@ def findings(recording: Recording) -> list[str]:
         + _repeated(recording, wrong)
         + _units(recording)
         + _levels(recording, wrong)
-        + [f"warning: {line}" for line in (*(fault.message for fault in wrong), *doubts(recording))]
+        + [f"warning: {line}" for line in (*(fault.message for fault in wrong), *remarks(recording))]
         + _missing(recording)
         + [note for note in recording.notes if not note.startswith(CLOCK_FAULT)]
     )
@@ -56,17 +56,17 @@ def faults(recording: Recording) -> list[Fault]:
 
 
 def warnings(recording: Recording) -> list[str]:
-    """Reasons to doubt a recording, one line each: electrodes that never change, and `doubts`.
+    """Reasons to doubt a recording, one line each: electrodes that never change, and `remarks`.
 
     Raises:
       TypeError: not a Recording.
     """
     check_recording(recording)
     log, _ = _log(recording)
-    return [*(fault.message for fault in (dead(log) if log is not None else [])), *doubts(recording)]
+    return [*(fault.message for fault in (dead(log) if log is not None else [])), *remarks(recording)]
 
 
-def doubts(recording: Recording) -> list[str]:
+def remarks(recording: Recording) -> list[str]:
     """Reasons for doubt other than single electrodes, one line each: no electrode changes, channels or a
     force are constant, a clock ran back.
 

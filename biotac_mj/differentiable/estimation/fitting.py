@@ -173,7 +173,7 @@ class _Search:
             slope = slope / np.sqrt(slope @ spread @ slope)
             move = spread @ slope
             try:
-                ends = [self._simulate(press.at + way * move) for way in (-1, 1)]
+                ends = [self._simulate(press.at + sign * move) for sign in (-1, 1)]
             except NoFilmError:
                 break
             missed, outcome = (

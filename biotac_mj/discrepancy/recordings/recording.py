@@ -14,7 +14,7 @@ from ...quality.clock import guessed_rate
 from ...quality.repeats import repeated_rows
 from ...recordings import Recording, load
 from ...recordings.importers import choose
-from ...recordings.inspection import check_clock, doubts
+from ...recordings.inspection import check_clock, remarks
 from ...recordings.recording import rest_correlation
 from ...sensor.channels import check_counts, check_force
 
@@ -235,7 +235,7 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
         tdc = None
     missing, faults = check_clock(found, counts)
     left = (note for note in found.notes if "left out" in note)
-    said = (*doubts(found), *lacks, *(fault.message for fault in faults), *left)
+    said = (*remarks(found), *lacks, *(fault.message for fault in faults), *left)
     source = found.rate_source
     since = found.time - begin
     out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit, since)

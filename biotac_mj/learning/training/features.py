@@ -181,5 +181,5 @@ def mirror_order(geometry: SkinGeometry) -> np.ndarray | None:
     not symmetric."""
     flip = np.array([1, 1, -1])
     off, order = cKDTree(geometry.electrode_pos).query(geometry.electrode_pos * flip)
-    beside = np.linalg.norm(mirror_matrix(geometry) @ geometry.vert - geometry.vert * flip, axis=1)
-    return order if max(off.max(), np.quantile(beside, 0.98)) < SAME_SHAPE else None
+    error = np.linalg.norm(mirror_matrix(geometry) @ geometry.vert - geometry.vert * flip, axis=1)
+    return order if max(off.max(), np.quantile(error, 0.98)) < SAME_SHAPE else None

@@ -216,7 +216,7 @@ def _eliminate(
     __syncthreads();
 #endif
 """)
-def _together(): ...
+def _synchronize(): ...
 
 
 # For each tile along the diagonal: factor the tile, solve for the tiles right of it and its right-hand
@@ -408,7 +408,7 @@ def solve_sheet(
         trial_out[w, e] = cell_constant[w % cell_constant.shape[0], e] * driving_point(
             e, w, trial_out.shape[1], pattern.disc, system_out, local, network, conductivity
         )
-    _together()
+    _synchronize()
     if t == 0:
         valid = int(1)
         for e in range(trial_out.shape[1]):
