@@ -114,11 +114,7 @@ def _energy_kernel(kind):
 
     @wp.kernel(module=f"{__name__}.{kind.module}", enable_backward=False)
     def energy(
-        cap: real,
-        rubber: Rubber,
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
-        energy_out: wp.array2d(dtype=real),
+        cap: real, rubber: Rubber, mesh: Mesh, x: wp.array2d(dtype=vec3), energy_out: wp.array2d(dtype=real)
     ):
         e, w = wp.tid()
         mu = rubber.mu[w]

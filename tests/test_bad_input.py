@@ -934,11 +934,7 @@ OUT = {
     "data resimulate electrodes.txt": ("--out", "resimulate.json"),
     "learn predict inverse electrodes.txt": ("--out", "contact.png"),
 }
-OUT_FILES = {
-    "learn judge trained": "--json",
-    "view": "--render",
-    "lab estimate electrodes.txt": "--out",
-}
+OUT_FILES = {"learn judge trained": "--json", "view": "--render", "lab estimate electrodes.txt": "--out"}
 # what is read, before its name, and a file of that name that the verb writes
 OVER_FOLDERS = {
     "press --effects ": "readings.csv",

@@ -102,10 +102,7 @@ def test_a_loop_of_ones_own_is_a_recording_and_a_bag(loop, tmp_path):
 def test_rows_that_are_no_reading_are_said(loop):
     time, reads, _ = loop
     for rows, text in (
-        (
-            [*reads[:1], reads[1]["electrodes"]],
-            "row 1 has no electrodes, pdc, pac, tdc, tac, contact_force",
-        ),
+        ([*reads[:1], reads[1]["electrodes"]], "row 1 has no electrodes, pdc, pac, tdc, tac, contact_force"),
         ([{k: v for k, v in reads[0].items() if k != "pac"}], "row 0 has no pac: give what finger.read"),
         (reads[1:], "20 times for 19 rows: give one for each, and one at least"),
         ([], "20 times for 0 rows"),

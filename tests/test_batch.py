@@ -662,9 +662,7 @@ def test_memory_and_liquids_of_worlds_equal_single_worlds():
     paths = start + np.arange(1, 7)[:, None, None] / 6 * np.array(depth)[:, None] * inwards
     mine = {"contact_law": {"adhesion_range": 5e-5} | {k: v[0] for k, v in law.items()}}
     expected = single(
-        paths[:, 0],
-        shell(),
-        {"material": rubber[0], "options": {"skin": skin | mine, "modulus": modulus[0]}},
+        paths[:, 0], shell(), {"material": rubber[0], "options": {"skin": skin | mine, "modulus": modulus[0]}}
     )[:, :3]
     np.testing.assert_allclose(got[0], expected, atol=2e-3 * abs(expected).max())
 

@@ -131,12 +131,7 @@ def test_batch_columns_equal_single_runs(shell):
     force, jacobian, _ = forces_and_jacobian(shell, TRUTH, names, values, way)
     alone = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
     np.testing.assert_allclose(force, alone, atol=1e-5)
-    for i, change in enumerate(
-        (
-            dict(poissons_ratio=0.38 + 0.00245),
-            dict(friction=0.5 * np.exp(0.01)),
-        )
-    ):
+    for i, change in enumerate((dict(poissons_ratio=0.38 + 0.00245), dict(friction=0.5 * np.exp(0.01)))):
         moved = simulate(shell.geometry, shell.options, [dataclasses.replace(TRUTH, **change)], way).force[0]
         column = (moved - alone) / 0.01
         assert np.linalg.norm(jacobian[..., i] - column) < 0.02 * np.linalg.norm(column), names[i].name
@@ -347,11 +342,7 @@ class Touches:
 
 def test_parts_are_kept_bit_for_bit(tmp_path, monkeypatch):
     path, plan = tmp_path / "parts.kept", plan_shear(skin="coarse")
-    made = {
-        "plan": plan,
-        "fit": fitted(),
-        "compared": _compared("solid", TRUTH),
-    }
+    made = {"plan": plan, "fit": fitted(), "compared": _compared("solid", TRUTH)}
     first = Kept(path, [{"seed": 1, "names": ("a", "b")}])
     for name, part in made.items():
         first.get(name, type(part), lambda part=part: part)

@@ -668,9 +668,7 @@ def test_runge_kutta_does_not_throw_what_is_light(mass, timestep, stiffness):
     assert np.abs(data.qvel).max() < 1e-6 and handle.read(data, "status")[0] == 1
 
 
-@pytest.mark.parametrize(
-    "integrator", ["RK4", pytest.param("Euler", marks=pytest.mark.slow), "implicitfast"]
-)
+@pytest.mark.parametrize("integrator", ["RK4", pytest.param("Euler", marks=pytest.mark.slow), "implicitfast"])
 def test_a_smooth_press_is_of_second_order(integrator):
     """1 kg on a slide is pressed smoothly, but for the springs that it meets: against steps of 0.2 ms."""
 

@@ -648,9 +648,7 @@ def test_a_skin_at_rest_is_what_a_solve_would_leave(options):
 
 def test_a_geom_inside_the_core_presses_though_no_skin_feels_it():
     stepper = fem.FemStepper(
-        Config(skin="coarse", coupling="one-way"),
-        SKIN,
-        [Geom("b", "sphere", [3e-3, 0, 0], 0.5, 0)],
+        Config(skin="coarse", coupling="one-way"), SKIN, [Geom("b", "sphere", [3e-3, 0, 0], 0.5, 0)]
     )
     state = np.empty(stepper.nstate)
     stepper.reset(state)

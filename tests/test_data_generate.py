@@ -112,11 +112,7 @@ def test_first_touch_is_where_rays_find_it(skin, name):
 
     quat = quaternion_from_y(direction)
     got = first_touch(
-        Placed(name, 1),
-        points,
-        (point - 0.05 * direction)[None],
-        matrix(quat)[None],
-        direction[None],
+        Placed(name, 1), points, (point - 0.05 * direction)[None], matrix(quat)[None], direction[None]
     )[0]
     spec = mujoco.MjSpec()
     shape = make_indenter(name)

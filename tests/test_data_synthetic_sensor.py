@@ -13,10 +13,7 @@ from biotac_mj.data.generation.liquid_conduction import LiquidConduction
 from biotac_mj.data.generation.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, Waves, relax
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.making.pads import column_tetrahedra
-from biotac_mj.sensor.channels import (
-    counts_from_impedance,
-    impedance_from_counts,
-)
+from biotac_mj.sensor.channels import counts_from_impedance, impedance_from_counts
 from biotac_mj.sensor.film import EXCITATION, FilmConduction
 
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])

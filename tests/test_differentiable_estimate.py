@@ -224,11 +224,7 @@ def test_touches_teach_a_sensors_gains(estimator, pressed):
     draw = np.random.default_rng(0)
     touches = [
         press(
-            estimator,
-            draw.uniform(-0.0125, -0.007),
-            draw.uniform(-0.3, 0.7),
-            draw.uniform(0.4, 0.9),
-            gain,
+            estimator, draw.uniform(-0.0125, -0.007), draw.uniform(-0.3, 0.7), draw.uniform(0.4, 0.9), gain
         )[2]
         for _ in range(6)
     ]

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from biotac_mj import calibration, cli, differentiable
-from biotac_mj.calibration import (
-    calibrate,
-    configuration,
-    parameter,
-    plan_indentation,
-    simulate,
-)
+from biotac_mj.calibration import calibrate, configuration, parameter, plan_indentation, simulate
 from biotac_mj.calibration.fit import forces_and_jacobian
 from biotac_mj.calibration.indentation import write_indentation
 from biotac_mj.differentiable.fit import Forces, forces_of

@@ -17,11 +17,7 @@ from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forw
 from biotac_mj.skin import Material
 from biotac_mj.skin.program import Launcher
 
-MEMORY = {
-    "prony": ((0.5, 0.03), (0.3, 0.4)),
-    "mullins": (1.6, 2e3, 0.1),
-    "hysteresis": ((0.4, 0.03),),
-}
+MEMORY = {"prony": ((0.5, 0.03), (0.3, 0.4)), "mullins": (1.6, 2e3, 0.1), "hysteresis": ((0.4, 0.03),)}
 ALL = tuple(MEMORY)
 # by which each of their constants is moved
 UNITS = {"prony": [[1.0, 0.05], [1.0, 0.5]], "mullins": [10.0, 1e4, 1.0], "hysteresis": [[1.0, 0.05]]}

@@ -104,10 +104,7 @@ def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
             "line 1: e1 is 'x1', not a finite number",
         ),
         ((" ".join(["0.5"] * 19) + "\n") * 500, "look like normalised values"),
-        (
-            (" ".join(["-40"] * 19) + "\n") * 500,
-            "no electrode changes from -40, .* record again",
-        ),
+        ((" ".join(["-40"] * 19) + "\n") * 500, "no electrode changes from -40, .* record again"),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
         (
             ",".join(["time", *(f"e{i}" for i in range(1, 20))]) + "\n0" + ",2000" * 19 + "\n",
@@ -742,10 +739,7 @@ def test_each_electrode_of_the_overview_has_its_own_color():
 
 @pytest.mark.parametrize(
     ("there", "rows", "text"),
-    [
-        (slice(3, 1000), (3, 1000), "only rows 4 to 1000 took part"),
-        (slice(0, 300), None, "it took no part"),
-    ],
+    [(slice(3, 1000), (3, 1000), "only rows 4 to 1000 took part"), (slice(0, 300), None, "it took no part")],
 )
 def test_a_force_that_is_not_there_in_all_rows(there, rows, text):
     """As where forces of another clock were interpolated and began later."""

@@ -138,8 +138,7 @@ def test_bad_tetrahedra(folder, coarse):
 def test_wrong_units(folder, coarse, factor, size, remedy):
     write_tet(folder / "skin.tet", coarse.vert * factor, coarse.elem)
     with pytest.raises(
-        ValueError,
-        match=rf"largest dimension is {size}.* mm, not between 5 and 100 mm: {remedy}",
+        ValueError, match=rf"largest dimension is {size}.* mm, not between 5 and 100 mm: {remedy}"
     ):
         import_mesh(folder)
 

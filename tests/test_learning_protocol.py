@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from biotac_mj.learning.protocol import (
-    conformal_width,
-    interaction_errors,
-    paired_test,
-    quartiles,
-)
+from biotac_mj.learning.protocol import conformal_width, interaction_errors, paired_test, quartiles
 
 
 def test_errors_are_averaged_within_an_interaction_first():

@@ -142,18 +142,7 @@ def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
     counts, force = synthetic_log(800)
     e, f = write(tmp_path, counts, force)
     assert (
-        main(
-            [
-                "learn",
-                "judge",
-                str(e),
-                "--force",
-                str(f),
-                "--json",
-                str(tmp_path / "o.json"),
-                "--quiet",
-            ]
-        )
+        main(["learn", "judge", str(e), "--force", str(f), "--json", str(tmp_path / "o.json"), "--quiet"])
         == 0
     )
     text = capsys.readouterr().out

@@ -53,15 +53,7 @@ def trained(folder, tmp_path_factory):
     """One training of our models on both kinds of split."""
     out = tmp_path_factory.mktemp("trained")
     torch.set_num_threads(1)
-    train_all(
-        folder,
-        out,
-        (0,),
-        ("trajectory", "ring_7mm"),
-        SMALL,
-        paper=False,
-        progress=False,
-    )
+    train_all(folder, out, (0,), ("trajectory", "ring_7mm"), SMALL, paper=False, progress=False)
     return out
 
 
@@ -180,10 +172,9 @@ def test_the_papers_networks_train_too(folder, tmp_path):
     )
     train_all(folder, tmp_path, (0,), ("trajectory",), config, progress=False)
     report = json.loads((tmp_path / "trajectory-0.json").read_text())
-    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {
-        "pod_inverse_taught",
-        "latent_inverse",
-    } == set(report["inverse"])
+    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {"pod_inverse_taught", "latent_inverse"} == set(
+        report["inverse"]
+    )
     assert {"latent_projection", "pointnet", "electrode_vae"} <= set(
         evaluate_models(tmp_path)["splits"]["trajectory"]["models"]
     )

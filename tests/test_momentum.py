@@ -74,10 +74,7 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
 
 @pytest.mark.parametrize(
     "integrator, tier, speed",
-    [
-        pytest.param("Euler", "full", 2.22, marks=pytest.mark.slow),
-        ("implicit", "condensed", 2.2),
-    ],
+    [pytest.param("Euler", "full", 2.22, marks=pytest.mark.slow), ("implicit", "condensed", 2.2)],
 )
 def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier, speed):
     """A light body that hits at 2 m/s, rolls and sticks by turns, at a long step."""

@@ -190,11 +190,7 @@ def test_a_press_has_the_settings_of_attach():
     for wrong, kind, said in (
         ({"depht": 1e-3}, TypeError, "has 'depht': did you mean 'depth'"),
         ({"coupling": "two-way"}, TypeError, "a call of PressOptions has 'coupling'"),
-        (
-            {"settings": {"contact": {"geoms": ["ball"]}}},
-            ValueError,
-            "geoms of settings is .'ball'",
-        ),
+        ({"settings": {"contact": {"geoms": ["ball"]}}}, ValueError, "geoms of settings is .'ball'"),
         ({"friction": -1.0}, ValueError, "the skin's friction is -1.0: give a finite number >= 0"),
         ({"seed": 0.5}, ValueError, "seed is 0.5: give a whole number"),
         ({"material": "jelly"}, ValueError, "unknown material 'jelly'"),

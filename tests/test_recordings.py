@@ -724,8 +724,7 @@ def test_commands(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "gone",
-    first([(), ("electrodes",), ("pac", "tdc"), ("pdc", "tac", "force", "torque", "object_pos")]),
+    "gone", first([(), ("electrodes",), ("pac", "tdc"), ("pdc", "tac", "force", "torque", "object_pos")])
 )
 def test_a_picture_of_whatever_there_is(tmp_path, gone):
     from biotac_mj.recordings import draw

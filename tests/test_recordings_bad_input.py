@@ -338,10 +338,7 @@ def others():
         lambda p: p.write_bytes(b"#ROSBAG V2.0\n" + bytes(99)),
     )
     yield Row("recording import a.mcap --out out.h5", "a.mcap is no .mcap file", "a.mcap", text("no"))
-    yield Row(
-        "learn judge rec.h5 --force f.txt",
-        "f.txt cannot be put beside synthetic, which is complete",
-    )
+    yield Row("learn judge rec.h5 --force f.txt", "f.txt cannot be put beside synthetic, which is complete")
     yield Row("recording record --out out.h5", "one of the arguments --topic --serial is required")
     yield Row("recording record --topic /a --serial b --out out.h5", "not allowed with")
     yield Row("recording record --topic /a --seconds -1 --out out.h5", "--seconds")

@@ -185,8 +185,7 @@ def test_numpy_clock_of_dates(tmp_path, form):
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(np.array([{}, 1]), "no NumPy file"), (np.zeros((2, 3, 19)), r"shape \(2, 3, 19\)")],
+    ("value", "text"), [(np.array([{}, 1]), "no NumPy file"), (np.zeros((2, 3, 19)), r"shape \(2, 3, 19\)")]
 )
 def test_numpy_that_is_no_table(tmp_path, value, text):
     np.save(tmp_path / "r.npy", value, allow_pickle=True)

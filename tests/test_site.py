@@ -113,13 +113,7 @@ def test_the_site_builds(repo, tmp_path):
         pytest.importorskip(name, reason="the site needs the extra docs: make docs")
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
     done = subprocess.run(
-        [
-            *command,
-            "-d",
-            tmp_path / "trees",
-            repo / "docs",
-            tmp_path / "site",
-        ],
+        [*command, "-d", tmp_path / "trees", repo / "docs", tmp_path / "site"],
         capture_output=True,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},

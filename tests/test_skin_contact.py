@@ -5,16 +5,7 @@ import pytest
 from blocks import boundary, box, faces_on, half_space, place, shell, skin
 from grids import covering
 
-from biotac_mj.skin import (
-    ContactLaw,
-    GeomSet,
-    Material,
-    SkinData,
-    SkinModel,
-    SkinOptions,
-    prepare_step,
-    step,
-)
+from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, prepare_step, step
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.contact.touch import CONSISTENT, CURRENT, LAGGED, RECORDED

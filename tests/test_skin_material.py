@@ -8,16 +8,7 @@ from forces import energy_of
 from scipy.linalg import polar as scipy_polar
 from scipy.optimize import brentq
 
-from biotac_mj.skin import (
-    PRESETS,
-    GeomSet,
-    Material,
-    SkinData,
-    SkinModel,
-    SkinOptions,
-    material,
-    step,
-)
+from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, material, step
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.rubber.element_forces import ElementForces
 from biotac_mj.skin.rubber.law import LAWS, polar, polar_single

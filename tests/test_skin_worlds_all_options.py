@@ -106,7 +106,7 @@ def alone(n, w, device):
     materials, values, ways = draw(n)
     mine = {name: value[w] for name, value in values.items()}
     law = ContactLaw(
-        *(mine[k] for k in ("friction_exponent", "friction_pressure", "adhesion", "adhesion_hysteresis")),
+        *(mine[k] for k in ("friction_exponent", "friction_pressure", "adhesion", "adhesion_hysteresis"))
     )
     bulk, fill = mine["bulk_modulus"], mine["fill_volume"]
     options = dataclasses.replace(OPTIONS, contact_law=law, liquid=bool(bulk))

@@ -401,10 +401,7 @@ def test_a_model_is_shown_while_it_steps():
 @pytest.mark.parametrize(
     "arguments, text",
     [
-        (
-            ["play", "/no/such.h5"],
-            "no recording at /no/such.h5: make one with `biotac press --out DIR`",
-        ),
+        (["play", "/no/such.h5"], "no recording at /no/such.h5: make one with `biotac press --out DIR`"),
         (["play", "notask"], "give a task: roll_rod, insert_peg, follow_edge"),
         (["play", __file__], "is no recording"),
         (

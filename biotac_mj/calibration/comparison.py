@@ -61,10 +61,7 @@ class Comparison:
 
 
 def plan_indentations(
-    count: int,
-    indenters: list | tuple | None = INDENTERS,
-    seed: int = 0,
-    skin: str = "coarse",
+    count: int, indenters: list | tuple | None = INDENTERS, seed: int = 0, skin: str = "coarse"
 ) -> list:
     """`count` random indentations for each indenter: location on the pad, depth, direction up to 25 degrees
     off the normal, and a slide.

@@ -22,12 +22,7 @@ from .refinement import skin as named_skin
 from .report import calibration_table, write_json, write_picture
 
 # arguments for the synthetic skin only, and their defaults
-_TRUTH = {
-    "truth": "rubber",
-    "truth_skin": None,
-    "noise": 0.01,
-    "truth_liquid": None,
-}
+_TRUTH = {"truth": "rubber", "truth_skin": None, "noise": 0.01, "truth_liquid": None}
 _REFERENCE = {"skin": "coarse", "element": "quadratic"}  # of the stand-in
 _NO_SETTINGS = (
     "configurations",
@@ -79,13 +74,7 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
         met = mesh_of_same_design(args.skin, "coarse")
         plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction, skin=met)
         data = stand_in(
-            plan,
-            args.truth,
-            args.truth_skin,
-            args.noise,
-            args.seed,
-            args.truth_liquid,
-            device=args.device,
+            plan, args.truth, args.truth_skin, args.noise, args.seed, args.truth_liquid, device=args.device
         )
         write_indentation(data, out / "synthetic.csv")
         truth = read_material(args.truth)

@@ -26,9 +26,7 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         "(docs/lab/discrepancy.md)",
     )
     verb.add_argument(
-        "--object",
-        metavar="NAME",
-        help="object in DATA, if the file does not name it, such as sphere_7mm",
+        "--object", metavar="NAME", help="object in DATA, if the file does not name it, such as sphere_7mm"
     )
     verb.add_argument(
         "--repeatability",

@@ -194,10 +194,7 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     )
     add_load_arguments(verb)
     verb.add_argument(
-        "--rest",
-        type=whole(1, 10**6),
-        default=1,
-        help="first rows, whose mean is the sensor at rest",
+        "--rest", type=whole(1, 10**6), default=1, help="first rows, whose mean is the sensor at rest"
     )
     verb.add_argument(
         "--sensor", metavar="NAME", help="sensor of the rest counts if no row is without contact, such as 1"

@@ -200,9 +200,7 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
         help="MJCF of a hand: show it with BioTacs on its fingertips and a ball instead",
     )
     verb.add_argument(
-        "--mount",
-        metavar="FILE",
-        help="with --hand: file of `biotac hand mount` for an unknown hand",
+        "--mount", metavar="FILE", help="with --hand: file of `biotac hand mount` for an unknown hand"
     )
 
 

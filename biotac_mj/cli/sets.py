@@ -44,10 +44,7 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         help="of the skin (default: the material's, or the mesh's)",
     )
     verb.add_argument(
-        "--batch",
-        type=whole(1, 100_000),
-        default=160,
-        help="most worlds in a batch; a shard holds one batch",
+        "--batch", type=whole(1, 100_000), default=160, help="most worlds in a batch; a shard holds one batch"
     )
     verb.add_argument(
         "--measured-batch",

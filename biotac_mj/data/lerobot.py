@@ -18,12 +18,7 @@ from .schema import SPLITS
 VERSION = "v3.0"
 _FILE_MB = 100  # of one data file, lerobot's default
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_CONTACT = {
-    "pos": ("x", "y", "z"),
-    "normal": ("x", "y", "z"),
-    "depth": ("depth",),
-    "area": ("area",),
-}
+_CONTACT = {"pos": ("x", "y", "z"), "normal": ("x", "y", "z"), "depth": ("depth",), "area": ("area",)}
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _REAL = ("recorded", "resimulated")  # kinds with measured counts of a real sensor
 _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")

@@ -292,10 +292,7 @@ _LEVELS = {
 
 class WarmUpInLog(WarmUp, SharedLevel):
     fits, asks, detector, drifts = _LOG, frozenset(), "shared", True
-    params = {
-        "a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source),
-        "tau": Param("s", 1, 1e5, "minutes"),
-    }
+    params = {"a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source), "tau": Param("s", 1, 1e5, "minutes")}
     confusable = WarmUp.confusable | _LEVELS
 
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:

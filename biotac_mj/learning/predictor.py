@@ -49,12 +49,7 @@ class PointsModel(_Served):
     """
 
     def __init__(
-        self,
-        net: nn.Module,
-        points: SkinPoints,
-        geometry: SkinGeometry,
-        config: LearningConfig,
-        meta: dict,
+        self, net: nn.Module, points: SkinPoints, geometry: SkinGeometry, config: LearningConfig, meta: dict
     ):
         super().__init__()
         self.meta, self.nvert, self.config = meta, geometry.nvert, config

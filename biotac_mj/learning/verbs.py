@@ -42,10 +42,7 @@ def _add_train(verbs, verb):
         help="FILE.safetensors, or a folder of predictions, errors and weights",
     )
     v.add_argument(
-        "--fraction",
-        type=real(0.2, 0.95),
-        default=0.7,
-        help="fraction of a recording, in time, for training",
+        "--fraction", type=real(0.2, 0.95), default=0.7, help="fraction of a recording, in time, for training"
     )
     v.add_argument("--seed", type=SEED, default=0, help="of one model's random numbers")
     v.add_argument(
@@ -388,13 +385,7 @@ def _judge_recording(args):
     from .instants.real import evaluate_recording
 
     recording, notes = load_one(args.source, args.which, force=args.force)
-    result = evaluate_recording(
-        recording,
-        args.json,
-        args.fraction,
-        args.seed,
-        progress=not args.quiet,
-    )
+    result = evaluate_recording(recording, args.json, args.fraction, args.seed, progress=not args.quiet)
     table = result["reconstruction"]
     print(
         f"reconstruction through a code of 8, counts ({result['train_rows']} rows train, "

@@ -15,12 +15,7 @@ from ..geometry.design import BIOTAC, Design, design_of_channels, designs
 from ..quality.clock import BUS_RATE, usual_step
 from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
-from ..sensor.channels import (
-    FULL_SCALE,
-    check_counts,
-    check_force,
-    log_impedance,
-)
+from ..sensor.channels import FULL_SCALE, check_counts, check_force, log_impedance
 from ..short_repr import short_repr
 
 SCHEMA = "biotac_mj.recording/1"

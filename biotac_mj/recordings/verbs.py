@@ -80,10 +80,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
 def add_which(verb: argparse.ArgumentParser) -> None:
     """Adds the choice of a file's recording as `which`."""
     verb.add_argument(
-        "--recording",
-        dest="which",
-        metavar="NAME",
-        help="name, if the file has several (default: the first)",
+        "--recording", dest="which", metavar="NAME", help="name, if the file has several (default: the first)"
     )
 
 
@@ -95,9 +92,7 @@ def add_load_arguments(
         "--rate", type=real(0.5, 1e4), metavar="HZ", help="of rows without times (default: guessed)"
     )
     verb.add_argument(
-        "--scale",
-        type=real(1e-9, 1e9),
-        help="counts per unit of the channels: 4095 if they are normalised",
+        "--scale", type=real(1e-9, 1e9), help="counts per unit of the channels: 4095 if they are normalised"
     )
     verb.add_argument("--object", metavar="NAME", help=touched)
 

@@ -200,10 +200,7 @@ class PhysicsReadings:
 
 
 def check_settings(
-    given: dict,
-    more: dict | None = None,
-    what: str = "options['readings']",
-    design: Design = BIOTAC,
+    given: dict, more: dict | None = None, what: str = "options['readings']", design: Design = BIOTAC
 ) -> dict:
     """Returns settings of `PhysicsReadings`, given by name, after a check.
 

@@ -41,13 +41,7 @@ LOSS_FACTOR = 0.2
 # (`benchmarks/vibration.py`). Effective values: the contact's averaging is not separated.
 _WAVE, _GRAIN = 4.15e-4, 2.0e-6
 _GRAIN_FRACTION = 1.13e-3
-ROUGHNESS = {
-    "carpet": 0.69e-6,
-    "cork": 0.83e-6,
-    "fiberboard": 0.70e-6,
-    "sponge": 0.61e-6,
-    "steel": 0.55e-6,
-}
+ROUGHNESS = {"carpet": 0.69e-6, "cork": 0.83e-6, "fiberboard": 0.70e-6, "sponge": 0.61e-6, "steel": 0.55e-6}
 _LOW, _HIGH = (math.tan(math.pi * hertz / SLOT_RATE) for hertz in (1040.0, 10.0))  # of the band-pass
 _FILTER = 4  # numbers of the band-pass, after the modes in the state
 # per body: phase; input of the waves, waves and grain, over their RMS; speed; its texture: pitch, height,

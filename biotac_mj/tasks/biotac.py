@@ -80,14 +80,7 @@ class BioTac(composer.Entity):
     settings. An episode's reset writes the state at rest without rebuilding. The sensor's own noise is off:
     noise belongs to the observables, drawn from the environment's random state."""
 
-    def _build(
-        self,
-        name="biotac",
-        slots=TO_COME,
-        noise=True,
-        settings=None,
-        **keywords,
-    ):
+    def _build(self, name="biotac", slots=TO_COME, noise=True, settings=None, **keywords):
         """
         Args:
           name: scope of its names.

@@ -32,11 +32,7 @@ _SPACING = 0.033  # [m] between two recorded sensors
 
 
 def play_model(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    handles: dict,
-    seconds: float = np.inf,
-    **server: object,
+    model: mujoco.MjModel, data: mujoco.MjData, handles: dict, seconds: float = np.inf, **server: object
 ) -> Page:
     """Steps a model and shows its BioTacs at 25 Hz of model time; returns the page.
 

@@ -214,11 +214,7 @@ def view(
             "DISPLAY"
         )
     settings = dict(
-        material=material,
-        liquid=liquid,
-        seed=seed,
-        device=device,
-        options=read_dict(options, "options"),
+        material=material, liquid=liquid, seed=seed, device=device, options=read_dict(options, "options")
     )
     if hand is None:
         spec, handle = build_scene(skin, tier=tier, **settings)

@@ -237,10 +237,7 @@ class _Now:
 
 @contextlib.contextmanager
 def readings_pool(
-    geometry: SkinGeometry,
-    workers: int,
-    start: Callable = prepare_worker,
-    start_args: tuple | None = None,
+    geometry: SkinGeometry, workers: int, start: Callable = prepare_worker, start_args: tuple | None = None
 ) -> object:
     """An executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0 workers:
     this process.

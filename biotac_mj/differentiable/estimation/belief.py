@@ -107,10 +107,7 @@ class Posterior:
         design[:, :n, n], design[:, :n, n + 1] = own @ (near - np.eye(n)), own.mean(1)[:, None]
         design[:, :, n + 2], design[:, :, n + 3] = along, across
         design[:, :, -3], design[:, :, -2], design[:, n, -1] = floor, presses.by_press[among, 2], signal[:, n]
-        level, alike = (
-            (own**2).mean(1)[:, None, None],
-            _CORRELATION * near + (1 - _CORRELATION) * np.eye(n),
-        )
+        level, alike = ((own**2).mean(1)[:, None, None], _CORRELATION * near + (1 - _CORRELATION) * np.eye(n))
         noise = np.zeros((len(signal), n + 1, n + 1))
         noise[:, :n, :n] = (_OFF**2 * own[:, :, None] * own[:, None] + _LEVEL**2 * level) * alike
         noise[:, :n, :n] += _ABSOLUTE**2 * np.eye(n) + _COMMON**2

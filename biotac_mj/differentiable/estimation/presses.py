@@ -158,12 +158,7 @@ class Presses:
     """
 
     def __init__(
-        self,
-        skin: Skin,
-        geometry: SkinGeometry,
-        indenter: str,
-        progress: bool = False,
-        slopes: bool = True,
+        self, skin: Skin, geometry: SkinGeometry, indenter: str, progress: bool = False, slopes: bool = True
     ):
         self.skin, self.geometry, self._indenter, self._progress = skin, geometry, indenter, progress
         self._slopes = slopes

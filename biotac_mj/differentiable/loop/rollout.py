@@ -249,11 +249,7 @@ class _Run:
                     driven[name][t] = [_to_quat(q, w) / max(n, _NONE) for q, w, n in turns]
                 else:
                     driven[name][t] = value.reshape(driven[name][t].shape)
-        state = {
-            "qpos": _from_along(model, self.qpos, y[:nv]),
-            "qvel": y[nv : 2 * nv],
-            "act": y[2 * nv :],
-        }
+        state = {"qpos": _from_along(model, self.qpos, y[:nv]), "qvel": y[nv : 2 * nv], "act": y[2 * nv :]}
         return driven | {name: state[name] for name in names if name in state}
 
     def _back(self, t, end, wrenches, skins, names):

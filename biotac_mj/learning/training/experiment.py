@@ -196,10 +196,7 @@ def train_split(
 
     more = config.members - 1
     members = [
-        timed(
-            name,
-            lambda seed=k: train_head(features, train, validation, config, seed, pod, checkpoints),
-        )
+        timed(name, lambda seed=k: train_head(features, train, validation, config, seed, pod, checkpoints))
         for name, k in [(_HEAD, seed), *((f"{_HEAD} again {k}", 1000 * (k + 1) + seed) for k in range(more))]
     ]
     each = torch.stack([member(both) for member in members])

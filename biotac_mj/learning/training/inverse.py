@@ -29,13 +29,7 @@ class InverseHead(nn.Module):
     """
 
     def __init__(
-        self,
-        pod: Pod,
-        force_modes: int,
-        nouter: int,
-        nelectrode: int,
-        width: int = 256,
-        dropout: float = 0.2,
+        self, pod: Pod, force_modes: int, nouter: int, nelectrode: int, width: int = 256, dropout: float = 0.2
     ):
         super().__init__()
         self.pod = pod

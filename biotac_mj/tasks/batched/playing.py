@@ -71,11 +71,7 @@ def acting(task: str, policy: pathlib.Path | str | None, device: str) -> tuple[s
 
 
 @torch.no_grad()
-def play(
-    env: BatchTask,
-    acts: Sequence[tuple[slice, Callable]],
-    seed: int = HELD_OUT,
-) -> list[dict]:
+def play(env: BatchTask, acts: Sequence[tuple[slice, Callable]], seed: int = HELD_OUT) -> list[dict]:
     """Plays an episode in each world, from random initial states and new grips, by `seed`.
 
     Args:
