@@ -11,14 +11,15 @@ from scipy.spatial.transform import Rotation
 from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
-from biotac_mj.discrepancy.trajectories.base import pairs
+from biotac_mj.discrepancy.trajectories.base import exchanges
+from biotac_mj.discrepancy.trajectories.base.exchanges import exchanged
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-from biotac_mj.discrepancy.trajectories.base.pairs import cross_talk, exchanged
 from biotac_mj.discrepancy.trajectories.base.rests import rested
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.search import screened
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
@@ -53,10 +54,11 @@ def fitted(data):
 def test_exchanges_and_lead_pairs_are_found_only_where_present():
     assert exchanged(*fitted(changed(ring, n=8))).reads == ((2, 9), (9, 13), (13, 2))
     pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
-    data = fitted(changed(heard(pairs), n=8))
-    assert exchanged(*data) is None and set(cross_talk(*data).hears.values()) == set(pairs)
-    data = fitted(measured([], n=8))
-    assert exchanged(*data) is None and cross_talk(*data) is None
+    plain = by_id("crosstalk")
+    for hidden, free in ((pairs, {f"e{i + 1}_hears_e{j + 1}" for i, j in pairs}), ({}, set(plain.free))):
+        comparison, fit, chosen = fitted(changed(heard(hidden), n=8))
+        ((_, effect, *_),) = screened(comparison, fit, [plain], chosen)
+        assert exchanged(comparison, fit, chosen) is None and set(effect.free) == free
 
 
 def test_a_ring_exchange_is_found_despite_a_contrary_contact(monkeypatch):
@@ -70,7 +72,7 @@ def test_a_ring_exchange_is_found_despite_a_contrary_contact(monkeypatch):
             out[shows, shown] = nats[i]
         return out
 
-    monkeypatch.setattr(pairs, "_in_place_of", evidence)
+    monkeypatch.setattr(exchanges, "_in_place_of", evidence)
     sim = types.SimpleNamespace(design=BIOTAC)
     comparison = types.SimpleNamespace(measured=[0.0] * 7, sim=sim)
     fit = types.SimpleNamespace(raw=lambda c: [0.0] * 7)

@@ -172,8 +172,7 @@ class Effect(abc.ABC):
       rare: further parameters, added only if the data require them (`given`).
       confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
         appearance, separated only by much evidence. refit_with: ids of effects that are fitted with it.
-      per_channel: whether each free parameter belongs to one electrode.
-      of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
+      per_channel: whether each free parameter belongs to one electrode, or one pair.
       wiring: whether it assigns electrodes to channels, and has no other form.
       of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
       pose_offset: whether it moves all poses of the object equally, like their scatter between trials.
@@ -204,7 +203,6 @@ class Effect(abc.ABC):
     equivalents: tuple = ()
     refit_with: tuple = ()
     per_channel = False
-    of_pairs = False
     wiring = False
     of_rest = False
     pose_offset = False

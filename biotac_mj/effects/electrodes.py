@@ -81,11 +81,11 @@ class Noise(Effect):
 
 class Exchange(Effect):
     """Parameters "e3_reads_e5": fraction of e5 in the reading of e3, for candidate electrodes that were found
-    before any fit (`trajectories.base.pairs`)."""
+    before any fit (`trajectories.base.exchanges`)."""
 
     id, name, stage = "swap", "exchanged electrodes", "A"
     physics = "a plug in another's place: an electrode shows the counts of another one"
-    per_channel = of_pairs = wiring = True
+    per_channel = wiring = True
     confusable = {"gain": "press one electrode alone", "crosstalk": "drive one electrode alone"}
 
     def __init__(self, reads: Sequence[tuple[int, int]] = ((0, 1), (1, 0))):

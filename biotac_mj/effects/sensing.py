@@ -15,6 +15,8 @@ _LOG_MODULUS = 0.1  # scatter between batches of rubber
 _FILM = 0.5e-3  # [m] mean thickness of liquid between skin and core
 
 
+_LEADS = Param("1", -0.6, 0.9, "adjacent leads: CHOSEN", 0.1)
+_NEAR = 5.0  # [mm] between electrodes whose leads lie side by side
 _FADE = Param("1/1000 counts", 0.01, 10.0, "a nonlinear gain: CHOSEN", 1.0, 0.01, True)
 
 
@@ -224,9 +226,13 @@ class DeadTaxels(Linear):
         run.counts = rest + (run.counts - rest) * (1 - np.array([theta[k] for k in self.params]))
 
 
+def _heard(i, j):
+    return f"e{i + 1}_hears_e{j + 1}"
+
+
 class CrossTalk(Linear):
-    """Parameters "e3_hears_e5": fraction of e5's change added to e3, for adjacent leads; the pairs are found
-    before the search for effects (`trajectories.base.pairs`)."""
+    """Cross-talk by distance, by the order of sampling, or to all; or, where the data single out pairs of
+    leads, of these: parameters "e3_hears_e5", the fraction of e5's change added to e3."""
 
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
     physics = (
@@ -240,7 +246,7 @@ class CrossTalk(Linear):
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
-    equivalents, of_pairs = ("asper",), True
+    equivalents = ("asper",)
     confusable = {
         "gain": "drive one electrode alone",
         "rocking": "another place",
@@ -249,21 +255,34 @@ class CrossTalk(Linear):
 
     def __init__(self, hears: Sequence[tuple[int, int]] = ()):
         """hears: (electrode, the one that couples into it), numbers from 0."""
-        of = Param("1", -0.6, 0.9, "adjacent leads: CHOSEN", 0.1)
-        self.hears = {f"e{i + 1}_hears_e{j + 1}": (i, j) for i, j in hears}
-        self.params = CrossTalk.params | dict.fromkeys(self.hears, of)
+        self.hears = {_heard(i, j): (i, j) for i, j in hears}
+        self.params = CrossTalk.params | dict.fromkeys(self.hears, _LEADS)
+
+    @property
+    def rare(self) -> dict:
+        """Parameters of all pairs of leads that lie side by side, in place or in the order of sampling."""
+        at = electrode_positions(self.design)
+        near = np.linalg.norm(at[:, None] - at, axis=2) < _NEAR
+        near |= np.eye(len(at), k=1, dtype=bool) | np.eye(len(at), k=-1, dtype=bool)
+        return {_heard(i, j): _LEADS for i, j in np.argwhere(near & ~np.eye(len(at), dtype=bool))}
 
     def given(self, names: Sequence[str]) -> "CrossTalk":
+        """With pairs; with these alone where no name is of another parameter."""
         pairs = [name.split("_hears_") for name in names if "_hears_" in name]
-        return CrossTalk([tuple(int(e[1:]) - 1 for e in pair) for pair in pairs])
+        other = CrossTalk([tuple(int(e[1:]) - 1 for e in pair) for pair in pairs]).on(self.design)
+        if len(pairs) == len(names):
+            other.params, other.grid, other.per_channel = dict.fromkeys(other.hears, _LEADS), ({},), True
+        return other
 
     def apply(self, run: Run, theta: dict) -> None:
         p = electrode_positions(self.design)
         n = len(p)
-        K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(n))
-        M = theta["kappa"] * K + theta["scan"] * np.eye(n, k=-1) + theta["common"] / n
-        for name, pair in self.hears.items():
-            M[pair] += theta[name]
+        M = theta.get("scan", 0.0) * np.eye(n, k=-1) + theta.get("common", 0.0) / n
+        if theta.get("kappa"):
+            distance = np.linalg.norm(p[:, None] - p[None], axis=2)
+            M += theta["kappa"] * np.exp(-distance / theta["length"]) * (1 - np.eye(n))
+        for name in theta.keys() & self.hears.keys():
+            M[self.hears[name]] += theta[name]
         run.counts = run.counts + (run.counts - run.rest) @ M.T
 
 

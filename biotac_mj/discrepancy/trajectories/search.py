@@ -176,9 +176,10 @@ def _fitted(comparison, effect, start, expected, current, chosen):
 def _candidate(comparison, effect, fit, current, usable):
     """Candidate of a fit with one effect more than `current`."""
     every = next(e for e in usable if e.id == effect.id)
-    few = effect.per_channel and len(effect.free) < len(every.free)
-    # any electrode may have it
-    forms = len(effect.free) * np.log(len(every.free)) if few else 0.0
+    any_of = every.free if every.per_channel else every.rare
+    few = effect.per_channel and len(effect.free) < len(any_of)
+    # any electrode, or any pair, may have it
+    forms = len(effect.free) * np.log(len(any_of)) if few else 0.0
     gain, theta = float(fit.score - current.score - forms), fit.effects[-1][1]
     # without the effect the expected ratio of densities is one (Markov's inequality, of each that is tried)
     p = float(np.exp(min(np.log(len(usable)) - gain, 0.0)))
@@ -264,6 +265,8 @@ def screened(
         shown = 0.5 * float(((np.diag(precision) - 1) / prior[:, 0] ** 2).max())
         pull = columns @ y
         some = _few(precision, pull) if effect.per_channel else []
+        if effect.per_channel and not some and len(columns) > effect.design.nelectrode:
+            continue  # not all pairs of electrodes
         if some:
             precision, pull = precision[np.ix_(some, some)], pull[some]
             effect = effect.only([effect.free[k] for k in some])

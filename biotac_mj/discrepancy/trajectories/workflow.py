@@ -12,8 +12,8 @@ from ...effects.catalogue import CATALOGUE
 from ...effects.sensor_file import SensorFile
 from ...geometry.design import check_nelectrode
 from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, of_electrodes
+from .base.exchanges import exchanged
 from .base.findings import other_modulus
-from .base.pairs import cross_talk, exchanged
 from .base.rests import rested
 from .beliefs import Beliefs, believed
 from .fitting import Fit, fit_effects
@@ -159,14 +159,12 @@ def about_rests(
 
 
 def _wired(usable, comparison, fit, chosen):
-    """Effects with the exchange and the pairs of leads that the data may have in place of any, and without
-    what is of the rest alone: electrodes are compared about it."""
+    """Effects with the exchange that the data may have in place of any, and without those of the rest alone,
+    about which electrodes are compared."""
     out = []
     for effect in usable:
         if effect.wiring:
             effect = exchanged(comparison, fit, chosen)
-        elif effect.of_pairs:
-            effect = cross_talk(comparison, fit, chosen) or effect
         out += [effect] if effect is not None and not effect.of_rest else []
     return out
 
