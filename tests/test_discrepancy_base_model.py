@@ -16,7 +16,7 @@ from biotac_mj.discrepancy.trajectories.base.exchanges import exchanged
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.base.rests import rested
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
-from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
+from biotac_mj.discrepancy.trajectories.model.differences import differences, softer, spots
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.search import screened
@@ -332,7 +332,7 @@ def test_under_pressure_at_rest_a_modulus_is_more_than_a_factor():
     soft = Simulator(material=material | {"youngs_modulus": 0.7 * material["youngs_modulus"]})
     data = plans(2)
     base, true = sim.solve(data), soft.solve(data)
-    fields = Fields(base, softer(sim, data, base), data)
+    fields = Fields(base, differences(softer(sim), data, base), data)
     for one, run, stiff in zip(true, sim.run(data, fields, False, modulus=0.7), base):
         peak = int(np.argmax(np.abs(one["force"][:, 1])))
         for value, said, before in zip(
@@ -345,7 +345,7 @@ def test_under_pressure_at_rest_a_modulus_is_more_than_a_factor():
         assert np.abs(run.log_z - one["log_z"]).max() < 0.2 * change
     alone = Simulator(material="calibrated", modulus=0.7).run(data)  # as an amended sensor's
     np.testing.assert_allclose(alone[0].force, sim.run(data, fields, False, modulus=0.7)[0].force)
-    assert softer(Simulator(material="default"), data, base) == {}
+    assert softer(Simulator(material="default")) == []
 
 
 def test_spots_are_where_trajectories_touch_again():

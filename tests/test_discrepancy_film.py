@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from biotac_mj.discrepancy.trajectories.model.differences import filled, sunk
+from biotac_mj.discrepancy.trajectories.model.differences import differences, filled, sunk
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
@@ -64,7 +64,7 @@ def test_a_skin_that_sinks_is_lost_liquid():
     air = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (8, 1, 1)), np.full((8, 19), 2500.0))
     sim, both = Simulator(), [air, dataclasses.replace(air, clock=3600.0)]
     base = sim.solve(both)
-    fields = Fields(base, filled(sim, both, base) | sunk(sim, both, base), both)
+    fields = Fields(base, differences([*filled(sim), *sunk(sim)], both, base), both)
     lost = by_id("fluidloss").given(["sink"])
     theta = {**lost.default(), "sink": 0.1e-3, "suction": 1e4}
     fresh, late = sim.run(both, fields, False, [(lost, theta)])

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import pathlib
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import tqdm
@@ -17,7 +17,7 @@ from ....geometry.rigid import across
 from ....geometry.skins import load_skin
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
-from ..base.nuisance import OTHER_MESH
+from ..base.nuisance import BETWEEN, OTHER_MESH
 from ..trajectory import Trajectory
 from .fields import MAPS, Curve, Fields, stack, unstack
 
@@ -55,6 +55,37 @@ class Solver(typing.Protocol):
         """SkinModel and FilmConduction."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """A small change of what is solved.
+
+    Attributes:
+      name: of the difference by it. by: its amount. sim: with the change. how: further arguments of `solve`.
+      load: factor on force and pressure, per unit of which `Simulator.run` adds differences.
+    """
+
+    name: str
+    by: float
+    sim: Solver
+    how: dict = dataclasses.field(default_factory=dict)
+    load: float = 1.0
+
+
+def differences(
+    changes: Iterable[Change],
+    trajectories: list[Trajectory],
+    base: list,
+    tick: Callable[[], object] | None = None,
+) -> dict:
+    """name of each change -> per trajectory the difference by one of it; base: what is solved without."""
+    out = {}
+    for change in changes:
+        solved = change.sim.solve(trajectories, progress=tick, **change.how)
+        borne = [{k: v if k == "log_z" else v / change.load for k, v in one.items()} for one in solved]
+        out[change.name] = _difference(borne, base, change.by)
+    return out
+
+
 def solved_fields(
     sim: Solver, trajectories: list[Trajectory], progress: bool = True, places: Sequence[str] | None = None
 ) -> Fields:
@@ -67,48 +98,37 @@ def solved_fields(
     fitted = places is None
     places = spots(trajectories) if fitted else places
     deeper, thick = (_DEEPER, _FILM) if fitted else (_DEEPER[2:7:2], _FILM[4:13:4])
-    spheres = any("sphere" in t.tool for t in trajectories)
     # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
+    lacking = [] if quick is sim else [_stiffer(sim), *(tacky(sim, work) for work in _TACKY)]
+    small = [*_uneven(quick, places), *filled(quick), *sunk(quick), *softer(quick)]
+    if sim.skin in OTHER_MESH:
+        small.append(Change("mesh", 1.0, quick.but(skin=OTHER_MESH[sim.skin])))
+    if any("sphere" in t.tool for t in trajectories):
+        small.append(Change("radius", _RADIUS, quick, {"log_radius": [_RADIUS] * len(trajectories)}))
+    small.append(Change("bubble", _BUBBLE, quick, {"bubble": _BUBBLE}))
+    # beside these the base by each tier, films, two shifts, two frictions, displacements
+    count = 6 + bool(lacking) + len(lacking) + len(small) + len(deeper) - 1
     with tqdm.tqdm(
-        total=(12 + len(deeper) - 1 + len(places) + spheres + inflated(sim) + 4 * (quick is not sim))
-        * len(trajectories),
-        desc="skin",
-        disable=not progress or None,
-        leave=False,
+        total=count * len(trajectories), desc="skin", disable=not progress or None, leave=False
     ) as bar:
         tick, slopes = bar.update, {}
-        base = sim.solve(trajectories, progress=tick)
-        here = base
+        here = base = sim.solve(trajectories, progress=tick)
         if quick is not sim:
             here = quick.solve(trajectories, progress=tick)
-            slopes["tier"] = _about_rest(_difference(here, base))
-            slopes["stiffen"] = _stiffer(sim, trajectories, base, tick)
+            slopes["tier"] = _difference(here, base)
             # a tool of fine meshes is exact only so far: then as much adhesion as there can be
             with contextlib.suppress(GridTooCoarse):
-                for work in _TACKY:
-                    slopes[f"{TACKY}{work:g}"] = tacky(sim, trajectories, base, work, tick)
-        if sim.skin in OTHER_MESH:
-            there = quick.but(skin=OTHER_MESH[sim.skin]).solve(trajectories, progress=tick)
-            slopes["mesh"] = _about_rest(_difference(there, here))
+                for change in lacking:
+                    slopes |= differences([change], trajectories, base, tick)
+        slopes |= differences(small, trajectories, here, tick)
+        for name in slopes.keys() & set(BETWEEN):
+            slopes[name] = [{k: v - v[0] for k, v in one.items()} for one in slopes[name]]
         film = _films(quick, trajectories, here, thick, tick)
-        slopes |= _uneven(quick, trajectories, here, places, tick)
-        slopes |= filled(quick, trajectories, here, tick)
-        slopes |= sunk(quick, trajectories, here, tick)
-        slopes |= softer(quick, trajectories, here, tick)
         deeper = _deeper(quick, trajectories, here, deeper, tick)
         slopes |= _shifts(quick, trajectories, here, deeper, tick)
-        if spheres:
-            slopes["radius"] = _difference(
-                quick.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
-                here,
-                _RADIUS,
-            )
         less, more = (quick.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
         slopes["friction"], slopes["friction2"] = _parabola(less, here, more, *_FRICTION)
-        slopes["bubble"] = _difference(
-            quick.solve(trajectories, bubble=_BUBBLE, progress=tick), here, _BUBBLE
-        )
     return Fields(base, slopes, trajectories, here, deeper=deeper, film=film)
 
 
@@ -159,97 +179,63 @@ def _films(sim, trajectories, base, logs, tick):
     return Curve(logs, changes)
 
 
-def _uneven(sim, trajectories, base, places, tick):
-    """Differences by a modulus that varies along and across the finger."""
-    given = read_settings(sim.material, sim.options).modulus
-    geometry, out = load_skin(sim.skin), {}
+def _uneven(sim, places):
+    """A modulus that varies along and across the finger, or in spots."""
+    given, geometry = read_settings(sim.material, sim.options).modulus, load_skin(sim.skin)
     for way in (*MAPS, *places):
         by = _UNEVEN if way in MAPS else _SPOT
-        other = sim.but(options=sim.options | {"modulus": moduli(given, modulus_of({way: by}), geometry)})
-        out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
-    return out
+        modulus = moduli(given, modulus_of({way: by}), geometry)
+        yield Change(way, by, sim.but(options=sim.options | {"modulus": modulus}))
 
 
-def _stiffer(sim, trajectories, base, tick):
-    """Difference by c2 of rubber that stiffens inside the elements, as the condensed tier cannot."""
+def _stiffer(sim):
+    """Rubber that stiffens inside the elements, as the condensed tier cannot."""
     inside = memory_of([(Stiffening(), {"c2": _STIFFER})])
-    other = sim.but(material=plain(inside.rubber(read_material(sim.material))))
-    return _difference(other.solve(trajectories, progress=tick), base, _STIFFER)
+    return Change("stiffen", _STIFFER, sim.but(material=plain(inside.rubber(read_material(sim.material)))))
 
 
-def tacky(
-    sim: Solver,
-    trajectories: list[Trajectory],
-    base: list,
-    work: float,
-    tick: Callable[[], object] | None = None,
-) -> list:
-    """Difference by a contact that sticks, of so much work of joining [J/m2]."""
+def tacky(sim: Solver, work: float) -> Change:
+    """A contact that sticks, of so much work of joining [J/m2], all of it together."""
     inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})])
     skin = plain(inside.options(read_settings(sim.material, sim.options)[1]))
-    other = sim.but(options=sim.options | {"skin": skin})
-    return _difference(other.solve(trajectories, progress=tick), base)
+    return Change(f"{TACKY}{work:.9g}", 1.0, sim.but(options=sim.options | {"skin": skin}))
 
 
-def filled(
-    sim: Solver,
-    trajectories: list[Trajectory],
-    base: list,
-    tick: Callable[[], object] | None = None,
-) -> dict:
-    """Difference by the fraction of its liquid that the fingertip has lost or won, the film as it was."""
+def filled(sim: Solver) -> list[Change]:
+    """The fraction of its liquid that the fingertip has lost or won, the film as it was."""
     model, film = sim.skin_and_film(0.0, 0.0)
     settings = read_settings(sim.material, sim.options)[1]
     if not model.has_liquid or settings.rest_pressure:
-        return {}
+        return []
     volume = settings.fill_volume + _FILL * model.liquid_volume
-    skin = {**plain(settings), "fill_volume": volume}
-    folder = None if sim.cache is None else str(pathlib.Path(sim.cache) / "filled")
-    other = sim.but({"film": film}, options=sim.options | {"skin": skin}, cache=folder)
-    return {"fill": _difference(other.solve(trajectories, progress=tick), base, _FILL)}
+    options = sim.options | {"skin": {**plain(settings), "fill_volume": volume}}
+    return [Change("fill", _FILL, sim.but({"film": film}, options=options, cache=_beside(sim, "filled")))]
 
 
-def sunk(
-    sim: Solver,
-    trajectories: list[Trajectory],
-    base: list,
-    tick: Callable[[], object] | None = None,
-) -> dict:
-    """Difference by the depth [m] to which the skin has sunk towards the core, all else as it was."""
+def sunk(sim: Solver) -> list[Change]:
+    """The depth [m] to which the skin has sunk towards the core, all else as it was."""
     from ....effects.in_film import SunkFilm
 
     model, film = sim.skin_and_film(0.0, 0.0)
     if not model.has_liquid:
-        return {}
-    folder = None if sim.cache is None else str(pathlib.Path(sim.cache) / "sunk")
-    other = sim.but({0.0: model, "film": SunkFilm(film, _SUNK)}, cache=folder)
-    return {"sink": _difference(other.solve(trajectories, progress=tick), base, _SUNK)}
+        return []
+    models = {0.0: model, "film": SunkFilm(film, _SUNK)}
+    return [Change("sink", _SUNK, sim.but(models, cache=_beside(sim, "sunk")))]
 
 
-def inflated(sim: Solver) -> bool:
-    """Whether the liquid bears a part of the load already at rest."""
-    return bool(read_settings(sim.material, sim.options)[1].rest_pressure)
+def _beside(sim, name):
+    """Folder of solutions that settings do not distinguish from the simulator's own."""
+    return None if sim.cache is None else str(pathlib.Path(sim.cache) / name)
 
 
-def softer(
-    sim: Solver,
-    trajectories: list[Trajectory],
-    base: list,
-    tick: Callable[[], object] | None = None,
-) -> dict:
-    """Difference by the logarithm of the modulus, beyond a factor on force and pressure: there is none
-    but where the liquid stands under pressure at rest, which another modulus leaves as it is."""
-    if not inflated(sim):
-        return {}
+def softer(sim: Solver) -> list[Change]:
+    """The logarithm of the modulus, beyond a factor on force and pressure: there is nothing but where the
+    liquid stands under pressure at rest, which another modulus leaves as it is."""
+    if not read_settings(sim.material, sim.options)[1].rest_pressure:
+        return []
     rubber, factor = read_material(sim.material), float(np.exp(_SOFTER))
-    other = sim.but(
-        material=plain(dataclasses.replace(rubber, youngs_modulus=factor * rubber.youngs_modulus))
-    )
-    solved = other.solve(trajectories, progress=tick)
-    by_it = [
-        {k: v if k == "log_z" else v / factor for k, v in one.items()} for one in solved
-    ]  # as `run` adds differences: per unit of the factor
-    return {"modulus": _difference(by_it, base, _SOFTER)}
+    material = plain(dataclasses.replace(rubber, youngs_modulus=factor * rubber.youngs_modulus))
+    return [Change("modulus", _SOFTER, sim.but(material=material), load=factor)]
 
 
 def spots(trajectories: list[Trajectory]) -> list[str]:
@@ -267,10 +253,6 @@ def spots(trajectories: list[Trajectory]) -> list[str]:
 
 def _difference(moved, base, by=1.0):
     return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
-
-
-def _about_rest(slopes):
-    return [{k: v - v[0] for k, v in one.items()} for one in slopes]
 
 
 def _parabola(before, base, after, low, high):

@@ -28,7 +28,7 @@ from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import BETWEEN, KNOWN, Nuisance, widen
 from ..trajectory import Trajectory
-from .differences import softer, solved_fields, tacky
+from .differences import differences, softer, solved_fields, tacky
 from .fields import Fields, apart, nearest, sizes, square, stack
 
 TIERS = ("condensed", "full")
@@ -275,10 +275,11 @@ class Simulator:
             return False
         try:
             base = [one | {"log_z": one["log_z"] - self.log_rest} for one in fields.base]
-            change = tacky(self, fields.trajectories, base, work)
+            solved = differences([tacky(self, work)], fields.trajectories, base)
         except GridTooCoarse:
             return False
-        fields.add(f"{TACKY}{work:.9g}", change)
+        for name, change in solved.items():
+            fields.add(name, change)
         return True
 
     # --- all stages  ---
@@ -306,7 +307,7 @@ class Simulator:
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
         if fields is None:
             base = [one | {"log_z": one["log_z"] + self.log_rest} for one in self.solve(trajectories)]
-            slopes = {} if modulus == 1.0 else softer(self, trajectories, base)
+            slopes = {} if modulus == 1.0 else differences(softer(self), trajectories, base)
             fields = Fields(base, slopes, trajectories)
         for effect, theta in effects:
             work = effect.joining(theta)
