@@ -134,7 +134,7 @@ def test_a_mesh_too_fine_for_adhesion_ends_no_diagnosis(monkeypatch):
     sim, asked = Simulator(skin="coarse", tier="full"), []
     fields = types.SimpleNamespace(slopes={f"{TACKY}1": {}}, base=[], trajectories=[])
 
-    def refuses(sim, trajectories, base, work):
+    def refuses(sim, work):
         asked.append(work)
         raise GridTooCoarse("adhesion reaches 92 um") if work < 25 else ValueError("another")
 
