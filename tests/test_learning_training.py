@@ -400,7 +400,7 @@ def dome(tmp_path_factory):
     return str(folder)
 
 
-@pytest.mark.parametrize("skin", ["biotac_sp/coarse", "dome"])
+@pytest.mark.parametrize("skin", [pytest.param("biotac_sp/coarse", marks=pytest.mark.slow), "dome"])
 def test_networks_of_other_designs_are_trained_and_serve_them(skin, dome, tmp_path):
     skin = dome if skin == "dome" else skin
     geometry = load_skin(skin)

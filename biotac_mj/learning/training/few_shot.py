@@ -130,11 +130,11 @@ def evaluate_new_sensor(
             chosen = np.isin(owner, rng.choice(labelled, k, replace=False))
             predictions = {"no change": np.zeros_like(truth), "film": film, "weights": network}
             if k:
-                x, y, sensor = film[chosen], truth[chosen], owner[chosen]
+                x, y, touched = film[chosen], truth[chosen], owner[chosen]
                 predictions["film with gains"] = fit_gains(x, y) * film
                 predictions["weights with gains"] = fit_gains(network[chosen], y) * network
                 for name, value in inputs.items():
-                    predictions[f"{name} with mixing"] = value @ fit_mixing(value[chosen], y, sensor).T
+                    predictions[f"{name} with mixing"] = value @ fit_mixing(value[chosen], y, touched).T
             for name, value in predictions.items():
                 found.setdefault(name, []).append(rms(value, ~chosen))
         for name, values in found.items():
