@@ -413,13 +413,12 @@ class Instance:
     def _acting(self):
         """Wrench (6,) on the BioTac in its frame as it acts now, and whether skin, bodies and MuJoCo's
         constraint solver settled."""
-        _, settled, *_, acting = self._outcome
-        skin = self._result.wrench if acting is None else acting
         solid, solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
-        force = solid - skin.sum(axis=0)
+        force = solid - self.acting_wrench().sum(axis=0)
         for other, group in self.skins_met:
-            force += other._push_on(self, group)
-        return force, self._result.converged and settled and solved
+            push = other.acting_wrench()[[group]]
+            force += _carried(push, other._frame(), self._frame())[0]
+        return force, self._result.converged and self._outcome[1] and solved
 
     def acting_wrench(self) -> np.ndarray:
         """(ngroup, 6) that the touching bodies get from the skin in this step, in the BioTac frame; zeros
@@ -451,13 +450,6 @@ class Instance:
             normal /= np.linalg.norm(normal, axis=1)[:, None]
             found.kept[face], found.geom[face], found.force[face] = 1, geom, -push[:, None] * normal
         return found.find()
-
-    def _push_on(self, other, group):
-        """(6,) of this skin on another BioTac, its touching body `group`, in the frame of that one."""
-        acting = self._outcome[-1]
-        if acting is None:
-            acting = np.zeros((group + 1, 6)) if self._result is None else self._result.wrench
-        return _carried(acting[[group]], self._frame(), other._frame())[0]
 
     def end_stage(self, first: bool, held: bool) -> None:
         """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
