@@ -291,16 +291,15 @@ def test_the_force_is_given_in_the_frame_of_the_poses():
 def test_load_dependent_friction_is_interpolated_from_solutions():
     run, n = run_of(), 40
     rng = np.random.default_rng(0)
-    shapes = {"force": (n, 3), "pressure": (n,), "log_z": (n, 19)}
-    first, second = ({k: rng.normal(size=s) for k, s in shapes.items()} for _ in range(2))
+    first, second = rng.normal(size=(2, n, 23))
     run.answers = {"friction": first, "friction2": second}
     before, theta = run_of(), {"exponent": 0.4, "log_mu": -0.2}
     by_id("fric_load").apply(run, theta)
     log_mu = -0.2 - 0.4 * np.log(np.maximum(before.normal_force, 0.05))
-    expected = before.pressure + log_mu * first["pressure"] + log_mu**2 * second["pressure"]
+    expected = before.pressure + log_mu * first[:, 3] + log_mu**2 * second[:, 3]
     np.testing.assert_allclose(run.pressure, expected)
     np.testing.assert_allclose(
-        run.log_z[7], before.log_z[7] + log_mu[7] * first["log_z"][7] + log_mu[7] ** 2 * second["log_z"][7]
+        run.log_z[7], before.log_z[7] + log_mu[7] * first[7, 4:] + log_mu[7] ** 2 * second[7, 4:]
     )
 
 

@@ -74,8 +74,8 @@ def test_adhesion_by_its_work_is_what_the_skin_answered():
     """Straight lines between the works that it was solved for, from none on; beyond them in proportion."""
     press = walk([-0.1e-3, 0.1e-3, -0.1e-3])
     n = len(press.time)
-    slope = {"force": np.ones((n, 3)), "pressure": np.ones(n), "log_z": np.full((n, 19), 0.01)}
-    answers = {f"{TACKY}{w:g}": {k: f * v for k, v in slope.items()} for w, f in ((4.0, 3.0), (1.0, 1.0))}
+    slope = np.column_stack([np.ones((n, 4)), np.full((n, 19), 0.01)])
+    answers = {f"{TACKY}{w:g}": f * slope for w, f in ((4.0, 3.0), (1.0, 1.0))}
     stuck = by_id("adhesion").given(list(answers))
     assert list(stuck.params) == ["joining"] and list(by_id("adhesion").given(["x"]).params) == ["W"]
     base = {"force": np.zeros((n, 3)), "pressure": np.zeros(n), "log_z": np.full((n, 19), 10.0)}
@@ -86,7 +86,7 @@ def test_adhesion_by_its_work_is_what_the_skin_answered():
         np.testing.assert_allclose(
             [run.force[3, 0], run.pressure[3], run.log_z[3, 0] - 10], [by, by, by / 100]
         )
-    fields.add(f"{TACKY}2", [{k: 5.0 * v for k, v in slope.items()}])
+    fields.add(f"{TACKY}2", [5.0 * slope])
     run = dataclasses.replace(fields.begun[0])
     stuck.apply(run, {"joining": 2.0})
     assert run.force[3, 0] == 5.0

@@ -241,8 +241,7 @@ def test_a_film_that_is_late_alone_or_scaled_alone_is_no_rubber():
 def test_stiffening_all_through_leaves_the_electrodes():
     run = run_of()
     load, films = run.normal_force.copy(), run.log_z.copy()
-    slope = {"force": 0.1 * run.force, "pressure": 0.1 * run.pressure, "log_z": 0 * run.log_z}
-    run.answers = {"stiffen": slope}
+    run.answers = {"stiffen": np.column_stack([0.1 * run.force, 0.1 * run.pressure, 0 * run.log_z])}
     by_id("stiffen").given(["through"]).apply(run, {"c2": 0.0, "through": 0.8})
     np.testing.assert_allclose(run.normal_force, load * (1 + 0.8 * (run.depth / 1.5e-3) ** 2))
     np.testing.assert_array_equal(run.log_z, films)

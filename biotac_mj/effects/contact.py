@@ -71,12 +71,8 @@ class FrictionLoad(Effect):
         if "friction" in run.answers:  # the skin was solved with more and less of it
             log_mu = theta.get("log_mu", 0.0) - theta["exponent"] * np.log(np.maximum(run.normal_force, 0.05))
             log_mu = np.clip(log_mu, -1.6, 1.0)
-            straight, bent = run.answers["friction"], run.answers["friction2"]
             square = log_mu * (log_mu + 2 * run.log_friction)
-            for name, factor in (("force", run.modulus), ("pressure", run.modulus), ("log_z", 1.0)):
-                value = getattr(run, name)
-                by, twice = (v if value.ndim == 1 else v[:, None] for v in (log_mu, square))
-                setattr(run, name, value + factor * (by * straight[name] + twice * bent[name]))
+            run.add(log_mu[:, None] * run.answers["friction"] + square[:, None] * run.answers["friction2"])
             return
         normal = -np.outer(run.force @ run.heading, run.heading)
         tangential = run.force + normal
@@ -117,9 +113,7 @@ class Adhesion(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         if "joining" in theta:
             for weight, answer in _between(theta["joining"], run.answers):
-                run.force = run.force + weight * run.modulus * answer["force"]
-                run.pressure = run.pressure + weight * run.modulus * answer["pressure"]
-                run.log_z = run.log_z + weight * answer["log_z"]
+                run.add(weight * answer)
             return
         radius, modulus = 3.5e-3, 1e6
         a = np.sqrt(radius * np.maximum(run.depth, 0))

@@ -65,8 +65,8 @@ class Run:
         the skin is solved. counts (n, nelectrode), pdc (n,): after the converter, before rounding.
       temperature: (n,) above the first row of the session [C], or None.
       stiffness: (n,) d normal force / d depth [N/m], None if unknown.
-      answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) per unit of it, for
-        solved changes; modulus: factor on the material's since.
+      answers: change of the rubber -> (n, 4 + nelectrode) of force and pressure, per unit of the modulus, and
+        log_z by one of it, for solved changes; modulus: factor on the material's since.
       turn: (3,) or (n, 3) rotation vector from the frame of poses and force to the sensor [rad].
       pos: (n, 3) of the object [m], None if only its contact position is known.
       session: dict shared by the effects of one simulation, from trajectory to trajectory.
@@ -140,6 +140,12 @@ class Run:
         for all rows."""
         stiffness = 0.0 if self.stiffness is None else self.stiffness
         return compliance * self.normal_force / (1 + np.maximum(compliance, 0) * stiffness)
+
+    def add(self, change: np.ndarray) -> None:
+        """Adds a change (n, 4 + nelectrode) of force and pressure, per unit of the modulus, and of log_z."""
+        self.force = self.force + self.modulus * change[:, :3]
+        self.pressure = self.pressure + self.modulus * change[:, 3]
+        self.log_z = self.log_z + change[:, 4:]
 
     def scale_load(self, factor: float | np.ndarray) -> None:
         """Multiplies the load on the rubber by a factor (n,): force and the liquid's pressure."""

@@ -311,10 +311,7 @@ class Stiffening(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         load = theta.get("through", 0.0)
         if "stiffen" in run.answers:  # the skin was solved with stiffening rubber
-            slope = run.answers["stiffen"]
-            run.force = run.force + theta["c2"] * run.modulus * slope["force"]
-            run.pressure = run.pressure + theta["c2"] * run.modulus * slope["pressure"]
-            run.log_z = run.log_z + theta["c2"] * slope["log_z"]
+            run.add(theta["c2"] * run.answers["stiffen"])
         else:
             load += theta["c2"]
         run.scale_load(1 + load * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
@@ -344,10 +341,7 @@ class Inhomogeneity(Effect):
             run.scale_load(float(modulus_of(theta)(run.place[None])[0]))
             return
         for direction, slope in ((w, run.answers[w]) for w in self.params if w in run.answers):
-            # the skin was solved with a varying modulus
-            run.force = run.force + theta[direction] * run.modulus * slope["force"]
-            run.pressure = run.pressure + theta[direction] * run.modulus * slope["pressure"]
-            run.log_z = run.log_z + theta[direction] * slope["log_z"]
+            run.add(theta[direction] * slope)  # the skin was solved with a varying modulus
 
 
 class Spots(Inhomogeneity):

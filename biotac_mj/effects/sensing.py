@@ -85,15 +85,13 @@ class FluidLoss(Effect):
         lost = -np.log(np.maximum(1 - gone, 0.2))
         sunk = theta.get("sink", 0.0) * run.clock / 3600
         if "sink" in run.answers:
-            run.log_z = run.log_z + sunk[:, None] * run.answers["sink"]["log_z"]
+            run.log_z = run.log_z + sunk[:, None] * run.answers["sink"][:, 4:]
         if "fill" not in run.answers:  # every impedance in proportion, all else as before
             run.log_z = run.log_z + lost[:, None]
             return
-        fill = run.answers["fill"]  # its pressure is above that at rest, from which suction subtracts
+        # its pressure is above that at rest, from which suction subtracts
         run.pressure = run.pressure - theta.get("suction", 0.0) * (lost + sunk / _FILM)
-        run.force = run.force - run.modulus * lost[:, None] * fill["force"]
-        run.pressure = run.pressure - run.modulus * lost * fill["pressure"]
-        run.log_z = run.log_z - lost[:, None] * fill["log_z"]
+        run.add(-lost[:, None] * run.answers["fill"])
 
 
 class Thermal(Effect):

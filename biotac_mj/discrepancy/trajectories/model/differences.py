@@ -19,7 +19,7 @@ from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import BETWEEN, OTHER_MESH
 from ..trajectory import Trajectory
-from .fields import MAPS, Curve, Fields, stack, unstack
+from .fields import MAPS, Curve, Fields, stack
 
 _SHIFT = 40e-6  # [m] of the poses for differences
 # [m] along the press: densest where errors of poses lie, since rows before the touch begin to touch there
@@ -123,7 +123,7 @@ def solved_fields(
                     slopes |= differences([change], trajectories, base, tick)
         slopes |= differences(small, trajectories, here, tick)
         for name in slopes.keys() & set(BETWEEN):
-            slopes[name] = [{k: v - v[0] for k, v in one.items()} for one in slopes[name]]
+            slopes[name] = [one - one[0] for one in slopes[name]]
         film = _films(quick, trajectories, here, thick, tick)
         deeper = _deeper(quick, trajectories, here, deeper, tick)
         slopes |= _shifts(quick, trajectories, here, deeper, tick)
@@ -138,7 +138,7 @@ def _deeper(sim, trajectories, base, displacements, tick):
     for by in displacements:
         offset = [np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories]
         solved = sim.solve(trajectories, offset=offset, progress=tick) if by else base
-        changes.append([stack(one) - stack(here) for one, here in zip(solved, base)])
+        changes.append(_difference(solved, base))
     return Curve(displacements, [np.array(of) for of in zip(*changes)])
 
 
@@ -152,10 +152,10 @@ def _shifts(sim, trajectories, base, deeper, tick):
         solved.append(_difference(sim.solve(trajectories, offset=offset, progress=tick), base, _SHIFT))
     out = {axis: [] for axis in "xyz"}
     for i, (t, side) in enumerate(zip(trajectories, sides)):
-        straight = [deeper.slope(i, 0.0), *(stack(one[i]) for one in solved)]
+        straight = [deeper.slope(i, 0.0), *(one[i] for one in solved)]
         for k, axis in enumerate("xyz"):
             share = t.heading[k], side[0][0, k], side[1][0, k]
-            out[axis].append(unstack(sum(by * slope for by, slope in zip(share, straight))))
+            out[axis].append(sum(by * slope for by, slope in zip(share, straight)))
     return out
 
 
@@ -252,11 +252,11 @@ def spots(trajectories: list[Trajectory]) -> list[str]:
 
 
 def _difference(moved, base, by=1.0):
-    return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
+    return [(stack(a) - stack(b)) / by for a, b in zip(moved, base)]
 
 
 def _parabola(before, base, after, low, high):
     """Slopes and curvatures of solutions at low, 0 and high."""
     first, second = _difference(before, base, low), _difference(after, base, high)
-    bend = [{k: (b[k] - a[k]) / (high - low) for k in a} for a, b in zip(first, second)]
-    return [{k: a[k] - low * c[k] for k in a} for a, c in zip(first, bend)], bend
+    bend = [(b - a) / (high - low) for a, b in zip(first, second)]
+    return [a - low * c for a, c in zip(first, bend)], bend

@@ -20,7 +20,8 @@ _ANSWERS = {name for effect in CATALOGUE for name in effect.answers}  # that eff
 
 @dataclasses.dataclass
 class Fields:
-    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
+    """base: per trajectory force, pressure, log_z; slopes: name -> per trajectory all of these
+    (n, nelectrode + 4), force and pressure per unit of the modulus: per metre (x, y, z), per log
     (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across), per metre that
     the skin has sunk (sink); "tacky_" and a work of joining: by all of it; about rest "mesh": of another
     mesh, "tier": of the condensed tier, "modulus": per log of the modulus, beyond a factor on force and
@@ -47,13 +48,12 @@ class Fields:
     def __post_init__(self):
         self.quick = self.base if self.quick is None else self.quick
         first = self.trajectories[0].tdc
-        self.stacked = {k: [stack(one) for one in v] for k, v in self.slopes.items()}
         self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
 
     def add(self, name: str, slope: list) -> None:
-        """Keeps a further difference [a dict per trajectory] among those that effects after the skin use."""
+        """Keeps a further difference [(n, nelectrode + 4) per trajectory] among those that effects after the
+        skin use."""
         self.slopes[name] = slope
-        self.stacked[name] = [stack(one) for one in slope]
         for run, one in zip(self.begun, slope):
             run.answers[name] = one
 
@@ -72,13 +72,13 @@ class Fields:
             along = offset @ heading
             change, offset = self.deeper.at(i, along), offset - np.outer(along, heading)
         for name, by in zip("xyz", offset.T):
-            if name in self.stacked and by.any():
-                change = change + self.stacked[name][i] * by[:, None]
+            if name in self.slopes and by.any():
+                change = change + self.slopes[name][i] * by[:, None]
         return change
 
     def shifting(self, i: int, offset: np.ndarray) -> list[np.ndarray]:
         """(n, nelectrode + 4) per metre along x, y and z, about an offset (3,) of trajectory i [m]."""
-        slopes = [self.stacked[name][i] for name in "xyz"]
+        slopes = [self.slopes[name][i] for name in "xyz"]
         if self.deeper is None:
             return slopes
         heading = self.trajectories[i].heading
@@ -205,11 +205,6 @@ def stack(one: dict) -> np.ndarray:
     return np.column_stack([one["force"], one["pressure"], one["log_z"]])
 
 
-def unstack(values: np.ndarray) -> dict:
-    """A solution of (n, nelectrode + 4) force, pressure and ln Z."""
-    return {"force": values[:, :3], "pressure": values[:, 3], "log_z": values[:, 4:]}
-
-
 def _begin(order, t, base, slopes, first_tdc):
     warm = None
     if t.tdc is not None and first_tdc is not None:
@@ -239,5 +234,5 @@ def _stiffness(base, slopes, t, order):
     """(n,) d normal force / d depth [N/m]; without differences that of a Hertzian contact."""
     if "x" not in slopes:
         return 1.5 * np.maximum(-base["force"] @ t.heading, 0) / np.maximum(t.depth, 1e-4)
-    along = sum(h * slopes[x][order]["force"] for h, x in zip(t.heading, "xyz"))
+    along = sum(h * slopes[x][order][:, :3] for h, x in zip(t.heading, "xyz"))
     return np.maximum(-along @ t.heading, 0)

@@ -340,11 +340,11 @@ class Simulator:
         if "modulus" in fields.slopes:
             shares.append((np.log(modulus), "modulus"))
         for i, run in enumerate(runs):
-            between = sum(share * fields.stacked[name][i] for share, name in shares if share)
+            between = sum(share * fields.slopes[name][i] for share, name in shares if share)
             if nuisance.log_film and fields.film is not None:
                 between = between + fields.film.at(i, nuisance.log_film)
             if np.ndim(between):
-                _add(run, modulus, between)
+                run.add(between)
             if nuisance.footprint:
                 run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint, self.design)
         for i, run in enumerate(runs):
@@ -355,7 +355,7 @@ class Simulator:
                     effect.apply(run, theta)
                     missed = fields.recalled(effect, theta, i)
                     if missed is not None:
-                        _add(run, modulus, missed)
+                        run.add(missed)
             if np.ndim(run.turn) and run.turn.any():  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
@@ -450,14 +450,14 @@ class Simulator:
             change = fields.shifted(i, run.offset) if run.offset.any() else 0.0
             for name, amount in parts:
                 several = np.ndim(amount) > 0
-                if name in fields.stacked and (amount.any() if several else amount):
-                    slope = fields.stacked[name][i]
+                if name in fields.slopes and (amount.any() if several else amount):
+                    slope = fields.slopes[name][i]
                     change = change + slope * (amount[:, None] if several else amount)
             for curve, share in curves:
                 if i in curve:
                     change = change + share * curve[i]
             if np.ndim(change):
-                _add(run, modulus, change)
+                run.add(change)
 
     # --- YAML  ---
 
@@ -482,13 +482,6 @@ def _turned(t, turn):
     from scipy.spatial.transform import Rotation
 
     return dataclasses.replace(t, mat=Rotation.from_rotvec(turn).as_matrix() @ t.mat)
-
-
-def _add(run, modulus, change):
-    """Adds changes (n, 4 + nelectrode) of force and pressure, per unit of the modulus, and ln Z."""
-    run.force = run.force + modulus * change[:, :3]
-    run.pressure = run.pressure + modulus * change[:, 3]
-    run.log_z = run.log_z + change[:, 4:]
 
 
 def placed(t: Trajectory, shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
