@@ -6,21 +6,20 @@ import numpy as np
 import warp as wp
 
 from ..program import Launcher
-from ..types import SINGLE, Precision, mat33, real, vec3
+from ..types import DOUBLE, SINGLE, Precision, mat33, real, vec3
 from .element_kernels import element_kernels
+from .element_points import BOUNDS
 from .points import Rubber
 
 if typing.TYPE_CHECKING:
     from .tetrahedra import Tetrahedra
-
-_THREADS = 256  # of a block
 
 
 def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
     """Module of the kernels for many worlds, and its block size, for `program.compile_ahead`. options: as in
     `ElementForces`."""
     kernels = element_kernels(elements.corners, elements.law == 0, SINGLE, options)
-    return kernels.force.module, _THREADS
+    return kernels.force.module, BOUNDS[0]
 
 
 class ElementForces:
@@ -46,11 +45,13 @@ class ElementForces:
         self._kernels = element_kernels(elements.corners, elements.law == 0, precision, options)
         # in double precision on CUDA they are for gradients of few worlds: small blocks use more
         # multiprocessors
-        self._block_dim = 64 if self.device.is_cuda and precision.name == "double" else _THREADS
+        self._block_dim = 64 if self.device.is_cuda and precision.name == "double" else BOUNDS[0]
         corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
         with wp.ScopedDevice(self.device):
             shape = np.ascontiguousarray(elements.mesh.shape.numpy())
-            self._shape = wp.array(shape, dtype=self._kernels.gradients)
+            self._shape, self._thin_shape = (
+                wp.array(shape, dtype=self._kernels.gradients(p)) for p in (DOUBLE, precision)
+            )
             self._pressure = wp.zeros((self._count if averaged else 0, self._nworld), dtype=real)
             stored = elements.npoint * self._count if precision.name == "double" else 0
             self._deformation = wp.zeros((stored, self._nworld), dtype=mat33)
@@ -62,12 +63,14 @@ class ElementForces:
         """Computes the forces on the corners at x [nvert, nworld] in the worlds that are on. Marks worlds
         with a point that is inverted (2), flatter than its law allows (1), or both (3)."""
         stored = [self._pressure, self._deformation, self._rotation]
-        self._launch(program, self._kernels.force, [x, on], [*stored, self.corner_force, inverted])
+        self._launch(
+            program, self._kernels.force, [self._shape, x, on], [*stored, self.corner_force, inverted]
+        )
 
     def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
         """Computes the tangent at x, the nodes of the last `evaluate_corners`, times p, on the corners."""
         stored = [self._pressure, self._deformation, self._rotation]
-        self._launch(program, self._kernels.product, [x, p, on, *stored], [self.corner])
+        self._launch(program, self._kernels.product, [self._thin_shape, x, p, on, *stored], [self.corner])
 
     def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
         """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""
@@ -100,5 +103,5 @@ class ElementForces:
         return tuple(a.numpy().reshape(shape[: 2 if a.dtype is real else 4]) for a in out)
 
     def _launch(self, program, kernel, inputs, outputs):
-        inputs = [self._elements.cap, self._rubber, self._elements.mesh, self._shape, *inputs]
+        inputs = [self._elements.cap, self._rubber, self._elements.mesh, *inputs]
         program.launch(kernel, (self._count, self._nworld), inputs, outputs, self._block_dim)

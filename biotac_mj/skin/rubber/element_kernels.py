@@ -10,7 +10,7 @@ import types
 
 import warp as wp
 
-from ..types import Precision, mat33, real, vec3
+from ..types import DOUBLE, Precision, mat33, real, vec3
 from .element_points import Kind, material_functions
 from .points import Mesh, Rubber, deformation_of
 
@@ -39,14 +39,14 @@ def element_kernels(
 
 def _force_kernel(kind: Kind) -> wp.Kernel:
     """Forces of the elements."""
-    corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
-    corotational, module, gradients = kind.corotational, kind.module, kind.gradients
+    corners, averaged, is_single = kind.corners, kind.averaged, kind.is_single
+    corotational, gradients = kind.corotational, kind.gradients(DOUBLE)
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     f = material_functions(kind)
-    rotation, theta, stress_of, weighted_volume = f.rotation, f.theta, f.stress_of, f.weighted_volume
-    local_lame, flaw = f.local_lame, f.flaw
+    rotation, stress_of, weighted_volume = f.rotation, f.stress_of, f.weighted_volume
+    local_lame, flaw, averaged_pressure = f.local_lame, f.flaw, f.averaged_pressure
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(enable_backward=False, **kind.placement)
     def force(
         # In:
         cap: real,
@@ -73,27 +73,27 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = local_lame(mu, lam, cap)
+        npoint = wp.static(kind.npoint)
+        if wp.static(is_single):  # no constant: unrolled, a loop would need more registers than there are
+            npoint = mesh.weight.shape[1]
         pressure = real(0.0)
         if wp.static(averaged):
             if lam > local:
-                mean = real(0.0)
-                for q in range(wp.static(npoint)):
-                    F = X * shape[q] * mesh.inverse[e, q]
-                    mean += mesh.weight[e, q] * theta(rubber.law, F, rotation(F))
-                pressure = (lam - local) * mean / mesh.volume[e]
+                pressure = averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
                 pressure_out[e, w] = pressure
         C = positions()
-        for q in range(wp.static(npoint)):
+        for q in range(npoint):
+            i = npoint * e + q
             F = X * shape[q] * mesh.inverse[e, q]
             bad = flaw(rubber.law, F)
             if bad > 0:
                 wp.atomic_max(inverted_out, w, bad)
             R = rotation(F)
             if wp.static(not is_single):
-                deformation_out[wp.static(npoint) * e + q, w] = F
+                deformation_out[i, w] = F
                 if wp.static(corotational):
-                    rotation_out[wp.static(npoint) * e + q, w] = R
-            P = stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, R)
+                    rotation_out[i, w] = R
+            P = stress_of(rubber, e, i, w, mu, local, pressure, F, R)
             C -= (
                 weighted_volume(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])
             ) * wp.transpose(shape[q])
@@ -105,49 +105,25 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
 
 def _product_kernel(kind: Kind) -> wp.Kernel:
     """Tangents of the elements times a direction."""
-    corners, npoint, averaged, is_single = kind.corners, kind.npoint, kind.averaged, kind.is_single
-    corotational, module, gradients = kind.corotational, kind.module, kind.gradients
-    scalar, vec, thin = kind.precision.scalar, kind.precision.vec, kind.precision.narrow
-    positions = wp.types.matrix(shape=(3, corners), dtype=real)
+    corners, averaged, is_single = kind.corners, kind.averaged, kind.is_single
+    corotational, precision, gradients = kind.corotational, kind.precision, kind.gradients(kind.precision)
+    scalar, vec, mat, thin = precision.scalar, precision.vec, precision.mat, precision.narrow
     directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
-    thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
     f = material_functions(kind)
     rotation_thin, direction_of, change_of = f.rotation_thin, f.direction_of, f.change_of
     weighted_volume, local_lame = f.weighted_volume, f.local_lame
 
     @wp.func
-    def narrow_gradients(g: gradients):
+    def point_state(here: mat, i: int, w: int, F: wp.array2d(dtype=mat33), R: wp.array2d(dtype=mat33)):
+        """Deformation gradient, `here` if none is stored, and rotation of point i."""
         if wp.static(is_single):
-            out = thin_gradients()
-            for a in range(wp.static(corners)):
-                for c in range(3):
-                    out[a, c] = scalar(g[a, c])
-            return out
-        else:  # Warp compiles what follows a return
-            return g
-
-    @wp.func
-    def point_state(
-        e: int,
-        q: int,
-        w: int,
-        X: positions,
-        shape: wp.array(dtype=gradients),
-        mesh: Mesh,
-        deformation_in: wp.array2d(dtype=mat33),
-        rotation_in: wp.array2d(dtype=mat33),
-    ):
-        """Deformation gradient and rotation of point q."""
-        i = wp.static(npoint) * e + q
-        if wp.static(is_single):
-            F = thin(X * shape[q] * mesh.inverse[e, q])
-            return F, rotation_thin(F)
+            return here, rotation_thin(here)
         elif wp.static(corotational):
-            return deformation_in[i, w], rotation_in[i, w]
+            return F[i, w], R[i, w]
         else:
-            return deformation_in[i, w], mat33()
+            return F[i, w], mat33()
 
-    @wp.kernel(enable_backward=False, **({"module": module} if is_single else _deep_module()))
+    @wp.kernel(enable_backward=False, **(kind.placement if is_single else _deep_module()))
     def product(
         # In:
         cap: real,
@@ -166,44 +142,49 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         e, w = wp.tid()
         if on[w] == 0:
             return
-        X = positions()
+        X = directions()  # relative to the first node
         D = directions()
-        p0 = p[mesh.elem[0, e], w]
-        for a in range(wp.static(corners)):
+        first = mesh.elem[0, e]
+        for a in range(1, wp.static(corners)):
             n = mesh.elem[a, e]
-            d = p[n, w] - p0
+            d = p[n, w] - p[first, w]
             for c in range(3):
                 D[c, a] = d[c]
             if wp.static(is_single):
-                v = x[n, w]
+                v = x[n, w] - x[first, w]
                 for c in range(3):
-                    X[c, a] = v[c]
+                    X[c, a] = float(v[c])
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = local_lame(mu, lam, cap)
+        npoint = wp.static(kind.npoint)
+        if wp.static(is_single):  # as in `force`
+            npoint = mesh.weight.shape[1]
         mean_pressure = real(0.0)
         stiff = scalar(0.0)
         if wp.static(averaged):
             if lam > local:
                 mean_pressure = pressure[e, w]
                 mean = scalar(0.0)
-                for q in range(wp.static(npoint)):
+                for q in range(npoint):
                     B = thin(mesh.inverse[e, q])
-                    F, R = point_state(e, q, w, X, shape, mesh, deformation_in, rotation_in)
-                    dF = D * narrow_gradients(shape[q]) * B
+                    F, R = point_state(X * shape[q] * B, npoint * e + q, w, deformation_in, rotation_in)
+                    dF = D * shape[q] * B
                     mean += scalar(mesh.weight[e, q]) * wp.ddot(direction_of(rubber.law, F, R), dF)
                 stiff = scalar((lam - local) / mesh.volume[e]) * mean
         C = directions()
-        for q in range(wp.static(npoint)):
+        for q in range(npoint):
+            i = npoint * e + q
             B = thin(mesh.inverse[e, q])
-            g = narrow_gradients(shape[q])
-            F, R = point_state(e, q, w, X, shape, mesh, deformation_in, rotation_in)
-            dF = D * g * B
-            dP = change_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, mean_pressure, F, R, dF)
+            F, R = point_state(X * shape[q] * B, i, w, deformation_in, rotation_in)
+            dF = D * shape[q] * B
+            dP = change_of(rubber, e, i, w, mu, local, mean_pressure, F, R, dF)
             if wp.static(averaged):
                 if lam > local:
                     dP += stiff * direction_of(rubber.law, F, R)
-            C += (scalar(weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(g)
+            C += (scalar(weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(
+                shape[q]
+            )
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
 
@@ -217,16 +198,7 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
     f = material_functions(kind)
     rotation, theta, stress_of, direction_of = f.rotation, f.theta, f.stress_of, f.direction_of
     change_of, weighted_volume, local_lame = f.change_of, f.weighted_volume, f.local_lame
-
-    @wp.func
-    def averaged_pressure(excess: real, law: int, mesh: Mesh, x: wp.array2d(dtype=vec3), e: int, w: int):
-        """Pressure of an element's mean dilatation, for the part `excess` of lambda that is not local
-        [Pa]."""
-        mean = real(0.0)
-        for q in range(wp.static(npoint)):
-            F = deformation(mesh, e, q, x, w)
-            mean += mesh.weight[e, q] * theta(law, F, rotation(F))
-        return excess * mean / mesh.volume[e]
+    averaged_pressure = f.averaged_pressure
 
     @wp.kernel(module=f"{module}.read", enable_backward=False)
     def cauchy(

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ..types import Precision, mat33, real
+from ..types import Precision, mat33, real, vec3
 from .law import (
     LAWS,
     barrier_derivative,
@@ -20,10 +20,13 @@ from .law import (
     stress,
     stress_derivative,
 )
-from .points import Mesh, Rubber, point_functions
+from .points import Mesh, Rubber, deformation_of, point_functions
 
 wp.set_module_options({"enable_backward": False})
 
+# of kernels for many worlds: threads of a block, and blocks that a multiprocessor has registers for. Fewer
+# threads would wait for memory, more have no room for what they hold
+BOUNDS = 128, 3
 # det F below which the line search rejects a step of rubber with friction elements, whose strain is isochoric
 _FLAT = 0.02
 
@@ -54,10 +57,14 @@ class Kind(NamedTuple):
         law = "corotational" if self.corotational else "laws"
         return f"{__package__}.elements.{self.corners}_{law}_{self.precision.name}_{'_'.join(self.options)}"
 
-    @property
-    def gradients(self) -> type:
+    def gradients(self, precision: Precision) -> type:
         """Type of the shape functions' gradients by parent coordinates."""
-        return wp.types.matrix(shape=(self.corners, 3), dtype=real)
+        return wp.types.matrix(shape=(self.corners, 3), dtype=precision.scalar)
+
+    @property
+    def placement(self) -> dict:
+        """Module and launch bounds of a kernel for many worlds."""
+        return {"module": self.module, "launch_bounds": BOUNDS if self.is_single else None}
 
 
 @functools.cache
@@ -76,7 +83,7 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
     polar_full = polar_upright if is_single else polar
     beyond = [name for name in options if name != "modulus"]
     uneven = "modulus" in options
-    at = point_functions(options)
+    at, deformation = point_functions(options), deformation_of(kind.corners)
     beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
 
     @wp.func
@@ -96,6 +103,16 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
         if wp.static(corotational):
             return wp.ddot(R, F) - real(3.0)
         return dilatation(law, F, R)
+
+    @wp.func
+    def averaged_pressure(excess: real, law: int, mesh: Mesh, x: wp.array2d(dtype=vec3), e: int, w: int):
+        """Pressure of an element's mean dilatation, for the part `excess` of lambda that is not local
+        [Pa]."""
+        mean = real(0.0)
+        for q in range(mesh.weight.shape[1]):
+            F = deformation(mesh, e, q, x, w)
+            mean += mesh.weight[e, q] * theta(law, F, rotation(F))
+        return excess * mean / mesh.volume[e]
 
     @wp.func
     def stress_of(
@@ -181,6 +198,7 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
         rotation=rotation,
         rotation_thin=rotation_thin,
         theta=theta,
+        averaged_pressure=averaged_pressure,
         stress_of=stress_of,
         direction_of=direction_of,
         change_of=change_of,
