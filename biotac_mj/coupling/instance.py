@@ -12,6 +12,8 @@ import warnings
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import cross
+from ..geometry.surface import face_areas
 from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.kinematics import Kinematics
@@ -445,8 +447,7 @@ class Instance:
                 found.x[:] = skin.stepper.vert_xpos(result.state)
         if touched is not None:
             face, geom, push = touched
-            corner = found.x[skin.geometry.outer_face[face]]
-            normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+            normal = face_areas(found.x, skin.geometry.outer_face[face])
             normal /= np.linalg.norm(normal, axis=1)[:, None]
             found.kept[face], found.geom[face], found.force[face] = 1, geom, -push[:, None] * normal
         return found.find()
@@ -545,5 +546,5 @@ def _carried(wrench, before, now):
     """Wrenches (n, 6) in a frame and about its origin (3,), (3, 3), in another one."""
     (at, turned), (origin, frame) = before, now
     force, torque = wrench[:, :3] @ turned.T, wrench[:, 3:] @ turned.T
-    torque += np.cross(at - origin, force)
+    torque += cross((at - origin)[None], force)
     return np.concatenate([force @ frame, torque @ frame], axis=1)

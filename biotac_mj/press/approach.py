@@ -119,9 +119,8 @@ def first_touch(
         hits = np.array([mujoco.mj_ray(model, data, p, backward, None, 1, -1, geom, normal) for p in points])
         return np.where(hits < 0, np.inf, hits)
 
-    tri = geometry.vert[geometry.outer_face]
-    facing = np.einsum("ij,j->i", np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]), backward) > 0
-    tri = _split(tri[facing])
+    facing = face_areas(geometry.vert, geometry.outer_face) @ backward > 0
+    tri = _split(geometry.vert[geometry.outer_face[facing]])
     best = np.inf
     while True:
         nearest = np.minimum(gap(tri.mean(1)), gap(tri.reshape(-1, 3)).reshape(-1, 3).min(1))

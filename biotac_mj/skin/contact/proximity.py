@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from ...geometry.rigid import displace, displacement
+from ...geometry.surface import face_areas
 from ...launches import recorded
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
@@ -254,12 +255,10 @@ class ProximityQuery:
     def _outward(self, point, faces):
         """Mean outward normal (3,) of outer faces (n,) of the undeformed skin; if n is 0, that of the face
         closest to a point (3,)."""
-        corner = self._rest[self._face]
         if not len(faces):
-            away = corner.mean(1) - point
+            away = self._rest[self._face].mean(1) - point
             faces = np.array([np.einsum("ij,ij->i", away, away).argmin()])
-        a, b, c = corner[faces].transpose(1, 0, 2)
-        total = np.cross(b - a, c - a).sum(0)
+        total = face_areas(self._rest, self._face[faces]).sum(0)
         return total / max(np.linalg.norm(total), 1e-30)
 
     def deep(self, pos: np.ndarray, mat: np.ndarray) -> bool:
