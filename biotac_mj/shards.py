@@ -120,7 +120,7 @@ def _in_processes(work, tasks, folder, say, processes):
     running = {}
     try:
         for name, environment in processes.items():
-            with _added(environment):
+            with added_to_environment(environment):
                 running[name] = context.Process(target=_process, args=(work, folder, name, todo, news))
                 running[name].start()
         while running:
@@ -145,10 +145,10 @@ def _in_processes(work, tasks, folder, say, processes):
 
 
 @contextlib.contextmanager
-def _added(environment):
+def added_to_environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Adds variables to the environment, which a process inherits when it starts."""
-    kept = {name: os.environ.get(name) for name in environment}
-    os.environ.update(environment)
+    kept = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:

@@ -18,7 +18,7 @@ mat66 = wp.spatial_matrixd
 
 
 @wp.func
-def double(p: wp.vec3):
+def double(p: Any):
     return vec3(real(p[0]), real(p[1]), real(p[2]))
 
 
@@ -28,7 +28,7 @@ def single(p: vec3):
 
 
 @wp.func
-def widen(A: wp.mat33):
+def widen(A: Any):
     return mat33(
         real(A[0, 0]), real(A[0, 1]), real(A[0, 2]),
         real(A[1, 0]), real(A[1, 1]), real(A[1, 2]),

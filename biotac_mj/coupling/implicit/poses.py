@@ -9,39 +9,25 @@ from typing import Any
 import warp as wp
 
 from ...geometry.rigid_warp import is_finite, rotation
-from ...skin.types import mat33, real, vec3, vec6
+from ...skin.types import double, mat33, real, vec3, vec6, widen
 from .rounds import Rounds, follow
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _double(p: Any):
-    return vec3(real(p[0]), real(p[1]), real(p[2]))
-
-
-@wp.func
-def _wide(A: Any):
-    return mat33(
-        real(A[0, 0]), real(A[0, 1]), real(A[0, 2]),
-        real(A[1, 0]), real(A[1, 1]), real(A[1, 2]),
-        real(A[2, 0]), real(A[2, 1]), real(A[2, 2]),
-    )  # fmt: skip
-
-
-@wp.func
 def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=Any),
                com: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):  # fmt: skip
     """Position of a body after time h at its present velocity."""
-    pos = _double(xpos[w, b])
-    spin = _double(wp.spatial_top(cvel[w, b]))
-    arm = pos - _double(com[w, rootid[b]])
-    return pos + h * (_double(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, arm))
+    pos = double(xpos[w, b])
+    spin = double(wp.spatial_top(cvel[w, b]))
+    arm = pos - double(com[w, rootid[b]])
+    return pos + h * (double(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, arm))
 
 
 @wp.func
 def _ahead_mat(b: int, w: int, h: real, xmat: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):
-    return rotation(h * _double(wp.spatial_top(cvel[w, b]))) * _wide(xmat[w, b])
+    return rotation(h * double(wp.spatial_top(cvel[w, b]))) * widen(xmat[w, b])
 
 
 @wp.kernel
@@ -57,9 +43,9 @@ def relative_poses(
 ):
     """Poses of the touching bodies now [group, world]."""
     g, w = wp.tid()
-    turn = wp.transpose(_wide(xmat[w, core]))
-    pos_out[g, w] = turn * (_double(xpos[w, body[g]]) - _double(xpos[w, core]))
-    mat_out[g, w] = turn * _wide(xmat[w, body[g]])
+    turn = wp.transpose(widen(xmat[w, core]))
+    pos_out[g, w] = turn * (double(xpos[w, body[g]]) - double(xpos[w, core]))
+    mat_out[g, w] = turn * widen(xmat[w, body[g]])
 
 
 @wp.kernel
@@ -111,10 +97,10 @@ def relative_jacobians(
     # the bodies' own columns differ in sign alone: both are about the BioTac's origin
     j = vec6()
     if sign != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
-        turn = wp.transpose(_wide(xmat[w, core]))
-        spin = _double(wp.spatial_top(cdof[w, i]))
-        arm = _double(xpos[w, core]) - _double(com[w, rootid[wp.where(sign > real(0.0), b, core)]])
-        linear = sign * (turn * (_double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+        turn = wp.transpose(widen(xmat[w, core]))
+        spin = double(wp.spatial_top(cdof[w, i]))
+        arm = double(xpos[w, core]) - double(com[w, rootid[wp.where(sign > real(0.0), b, core)]])
+        linear = sign * (turn * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
         angular = sign * (turn * spin)
         j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
     jacobian_out[g, w, i] = j
@@ -178,19 +164,19 @@ def advance_core(
     """Poses of the BioTac frame in the world: now, and after h at present velocities, moved by `square` times
     J a."""
     w = wp.tid()
-    here = _double(xpos[w, core])
-    arm = here - _double(com[w, rootid[core]])
+    here = double(xpos[w, core])
+    arm = here - double(com[w, rootid[core]])
     linear = vec3()
     angular = vec3()
     if square > real(0.0):
         for i in range(cdof.shape[1]):
             if isdofancestor[core, i] != 0:
-                spin = _double(wp.spatial_top(cdof[w, i]))
+                spin = double(wp.spatial_top(cdof[w, i]))
                 a = square * real(qacc[w, i])
-                linear += a * (_double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
+                linear += a * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
                 angular += a * spin
     pos_out[w] = here
-    mat_out[w] = _wide(xmat[w, core])
+    mat_out[w] = widen(xmat[w, core])
     pos_end_out[w] = _ahead_pos(core, w, h, rootid, xpos, com, cvel) + linear
     mat_end_out[w] = rotation(angular) * _ahead_mat(core, w, h, xmat, cvel)
 

@@ -4,7 +4,6 @@ milliseconds on a core."""
 import contextlib
 import dataclasses
 import multiprocessing
-import os
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 
@@ -21,7 +20,7 @@ from ...sensor.presets import SENSORS, Sensor, read_sensor
 from ...sensor.readings import PhysicsReadings
 from ...sensor.signals import read_signal
 from ...sensor.vibration import Modes, Texture, Vibration
-from ...shards import end_with_parent
+from ...shards import added_to_environment, end_with_parent
 from ..schema import DISPLACEMENT_SCALE
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -250,16 +249,13 @@ def readings_pool(
         with threadpool_limits(1, "blas"):  # one thread as in the workers, so that the results are bit-equal
             yield _Now()
         return
-    kept = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))  # workers inherit them: one core each
-    try:
-        spawned = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, spawned, _start_worker, (start, args)) as pool:
-            try:
-                yield pool
-            except BaseException:  # pending readings are not needed
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-    finally:
-        for name, value in kept.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    spawned = multiprocessing.get_context("spawn")
+    with (
+        added_to_environment(dict.fromkeys(THREADS, "1")),  # workers inherit it: one core each
+        ProcessPoolExecutor(workers, spawned, _start_worker, (start, args)) as pool,
+    ):
+        try:
+            yield pool
+        except BaseException:  # pending readings are not needed
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
