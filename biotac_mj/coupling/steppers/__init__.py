@@ -1,1 +1,1 @@
-"""Skins behind the protocol `SkinStepper`: finite elements, and the fast tier."""
+"""The skins of the package as `SkinStepper`s: finite elements, and the fast tier."""

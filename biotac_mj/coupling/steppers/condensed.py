@@ -1,4 +1,4 @@
-"""The fast tier as the coupling sees it: `skin.condensed` behind the protocol `SkinStepper`."""
+"""The fast tier as the coupling sees it: `skin.condensed` as a `SkinStepper`."""
 
 import functools
 
