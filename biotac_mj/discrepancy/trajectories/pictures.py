@@ -4,7 +4,6 @@ import numpy as np
 
 from ..report import plots
 from ..report.verdict import Picture, Verdict
-from .fitting import fit_effects
 from .where import residual_cells
 
 _SHOWN = 4  # trajectories, of each of two channels
@@ -41,9 +40,8 @@ def _curves(diagnosis):
 def _where(diagnosis):
     """Mean residual of the model without effects, in noise and resolution, or its trend over trajectories."""
     c = diagnosis.comparison
-    null = fit_effects(c, [], diagnosis.selection)
     columns = {name: slice(k, k + 1) for k, name in enumerate(c.channels)}
-    cells = residual_cells(c, null, diagnosis.selection, columns)
+    cells = residual_cells(c, diagnosis.null, diagnosis.selection, columns)
     asked, column = list(cells.conditions), {"force": "Fy"}
     dots = [
         (asked.index(one["condition"]), c.channels.index(column.get(one["channel"], one["channel"])))

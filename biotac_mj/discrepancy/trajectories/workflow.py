@@ -44,7 +44,8 @@ class TrajectoryDiagnosis(Verdict):
     """A verdict on data with poses; `effects` are those of single electrodes, too, with their channels.
 
     Attributes:
-      given: the simulator that was compared. fit: Fit, with the effects that are named and added.
+      given: the simulator that was compared. fit: Fit, with the effects that are named and added; null:
+        without effects.
       proof: on held-out trajectories, the skin solved again. comparison, selection, locked: what it was
         made of. beliefs: how likely which explanation is.
       trace: numbers that thresholds are set on, as a file can hold them.
@@ -52,6 +53,7 @@ class TrajectoryDiagnosis(Verdict):
 
     given: Simulator
     fit: Fit
+    null: Fit
     proof: Proof
     comparison: Comparison
     selection: np.ndarray
@@ -329,6 +331,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         },
         given=given,
         fit=proof.fit,
+        null=null,
         proof=proof,
         comparison=comparison,
         selection=chosen,
