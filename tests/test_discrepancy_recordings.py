@@ -136,6 +136,7 @@ def test_short_series_of_a_sensor_are_diagnosed_together(tmp_path):
         np.savetxt(path, part, fmt="%d")
     together = read_recording(paths)
     assert together.name == "s0 and 23 more" and together.joints == tuple(range(250, 6000, 250))
+    assert "s0, s1, s2, s3, s4 ... are taken for series of one sensor" in together.warnings[0]
     np.testing.assert_array_equal(np.flatnonzero(np.diff(together.tick) != 1) + 1, together.joints)
     found = diagnose_recording(together)
     assert found.verdict == "no significant disagreement" and found.session.loaded

@@ -262,6 +262,8 @@ def csv():
     yield Row(CSV, "420 of 420 rows lack an electrode, mostly e3: a gap cannot", "r.csv", turns)
     dynes = replaced(",pdc,", ",Fx (dyn),")
     yield Row(CSV, "column 'Fx (dyn)' has unit dyn: N, mN, kN, gf, kgf, ozf, lbf are known", "r.csv", dynes)
+    volts = replaced(",e3,", ",e3 [mV],")
+    yield Row(CSV, "the electrodes are in mV; raw counts 0..4095 are needed: give --scale", "r.csv", volts)
     untimed = lines(lambda v: [row.partition(",")[2] for row in v])
     one = column("e3", lambda i, v: "" if i == 0 else v)
     yield Row(CSV, "line 2: e3 is '', not a finite", "r.csv", lambda path: (untimed(path), one(path)))

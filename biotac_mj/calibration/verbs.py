@@ -2,7 +2,6 @@
 
 import argparse
 import pathlib
-from collections.abc import Callable
 
 import tqdm
 
@@ -49,13 +48,10 @@ def _body(name, skin, liquid, options):
     return configuration(name, skin, modulus, **{"liquid": liquid, **plain(given.get("skin") or {})})
 
 
-def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
-    """`biotac lab calibrate`; raises ValueError or FileNotFoundError for invalid input.
-
-    Args:
-      forces_of: (configuration, material, parameters, indentation, device) -> the argument `forces` of
-        `calibrate`, and the name of its method for derivatives.
-    """
+def calibrate_verb(args: argparse.Namespace) -> None:
+    """`biotac lab calibrate`; raises ValueError or FileNotFoundError for invalid input. args.forces_of:
+    (configuration, material, parameters, indentation, device) -> the argument `forces` of `calibrate`, and
+    the name of its method for derivatives."""
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
     _complete(args, _TRUTH, args.synthetic, "give --synthetic in place of DATA, or leave it out")
@@ -87,7 +83,7 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
         data = read_indentation(args.data, args.indenter, args.direction)
     finer = refined(body.geometry) if args.correct else None
     start = read_material(args.material)
-    forces, how = forces_of(body, start, parameters, data, args.device)
+    forces, how = args.forces_of(body, start, parameters, data, args.device)
     result = calibrate(
         body,
         start,
@@ -106,8 +102,8 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     print(f"wrote {out / 'calibration.json'} and {out / 'calibration.png'}")
 
 
-def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
-    """`biotac lab compare`; raises ValueError or FileNotFoundError for invalid input. forces_of: see
+def compare_verb(args: argparse.Namespace) -> None:
+    """`biotac lab compare`; raises ValueError or FileNotFoundError for invalid input. args.forces_of: see
     `calibrate_verb`.
 
     When called again with the same settings and folder, it continues.
@@ -169,7 +165,7 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
             kept.get(
                 body.name,
                 Comparison,
-                lambda body=body: _compared(body, given, calibration, cases, kept, args, forces_of),
+                lambda body=body: _compared(body, given, calibration, cases, kept, args),
             )
         )
     write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
@@ -183,12 +179,12 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     print(f"wrote {out / 'compare.json'}")
 
 
-def _compared(body, given, calibration, cases, kept, args, forces_of):
+def _compared(body, given, calibration, cases, kept, args):
     """Calibrates a configuration, unless its material is given, and evaluates it."""
     fitted = None
     if not given:
         wanted = [parameter(name) for name in ("E", "nu", "mu")]
-        forces, _ = forces_of(body, material("paper"), wanted, calibration, args.device)
+        forces, _ = args.forces_of(body, material("paper"), wanted, calibration, args.device)
         settings = dict(device=args.device, progress=not args.quiet, forces=forces)
         fitted = kept.get(
             f"calibration of {body.name}",

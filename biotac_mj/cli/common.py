@@ -4,7 +4,7 @@ import argparse
 import importlib
 from collections.abc import Callable
 
-from ..arguments import SEED, check_device, device
+from ..arguments import SEED, check_device, device, output_folder
 from .names import MATERIALS, SKINS, TIERS
 
 
@@ -114,6 +114,12 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
             help=f"{what.format(touched)}, such as {example}, or JSON; of several one is drawn at random "
             "(default: none)",
         )
+
+
+def add_results(verb: argparse.ArgumentParser, folder: str, text: str, *names: str) -> None:
+    """Adds --out, a folder to which files of these names are written, and --quiet."""
+    verb.add_argument("--out", type=output_folder(*names), default=folder, metavar="DIR", help=text)
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def choice(text: str) -> str | dict:

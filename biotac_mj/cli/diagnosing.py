@@ -3,8 +3,8 @@
 import argparse
 import math
 
-from ..arguments import SEED, check_device, device, output_file, output_folder, quantity, real, whole
-from .common import add_options, add_verb
+from ..arguments import SEED, check_device, device, output_file, quantity, real, whole
+from .common import add_options, add_results, add_verb
 from .names import TIERS
 
 
@@ -107,9 +107,8 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--device", type=device, default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0"
     )
-    files = output_folder("report.html", "verdict.json", "sensor_amended.yaml")
-    verb.add_argument("--out", type=files, default="out/diagnose", metavar="DIR", help="folder of the report")
-    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+    files = "report.html", "verdict.json", "sensor_amended.yaml"
+    add_results(verb, "out/diagnose", "folder of the report", *files)
 
 
 def add_next(verbs: argparse._SubParsersAction) -> None:

@@ -2,9 +2,9 @@
 
 import argparse
 
-from ..arguments import SEED, check_device, output_file, output_folder, real, whole
+from ..arguments import SEED, output_file, real, whole
 from ..recordings.verbs import add_load_arguments
-from .common import add_device, add_options, add_verb
+from .common import add_device, add_options, add_results, add_verb
 from .names import CONFIGURATIONS, INDENTER_HELP, INDENTERS, MATERIALS, SKINS
 
 
@@ -13,7 +13,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "calibrate",
-        _calibrate,
+        "calibration.verbs.calibrate_verb",
         "Fit E, nu, mu (and other parameters) to the forces of one indentation with shear.",
     )
     verb.add_argument(
@@ -95,21 +95,9 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help="number of starting points, used if they may improve the fit: forces may jump in the parameters",
     )
     add_device(verb)
-    verb.add_argument(
-        "--out",
-        type=output_folder("calibration.json", "calibration.png"),
-        default="out/calibrate",
-        metavar="DIR",
-        help="folder of calibration.json and calibration.png",
-    )
-    verb.add_argument("--quiet", action="store_true", help="no progress bar")
-
-
-def _calibrate(args):
-    from ..calibration import verbs
-
-    check_device(args.device)
-    verbs.calibrate_verb(args, _forces_of)
+    files = "calibration.json", "calibration.png"
+    verb.set_defaults(forces_of=_forces_of)
+    add_results(verb, "out/calibrate", f"folder of {' and '.join(files)}", *files)
 
 
 def _forces_of(*given):
@@ -125,7 +113,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs,
         "compare",
-        _compare,
+        "calibration.verbs.compare_verb",
         "Compare the paper's four configurations with a reference over many indentations.",
     )
     verb.add_argument(
@@ -163,18 +151,8 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
     )
     add_device(verb)
-    files = output_folder("compare.json", "compare.kept")
-    verb.add_argument(
-        "--out", type=files, default="out/compare", metavar="DIR", help="folder of compare.json"
-    )
-    verb.add_argument("--quiet", action="store_true", help="no progress bar")
-
-
-def _compare(args):
-    from ..calibration import verbs
-
-    check_device(args.device)
-    verbs.compare_verb(args, _forces_of)
+    verb.set_defaults(forces_of=_forces_of)
+    add_results(verb, "out/compare", "folder of compare.json", "compare.json", "compare.kept")
 
 
 def add_estimate(verbs: argparse._SubParsersAction) -> None:

@@ -5,7 +5,7 @@ import argparse
 from ..arguments import SEED, check_device, output_file, output_folder, place, quantity, real, whole
 from ..files import check_output_file, refuse_inputs
 from ..reading import reading
-from .common import add_sensor, add_skin, add_verb
+from .common import add_results, add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP, TASKS
 
 _LONGEST_STEP = 0.1  # [s] quasi-static presses use longer internal steps
@@ -68,8 +68,7 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     )
     add_skin(verb)
     add_sensor(verb, "the indenter is")
-    files = output_folder("readings.csv", "skin.h5", "press.png")
-    verb.add_argument("--out", type=files, default="out/press", metavar="DIR", help="folder of the results")
+    add_results(verb, "out/press", "folder of the results", "readings.csv", "skin.h5", "press.png")
     verb.add_argument(
         "--render",
         action=argparse.BooleanOptionalAction,
@@ -77,7 +76,6 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         help="MuJoCo's render in press.png; "
         "without it, or without a GL library, matplotlib draws the surfaces",
     )
-    verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _press(args):

@@ -3,7 +3,7 @@
 import argparse
 
 from ..arguments import SEED, add_ray, output_folder, quantity, real, whole
-from .common import add_sensor, add_skin, add_verb
+from .common import add_results, add_sensor, add_skin, add_verb
 from .names import INTERACTIONS, OBJECTS
 
 
@@ -70,15 +70,8 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     )
     add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
     add_sensor(verb, "the objects are")
-    verb.add_argument(
-        "--out",
-        type=output_folder("generate.json"),
-        default="out/set",
-        metavar="DIR",
-        help="folder of the set",
-    )
     add_ray(verb)
-    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+    add_results(verb, "out/set", "folder of the set", "generate.json")
 
 
 def add_data(verbs: argparse._SubParsersAction) -> None:

@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import json
 import pathlib
+import sys
 
 import numpy as np
 from tqdm import tqdm
@@ -58,6 +59,8 @@ def estimate_verb(args: argparse.Namespace) -> None:
             return estimator.fit(counts[row], rest, pressure, args.rest, film)
         return estimator(counts[row], rest, pressure, belief)
 
+    if simulated and not args.quiet:
+        print(f"note: fitting a press to each of {len(rows)} rows, half a minute each", file=sys.stderr)
     found = [
         estimate(row)
         for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False)

@@ -186,7 +186,11 @@ def read_recording(
     plain.joints = tuple(np.cumsum([len(one) for one in series])[:-1].tolist())
     if plain.joints and plain.missing is not None:
         plain.missing[list(plain.joints)] = 0
-    plain.warnings = (*(note for _, notes in chosen for note in notes), *plain.warnings)
+    notes = [note for _, more in chosen for note in more]
+    if others := series[1:]:
+        names = ", ".join(one.name for one in others[:4]) + (" ..." if len(others) > 4 else "")
+        notes.append(f"{series[0].name}, {names} are taken for series of one sensor: diagnose several apart")
+    plain.warnings = (*notes, *plain.warnings)
     return plain
 
 

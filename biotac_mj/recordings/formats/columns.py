@@ -12,7 +12,7 @@ import zlib
 import numpy as np
 
 from ...reading import Unfit
-from .names import UNITS, is_time, place_of
+from .names import COUNTED, UNITS, is_time, place_of
 
 _HEX = re.compile(r"0x[0-9a-f]+", re.I)
 _BARE_HEX = re.compile(r"(?=.*\d)[0-9a-f]{1,4}", re.I)  # without 0x, up to 16 bits
@@ -22,7 +22,6 @@ _CLOCKS = "seconds, a time of day as 12:34:56.7, or date and time in one word as
 _LIST = re.compile(r"[\[(](\s*[-+.\deE]+(?:[\s,]+[-+.\deE]+)+,?\s*)[\])]")
 _START = 4096  # characters to search for a list
 _KNOWN_UNITS = {"s", "sec", "ms", "us", "ns", *UNITS}
-_COUNTED = {"", "-", "count", "counts", "bit", "bits", "raw"}  # no unit, or counts
 _EMPTY = ("", "nan", "-nan", "none", "null", "na", "n/a")  # cells without a number
 _MOST = 2**30  # bytes that are read at once: 4 hours of a native log; guards against decompression bombs
 
@@ -291,7 +290,7 @@ def _of_elements(names):
 def _units(row, names):
     """Names with the units in the row below them, None if it has none."""
     words = [re.sub(r"[\s()\[\]*.·]", "", word).lower() for word in row]
-    if len(words) != len(names) or not any(words) or not set(words) <= _KNOWN_UNITS | _COUNTED:
+    if len(words) != len(names) or not any(words) or not set(words) <= _KNOWN_UNITS | COUNTED:
         return None
     return [f"{name}_{word}" if word in _KNOWN_UNITS else name for name, word in zip(names, words)]
 

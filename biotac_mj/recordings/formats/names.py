@@ -63,6 +63,7 @@ _PATTERNS = [
         r"|(?:.*_)?(?P<whole>quaternion|quat)",
     }.items()
 ]
+COUNTED = {"", "-", "count", "counts", "bit", "bits", "raw"}  # no unit, or counts
 UNITS = {written: unit for units in _UNITS.values() for written, unit in units.items()}
 _BRACKETED = re.compile(r"(.*[^\s_])[\s_]*[\[(]\s*(.*?)\s*[\])]\s*")
 _CLOCK = re.compile(
@@ -116,7 +117,8 @@ def place_of(name: str) -> Place | None:
                 return None
         column = None if whole else (_QUATERNION if field.endswith("quat") else _AXES)[axis]
         return Place(prefix, field, column)
-    return None
+    place = place_of(found[1]) if (found := _BRACKETED.fullmatch(name)) else None
+    return place if place and place.field == "electrodes" else None  # in whatever unit
 
 
 def unit_of(name: str) -> tuple[str, float]:
@@ -135,17 +137,25 @@ def unit_named(unit: str) -> tuple[str, float]:
     return next((known for known in UNITS.values() if known[0] == unit), ("", 1.0))
 
 
-def refuse_unknown_unit(name: str) -> None:
-    """Raises ValueError for a column of force, torque or position whose name has another unit in brackets
-    than those known."""
+def other_unit(name: str) -> str:
+    """Unit in brackets in the name of an electrode, "" if none or counts.
+
+    Raises:
+      ValueError: the name of a force, torque or position has another unit in brackets than those known.
+    """
     found = _BRACKETED.fullmatch(name)
     place, whole = (place_of(found[1]), place_of(name)) if found else (None, None)
-    units = _UNITS.get(place.field.rpartition("_")[2]) if place else None
+    if place is None:
+        return ""
+    if place.field == "electrodes":
+        return "" if found[2].lower() in COUNTED else found[2]
+    units = _UNITS.get(place.field.rpartition("_")[2])
     if units and (whole is None or whole.field != place.field):
         known = ", ".join(dict.fromkeys(unit for unit, _ in units.values()))
         raise ValueError(
             f"column {name!r} has unit {found[2]}: {known} are known; convert the numbers and rename it"
         )
+    return ""
 
 
 def _split_body(prefix):

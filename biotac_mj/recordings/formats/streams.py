@@ -10,7 +10,7 @@ from ...geometry.design import BIOTAC, design_named, designs
 from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
 from ...sensor.channels import FULL_SCALE
 from ..recording import CHANNELS, FIELDS, Recording, designed
-from .names import is_stamp, is_time, place_of, refuse_unknown_unit, unit_of
+from .names import is_stamp, is_time, other_unit, place_of, unit_of
 
 _OF_ONE_SENSOR = {"force", "torque", "sensor_pos", "sensor_quat"}
 _HOLE = 0.25  # [s] longest gap of a force or pose log that is interpolated
@@ -39,6 +39,7 @@ class Stream:
       called: the sensor's own identification, such as its serial number, or "".
       time: (n,) [s], None without times.
       rate: [Hz] implied by the format, if there is no time. object, notes: see Recording.
+      unit: of the electrodes as written in the file, "" for counts or if none is.
     """
 
     source: str
@@ -49,6 +50,7 @@ class Stream:
     object: str = ""
     notes: list[str] = dataclasses.field(default_factory=list)
     called: str = ""
+    unit: str = ""
 
     @property
     def has_channels(self) -> bool:
@@ -71,10 +73,11 @@ def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] |
     """
     notes, time, unused, found, called = list(notes or ()), None, [], {}, {}
     columns = _with_whole_stamps(columns)
-    units, clock = {}, _clock_name(columns)
+    units, clock, written = {}, _clock_name(columns), {}
     for name, value in columns.items():
-        place = place_of(name)
-        refuse_unknown_unit(name)
+        place, unit = place_of(name), other_unit(name)
+        if unit:
+            written[place.sensor] = unit
         if name == clock:
             time = _seconds(np.asarray(value, float).ravel(), name)
         elif place is None:
@@ -119,9 +122,8 @@ def make_streams(source: str, columns: dict[str, np.ndarray], notes: list[str] |
                 whole[field] = value
         notes += _normalise(source, whole)
         if whole:
-            streams.append(
-                Stream(source, sensor, whole, own[sensor][1] if sensor in own else time, notes=notes)
-            )
+            clock = own[sensor][1] if sensor in own else time
+            streams.append(Stream(source, sensor, whole, clock, notes=notes, unit=written.get(sensor, "")))
     lengths = {len(value) for stream in streams for value in stream.fields.values()}
     lengths |= set() if time is None else {len(time)}
     each = [{len(p.time), *map(len, p.fields.values())} for p in streams if p.time is not None]
@@ -431,6 +433,11 @@ def _recording(name, stream, others, rows_clock, object_name, scale):
     if scale is not None:
         fields |= {key: fields[key] * scale for key in there}
         notes.append(f"channels were multiplied by {scale:g}")
+    elif stream.unit:
+        raise ValueError(
+            f"{stream.source}: the electrodes are in {stream.unit}; raw counts 0..4095 are needed: give "
+            "--scale, counts for one of their units"
+        )
     unit = "counts"
     if "electrodes" in fields:
         read = fields["electrodes"]

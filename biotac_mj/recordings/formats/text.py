@@ -8,7 +8,7 @@ import numpy as np
 from ...geometry.design import designs
 from ...sensor.channels import ELECTRODES, NPAC
 from .columns import Table, parse_table
-from .names import is_part_of_stamp, is_stamp, is_time, place_of, refuse_unknown_unit
+from .names import is_part_of_stamp, is_stamp, is_time, other_unit, place_of
 from .streams import Stream, make_streams
 
 # Ruppel et al. (IAS-15, 2019): a table that may come without a header
@@ -124,7 +124,7 @@ def read_matrix(table: Table, role: str | None = None) -> list[Stream]:
     """
     path, width, n = table.path, table.width, len(table.cells)
     for name in table.names or ():
-        refuse_unknown_unit(name)
+        other_unit(name)
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
     names, more = _ROLES[role]
     if role == "electrodes":
