@@ -51,6 +51,7 @@ class Inverse:
             self.along = wp.zeros(self._nodes if self._liquid else (0, nworld), dtype=wp.vec3)
             self._partial = wp.zeros((2, *self._chunks), dtype=real)
             none = wp.zeros((0, nworld), dtype=wp.mat33)
+            self._no_slot, self._nothing = wp.zeros((0, nworld), dtype=int), wp.zeros(nworld, dtype=float)
         self.pushed = None
         if pushes_forward(model.elements, model.material.poissons_ratio):
             self.pushed = PushForwardMatrices(model.elements, nworld, model.device, lanes)
@@ -95,9 +96,8 @@ class Inverse:
             inputs = [self._chunk, *nodes, product.answer, st, on]
             out = [self.along, self._partial]
             self._launch(program, right_hand_sides.read_along, self._chunks, inputs, out)
-        self._launch(
-            program, right_hand_sides.load_residual, self._nodes, [self.node_map, r, on], [product.side]
-        )
+        inputs = [0, self.node_map, self._no_slot, r, *nodes[1:], u_out, self._nothing, st, on]
+        self._launch(program, right_hand_sides.load_difference, self._nodes, inputs, [product.side])
         product.run(program)
         if liquid:
             inputs = [self._chunk, *nodes, product.answer, st, on]

@@ -108,20 +108,6 @@ def load_gradient(
 
 
 @wp.kernel
-def load_residual(
-    node_map: NodeMap,
-    r: wp.array2d(dtype=wp.vec3),
-    on: wp.array(dtype=int),
-    side_out: wp.array3d(dtype=wp.float16),
-):
-    """Stores the residual at node i, over its norm, as a right-hand side."""
-    i, w = wp.tid()
-    j = node_map.row[i]
-    if on[w] == 1 and j >= 0:
-        write_node(pull_back(node_map, i, w, r[i, w] / node_map.norm[0, w]), j, w, side_out)
-
-
-@wp.kernel
 def measure_norm(partial: wp.array3d(dtype=real), on: wp.array(dtype=int), norm_out: wp.array2d(dtype=float)):
     """Norm of the residual in world w. partial: its square by chunks."""
     w, t = wp.tid()
@@ -234,13 +220,16 @@ def load_difference(
     # Out:
     side_out: wp.array3d(dtype=wp.float16),
 ):
-    """Stores the residual minus the forces q of contact and liquid at node i as a right-hand side."""
+    """Stores the residual minus the forces q of contact and liquid at node i as a right-hand side; without
+    slots and liquid the residual."""
     i, w = wp.tid()
     j = node_map.row[i]
     if on[w] == 0 or j < 0:
         return
     b = r[i, w]
-    s = slot[i, w]
+    s = int(-1)
+    if slot.shape[0] > 0:
+        s = slot[i, w]
     if s >= 0:
         at = has_liquid + 3 * s
         b -= wp.vec3(q[w, at], q[w, at + 1], q[w, at + 2])
