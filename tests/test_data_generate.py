@@ -266,10 +266,10 @@ def test_a_set_whose_mesh_changed_is_not_completed(tmp_path):
     mesh, out = tmp_path / "own.stl", tmp_path / "set"
     trimesh.creation.icosphere(2, 4e-3).export(mesh)
     own = dataclasses.replace(
-        SMALL, count=2, labelled=0, steps=8, kinds=("press",), objects=(f"mesh:{mesh}",), batch=1
+        SMALL, count=1, labelled=0, steps=8, kinds=("press",), objects=(f"mesh:{mesh}",), batch=1
     )
     generate(out, own, workers=0, progress=False)
-    (out / "shard-00001.h5").unlink()
+    (out / "shard-00000.h5").unlink()
     assert generate(out, own, workers=0, progress=False).made == 1
     trimesh.creation.box((4e-3, 4e-3, 8e-3)).export(mesh)
     with pytest.raises(ValueError, match="other options .files .*own.stl.* there, .*own.stl.* now"):
