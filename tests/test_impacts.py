@@ -251,14 +251,14 @@ def test_fast_turning_bodies_gain_nothing_from_withheld_force(integrator):
 @pytest.mark.parametrize(
     "integrator, light, quat, place, heavy, speed",
     [
-        ("RK4", 'box" size=".0022 .0038 .0031" mass=".0039', "-.62 .15 -1.61 .24", ".0016 -.0001 .0312",
-         1.71, 0.79),
+        pytest.param("RK4", 'box" size=".0022 .0038 .0031" mass=".0039', "-.62 .15 -1.61 .24",
+                     ".0016 -.0001 .0312", 1.71, 0.79, marks=pytest.mark.slow),
         ("RK4", 'cylinder" size=".0028 .0022" mass=".0037', "1.83 .03 -.52 .58", "-.0009 .0013 .0324",
          2.06, 0.72),
         ("implicitfast", 'box" size=".0025 .003 .0027" mass=".0025', "-.63 -1.32 -.11 1", "-.002 .0002 .0298",
          2.15, 0.48),
-        ("implicitfast", 'box" size=".0021 .0022 .003" mass=".0037', "-.01 -1.18 .41 -.46",
-         "-.0007 .0013 .029", 2.08, 0.71),
+        pytest.param("implicitfast", 'box" size=".0021 .0022 .003" mass=".0037', "-.01 -1.18 .41 -.46",
+                     "-.0007 .0013 .029", 2.08, 0.71, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_a_light_body_that_a_heavy_one_crushes_gains_nothing(integrator, light, quat, place, heavy, speed):
@@ -847,8 +847,8 @@ def test_a_box_that_sank_beside_a_press_comes_up_with_it():
     [
         ((4e-3, 4.4e-3, 2.1e-3), 0.0042, 0.001, (-0.0098, 0.0001), (0.27, -0.03, 0.36, -0.89),
          (0.08, -0.02, -1.12, -1.9, 2.32, 4.12)),
-        ((3.4e-3, 4.8e-3, 5.4e-3), 0.0514, 0.004, (-0.0075, -0.0026), (0.02, 0.35, 0.71, -0.61),
-         (0.03, 0.19, -0.7, -3.43, 3.43, -15.36)),
+        pytest.param((3.4e-3, 4.8e-3, 5.4e-3), 0.0514, 0.004, (-0.0075, -0.0026), (0.02, 0.35, 0.71, -0.61),
+                     (0.03, 0.19, -0.7, -3.43, 3.43, -15.36), marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_a_box_that_leaves_is_not_pulled(half, mass, timestep, pos, quat, velocity):
