@@ -245,6 +245,9 @@ def files_of_skins():
             yield Row(SKIN, f"the surface of its tetrahedra: {said}", "skin.npz", arrays(**{name: change}))
     twice = arrays(elem=lambda v: np.concatenate([v, v[:1]]))
     yield Row(SKIN, "belong to more than two tetrahedra", "skin.npz", twice)
+    turned = arrays(elem=lambda v: np.concatenate([v[:1, [1, 0, *range(2, v.shape[1])]], v[1:]]))
+    said = "1 of 1382 tetrahedra of skin skin.npz are inverted or degenerate (first: 0, "
+    yield Row(SKIN, said, "skin.npz", turned)
     for name in ("nail", "clamp"):
         said = f"the {name} of skin skin.npz encloses no volume"
         yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))

@@ -78,7 +78,12 @@ def test_sensors_written_into_a_pad_s_design_are_its_own(tmp_path):
     path.write_text(json.dumps(written))
     assert biotac_mj.load_skin(tmp_path / "dome").design == read_design(tmp_path / "dome")
     handle, _, data = pushed(tmp_path / "dome", -20e-3, 0.0, readings={"noise": False})
-    np.testing.assert_allclose(handle.read(data, "electrodes"), written["sensors"]["mine"]["rest"], atol=2)
+    rest = written["sensors"]["mine"]["rest"]
+    np.testing.assert_allclose(handle.read(data, "electrodes"), rest, atol=2)
+    rest[0] -= 100  # and edited again in the same process
+    path.write_text(json.dumps(written))
+    handle, _, data = pushed(tmp_path / "dome", -20e-3, 0.0, readings={"noise": False})
+    np.testing.assert_allclose(handle.read(data, "electrodes"), rest, atol=2)
     path.write_text(json.dumps(written | {"slots": written["slots"] + 2}))
     with pytest.raises(ValueError, match="is not the design that default.npz was made of: .* sensors alone"):
         biotac_mj.load_skin(tmp_path / "dome")

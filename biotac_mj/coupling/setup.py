@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.skins import load_skin
+from ..geometry.skins import file_state, load_skin
 from .config import Config
 from .shared import Shared
 from .stepper import SkinResult, make_readings, make_stepper
@@ -67,7 +67,7 @@ _asked = -1  # the instance of MuJoCo's last call: its calls are in the order of
 
 
 def _skin(config, touching):
-    key = (tuple(config.strings().items()), touching.key())
+    key = (tuple(config.strings().items()), touching.key(), file_state(config.skin))
     return _skins.get(key, lambda: _Skin(config, touching.geoms))
 
 

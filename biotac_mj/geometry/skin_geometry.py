@@ -10,7 +10,7 @@ from ..reading import Array, read_npz
 from ..short_repr import short_repr
 from .design import BIOTAC, Design, read_design
 from .solid import check_place, check_size, no_solid
-from .tet_mesh import TetMesh, check_closed, enclosed_volume, indices, triangle_numbers
+from .tet_mesh import TetMesh, check_closed, check_volumes, enclosed_volume, indices, triangle_numbers
 
 # the eight four-node tetrahedra of a ten-node one: four at the corners, four around the octahedron's diagonal
 # 4-9
@@ -171,10 +171,12 @@ class SkinGeometry:
             self._check_surfaces(name)
 
     def _check_surfaces(self, name):
-        """Raises ValueError unless the outer and the inner surface are the free surface of the tetrahedra."""
+        """Raises ValueError unless the outer and the inner surface are the free surface of the tetrahedra,
+        and these have volumes."""
+        check_volumes(self.vert, self.elem, f"of skin {name} ")
         mesh = TetMesh(self.vert, self.tets)
         if (mesh.volumes <= 0).any():
-            return  # such faces have no side; `SkinModel` names the tetrahedra
+            return  # curved edges fold a part of an element: `SkinModel` names it
         surface = _directed(mesh.boundary)
         for which in ("outer_face", "inner_face"):
             face = getattr(self, which)

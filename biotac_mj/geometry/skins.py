@@ -36,15 +36,20 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
 def _loaded(name_or_path):
     """The skin of `load_skin`, cached in the process: each `attach` loads it three times, and each
     `Handle.read` takes its design."""
-    if isinstance(name_or_path, str) and name_or_path in _SHIPPED:
-        return _read(name_or_path, None)
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(
             f"skin is {short_repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
+    return _read(name_or_path, file_state(name_or_path))
+
+
+def file_state(name_or_path: pathlib.Path | str) -> tuple:
+    """Tells a stored skin from a later one of this path; () for a shipped skin."""
+    if name_or_path in _SHIPPED:
+        return ()
     path = _file(name_or_path)
     files = [file.stat() for file in (path, path.parent / "design.json") if file.exists()]
-    return _read(path, tuple((f.st_ino, f.st_mtime_ns, f.st_size) for f in files))
+    return tuple((f.st_ino, f.st_mtime_ns, f.st_size) for f in files)
 
 
 @functools.lru_cache(maxsize=2 * len(_SHIPPED))

@@ -172,6 +172,19 @@ def check_closed(face: np.ndarray, name: str = "surface") -> None:
         raise ValueError(f"the {name} has faces of both orientations: make all normals point outwards")
 
 
+def check_volumes(vert: np.ndarray, elem: np.ndarray, of: str = "") -> None:
+    """Raises ValueError if tetrahedra (nelem, 4 or more) are inverted or degenerate; of: their skin, in the
+    text."""
+    edges = np.moveaxis(vert[elem[:, 1:4]] - vert[elem[:, :1]], 1, 2)
+    volume = np.linalg.det(edges) / 6
+    bad = np.flatnonzero(~(volume > 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3))
+    if len(bad):
+        raise ValueError(
+            f"{len(bad)} of {len(elem)} tetrahedra {of}are inverted or degenerate (first: {bad[0]}, volume "
+            f"{volume[bad[0]]:.3g} m^3): repair the mesh or swap two nodes of each inverted tetrahedron"
+        )
+
+
 def enclosed_volume(vert: np.ndarray, face: np.ndarray) -> float:
     """Volume inside a closed surface by the divergence theorem; negative where the normals point inwards."""
     a, b, c = (vert[face[:, i]] for i in range(3))

@@ -23,6 +23,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ...geometry.edge_nodes import shape_gradients
+from ...geometry.tet_mesh import check_volumes
 from ..types import mat33, real, vec3
 from .law import LAWS
 from .points import Mesh
@@ -107,7 +108,7 @@ class Tetrahedra:
     def _measure(self, vert):
         """Inverse of the parent map, and volume of the points, for reference positions `vert`."""
         elem = self.elem
-        _refuse_degenerate(vert, elem)
+        check_volumes(vert, elem)
         edges = np.einsum("eai,qak->eqik", vert[elem], self._shape)
         weight = np.linalg.det(edges) / self._whole
         folded = np.flatnonzero(weight.min(1) <= 0)
@@ -177,14 +178,3 @@ class Tetrahedra:
             cols = np.tile(dof[elements], n).ravel()
             total += sp.coo_matrix((block.ravel(), (rows, cols)), shape=total.shape).tocsc()
         return total
-
-
-def _refuse_degenerate(vert, elem):
-    edges = np.moveaxis(vert[elem[:, 1:4]] - vert[elem[:, :1]], 1, 2)
-    volume = np.linalg.det(edges) / 6
-    bad = np.flatnonzero(~(volume > 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3))
-    if len(bad):
-        raise ValueError(
-            f"{len(bad)} of {len(elem)} tetrahedra are inverted or degenerate (first: {bad[0]}, volume "
-            f"{volume[bad[0]]:.3g} m^3): repair the mesh or swap two nodes of each inverted tetrahedron"
-        )
