@@ -115,16 +115,15 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
 
 @pytest.mark.slow
 def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
-    count, steps = Checkpoints.count, []
+    begin, steps = Checkpoints.__init__, []
 
-    def counted(self, n, seconds=0.0):
-        count(self, n, seconds)
+    def counted(n):
         steps.append(n)
         if len(steps) == 400:  # within the inverse, between two of its states that are kept
             raise KeyboardInterrupt
 
     same = dict(paper=False, progress=False)
-    monkeypatch.setattr(Checkpoints, "count", counted)
+    monkeypatch.setattr(Checkpoints, "__init__", lambda self, folder, say: begin(self, folder, counted))
     monkeypatch.setattr(fitting, "_BETWEEN", 0.0)
     with pytest.raises(KeyboardInterrupt):
         train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
@@ -142,13 +141,12 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
 @pytest.mark.slow
 def test_the_bar_reaches_its_end(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # elsewhere no bar is drawn
-    count, steps = Checkpoints.count, []
+    begin, steps = Checkpoints.__init__, []
 
-    def counted(self, n, seconds=0.0):
-        count(self, n, seconds)
-        steps.append(n)
+    def counted(self, folder, say):
+        begin(self, folder, lambda n: [steps.append(n), say(n)])
 
-    monkeypatch.setattr(Checkpoints, "count", counted)
+    monkeypatch.setattr(Checkpoints, "__init__", counted)
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False)
     said, bar = capsys.readouterr()
     total = 120 * (2 + 3)  # the head, the inverse

@@ -40,17 +40,13 @@ class Checkpoints:
 
     Args:
       folder: of checkpoints, None: no checkpoints. say: progress callback, called with 1 at each step.
-
-    Attributes:
-      steps: of all trainings so far, seconds: of the steps of this run, without validation.
     """
 
     def __init__(
         self, folder: pathlib.Path | None = None, say: Callable[[int], object] = lambda n: None
     ) -> None:
         self.folder, self.say = folder, say
-        self.number = self.steps = 0
-        self.seconds = 0.0
+        self.number = 0
         self._kept = time.perf_counter()
 
     def begin(self) -> dict | None:
@@ -58,14 +54,8 @@ class Checkpoints:
         self.number += 1
         path = self._path()
         kept = torch.load(path, weights_only=True) if path is not None and path.is_file() else None
-        self.count(kept["step"] if kept else 0)
+        self.say(kept["step"] if kept else 0)
         return kept
-
-    def count(self, steps: int, seconds: float = 0.0) -> None:
-        """Some steps more."""
-        self.steps += steps
-        self.seconds += seconds
-        self.say(steps)
 
     def keep(self, last: bool, **state: object) -> None:
         """Saves the training's state: the last one, and others every few seconds."""
@@ -120,7 +110,7 @@ def train(
       rows: (k,) rows to draw from, on the device.
       validate: () -> float, called twelve times; the state with its smallest value is restored at the end.
         None keeps the last.
-      checkpoints: counts and saves the steps. curve: gets [step, value] of each validation.
+      checkpoints: says and saves the steps. curve: gets [step, value] of each validation.
 
     Returns:
       smallest value of validate, or None.
@@ -163,7 +153,6 @@ def train(
 
     replay = None
     for step in range(first, steps):
-        clock = time.perf_counter()
         chosen.copy_(rows[torch.randint(len(rows), chosen.shape, generator=generator, device=rows.device)])
         if replay:
             replay.replay()
@@ -173,7 +162,7 @@ def train(
         else:
             value = _on_side_stream(one) if cuda and options.graph else one()
         schedule.step()
-        checkpoints.count(1, time.perf_counter() - clock)
+        checkpoints.say(1)
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(

@@ -33,11 +33,6 @@ class Bank:
         self._parts += [wp.to_torch(b.skin.geoms.struct.friction).T for b in batches]
         self._kept = []
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the stored states [bytes]."""
-        return sum(part.nbytes for part in self._parts)
-
     def keep(self) -> None:
         """Stores the present state of every world."""
         self._rows.write()
