@@ -23,17 +23,23 @@ def solves(monkeypatch):
     return made
 
 
-def ball(tier, **keywords):
-    """A ball that has come to rest on a pad which looks up; its joint is damped."""
+def ball(tier, beside=None, **keywords):
+    """A ball that has come to rest on a pad which looks up; its joint is damped. beside: velocity [m/s] along
+    z of another one of 3 mm radius without weight, whose middle is 12.5 mm high in the end."""
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.worldbody.add_site(name="tip", quat=[1, -1, 0, 0])
     body = spec.worldbody.add_body(name="ball", pos=[-10e-3, 0, 13.2e-3])
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=[5.0, 0, 0])
     body.add_geom(name="ball", size=[5e-3, 0, 0], mass=MASS)
+    if beside is not None:
+        other = spec.worldbody.add_body(name="other", pos=[0, 0, 0.0125 - 0.5 * beside], gravcomp=1)
+        other.add_joint(name="other", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+        other.add_geom(name="other", size=[3e-3, 0, 0], mass=0.01, contype=2, conaffinity=0)
     handle = biotac_mj.attach(spec, site="tip", tier=tier, skin="coarse", **keywords)
     model = spec.compile()
     data = mujoco.MjData(model)
+    data.qvel[1:] = beside or 0.0
     while data.time < 0.5:
         mujoco.mj_step(model, data)
     biotac_mj.plugin.check()
@@ -79,3 +85,12 @@ def test_a_skin_that_is_asked_for_more_is_solved(solves):
     solves.clear()
     mujoco.mj_step(model, data)
     assert solves
+
+
+def test_a_body_that_cannot_touch_a_skin_does_not_have_it_solved(solves):
+    """10 nm a step beside a ball at rest, for less than `TOLERANCE`."""
+    model, data, _ = ball("condensed", beside=-5e-6, geoms=["ball", "other"])
+    solves.clear()
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    assert len(solves) <= 1

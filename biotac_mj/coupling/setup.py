@@ -24,10 +24,10 @@ FAILED, CONVERGED, STARTED = range(_HEAD)
 # STAYED: the last solve left the skin as it was; negative where its error is not measured
 REACHED, OUT_OF_REACH, STAYED = 1.0, 2.0, 3.0
 # of a touching body: wrench, tangent, the pose they belong to, the pose at the end of the step, the energy
-# that it has in the skin at most [J], infinite where that is not known, and the angular frequency [rad/s] at
-# which it bounces
-_MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1 + 1
-ENERGY, FREQUENCY = _MODEL - 2, _MODEL - 1
+# that it has in the skin at most [J], infinite where that is not known, the angular frequency [rad/s] at
+# which it bounces, and how far from that pose it cannot touch (`rounds.Model`)
+_MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1 + 1 + 1
+ENERGY, FREQUENCY, SPARE = (_MODEL - k for k in (3, 2, 1))
 
 
 class _Skin:
@@ -104,7 +104,7 @@ class Setup:
         return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state: np.ndarray) -> tuple:
-        """Head, linear models of the last step (ngroup, 68), the skin's and the readings' parts of a plugin
+        """Head, linear models of the last step (ngroup, 69), the skin's and the readings' parts of a plugin
         state, as views."""
         a = _HEAD + _MODEL * self.ngroup
         b = a + self.skin.stepper.nstate

@@ -7,7 +7,7 @@ from ...geometry.rigid_warp import LEVER
 from ...skin.bodies import BodyMotion
 from ..instance import Instance
 from ..structs import DataView
-from .rules import FORETOLD, STILL
+from .rules import FORETOLD, STILL, TOLERANCE
 
 # of what the solves of a step may cost together: what is left is not worth another one
 _MOST = 0.9
@@ -71,7 +71,8 @@ class Coupled:
         if self.withdrawn:
             arrays.acting[:] = 0.0
         if self.result is None:  # where the last step has left it
-            self.still = len(arrays.acting) > 0 and arrays.off[0] < STILL and not arrays.placed.any()
+            still = arrays.off[0] < STILL and arrays.off[1] < TOLERANCE
+            self.still = len(arrays.acting) > 0 and still and not arrays.placed.any()
             self.result = self.instance.stay() if self.still else None
         self.off = np.inf if self.result is None else float(arrays.off[0])
 
@@ -104,7 +105,7 @@ class Coupled:
             self.instance.stays = bool(wrong.max() < FORETOLD * wrench.max())
         self.result, self.may_act = result, result.converged and self._cost < _MOST
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
-        arrays.pos0[:], arrays.mat0[:] = result.pose
+        (arrays.pos0[:], arrays.mat0[:]), arrays.spare[:] = result.pose, result.spare
         self.written = False
         held = arrays.tangent0.any(axis=(1, 2))
         self.touching, self.correction[~held] = held.nonzero()[0], 0.0

@@ -23,12 +23,14 @@ _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPOR
 
 @wp.struct
 class Model:
-    """Linear models of skins [group, world]: wrench0 - tangent0 (pose - pose0)."""
+    """Linear models of skins [group, world]: wrench0 - tangent0 (pose - pose0). A body that goes from
+    there no further than `spare` [m], turns times LEVER, cannot touch the skin; 0: it may."""
 
     wrench0: wp.array2d(dtype=vec6)
     tangent0: wp.array2d(dtype=mat66)
     pos0: wp.array2d(dtype=vec3)
     mat0: wp.array2d(dtype=mat33)
+    spare: wp.array2d(dtype=real)
 
 
 @wp.struct
@@ -301,12 +303,16 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 
 
 @wp.func
-def distance_off(model: Model, r: Rounds, w: int):
-    """Largest distance of the bodies from the poses of the skin's model [m]."""
+def distance_off(model: Model, r: Rounds, w: int, free: real):
+    """Largest distance of the bodies from the poses of the skin's model [m], but of those that cannot touch it:
+    whose motion is within a share `free` of `spare`."""
     off = real(0.0)
     for g in range(r.pos.shape[0]):
         if is_finite(r.pos[g, w], r.mat[g, w]):  # what is lost takes no part
-            off = wp.max(off, size_of(motion(r.pos[g, w], r.mat[g, w], model.pos0[g, w], model.mat0[g, w])))
+            moved = motion(r.pos[g, w], r.mat[g, w], model.pos0[g, w], model.mat0[g, w])
+            way = wp.length(vec3(moved[0], moved[1], moved[2])) + real(LEVER) * wp.length(_turns(moved))
+            if way > free * model.spare[g, w]:
+                off = wp.max(off, size_of(moved))
     return off
 
 
@@ -326,7 +332,7 @@ def look(
         return
     r.rounds[w] = 1
     r.settled[w] = 0
-    if distance_off(model, r, w) < _TOLERANCE:
+    if distance_off(model, r, w, real(1.0)) < _TOLERANCE:
         r.settled[w] = 1
     else:
         mark(going, w)
@@ -349,7 +355,7 @@ def judge(
     wanted[w] = 0
     if going[w] == 0 or r.settled[w] == 1:
         return
-    if distance_off(model, r, w) < _TOLERANCE:
+    if distance_off(model, r, w, real(1.0)) < _TOLERANCE:
         r.settled[w] = 1
     elif reason[w] == CONVERGED and r.rounds[w] < r.limit:
         r.rounds[w] = r.rounds[w] + 1

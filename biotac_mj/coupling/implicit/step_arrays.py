@@ -29,9 +29,9 @@ def find_off(
     # Out:
     off_out: wp.array(dtype=real),
 ):
-    """Largest distance of the bodies from where the skin was solved [m]."""
-    w = wp.tid()
-    off_out[w] = rounds.distance_off(model, r, w)
+    """Largest distance from where the skin was solved [m], of the bodies that may touch it and of all."""
+    for k in range(2):
+        off_out[k] = rounds.distance_off(model, r, 0, real(1 - k))
 
 
 class StepArrays:
@@ -46,10 +46,10 @@ class StepArrays:
       qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
       compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
       stiffness: of the rows, see `Metric.record`.
-      off: (1,) [m] of `evaluate`. left_out: (ngroup,) of `energy.conclude` [J].
+      off: (2,) [m] of `evaluate`, see `find_off`. left_out: (ngroup,) of `energy.conclude` [J].
       find_energy, restrain, gains: functions that do the energy balance. They return whether the skin is
         greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
-      models: views of wrench0, tangent0, pos0 and mat0, in the last step and in this one.
+      models: views of wrench0, tangent0, pos0, mat0 and spare, in the last step and in this one.
     """
 
     def __init__(self, kinematics: Kinematics, setup: Setup, springs: Springs, inertial: bool):
@@ -65,7 +65,8 @@ class StepArrays:
             self._wrench, self._qacc = wp.zeros(shape, dtype=vec6), wp.zeros_like(kinematics.d.qvel)
             self._left_out = wp.zeros(shape, dtype=real)
             self._compliance = wp.zeros((setup.ngroup, *shape), dtype=wp.spatial_matrixd)
-            self._off, self._one, self._greedy = (wp.zeros(1, dtype=kind) for kind in (real, int, int))
+            self._off = wp.zeros(2, dtype=real)
+            self._one, self._greedy = (wp.zeros(1, dtype=int) for _ in range(2))
             self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
             self._led = wp.array(setup.touching.by_mocap, dtype=bool)
         self._one.fill_(1)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...geometry.rigid_warp import LEVER
 from ..block import block_max, block_rank, sync
 from ..contact.broadphase import (
     ALL,
@@ -14,7 +15,7 @@ from ..contact.broadphase import (
 )
 from ..contact.meshes import TRILINEAR, smooth_distance
 from ..contact.penetration import geoms_core_clearance
-from ..contact.posed import SKIN, Geoms, face_radius
+from ..contact.posed import SKIN, Geoms, bound_to, face_radius, place_on, touch_bound
 from ..contact.shapes import GEOM_TYPES
 from ..types import real, vec3
 from .lanes import keep_rows
@@ -305,6 +306,55 @@ def find_faces(
     sync()
     nface = _list_marked(w, t, threads, 0, s.near, s.face)
     return nface, block_rank(new)[1]
+
+
+@wp.func
+def _clearance(
+    f: int,
+    g: int,
+    w: int,
+    view: int,
+    travel: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """A lower bound of a face's distance from geom g [m], from a view where that says enough."""
+    if not has(s.seen[w, view, f], g):
+        room = _SEEN - ROOT3 * (travel + wp.sqrt(_moved(f, w, c.face, x, c)))
+        if room > _REGION:
+            return room
+    face = c.face[f]
+    center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+    y = place_on(geoms, g, w, center)
+    return touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) - radius
+
+
+@wp.func
+def find_spare(
+    w: int,
+    t: int,
+    threads: int,
+    o: Increment,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Finds how far each group of geoms can go without touching the skin [m], its turns times LEVER."""
+    lever = wp.max(real(1.0), (wp.length(c.center) + c.radius) / real(LEVER))
+    travel = _moved_since(w, o.view, o.near, geoms, c, s)
+    for group in range(s.spare.shape[0]):
+        nearer = real(-1.0)
+        for g in range(geoms.count):
+            if geoms.group[g] == group:
+                for f in range(t, c.face.shape[0], threads):
+                    if nearer < real(0.0):
+                        nearer = wp.max(nearer, -_clearance(f, g, w, o.view, travel, geoms, x, c, s))
+        nearer = block_max(nearer)
+        if t == 0:
+            s.spare[group, w] = wp.where(o.ok == 1, wp.max(-nearer, real(0.0)) / (ROOT3 * lever), real(0.0))
 
 
 @wp.func

@@ -16,6 +16,7 @@ from .broadphase import (
     find_faces,
     find_inner_faces,
     find_nodes,
+    find_spare,
     forget_faces,
     is_deep,
     is_known,
@@ -557,6 +558,8 @@ def conclude_balance(
             s.solve.increment[w] = _next_increment(o)
             s.solve.phase[w] = SEARCH
         return
+    find_spare(w, t, threads, o, geoms, x, c, s)
+    sync()
     for i in range(t, c.node.shape[0], threads):
         node_force[c.node[i], w] = r.force[i, w]
     for g in range(t, geoms.count, threads):
