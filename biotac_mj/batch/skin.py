@@ -62,8 +62,8 @@ class BatchSkin:
       bodies: `skin.bodies.Bodies`, of skins with tangents: how what touches gives way, for the caller to
         write.
       by_mocap: (ngroup,) bool, bodies that a mocap body leads.
-      spare: (ngroup, nworld) of the groups' models, see `coupling.implicit.rounds`; of length zero in the full
-        tier and without tangents.
+      spare: (ngroup, nworld) of the groups' models, see `coupling.implicit.rounds`; of length zero in the
+        full tier and without tangents.
       kind: "full" or "condensed". tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond
         what that was measured for.
       reason: (nworld,) int: 0, or why the last step failed (`skin.newton.worlds`). iterations: (nworld,) int

@@ -304,8 +304,8 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 
 @wp.func
 def distance_off(model: Model, r: Rounds, w: int, free: real):
-    """Largest distance of the bodies from the poses of the skin's model [m], but of those that cannot touch it:
-    whose motion is within a share `free` of `spare`."""
+    """Largest distance of the bodies from the poses of the skin's model [m], except of those that are within
+    `free` times `spare` of them, and so cannot touch."""
     off = real(0.0)
     for g in range(r.pos.shape[0]):
         if is_finite(r.pos[g, w], r.mat[g, w]):  # what is lost takes no part
