@@ -134,7 +134,7 @@ def forget_faces(
     sync()
 
 
-@wp.func
+@wp.func(inline=True)
 def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=vec3), c: Constants):
     """Largest squared displacement of a face's nodes [m^2]."""
     most = real(0.0)
@@ -309,29 +309,6 @@ def find_faces(
 
 
 @wp.func
-def _clearance(
-    f: int,
-    g: int,
-    w: int,
-    view: int,
-    travel: real,
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-    s: Scratch,
-):
-    """A lower bound of a face's distance from geom g [m], from a view where that says enough."""
-    if not has(s.seen[w, view, f], g):
-        room = _SEEN - ROOT3 * (travel + wp.sqrt(_moved(f, w, c.face, x, c)))
-        if room > _REGION:
-            return room
-    face = c.face[f]
-    center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-    y = place_on(geoms, g, w, center)
-    return touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) - radius
-
-
-@wp.func
 def find_spare(
     w: int,
     t: int,
@@ -343,18 +320,36 @@ def find_spare(
     s: Scratch,
 ):
     """Finds how far each group of geoms can go without touching the skin [m], its turns times LEVER."""
+    for group in range(t, s.spare.shape[0], threads):
+        s.spare[group, w] = wp.where(o.ok == 1, _REGION, real(0.0))
+    sync()
+    close = wp.int64(0)
+    for k in range(t, o.nface, threads):
+        close = close | s.close_to[w, s.face[w, k]]
+    for g in range(geoms.count):
+        if has(close, g):
+            wp.atomic_min(s.spare, geoms.group[g], w, real(0.0))
+    others = o.near & ~close
+    moved = _REGION + ROOT3 * _moved_since(w, o.view, o.near, geoms, c, s)
+    for f in range(t, c.face.shape[0], threads):
+        moves = ROOT3 * wp.sqrt(_moved(f, w, c.face, x, c)) + moved
+        within = others
+        if moves < s.far[w, o.view, f]:
+            within = wp.int64(0)
+        elif moves < _SEEN:
+            within = others & s.seen[w, o.view, f]
+        if within != wp.int64(0):
+            face = c.face[f]
+            center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+            for g in range(geoms.count):
+                if has(within, g):
+                    y = place_on(geoms, g, w, center)
+                    bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) - radius
+                    wp.atomic_min(s.spare, geoms.group[g], w, wp.max(bound, real(0.0)))
+    sync()
     lever = wp.max(real(1.0), (wp.length(c.center) + c.radius) / real(LEVER))
-    travel = _moved_since(w, o.view, o.near, geoms, c, s)
-    for group in range(s.spare.shape[0]):
-        nearer = real(-1.0)
-        for g in range(geoms.count):
-            if geoms.group[g] == group:
-                for f in range(t, c.face.shape[0], threads):
-                    if nearer < real(0.0):
-                        nearer = wp.max(nearer, -_clearance(f, g, w, o.view, travel, geoms, x, c, s))
-        nearer = block_max(nearer)
-        if t == 0:
-            s.spare[group, w] = wp.where(o.ok == 1, wp.max(-nearer, real(0.0)) / (ROOT3 * lever), real(0.0))
+    for group in range(t, s.spare.shape[0], threads):
+        s.spare[group, w] = s.spare[group, w] / (ROOT3 * lever)
 
 
 @wp.func
