@@ -558,8 +558,9 @@ def conclude_balance(
             s.solve.increment[w] = _next_increment(o)
             s.solve.phase[w] = SEARCH
         return
-    find_spare(w, t, threads, o, geoms, x, c, s)
-    sync()
+    if s.spare.shape[0] > 0:
+        find_spare(w, t, threads, o, geoms, x, c, s)
+        sync()
     for i in range(t, c.node.shape[0], threads):
         node_force[c.node[i], w] = r.force[i, w]
     for g in range(t, geoms.count, threads):
