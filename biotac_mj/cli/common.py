@@ -57,15 +57,16 @@ def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise")
     verb.add_argument(
         "--material", default="default", help=f"{', '.join(MATERIALS)}, a .json file of a material, or JSON"
     )
-    verb.add_argument(
-        "--liquid",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="liquid under the skin (default: by the material)",
-    )
+    add_liquid(verb, None, "liquid under the skin (default: by the material)")
     verb.add_argument("--seed", type=SEED, default=0, help=seed)
     add_device(verb)
     add_options(verb)
+
+
+def add_liquid(verb: argparse.ArgumentParser, default: bool | None, text: str, of: str = "") -> None:
+    """Adds --liquid and --no-liquid, or --OF-liquid."""
+    name = f"--{of}liquid"
+    verb.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
 
 
 def add_device(verb: argparse.ArgumentParser) -> None:

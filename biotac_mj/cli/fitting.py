@@ -4,7 +4,7 @@ import argparse
 
 from ..arguments import SEED, output_file, real, whole
 from ..recordings.verbs import add_load_arguments
-from .common import add_device, add_options, add_results, add_verb
+from .common import add_device, add_liquid, add_options, add_results, add_verb
 from .names import CONFIGURATIONS, INDENTER_HELP, INDENTERS, MATERIALS, SKINS
 
 
@@ -35,12 +35,8 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight (default: the "
         "default one of --skin's design)",
     )
-    verb.add_argument(
-        "--truth-liquid",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="liquid under the synthetic skin (default: as the preset --truth has it)",
-    )
+    said = "liquid under the synthetic skin (default: as the preset --truth has it)"
+    add_liquid(verb, None, said, "truth-")
     verb.add_argument(
         "--noise",
         type=real(0, 1e3),
@@ -75,12 +71,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help=f"law and starting values: {', '.join(MATERIALS)}, or a material's or calibration's .json",
     )
     add_options(verb)
-    verb.add_argument(
-        "--liquid",
-        action=argparse.BooleanOptionalAction,
-        default=False,
-        help="liquid under the skin; matters for E and nu",
-    )
+    add_liquid(verb, False, "liquid under the skin; matters for E and nu")
     verb.add_argument(
         "--fit",
         nargs="+",
@@ -147,9 +138,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         "each is calibrated first)",
     )
     add_options(verb)
-    verb.add_argument(
-        "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
-    )
+    add_liquid(verb, False, "liquid in the shells")
     add_device(verb)
     verb.set_defaults(forces_of=_forces_of)
     add_results(verb, "out/compare", "folder of compare.json", "compare.json", "compare.kept")

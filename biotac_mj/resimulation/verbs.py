@@ -68,17 +68,10 @@ def _resimulate(args):
     recording, notes = load_one(
         args.recording, args.which, force=args.force, rate=args.rate, scale=args.scale
     )
-    chosen = {name: getattr(args, name) for name in ("mount", "object_pose")}
-    options = ResimulateOptions(
-        object=args.object,
-        poses=args.poses,
-        rate=args.at_most,
-        **{name: tuple(value) for name, value in chosen.items() if value},
-        **{
-            name: getattr(args, name)
-            for name in "block skin material liquid options batch seed device".split()
-        },
-    )
+    same = "object poses block skin material liquid options batch seed device".split()
+    settings = {name: getattr(args, name) for name in same}
+    poses = {name: tuple(value) for name in ("mount", "object_pose") if (value := getattr(args, name))}
+    options = ResimulateOptions(rate=args.at_most, **settings, **poses)
     report = resimulate(recording, args.out, options, args.workers, not args.quiet, args.ray)
     print(
         f"{report.interactions} touches, {report.steps} time steps, {report.nonconverged} of them not "
