@@ -359,6 +359,8 @@ _COUPLING = (
      "can", "condensed, on all its paths"),
     ("A skin whose bodies stay within 2 nm of where it was solved is not solved again, nor its film",
      "attach, condensed; solved in batches and where coupling is one-way"),
+    ("Bodies that cannot touch a skin do not have it solved again",
+     "condensed: attach, batches; in the full tier all bodies near the BioTac count"),
 )  # fmt: skip
 
 
