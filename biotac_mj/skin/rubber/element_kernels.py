@@ -107,16 +107,26 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
     """Tangents of the elements times a direction."""
     corners, averaged, is_single = kind.corners, kind.averaged, kind.is_single
     corotational, precision, gradients = kind.corotational, kind.precision, kind.gradients(kind.precision)
-    scalar, vec, mat, thin = precision.scalar, precision.vec, precision.mat, precision.narrow
-    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
+    scalar, vec, thin = precision.scalar, precision.vec, precision.narrow
+    directions, deformation = wp.types.matrix(shape=(3, corners), dtype=scalar), deformation_of(corners)
     f = material_functions(kind)
     rotation_thin, direction_of, change_of = f.rotation_thin, f.direction_of, f.change_of
     weighted_volume, local_lame = f.weighted_volume, f.local_lame
 
     @wp.func
-    def point_state(here: mat, i: int, w: int, F: wp.array2d(dtype=mat33), R: wp.array2d(dtype=mat33)):
-        """Deformation gradient, `here` if none is stored, and rotation of point i."""
+    def point_state(
+        e: int,
+        q: int,
+        w: int,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        F: wp.array2d(dtype=mat33),
+        R: wp.array2d(dtype=mat33),
+    ):
+        """Deformation gradient and rotation of point q."""
+        i = wp.static(kind.npoint) * e + q
         if wp.static(is_single):
+            here = thin(deformation(mesh, e, q, x, w))
             return here, rotation_thin(here)
         elif wp.static(corotational):
             return F[i, w], R[i, w]
@@ -142,7 +152,6 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         e, w = wp.tid()
         if on[w] == 0:
             return
-        X = directions()  # relative to the first node
         D = directions()
         first = mesh.elem[0, e]
         for a in range(1, wp.static(corners)):
@@ -150,10 +159,6 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
             d = p[n, w] - p[first, w]
             for c in range(3):
                 D[c, a] = d[c]
-            if wp.static(is_single):
-                v = x[n, w] - x[first, w]
-                for c in range(3):
-                    X[c, a] = float(v[c])
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = local_lame(mu, lam, cap)
@@ -168,7 +173,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
                 mean = scalar(0.0)
                 for q in range(npoint):
                     B = thin(mesh.inverse[e, q])
-                    F, R = point_state(X * shape[q] * B, npoint * e + q, w, deformation_in, rotation_in)
+                    F, R = point_state(e, q, w, mesh, x, deformation_in, rotation_in)
                     dF = D * shape[q] * B
                     mean += scalar(mesh.weight[e, q]) * wp.ddot(direction_of(rubber.law, F, R), dF)
                 stiff = scalar((lam - local) / mesh.volume[e]) * mean
@@ -176,7 +181,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         for q in range(npoint):
             i = npoint * e + q
             B = thin(mesh.inverse[e, q])
-            F, R = point_state(X * shape[q] * B, i, w, deformation_in, rotation_in)
+            F, R = point_state(e, q, w, mesh, x, deformation_in, rotation_in)
             dF = D * shape[q] * B
             dP = change_of(rubber, e, i, w, mu, local, mean_pressure, F, R, dF)
             if wp.static(averaged):
