@@ -15,7 +15,7 @@ from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
 from biotac_mj import cli
 from biotac_mj.recordings import FIELDS, Recording, findings, load, load_one, read, write
 from biotac_mj.recordings.formats.messages import Topic
-from biotac_mj.recordings.formats.names import is_time, place_of, unit_of
+from biotac_mj.recordings.formats.names import is_time, other_unit, place_of, unit_of
 from biotac_mj.recordings.formats.streams import guess_unit, join
 from biotac_mj.recordings.live import streams_of_lines
 from biotac_mj.recordings.picture import pac_spectrum
@@ -249,6 +249,11 @@ def test_names_in_the_wild():
         "posy": ("", "sensor_pos", 1),
         "ow": ("", "sensor_quat", 0),
         "px": ("", "contact_pos", 0),
+        "px_mm": ("", "contact_pos", 0),
+        "py [mm]": ("", "contact_pos", 1),
+        "thumb.pz_cm": ("thumb", "contact_pos", 2),
+        "object_px": ("", "object_pos", 0),
+        "pos_x_mm": ("", "sensor_pos", 0),
         "object/pose/position/x": ("", "object_pos", 0),
         "tool_qw": ("", "object_quat", 0),
     }
@@ -265,6 +270,7 @@ def test_names_in_the_wild():
         "depth",
     ):
         assert place_of(name) is None, name
+    assert not other_unit("py [mm]")
     assert is_time("%time") and is_time("time [ms]") and not is_time("times_seven")
 
 

@@ -274,7 +274,8 @@ def _save_reader(args, reader, scores):
         covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
         error = ""
         if row["rmse"] is not None:
-            error = f"RMSE {row['rmse']:.4g} {row['unit']} (the mean {row['rmse_of_mean']:.4g}), "
+            mean = f"the mean {row['rmse_of_mean']:.4g}"
+            error = f"RMSE of a component {row['rmse']:.4g} {row['unit']} ({mean}), "
         print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
     _note_useless(reader.meta)
     outputs = {name for target in scores["targets"] for name in TARGETS[target]}

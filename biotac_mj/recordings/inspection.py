@@ -191,8 +191,8 @@ def _far(recording):
             travel = np.nanmax(np.nanmax(value, 0) - np.nanmin(value, 0))
             if travel > _MOST_TRAVEL:
                 out.append(
-                    f"{name} moves over {travel:.3g} m: are these millimetres? Say so in the name of the "
-                    "(pos_x_mm), and import it again"
+                    f"{name} moves over {travel:.3g} m: are these millimetres? Say so in the names of its "
+                    f"columns ({name}_x_mm), and import it again"
                 )
     return out
 

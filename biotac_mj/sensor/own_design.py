@@ -72,8 +72,8 @@ class PadShape:
             clearance = np.subtract(self.dome, self.core).min() - self.thickness
             if clearance <= 0:
                 raise ValueError(
-                    f"between core and skin are {clearance:.3g} mm at the least: no liquid fits; give a "
-                    "smaller core or a thinner skin"
+                    f"between core and skin of {self.thickness:g} mm are {clearance:.3g} mm at the least: no "
+                    "liquid fits; give a smaller --core or --thickness"
                 )
 
     @property

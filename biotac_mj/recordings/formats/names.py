@@ -111,8 +111,8 @@ def place_of(name: str) -> Place | None:
         prefix = plain[: -len(whole)] if whole else prefix
         body, prefix = _split_body(prefix.strip("_"))
         if field in ("pos", "quat"):
-            point = plain in ("px", "py", "pz")
-            field = f"{'contact' if point else body or 'sensor'}_{field}"
+            point = re.fullmatch(f"(.*_)?p[xyz]{_WRITTEN['pos']}", plain)
+            field = f"{body or ('contact' if point else 'sensor')}_{field}"
             if field == "contact_quat":
                 return None
         column = None if whole else (_QUATERNION if field.endswith("quat") else _AXES)[axis]

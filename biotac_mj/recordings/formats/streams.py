@@ -275,7 +275,8 @@ def _whole(source, field, pieces):
             raise ValueError(f"{source} has no columns {missing}: its header must name e1..e{count}")
         return np.stack([place[i + base] for i in range(len(place))], 1), []
     if set(place) != set(range(width)):
-        return None, [f"{source}: left out {field}, of which only {len(place)} of {width} columns are there"]
+        lack = f"left out {field}, of which only {len(place)} of {width} columns are there"
+        return None, [f"{source}: {lack}: add the others, of zeros if they were not measured"]
     return np.stack([place[i] for i in range(width)], 1), []
 
 
