@@ -389,8 +389,15 @@ def test_a_model_is_shown_while_it_steps():
         spec, body="world", skin=spring_skin.pad_geometry(), stepper="springs", readings="sum"
     )
     model = spec.compile()
-    page = web_play.play_model(model, mujoco.MjData(model), {"finger": handle}, seconds=0.2, port=8933)
+    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+    mujoco.mj_forward(model, data)
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.1, 0, 0.2), 0.5, 90, -30
+    page = web_play.play_model(model, data, {"finger": handle}, camera, seconds=0.2, port=8933)
     try:
+        first = page.server.initial_camera  # behind the place that it looks at, and above it
+        assert np.allclose(first.look_at, camera.lookat)
+        assert np.allclose(first.position, [0.1, -0.5 * np.cos(np.pi / 6), 0.45])
+        assert first.fov == pytest.approx(np.radians(model.vis.global_.fovy))
         rows = page._gui["finger"][1][2].data
         assert len(rows[0]) == 5 and rows[0][0] == pytest.approx(0.01) and np.ptp(np.diff(rows[0])) < 1e-9
         assert rows[1][-1] > 0  # the ball pushes

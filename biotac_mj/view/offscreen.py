@@ -153,6 +153,14 @@ def show_bodies(spec: mujoco.MjSpec) -> None:
         other.group = mujoco.mjNGROUP - 1
 
 
+def directions(camera: mujoco.MjvCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Where a free camera looks and what it shows upwards: unit vectors (3,) in the world."""
+    turn, lift = np.radians([camera.azimuth, camera.elevation])
+    away = np.array([np.cos(turn), np.sin(turn), 0.0])
+    above = np.array([0.0, 0.0, 1.0])
+    return np.cos(lift) * away + np.sin(lift) * above, np.cos(lift) * above - np.sin(lift) * away
+
+
 def frame_bodies(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -167,10 +175,8 @@ def frame_bodies(
       aspect: width of the picture over its height.
     """
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & (model.geom_group < SHOWN))
-    turn, lift = np.radians([camera.azimuth, camera.elevation])
-    forward = np.array([np.cos(lift) * np.cos(turn), np.cos(lift) * np.sin(turn), np.sin(lift)])
-    right = np.array([np.sin(turn), -np.cos(turn), 0.0])
-    axes = np.array([right, np.cross(right, forward), forward])
+    forward, up = directions(camera)
+    axes = np.array([np.cross(forward, up), up, forward])
     corners = np.array([np.ravel(c) for c in np.meshgrid(*3 * [[-1.0, 1.0]])]).T
     local = model.geom_aabb[geoms, None, :3] + corners * model.geom_aabb[geoms, None, 3:]
     turned = np.einsum("gij,gcj->gci", data.geom_xmat[geoms].reshape(-1, 3, 3), local)

@@ -169,6 +169,8 @@ def show_page(env: BatchTask, act: Callable, port: int = 8080, seconds: float = 
     fingers = {f: Finger.of(mirror.geometry, mirror.at_rest(f)) for f in env.batches}
     page = Page(fingers, port=port)
     print(f"  the page is at {page.url} until Ctrl-C", flush=True)
+    mirror.point(camera := mujoco.MjvCamera())
+    page.point_camera(camera, env.model.vis.global_.fovy)
     scene = Scene(page.server, env.model, [f"{p}core" for p in env.prefixes.values()])
     time, each = 0.0, env.cfg.substeps * env.cfg.timestep
     for _ in _decisions(env, act, mirror):

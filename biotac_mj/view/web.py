@@ -4,11 +4,13 @@ import dataclasses
 import logging
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 
 from ..coupling.show import CORE, OBJECT, SKIN
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.colors import FULL_CHANGE, electrode_colors
+from .offscreen import directions
 
 _WINDOW = 200  # samples in a trace of a simulation
 _MAP = 280, 190  # size of the electrode map, along x and around the finger
@@ -218,8 +220,8 @@ class Page:
         self._gui[name] = picture, plots
         self._log[name] = []
 
-    def _point_camera(self, state):
-        """Points the camera at all fingers, once; afterwards the user moves it."""
+    def _point_at_fingers(self, state):
+        """Points the camera at all fingers, once."""
         from scipy.spatial.transform import Rotation
 
         place = np.concatenate(
@@ -227,17 +229,26 @@ class Page:
         )
         low, high = place.min(0), place.max(0)
         center = (low + high) / 2
-        away = center + 1.15 * np.linalg.norm(high - low) * _FROM / np.linalg.norm(_FROM)
+        away = 1.15 * np.linalg.norm(high - low) * _FROM / np.linalg.norm(_FROM)
+        self._look(center, center + away, self.server.initial_camera.fov)
+
+    def point_camera(self, camera: mujoco.MjvCamera, fovy: float) -> None:
+        """Shows what a free camera of MuJoCo shows, with `fovy` [deg]; afterwards the user moves it."""
+        place = camera.lookat - camera.distance * directions(camera)[0]
+        self._look(camera.lookat.copy(), place, np.radians(fovy))
+
+    def _look(self, center, place, fov):
         up, first = (0.0, 0.0, 1.0), self.server.initial_camera
-        first.look_at, first.position, first.up = center, away, up
+        first.look_at, first.position, first.up, first.fov = center, place, up, fov
         for client in self.server.get_clients().values():
-            client.camera.up_direction, client.camera.position, client.camera.look_at = up, away, center
+            client.camera.fov, client.camera.up_direction = fov, up
+            client.camera.position, client.camera.look_at = place, center
         self._aimed = True
 
     def update(self, time: float, state: dict[str, Moment]) -> None:
         """Shows a moment of all fingers; time: [s]."""
         if not self._aimed:
-            self._point_camera(state)
+            self._point_at_fingers(state)
         chosen = self.field.value
         values = {
             name: (m.fields[chosen]() if chosen in m.fields else np.zeros(len(m.vert)))[

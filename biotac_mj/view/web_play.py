@@ -32,12 +32,17 @@ _SPACING = 0.033  # [m] between two recorded sensors
 
 
 def play_model(
-    model: mujoco.MjModel, data: mujoco.MjData, handles: dict, seconds: float = np.inf, **server: object
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    handles: dict,
+    camera: mujoco.MjvCamera,
+    seconds: float = np.inf,
+    **server: object,
 ) -> Page:
     """Steps a model and shows its BioTacs at 25 Hz of model time; returns the page.
 
     Args:
-      handles: {name: Handle}.
+      data: after mj_forward. handles: {name: Handle}. camera: from where the page looks at first.
       seconds: duration [s of the model].
     """
     from .. import plugin
@@ -46,12 +51,12 @@ def play_model(
 
     skins = {name: load_skin(h.config.skin) for name, h in handles.items()}
     films = {name: _under(skin) for name, skin in skins.items()}
-    mujoco.mj_forward(model, data)
     fingers = {}
     for name, h in handles.items():
         known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
         fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
     page = _served(fingers, **server)
+    page.point_camera(camera, model.vis.global_.fovy)
     scene = Scene(page.server, model, [h.body for h in handles.values()])
     rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
 

@@ -25,8 +25,9 @@ from .offscreen import frame_bodies, show_bodies, stage
 
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 _BALL = "biotac_ball"  # in a hand's model, which may have a ball of its own
-_EYE = -0.3, -0.5, -0.8  # direction of the camera in the BioTac frame
-_SPRING, _PUSH = 50.0, 0.5  # stiffness [N/m] and force on the pad [N] of the ball at a hand's finger
+_EYE = -0.8, -0.6, 0.4  # direction of the camera in the BioTac frame
+_PUSH = 0.5  # force [N] of the ball on the pad of a hand's finger
+_SPRINGS = 50.0, 10.0, 50.0  # [N/m] of its slides: soft onto the pad, which may give way by some 10 mm
 
 
 def build_scene(
@@ -81,8 +82,7 @@ def build_hand(
     mount: pathlib.Path | str | None = None,
     **attach_options: object,
 ) -> tuple[mujoco.MjSpec, dict]:
-    """A hand with BioTacs and a ball that presses them: on the fingers of the Menagerie's Shadow Hand, whose
-    palm is up; for other hands, on springs at the pad of the first finger.
+    """A hand with BioTacs, and a ball that springs press against the pad of the first.
 
     Args:
       path: MJCF of a hand in `HANDS`, or of the hand of `mount`, a file of `biotac hand mount`.
@@ -111,15 +111,9 @@ def build_hand(
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     stage(spec)
     show_bodies(spec)
-    if known == "shadow_hand":
-        ball = spec.worldbody.add_body(name=_BALL, pos=[0.41, 0.0, 0.05])
-        ball.add_freejoint(name=_BALL)
-        size, mass = 0.02, 0.05
-    else:
-        geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
-        ball = _ball_before(spec, next(iter(mounts.values())), geometry)
-        size, mass = _RADIUS, _MASS
-    ball.add_geom(name=_BALL, size=[size, 0, 0], mass=mass, rgba=[*OBJECT, 1])
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    ball = _ball_before(spec, next(iter(mounts.values())), geometry)
+    ball.add_geom(name=_BALL, size=[_RADIUS, 0, 0], mass=_MASS, rgba=[*OBJECT, 1])
     return spec, attach_to_hand(spec, mounts, skin=skin, **attach_options)
 
 
@@ -137,8 +131,8 @@ def _ball_before(spec, mount, geometry):
     mujoco.mju_rotVecQuat(pos, place - [0, _RADIUS + 2e-4, 0], quat)
     pos += link.xpos + link.xmat.reshape(3, 3) @ mount.pos
     ball = spec.worldbody.add_body(name=_BALL, pos=pos, quat=quat, gravcomp=1)
-    _add_slides(ball, (_SPRING,) * 3)
-    spec.joint(f"{_BALL}_y").springref = _PUSH / _SPRING
+    _add_slides(ball, _SPRINGS)
+    spec.joint(f"{_BALL}_y").springref = _PUSH / _SPRINGS[1]
     return ball
 
 
@@ -226,14 +220,15 @@ def view(
     data = mujoco.MjData(model)
     if render is not None:
         return _render(model, data, render, seconds, point_camera)
+    mujoco.mj_forward(model, data)
     if web:
         from .web_play import play_model
 
-        return play_model(model, data, handles, port=port)
+        point_camera(model, data, camera := mujoco.MjvCamera())
+        return play_model(model, data, handles, camera, port=port)
     from mujoco import viewer
 
     with viewer.launch_passive(model, data) as window:
-        mujoco.mj_forward(model, data)
         point_camera(model, data, window.cam)
         while window.is_running():
             begin = time.perf_counter()
@@ -251,14 +246,11 @@ def _point_camera(camera):
 
 def _point_at_hand(spec, handles, model, data, camera):
     """Frames the subtree of the last common ancestor of the links with BioTacs, and the ball."""
-    ball = spec.body(_BALL)
-    if len(ball.joints) == 1:  # of the Shadow Hand, whose palm is up
-        camera.azimuth, camera.elevation = 150, -35
-    else:
-        from ..tasks.mounting import side_view
+    from ..tasks.mounting import side_view
 
-        look = side_view(ball.pos, matrix(ball.quat), _EYE)
-        camera.azimuth, camera.elevation = look.azimuth, look.elevation
+    ball = spec.body(_BALL)
+    look = side_view(ball.pos, matrix(ball.quat), _EYE)
+    camera.azimuth, camera.elevation = look.azimuth, look.elevation
     chains = [_ancestors(model, model.body(handle.body).id) for handle in handles.values()]
     common = set.intersection(*map(set, chains))
     # bodies come after their parents; fingers on the world body have no common ancestor
