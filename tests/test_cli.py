@@ -128,6 +128,12 @@ def test_help_says_each_default(capsys):
         assert text in " ".join(capsys.readouterr().out.split())
 
 
+def test_help_says_a_default_once(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["data", "export", "--help"])
+    assert capsys.readouterr().out.count("(default: lerobot)") == 1
+
+
 def test_defaults_are_those_of_the_dataclasses():
     """argparse keeps the command light: a press is a dataclass, but it brings MuJoCo and Warp along."""
     press = cli.parser().parse_args(["press"])

@@ -106,7 +106,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         "Write a set in the layout of LeRobotDataset v3.0, or as models, states and sensor data of MuJoCo.",
     )
     verb.add_argument("set", metavar="SET", help="folder of shards")
-    verb.add_argument("--form", choices=("lerobot", "mujoco"), default="lerobot", help="(default: lerobot)")
+    verb.add_argument("--form", choices=("lerobot", "mujoco"), default="lerobot", help="layout of the files")
     verb.add_argument(
         "--measured",
         action="store_true",

@@ -95,19 +95,15 @@ class Mirror:
             prefix = env.prefixes[finger]
             start = model.skin_vertadr[model.skin(f"{prefix}skin").id]
             model.skin_vert[start : start + len(self.node)] = batch.vert_xpos[0][self.node]
-            change = self.counts(finger) - self.at_rest(finger)
             sites = [model.site(f"{prefix}{name}").id for name in self.geometry.design.electrodes]
-            model.site_rgba[sites] = electrode_colors(change)
+            model.site_rgba[sites] = electrode_colors(self.change(finger))
 
-    def counts(self, finger: str) -> np.ndarray:
-        """Counts (nelectrode,) of a finger."""
-        return self.data.sensor(f"{self.env.prefixes[finger]}electrodes").data.copy()
-
-    def at_rest(self, finger: str) -> np.ndarray:
-        """Counts (nelectrode,) of a finger without contact."""
+    def change(self, finger: str) -> np.ndarray:
+        """Counts (nelectrode,) of a finger over those without contact; 0 before these are known."""
         tare = self.env.rest_counts[0, list(self.env.batches).index(finger)].cpu().numpy()
-        counts = tare[: len(self.geometry.electrode_pos)]
-        return counts if counts.any() else self.counts(finger)
+        rest = tare[: len(self.geometry.electrode_pos)]
+        counts = self.data.sensor(f"{self.env.prefixes[finger]}electrodes").data
+        return counts - rest if rest.any() else np.zeros_like(counts)
 
     def point(self, camera: mujoco.MjvCamera) -> None:
         """Points a camera at the task."""
@@ -137,7 +133,7 @@ def save_gif(env: BatchTask, act: Callable, path: pathlib.Path | str) -> None:
                 lasts[-1] = round(1e3 * _LAST)
                 if sum(lasts) > 1e3 * _SHOWN:
                     break
-            changes = {finger: mirror.counts(finger) - mirror.at_rest(finger) for finger in env.batches}
+            changes = {finger: mirror.change(finger) for finger in env.batches}
             frames.append(maps.below(screen.render(mirror.data, camera), changes))
             lasts.append(each)
     few = maps.quantize(frames, 64)
@@ -165,8 +161,8 @@ def show_page(env: BatchTask, act: Callable, port: int = 8080, seconds: float = 
     from .web_scene import Scene
 
     mirror = Mirror(env)
-    mirror.update()
-    fingers = {f: Finger.of(mirror.geometry, mirror.at_rest(f)) for f in env.batches}
+    rest = np.zeros(len(mirror.geometry.electrode_pos))  # of changes
+    fingers = {f: Finger.of(mirror.geometry, rest) for f in env.batches}
     page = Page(fingers, port=port)
     print(f"  the page is at {page.url} until Ctrl-C", flush=True)
     mirror.point(camera := mujoco.MjvCamera())
@@ -181,11 +177,11 @@ def show_page(env: BatchTask, act: Callable, port: int = 8080, seconds: float = 
             prefix, data = env.prefixes[finger], mirror.data
             body = data.body(f"{prefix}core")
             pdc = float(data.sensor(f"{prefix}pdc").data[0])
-            rest = float(env.rest_counts[0, i, len(mirror.geometry.electrode_pos)])
+            tare = float(env.rest_counts[0, i, len(rest)])
             moments[finger] = Moment(
                 batch.vert_xpos[0][mirror.node],
-                mirror.counts(finger),
-                pdc - rest if rest else 0.0,
+                mirror.change(finger),
+                pdc - tare if tare else 0.0,
                 float(env.force[0, i]),
                 body.xpos.copy(),
                 body.xquat.copy(),
