@@ -81,7 +81,7 @@ def accept_models(
     began: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
-    spare: wp.array2d(dtype=real),
+    slack: wp.array2d(dtype=real),
     at_rest: wp.array(dtype=bool),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
@@ -118,9 +118,9 @@ def accept_models(
         model.tangent0[g, w] = hold_by_rows(tangent[g, w])
     model.pos0[g, w] = p
     model.mat0[g, w] = R
-    model.spare[g, w] = real(0.0)
-    if spare.shape[0] > 0 and load_factor[w] == real(1.0) and not at_rest[w]:
-        model.spare[g, w] = spare[g, w]
+    model.slack[g, w] = real(0.0)
+    if slack.shape[0] > 0 and load_factor[w] == real(1.0) and not at_rest[w]:
+        model.slack[g, w] = slack[g, w]
 
 
 @wp.kernel
@@ -140,7 +140,7 @@ def reset_models(
         model.tangent0[g, w] = mat66()
         model.pos0[g, w] = vec3()
         model.mat0[g, w] = wp.identity(n=3, dtype=real)
-        model.spare[g, w] = real(0.0)
+        model.slack[g, w] = real(0.0)
     failed_out[w] = 0
     began_out[w] = 0
 

@@ -62,7 +62,7 @@ class BatchSkin:
       bodies: `skin.bodies.Bodies`, of skins with tangents: how what touches gives way, for the caller to
         write.
       by_mocap: (ngroup,) bool, bodies that a mocap body leads.
-      spare: (ngroup, nworld) of the groups' models, see `coupling.implicit.rounds`; of length zero in the
+      slack: (ngroup, nworld) of the groups' models, see `coupling.implicit.rounds`; of length zero in the
         full tier and without tangents.
       kind: "full" or "condensed". tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond
         what that was measured for.
@@ -112,7 +112,7 @@ class BatchSkin:
             self.bodies = self._condensed.bodies if self._condensed else self.data.bodies
         with wp.ScopedDevice(model.device):
             self.tier = self._condensed.tier if self._condensed else wp.zeros(nworld, dtype=int)
-            self.spare = self._condensed.spare if self._condensed else wp.zeros((0, nworld), dtype=wp.float64)
+            self.slack = self._condensed.slack if self._condensed else wp.zeros((0, nworld), dtype=wp.float64)
             allocate("batch", self, {"group": self.ngroup, "world": nworld})
             self.fraction, self._path = (
                 wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)

@@ -160,7 +160,7 @@ class Skins:
         self.rest.come_to_rest()
         where = [pos, mat, skin.geoms.struct]
         solved = [st.wanted, st.reason, st.load_factor, self.began, skin.wrench, skin.tangent]
-        solved += [skin.spare, self.rest.resets]
+        solved += [skin.slack, self.rest.resets]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
 
     def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:

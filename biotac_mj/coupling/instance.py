@@ -20,7 +20,7 @@ from .implicit.kinematics import Kinematics
 from .implicit.metric import Metric
 from .implicit.rules import EULER, PATIENCE, stayed
 from .implicit.step_arrays import StepArrays
-from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, SPARE, STARTED, STAYED, Setup
+from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, SLACK, STARTED, STAYED, Setup
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
@@ -146,14 +146,14 @@ class Instance:
 
     def last_model(self) -> tuple:
         """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3),
-        (ngroup, 3, 3), spare (ngroup,)."""
+        (ngroup, 3, 3), slack (ngroup,)."""
         models = self.parts[1]
         return (
             models[:, :6],
             models[:, 6:42].reshape(-1, 6, 6),
             models[:, 42:45],
             models[:, 45:54].reshape(-1, 3, 3),
-            models[:, SPARE],
+            models[:, SLACK],
         )
 
     @functools.cached_property
@@ -234,10 +234,10 @@ class Instance:
         pressure = skin.stepper.pressure(state) if known else None
         if pressure is None:
             return None
-        wrench, tangent, *pose, spare = (part.copy() for part in self.last_model())
+        wrench, tangent, *pose, slack = (part.copy() for part in self.last_model())
         with skin.lock:
             vert = skin.stepper.vert_xpos(state)
-        known = {"measured": reach > 0, "pose": tuple(pose), "spare": spare}
+        known = {"measured": reach > 0, "pose": tuple(pose), "slack": slack}
         result = SkinResult(state, wrench, tangent, vert, pressure, **known)
         self._result, self._reading, self._pose, self.stays = result, None, result.pose, True
         return result
@@ -518,7 +518,7 @@ class Instance:
         head[:] = head[FAILED] + (not good), good - steps, reach
         n, ends = self.setup.ngroup, self._ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
-        models[:, SPARE] = result.spare
+        models[:, SLACK] = result.slack
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
         models[:, 54:57], models[:, 57:66], models[:, ENERGY] = ends[0], ends[1].reshape(n, 9), energy
         if self.frequency is not None:

@@ -27,7 +27,7 @@ REACHED, OUT_OF_REACH, STAYED = 1.0, 2.0, 3.0
 # that it has in the skin at most [J], infinite where that is not known, the angular frequency [rad/s] at
 # which it bounces, and how far from that pose it cannot touch (`rounds.Model`)
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1 + 1 + 1
-ENERGY, FREQUENCY, SPARE = (_MODEL - k for k in (3, 2, 1))
+ENERGY, FREQUENCY, SLACK = (_MODEL - k for k in (3, 2, 1))
 
 
 class _Skin:

@@ -56,7 +56,7 @@ class SkinResult:
       pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
       load: (k,) size of the force on each contact that the state holds [N], where somebody may want it.
       cost: of the solve, as a fraction of what a hard one may cost.
-      spare: (ngroup,) of the bodies' models, see `implicit.rounds` [m].
+      slack: (ngroup,) of the bodies' models, see `implicit.rounds` [m].
       measured: False where an approximate tier leaves the range in which its error was measured.
     """
 
@@ -73,7 +73,7 @@ class SkinResult:
     pose: tuple | None = None
     load: np.ndarray | None = None
     cost: float = 0.0
-    spare: np.ndarray | float = 0.0
+    slack: np.ndarray | float = 0.0
 
 
 class SkinStepper:

@@ -105,7 +105,7 @@ class Coupled:
             self.instance.stays = bool(wrong.max() < FORETOLD * wrench.max())
         self.result, self.may_act = result, result.converged and self._cost < _MOST
         arrays.wrench0[:], arrays.tangent0[:] = result.wrench, result.tangent
-        (arrays.pos0[:], arrays.mat0[:]), arrays.spare[:] = result.pose, result.spare
+        (arrays.pos0[:], arrays.mat0[:]), arrays.slack[:] = result.pose, result.slack
         self.written = False
         held = arrays.tangent0.any(axis=(1, 2))
         self.touching, self.correction[~held] = held.nonzero()[0], 0.0

@@ -24,13 +24,13 @@ _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPOR
 @wp.struct
 class Model:
     """Linear models of skins [group, world]: wrench0 - tangent0 (pose - pose0). A body that goes from
-    there no further than `spare` [m], turns times LEVER, cannot touch the skin; 0: it may."""
+    there no further than `slack` [m], turns times LEVER, cannot touch the skin; 0: it may."""
 
     wrench0: wp.array2d(dtype=vec6)
     tangent0: wp.array2d(dtype=mat66)
     pos0: wp.array2d(dtype=vec3)
     mat0: wp.array2d(dtype=mat33)
-    spare: wp.array2d(dtype=real)
+    slack: wp.array2d(dtype=real)
 
 
 @wp.struct
@@ -305,13 +305,13 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 @wp.func
 def distance_off(model: Model, r: Rounds, w: int, free: real):
     """Largest distance of the bodies from the poses of the skin's model [m], except of those that are within
-    `free` times `spare` of them, and so cannot touch."""
+    `free` times `slack` of them, and so cannot touch."""
     off = real(0.0)
     for g in range(r.pos.shape[0]):
         if is_finite(r.pos[g, w], r.mat[g, w]):  # what is lost takes no part
             moved = motion(r.pos[g, w], r.mat[g, w], model.pos0[g, w], model.mat0[g, w])
             way = wp.length(vec3(moved[0], moved[1], moved[2])) + real(LEVER) * wp.length(_turns(moved))
-            if way > free * model.spare[g, w]:
+            if way > free * model.slack[g, w]:
                 off = wp.max(off, size_of(moved))
     return off
 

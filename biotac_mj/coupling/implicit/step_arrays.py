@@ -49,7 +49,7 @@ class StepArrays:
       off: (2,) [m] of `evaluate`, see `find_off`. left_out: (ngroup,) of `energy.conclude` [J].
       find_energy, restrain, gains: functions that do the energy balance. They return whether the skin is
         greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
-      models: views of wrench0, tangent0, pos0, mat0 and spare, in the last step and in this one.
+      models: views of wrench0, tangent0, pos0, mat0 and slack, in the last step and in this one.
     """
 
     def __init__(self, kinematics: Kinematics, setup: Setup, springs: Springs, inertial: bool):

@@ -84,7 +84,7 @@ class CondensedStepper(FemStepper):
             load_factor=out.load_factor,
             load=out.load,
             cost=out.cost / bound,
-            spare=out.spare,
+            slack=out.slack,
         )
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:

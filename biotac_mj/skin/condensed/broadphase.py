@@ -309,7 +309,7 @@ def find_faces(
 
 
 @wp.func
-def find_spare(
+def find_slack(
     w: int,
     t: int,
     threads: int,
@@ -320,15 +320,15 @@ def find_spare(
     s: Scratch,
 ):
     """Finds how far each group of geoms can go without touching the skin [m], its turns times LEVER."""
-    for group in range(t, s.spare.shape[0], threads):
-        s.spare[group, w] = wp.where(o.ok == 1, _REGION, real(0.0))
+    for group in range(t, s.slack.shape[0], threads):
+        s.slack[group, w] = wp.where(o.ok == 1, _REGION, real(0.0))
     sync()
     close = wp.int64(0)
     for k in range(t, o.nface, threads):
         close = close | s.close_to[w, s.face[w, k]]
     for g in range(geoms.count):
         if has(close, g):
-            wp.atomic_min(s.spare, geoms.group[g], w, real(0.0))
+            wp.atomic_min(s.slack, geoms.group[g], w, real(0.0))
     others = o.near & ~close
     moved = _REGION + ROOT3 * _moved_since(w, o.view, o.near, geoms, c, s)
     for f in range(t, c.face.shape[0], threads):
@@ -345,11 +345,11 @@ def find_spare(
                 if has(within, g):
                     y = place_on(geoms, g, w, center)
                     bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) - radius
-                    wp.atomic_min(s.spare, geoms.group[g], w, wp.max(bound, real(0.0)))
+                    wp.atomic_min(s.slack, geoms.group[g], w, wp.max(bound, real(0.0)))
     sync()
     lever = wp.max(real(1.0), (wp.length(c.center) + c.radius) / real(LEVER))
-    for group in range(t, s.spare.shape[0], threads):
-        s.spare[group, w] = s.spare[group, w] / (ROOT3 * lever)
+    for group in range(t, s.slack.shape[0], threads):
+        s.slack[group, w] = s.slack[group, w] / (ROOT3 * lever)
 
 
 @wp.func

@@ -71,7 +71,7 @@ class Outcome:
       iterations, error: of Newton's method, and relative residual in the energy norm.
       load: (k,) size of the force on each contact of the state [N].
       cost: as a fraction of the limit for a difficult step.
-      spare: (ngroup,) of the groups' models, see `coupling.implicit.rounds` [m].
+      slack: (ngroup,) of the groups' models, see `coupling.implicit.rounds` [m].
     """
 
     memory: Memory
@@ -85,4 +85,4 @@ class Outcome:
     load: np.ndarray
     load_factor: float = 1.0
     cost: float = 0.0
-    spare: np.ndarray | float = 0.0
+    slack: np.ndarray | float = 0.0

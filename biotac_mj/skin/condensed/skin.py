@@ -82,7 +82,7 @@ class CondensedSkin:
         d, g = self._data, self.geoms.struct
         _, touched_by, wrench = d.geom_memory(self.geoms.count, self.geoms.ngroup)
         of_items = {"x": d.x, "x_last": d.x_last, "node_force": d.outer.node_force, "wrench": wrench}
-        of_items["spare"] = self._step.spare
+        of_items["slack"] = self._step.slack
         of_items |= {"sample_force": d.outer.sample_force, "touched_by": touched_by}
         of_items |= {name: getattr(g, name) for name in ("pos", "mat", "pos_last")}
         out = {name: array.numpy()[:, 0] for name, array in of_items.items()}
@@ -186,7 +186,7 @@ class CondensedSkin:
             load=np.sqrt((push * push).sum(axis=1)),
             load_factor=load_factor,
             cost=float(v["spent"][0]) / self._first,
-            spare=v["spare"].copy(),
+            slack=v["slack"].copy(),
         )
 
     def _load(self, memory):

@@ -65,7 +65,7 @@ class CondensedStep:
         contact.
       deep: (nworld,) int, 1: a geom is in the core.
       bodies: `Bodies`; the caller writes compliance, predicted wrenches and reference points before a launch.
-      spare: (groups, nworld) of the groups' models, see `coupling.implicit.rounds`.
+      slack: (groups, nworld) of the groups' models, see `coupling.implicit.rounds`.
       previous: `Previous`; the caller lets a solve begin there.
       touch: `Contact` of the outer surface.
       tier: (nworld,) int, for the sensor `status`: 1, or -1 outside the range of measured errors.
@@ -97,7 +97,7 @@ class CondensedStep:
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
         self.most, self.spent = self._scratch.most, self._scratch.spent
         self.bodies, self.previous = self._scratch.bodies, self._scratch.previous
-        self.spare = self._scratch.spare
+        self.slack = self._scratch.slack
         self.most.fill_(float(model.options.max_work))
         self._going = wp.zeros(1, dtype=int, device=model.device)
         self._phases = phases(geoms.shapes) if model.device.is_cuda else None
@@ -198,7 +198,7 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     ):
         setattr(s, name, wp.zeros((nworld, count), dtype=int))
     s.free = wp.zeros((nworld, nface), dtype=real)
-    s.spare = wp.zeros((groups, nworld), dtype=real)
+    s.slack = wp.zeros((groups, nworld), dtype=real)
     s.close_to = wp.zeros((nworld, nface), dtype=wp.int64)
     s.force = wp.zeros((nworld, nouter), dtype=vec3)
     s.core_force = wp.zeros((nworld, ninner), dtype=real)

@@ -16,7 +16,7 @@ from .broadphase import (
     find_faces,
     find_inner_faces,
     find_nodes,
-    find_spare,
+    find_slack,
     forget_faces,
     is_deep,
     is_known,
@@ -558,8 +558,8 @@ def conclude_balance(
             s.solve.increment[w] = _next_increment(o)
             s.solve.phase[w] = SEARCH
         return
-    if s.spare.shape[0] > 0:
-        find_spare(w, t, threads, o, geoms, x, c, s)
+    if s.slack.shape[0] > 0:
+        find_slack(w, t, threads, o, geoms, x, c, s)
         sync()
     for i in range(t, c.node.shape[0], threads):
         node_force[c.node[i], w] = r.force[i, w]

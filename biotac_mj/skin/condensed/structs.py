@@ -165,4 +165,4 @@ class Scratch:
     arm: wp.array2d(dtype=vec3)  # where the outer candidates are [m]
     group: wp.array2d(dtype=int)  # whose body each of them answers to
     borders: wp.array(dtype=int)  # equations of the bodies
-    spare: wp.array2d(dtype=real)  # of the model of each group, see `coupling.implicit.rounds` [group, world]
+    slack: wp.array2d(dtype=real)  # of the model of each group, see `coupling.implicit.rounds` [group, world]
