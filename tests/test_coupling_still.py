@@ -1,6 +1,9 @@
 """A skin whose bodies stay where it was solved is not solved again."""
 
+import dataclasses
+
 import mujoco
+import numpy as np
 import pytest
 
 import biotac_mj
@@ -94,3 +97,26 @@ def test_a_body_that_cannot_touch_a_skin_does_not_have_it_solved(solves):
     for _ in range(200):
         mujoco.mj_step(model, data)
     assert len(solves) <= 1
+
+
+def test_a_body_that_comes_slowly_is_felt_in_time(monkeypatch):
+    """0.2 um a step onto the skin, beside a ball at rest: less than `TOLERANCE`, within which the skin of a
+    body that cannot touch it stays. Against a skin that is solved for all bodies."""
+
+    def creep():
+        model, data, _ = ball("condensed", beside=-4e-3, geoms=["ball", "other"])
+        for _ in range(215):
+            mujoco.mj_step(model, data)
+        data.qvel[1] = -1e-4
+        ways = []
+        for _ in range(100):
+            mujoco.mj_step(model, data)
+            ways.append(data.qpos[1])
+        assert ways[20] < ways[0] - 3.9e-6 and data.qvel[1] > 0.0  # it comes, and has touched
+        return np.array(ways)
+
+    ways, own = creep(), CondensedStepper.solve_skin
+    monkeypatch.setattr(
+        CondensedStepper, "solve_skin", lambda *a, **k: dataclasses.replace(own(*a, **k), slack=0.0)
+    )
+    assert np.abs(ways - creep()).max() < 1e-8
