@@ -22,8 +22,8 @@ quiet_warp()
 wp.set_module_options({"enable_backward": False})
 
 _FARTHEST = 1.0e4  # [mm] largest distance of a query point from the core
-_NEAREST = 16  # most candidate triangles per point
-_ROOM = 0.2  # [mm] motion of a point for which its candidates suffice
+_NEAREST = 64  # most candidate triangles per point
+_ROOM = 0.5  # [mm] motion of a point for which its candidates suffice
 real, vec3 = wp.float64, wp.vec3d
 
 
