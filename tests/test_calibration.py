@@ -2,19 +2,18 @@
 closed forms, error texts."""
 
 import dataclasses
-import pathlib
-import pickle
 
 import numpy as np
 import pytest
 
-from biotac_mj import cache, cli
+from biotac_mj import cli
 from biotac_mj.calibration import (
     CONFIGURATIONS,
     calibrate,
     comparison_table,
     configuration,
     evaluate,
+    forward,
     parameter,
     plan_indentation,
     plan_shear,
@@ -24,13 +23,11 @@ from biotac_mj.calibration import (
     stand_in,
     write_indentation,
 )
-from biotac_mj.calibration.comparison import Comparison
-from biotac_mj.calibration.fit import Calibration, forces_and_jacobian
-from biotac_mj.calibration.kept import Kept
+from biotac_mj.calibration.fit import forces_and_jacobian
 from biotac_mj.calibration.report import write_json
 from biotac_mj.calibration.statistics import covariance, ljung_box
 from biotac_mj.geometry.tet_mesh import TetMesh
-from biotac_mj.skin import Material, SkinOptions
+from biotac_mj.skin import Material
 from biotac_mj.skin.settings import read_material
 
 TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5, liquid=False)
@@ -280,125 +277,49 @@ def test_command_line_errors(capsys):
     assert tuple(CONFIGURATIONS) == cli.CONFIGURATIONS
 
 
-@pytest.mark.slow
-def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
-    """What was finished is not made again; other settings start anew; the table is that of a run in one
-    go."""
-    from biotac_mj.calibration import verbs
+def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch):
+    """What was simulated is not simulated again, and the result is that of a run in one go."""
+    made = []
 
-    calls = []
-
-    def calibrated(body, *args, **kwargs):
-        calls.append(body.name)
-        if body.name == "shell_with_core" and calls.count(body.name) == 1:
+    def response(geometry, options, materials, indentation, *rest):
+        made.append((geometry.name, indentation.name))
+        if len(made) == stop:
             raise KeyboardInterrupt
-        return fitted()
+        norm = np.full((1, len(indentation.time)), options.tolerance)
+        force = np.stack([norm, norm, indentation.tip[None, :, 0]], -1)
+        return forward.Response(force, norm, norm, np.zeros(1, int), 7)
 
-    monkeypatch.setattr(verbs, "calibrate", calibrated)
-    monkeypatch.setattr(verbs, "calibration_table", lambda fitted: "fitted")
-    monkeypatch.setattr(
-        verbs, "stand_in", lambda plan, **settings: dataclasses.replace(plan, force=np.ones_like(plan.force))
-    )
-    monkeypatch.setattr(
-        verbs, "references", lambda plans, progress, **settings: calls.append("reference") or plans
-    )
-    given = [
-        "lab",
-        "compare",
-        "--configurations",
-        "deformable_shell",
-        "shell_with_core",
-        "--indenters",
-        "sphere_7mm",
-        "--out",
-        str(tmp_path),
-    ]
-    monkeypatch.setattr(verbs, "evaluate", lambda body, material, *rest: _compared(body.name, material))
-    assert cli.main(given) != 0  # stopped
-    assert (
-        calls == ["reference", "deformable_shell", "shell_with_core"]
-        and not (tmp_path / "compare.json").exists()
-    )
-    assert cli.main(given) == 0
-    assert calls[3:] == ["shell_with_core"] and "goes on after reference" in capsys.readouterr().out
-    assert cli.main([*given, "--seed", "1"]) == 0
-    assert calls[4:] == ["reference", "deformable_shell", "shell_with_core"]
-    for damage in (b"cut short", pickle.dumps(Touches(tmp_path / "executed"))):
-        (tmp_path / "compare.kept").write_bytes(damage)
-        before = len(calls)
-        assert cli.main(given) == 0 and calls[before:] == ["reference", "deformable_shell", "shell_with_core"]
-    assert not (tmp_path / "executed").exists()
+    monkeypatch.setattr(forward, "_simulate", response)
+    given = ["lab", "compare", "--material", "paper", "--indenters", "sphere_7mm", "--count", "2", "--quiet"]
+    given += ["--configurations", "deformable_shell", "shell_with_core", "--out", str(tmp_path)]
+    reports = []
+    for folder, stop in (("stopped", 4), ("whole", 0)):
+        monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path / folder))
+        assert (cli.main(given) == 0) is (stop == 0)
+        assert len(made) == (stop or 6)
+        if stop:
+            assert not (tmp_path / "compare.json").exists()
+            assert cli.main(given) == 0 and made[3:4] == made[4:5] and len(made) == 7
+        reports.append((tmp_path / "compare.json").read_text())
+        if not stop:
+            assert cli.main([*given, "--seed", "1"]) == 0 and len(made) == 12
+        made.clear()
+    assert reports[0] == reports[1]
 
 
-class Touches:
-    """A pickle that makes a file when it is loaded."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return pathlib.Path.touch, (self.path,)
-
-
-def test_parts_are_kept_bit_for_bit(tmp_path, monkeypatch):
-    path, plan = tmp_path / "parts.kept", plan_shear(skin="coarse")
-    made = {"plan": plan, "fit": fitted(), "compared": _compared("solid", TRUTH)}
-    first = Kept(path, [{"seed": 1, "names": ("a", "b")}])
-    for name, part in made.items():
-        first.get(name, type(part), lambda part=part: part)
-    again = Kept(path, [{"seed": 1, "names": ["a", "b"]}])
-    assert again.names == list(made)
-    for name, part in made.items():
-        found = again.get(name, type(part), None)
-        for field in dataclasses.fields(part):
-            left, right = getattr(found, field.name), getattr(part, field.name)
-            if isinstance(right, np.ndarray):
-                np.testing.assert_array_equal(left, right)
-                assert left.dtype == right.dtype
-            elif not dataclasses.is_dataclass(right):
-                assert left == right or left != left and right != right  # NaN
-    assert again.get("fit", Comparison, lambda: made["compared"]) is made["compared"]  # of another type
-    assert Kept(path, [{"seed": 2}]).names == []
-    monkeypatch.setattr(cache, "_code", lambda names: "other code")
-    assert Kept(path, [{"seed": 1, "names": ["a", "b"]}]).names == []
-
-
-def fitted():
-    """A Calibration that nobody made: a real one takes minutes."""
-    two, n = np.array([0.1, 1 / 3]), 3
-    return Calibration(
-        configuration="shell_with_core",
-        skin="coarse",
-        law="neo_hookean",
-        element="linear",
-        liquid=False,
-        indenter="sphere_7mm",
-        parameters=["youngs_modulus", "friction"],
-        start=two,
-        value=two,
-        interval=np.stack([two, two], 1),
-        standard_error=two,
-        standard_error_robust=two,
-        lags=1,
-        correlation=np.eye(2),
-        at_bound=np.array([True, False]),
-        rms=0.1,
-        mean=0.1,
-        peak=1.0,
-        whiteness={"p_value": [0.1, 0.2, 0.3], "white": True, "lags": 1},
-        material=TRUTH,
-        options=SkinOptions(contact_law={"adhesion": 0.05}),
-        time=np.arange(n) / 3,
-        measured=np.ones((n, 3)),
-        fitted=np.ones((n, 3)),
-        evaluations=1,
-        success=True,
-        message="",
-        nonconverged=0,
-    )
-
-
-def _compared(name, material):
-    return Comparison(
-        name, fitted(), material, {"sphere_7mm": 0.1}, {"sphere_7mm": 0.2}, 1e-5, float("nan"), 0, 1, []
-    )
+def test_responses_are_cached_bit_for_bit(shell, way, tmp_path, monkeypatch):
+    monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path))
+    short = dataclasses.replace(way, **{name: getattr(way, name)[:4] for name in ("time", "tip", "force")})
+    softer = dataclasses.replace(TRUTH, youngs_modulus=1e6)
+    one = shell.geometry, shell.options, [TRUTH], short
+    first = simulate(*one)
+    stepped, step = [], forward.step
+    monkeypatch.setattr(forward, "step", lambda *given: stepped.append(given) or step(*given))
+    again = simulate(*one)
+    assert not stepped and again.steps == first.steps
+    for field in dataclasses.fields(first):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(first, field.name))
+    for other in ((*one[:2], [softer], short), (*one[:3], dataclasses.replace(short, tip=short.tip * 1.01))):
+        before = len(stepped)
+        simulate(*other)
+        assert len(stepped) > before

@@ -12,6 +12,7 @@ from biotac_mj.calibration import calibrate, configuration, parameter, plan_inde
 from biotac_mj.calibration.fit import forces_and_jacobian
 from biotac_mj.calibration.indentation import write_indentation
 from biotac_mj.differentiable.fit import Forces, forces_of
+from biotac_mj.differentiable.record import follow
 from biotac_mj.skin import Material
 from biotac_mj.skin.settings import read_material
 
@@ -59,6 +60,19 @@ def test_slopes_of_rubber_that_relaxes(shell, data):
     assert not lost and np.abs(force - data.force).max() > 0.1 * np.abs(data.force).max()
     assert force == pytest.approx(expected, abs=2e-5)
     assert slopes == pytest.approx(differences, abs=1e-2 * np.abs(slopes).max())  # of the first order
+
+
+def test_slopes_are_cached_bit_for_bit(shell, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path))
+    short = dataclasses.replace(data, **{name: getattr(data, name)[:4] for name in ("time", "tip", "force")})
+    wanted, followed = [parameter("E"), parameter("mu")], []
+    counted = lambda *args, **more: followed.append(1) or follow(*args, **more)  # noqa: E731
+    monkeypatch.setattr("biotac_mj.differentiable.fit.follow", counted)
+    first, again, other = (Forces()(shell, TRUTH, wanted, at, short) for at in ([1e6, 1], [1e6, 1], [2e6, 1]))
+    assert len(followed) == 2 and again[2] == first[2]
+    for one, two, three in zip(first[:2], again, other):
+        np.testing.assert_array_equal(one, two)
+        assert not np.array_equal(one, three)
 
 
 def test_what_has_no_gradient_is_named(shell, data):

@@ -1,20 +1,24 @@
-"""Forward model: one indentation of many materials in parallel, each material a world of one batch."""
+"""Forward model: one indentation of many materials in parallel, each material a world of one batch.
+
+Responses are cached on disk, so that an interrupted fit or comparison continues where it stopped."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import numpy as np
 
+from ..cache import cached
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import face_areas, node_areas
 from ..press.indenter import make_indenter
-from ..skin import GeomSet, SkinModel, SkinOptions, bake_distance_grid, step
+from ..skin import GeomSet, SkinModel, SkinOptions, step
 from ..skin.per_world import make_worlds
+from ..skin.settings import plain
 from .indentation import Indentation
 
 _LARGEST_STEP = 2.5e-4  # [m] longer displacements between two samples are divided into several steps
+CODE = ("geometry", "skin", "press/indenter", "calibration/forward")  # which makes a response
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +58,34 @@ def simulate(
       materials: k Materials with one law; Young's modulus, Poisson's ratio and friction may differ.
       indentation: path and times; its force is not used. Before the first sample the skin is at rest for the
         first interval.
-      progress: called after every sample.
+      progress: called after every simulated sample.
       modulus: factors on Young's modulus of the body's elements, see `SkinModel`.
 
     Raises:
       ValueError: materials with different laws, or an indenter deep inside the rigid core.
     """
     materials = list(materials)
+
+    def make():
+        return vars(_simulate(geometry, options, materials, indentation, device, progress, modulus))
+
+    inputs = [*inputs_of(geometry, options, modulus, indentation), materials, str(device).split(":")[0]]
+    found = cached("indentation", inputs, make, CODE)
+    return Response(**{**found, "steps": int(found["steps"])})
+
+
+def inputs_of(
+    geometry: SkinGeometry,
+    options: SkinOptions,
+    modulus: np.ndarray | Callable | None,
+    indentation: Indentation,
+) -> list:
+    """Body and path as inputs of `cache.cached`; arguments as for `simulate`."""
+    path = make_indenter(indentation.indenter), indentation.time, indentation.tip, indentation.quat
+    return [geometry, options, plain(modulus, geometry), *path]
+
+
+def _simulate(geometry, options, materials, indentation, device, progress, modulus):
     model = SkinModel(geometry, materials[0], options, device, modulus=modulus)
     data = make_worlds(model, len(materials), materials)
     steps, shape = steps_of(indentation)
@@ -98,18 +123,19 @@ class Steps:
 
 def steps_of(indentation: Indentation) -> tuple[Steps, dict]:
     """Steps of an indentation, and the indenter as arguments of `skin.GeomSet`."""
-    shape, place = _indenter(indentation)
-    pos, mat, times, ends = [], [], [], []
+    shape = make_indenter(indentation.indenter)
+    frame = matrix(indentation.quat / np.linalg.norm(indentation.quat))
+    tips, times, ends = [], [], []
     at = indentation.tip[0]
     times_of_samples = np.diff(indentation.time, prepend=2 * indentation.time[0] - indentation.time[1])
     for tip, dt in zip(indentation.tip, times_of_samples):
         count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _LARGEST_STEP - 1e-9)))
-        for k in range(1, count + 1):
-            p, m = place(at + (tip - at) * k / count)
-            pos, mat, times = [*pos, p], [*mat, m], [*times, dt / count]
+        tips += [at + (tip - at) * k / count for k in range(1, count + 1)]
+        times += [dt / count] * count
         at = tip
-        ends.append(len(pos) - 1)
-    return Steps(np.array(pos), np.array(mat), np.array(times), np.array(ends)), shape
+        ends.append(len(tips) - 1)
+    pos, mat = shape.pose(np.array(tips), np.tile(frame, (len(tips), 1, 1)))
+    return Steps(pos[:, None], mat[:, None], np.array(times), np.array(ends)), shape.geom
 
 
 def displacement_norms(displacement: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -123,23 +149,3 @@ def _outer_weights(geometry):
     face, nodes = geometry.outer_face, np.unique(geometry.outer_face)
     area = np.linalg.norm(face_areas(geometry.vert, face), axis=1)
     return node_areas(face, area, geometry.nvert)[nodes], nodes
-
-
-@functools.lru_cache(maxsize=8)
-def _shape(name):
-    """The indenter with this name and, for a mesh, its distance grid."""
-    shape = make_indenter(name)
-    return shape, bake_distance_grid(shape.vert, shape.face) if shape.type == "mesh" else None
-
-
-def _indenter(indentation):
-    """The indenter as arguments of GeomSet, and tip -> (positions, rotations)."""
-    shape, grid = _shape(indentation.indenter)
-    mesh = grid is not None
-    geoms = dict(
-        types=[shape.type], sizes=[shape.size], rounding=[shape.rounding], grids=[grid] if mesh else ()
-    )
-    frame = matrix(indentation.quat / np.linalg.norm(indentation.quat))
-    offset = np.zeros(3) if mesh else frame @ shape.pos
-    rotation = frame if mesh else frame @ matrix(shape.quat)
-    return geoms, lambda tip: ((tip + offset)[None], rotation[None])

@@ -7,14 +7,13 @@ import tqdm
 
 from ..files import check_output
 from ..geometry.design import BIOTAC
-from ..geometry.skins import design_of, load_skin, mesh_of_same_design
+from ..geometry.skins import design_of, mesh_of_same_design
 from ..skin.rubber.material import material
 from ..skin.settings import plain, read_dict, read_material, read_settings
-from .comparison import PAPER, Comparison, comparison_table, evaluate, plan_indentations, references
+from .comparison import PAPER, comparison_table, evaluate, plan_indentations, references
 from .configurations import CONFIGURATIONS, configuration
-from .fit import Calibration, calibrate, parameter
-from .indentation import Indentation, plan_shear, read_indentation, write_indentation
-from .kept import Kept
+from .fit import calibrate, parameter
+from .indentation import plan_shear, read_indentation, write_indentation
 from .reference import STAND_IN, stand_in
 from .refinement import refined
 from .refinement import skin as named_skin
@@ -23,13 +22,6 @@ from .report import calibration_table, write_json, write_picture
 # arguments for the synthetic skin only, and their defaults
 _TRUTH = {"truth": "rubber", "truth_skin": None, "noise": 0.01, "truth_liquid": None}
 _REFERENCE = {"skin": "coarse", "element": "quadratic"}  # of the stand-in
-_NO_SETTINGS = (
-    "configurations",
-    "out",
-    "quiet",
-    "device",
-    "verb",
-)  # arguments that the results of a comparison do not depend on
 
 
 def _complete(args, defaults, used, remedy):
@@ -104,10 +96,7 @@ def calibrate_verb(args: argparse.Namespace) -> None:
 
 def compare_verb(args: argparse.Namespace) -> None:
     """`biotac lab compare`; raises ValueError or FileNotFoundError for invalid input. args.forces_of: see
-    `calibrate_verb`.
-
-    When called again with the same settings and folder, it continues.
-    """
+    `calibrate_verb`. When called again, it continues with what the cache has."""
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
     if design_of(args.skin) != BIOTAC:
@@ -126,21 +115,7 @@ def compare_verb(args: argparse.Namespace) -> None:
         for name in args.configurations
     ]
     given = args.material and read_material(args.material)
-    truth_material = material(args.reference_material)
     out = pathlib.Path(args.out)
-    settings = {
-        k: v
-        for k, v in vars(args).items()
-        if isinstance(v, (str, int, float, list, tuple, type(None))) and k not in _NO_SETTINGS
-    }
-    files = [pathlib.Path(text.partition("=")[2]) for text in args.data or ()]
-    inputs = [settings, given, truth_material, load_skin(args.skin), load_skin(_REFERENCE["skin"])]
-    inputs.append(read_dict(args.options, "options"))
-    kept = Kept(out / "compare.kept", [*inputs, *(file.read_bytes() for file in files if file.is_file())])
-    if kept.names and not args.quiet:
-        print(
-            f"goes on after {', '.join(kept.names)} (kept in {out / 'compare.kept'}; remove it to start anew)"
-        )
     if args.data:
         cases = [_measured(text) for text in args.data]
         calibration, cases = (None, cases) if given else (cases[0], cases[1:])
@@ -149,25 +124,11 @@ def compare_verb(args: argparse.Namespace) -> None:
         truth = {"material": args.reference_material, "device": args.device, **_REFERENCE}
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:
-            cases = kept.get("reference", list, lambda: references(plans, bar.update, **truth))
-        calibration = (
-            None
-            if given
-            else kept.get(
-                "reference of the calibration", Indentation, lambda: stand_in(plan_shear(), **truth)
-            )
-        )
+            cases = references(plans, bar.update, **truth)
+        calibration = None if given else stand_in(plan_shear(), **truth)
         element, skin = _REFERENCE["element"], _REFERENCE["skin"]
         reference = f"{STAND_IN} ({args.reference_material}, {element} elements, skin {skin})"
-    results = []
-    for body in chosen:
-        results.append(
-            kept.get(
-                body.name,
-                Comparison,
-                lambda body=body: _compared(body, given, calibration, cases, kept, args),
-            )
-        )
+    results = [_compared(body, given, calibration, cases, args) for body in chosen]
     write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
     for result in results:
         m = result.material
@@ -179,18 +140,14 @@ def compare_verb(args: argparse.Namespace) -> None:
     print(f"wrote {out / 'compare.json'}")
 
 
-def _compared(body, given, calibration, cases, kept, args):
+def _compared(body, given, calibration, cases, args):
     """Calibrates a configuration, unless its material is given, and evaluates it."""
     fitted = None
     if not given:
         wanted = [parameter(name) for name in ("E", "nu", "mu")]
         forces, _ = args.forces_of(body, material("paper"), wanted, calibration, args.device)
         settings = dict(device=args.device, progress=not args.quiet, forces=forces)
-        fitted = kept.get(
-            f"calibration of {body.name}",
-            Calibration,
-            lambda: calibrate(body, material("paper"), calibration, **settings),
-        )
+        fitted = calibrate(body, material("paper"), calibration, **settings)
         if not args.quiet:
             print(f"{body.name}\n{calibration_table(fitted)}", flush=True)
     with _bar(body.name, len(cases), args.quiet) as bar:

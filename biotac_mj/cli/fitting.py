@@ -141,7 +141,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
     add_liquid(verb, False, "liquid in the shells")
     add_device(verb)
     verb.set_defaults(forces_of=_forces_of)
-    add_results(verb, "out/compare", "folder of compare.json", "compare.json", "compare.kept")
+    add_results(verb, "out/compare", "folder of compare.json", "compare.json")
 
 
 def add_estimate(verbs: argparse._SubParsersAction) -> None:

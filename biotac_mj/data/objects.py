@@ -12,7 +12,6 @@ import numpy as np
 from ..geometry.indenters import INDENTERS
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix, quaternion_from_y
 from ..press.indenter import Indenter, make_indenter, solid
-from ..skin.contact.meshes import DistanceGrid, bake_distance_grid
 from ..triangles import trimesh
 
 _EDGE = 0.5e-3  # [m] rounding of pegs and of the table's edges
@@ -80,10 +79,3 @@ def make_object(name: str) -> Indenter:
     if kind == "square":
         return _box(name, (width / 2, _LENGTH / 2, width / 2), None)
     return _prism(name, {"hexagon": 6, "triangle": 3}[kind], width)
-
-
-@functools.lru_cache(maxsize=32)
-def grid_of(name: str) -> DistanceGrid | None:
-    """Distance grid of an object that is a mesh."""
-    shape = make_object(name)
-    return bake_distance_grid(shape.vert, shape.face) if shape.type == "mesh" else None

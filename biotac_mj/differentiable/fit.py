@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from ..cache import cached
 from ..calibration import Calibration, Configuration, FitParameter, Indentation
 from ..calibration import calibrate as calibrate_with
-from ..calibration.forward import Steps, steps_of
+from ..calibration.forward import CODE, Steps, inputs_of, steps_of
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
 from .record import follow
@@ -19,7 +20,8 @@ _PRECISION = 1e-4  # of derivatives, which only set the direction
 
 
 class Forces:
-    """`calibration.fit.forces_and_jacobian` by gradients. Caches the skin between calls.
+    """`calibration.fit.forces_and_jacobian` by gradients. Keeps the skin between calls, and caches results on
+    disk.
 
     Raises:
       ValueError: a parameter without gradient.
@@ -39,31 +41,16 @@ class Forces:
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Forces (n, 3) [N], their derivatives by the scaled parameters (n, 3, p), number of steps without
         convergence."""
-        names = [p.name for p in parameters]
         steps, skin = self.prepare(configuration, material, parameters, indentation)
-        values = torch.tensor(values, dtype=torch.float64)
-        others = [name for name in names if name != "friction"]
 
-        def numbers(values):
-            given = numbers_of(skin, {name: values[names.index(name)] for name in others})
-            return torch.stack([given[name] for name in NUMBERS])
+        def make():
+            found = _forces_and_jacobian(skin, steps, material, parameters, values)
+            return dict(zip(("force", "jacobian", "lost"), found))
 
-        slopes = torch.autograd.functional.jacobian(numbers, values).numpy()
-        slopes = slopes * [p.slope(float(v)) for p, v in zip(parameters, values)]
-        friction = material.friction if "friction" not in names else float(values[names.index("friction")])
-        made = dict(zip(NUMBERS, numbers(values)))
-        path = steps.pos[None], steps.mat[None]
-        trajectory = follow(skin, *path, np.array([friction]), made, dt=steps.dt)
-        by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
-        tangents = Inputs(
-            np.zeros((len(parameters), 1, len(steps.pos), 1, 6)),
-            np.array(by_friction)[:, None],
-            dict(zip(NUMBERS, slopes[..., None])),
-        )
-        found = push_forward(skin, trajectory, tangents)
-        change = found.wrench[:, 0, steps.ends, 0, :3]
-        force = np.array([trajectory.steps[i].wrench[0, 0, :3].numpy() for i in steps.ends])
-        return force, np.moveaxis(change, 0, -1), sum(r.changes[0].lost for r in trajectory.steps)
+        body = configuration.geometry, configuration.options, configuration.modulus, indentation
+        inputs = [*inputs_of(*body), material, parameters, np.asarray(values, float)]
+        found = cached("slopes", inputs, make, (*CODE, "differentiable"))
+        return found["force"], found["jacobian"], int(found["lost"])
 
     def prepare(
         self,
@@ -91,6 +78,33 @@ class Forces:
                 precision=_PRECISION,
             )
         return steps, self._skins[key]
+
+
+def _forces_and_jacobian(skin, steps, material, parameters, values):
+    names = [p.name for p in parameters]
+    values = torch.tensor(values, dtype=torch.float64)
+    others = [name for name in names if name != "friction"]
+
+    def numbers(values):
+        given = numbers_of(skin, {name: values[names.index(name)] for name in others})
+        return torch.stack([given[name] for name in NUMBERS])
+
+    slopes = torch.autograd.functional.jacobian(numbers, values).numpy()
+    slopes = slopes * [p.slope(float(v)) for p, v in zip(parameters, values)]
+    friction = material.friction if "friction" not in names else float(values[names.index("friction")])
+    made = dict(zip(NUMBERS, numbers(values)))
+    path = steps.pos[None], steps.mat[None]
+    trajectory = follow(skin, *path, np.array([friction]), made, dt=steps.dt)
+    by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
+    tangents = Inputs(
+        np.zeros((len(parameters), 1, len(steps.pos), 1, 6)),
+        np.array(by_friction)[:, None],
+        dict(zip(NUMBERS, slopes[..., None])),
+    )
+    found = push_forward(skin, trajectory, tangents)
+    change = found.wrench[:, 0, steps.ends, 0, :3]
+    force = np.array([trajectory.steps[i].wrench[0, 0, :3].numpy() for i in steps.ends])
+    return force, np.moveaxis(change, 0, -1), sum(r.changes[0].lost for r in trajectory.steps)
 
 
 def forces_of(

@@ -4,6 +4,7 @@ The frame of an indenter has its origin at the tip and presses along +y, as in t
 """
 
 import dataclasses
+import functools
 import pathlib
 
 import mujoco
@@ -47,6 +48,21 @@ class Indenter:
     quat: np.ndarray
     vert: np.ndarray
     face: np.ndarray
+
+    @functools.cached_property
+    def geom(self) -> dict:
+        """Arguments of `skin.GeomSet` for this shape alone; a mesh has a distance grid."""
+        from ..skin.contact.meshes import bake_distance_grid
+
+        grids = [bake_distance_grid(self.vert, self.face)] if self.type == "mesh" else []
+        return {"types": [self.type], "sizes": [self.size], "rounding": [self.rounding], "grids": grids}
+
+    def pose(self, pos: np.ndarray, mat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Position (..., 3) [m] and rotation (..., 3, 3) of the geom for those of the indenter's frame, in
+        which a mesh has its vertices."""
+        if self.type == "mesh":
+            return pos, mat
+        return pos + mat @ self.pos, mat @ matrix(self.quat)
 
 
 def _surface(kind, size):

@@ -4,13 +4,12 @@ depth."""
 import numpy as np
 import warp as wp
 
-from ...geometry.rigid import matrix
 from ...skin.contact.faces import face_samples
 from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
 from ...skin.geoms import GeomSet
 from ...skin.types import real, vec3
-from ..objects import grid_of, make_object
+from ..objects import make_object
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,11 +46,8 @@ class Placed:
     """
 
     def __init__(self, name: str, nworld: int, device: str = "cpu", friction: float = 0.0):
-        shape, grid = make_object(name), grid_of(name)
-        self.geoms = GeomSet([shape.type], [shape.size], friction=[friction], rounding=[shape.rounding],
-                             grids=[] if grid is None else [grid], nworld=nworld, device=device)  # fmt: skip
-        self._pos = np.zeros(3) if grid is not None else np.asarray(shape.pos)
-        self._mat = np.eye(3) if grid is not None else matrix(shape.quat)
+        self._shape = make_object(name)
+        self.geoms = GeomSet(**self._shape.geom, friction=[friction], nworld=nworld, device=device)
 
     def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Puts the object's frame at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
@@ -60,8 +56,8 @@ class Placed:
     def pose(self, pos: np.ndarray, mat: np.ndarray) -> object:
         """Position (nworld, 1, 3) [m] and rotation (nworld, 1, 3, 3) of the geom for those of the object's
         frame."""
-        pos, mat = np.asarray(pos, float), np.asarray(mat, float)
-        return (pos + mat @ self._pos)[:, None], (mat @ self._mat)[:, None]
+        pos, mat = self._shape.pose(np.asarray(pos, float), np.asarray(mat, float))
+        return pos[:, None], mat[:, None]
 
     def nearest(self, points: wp.array) -> np.ndarray:
         """(nworld,) signed distance to the nearest of points (n,) vec3 [m], at most 2 mm."""

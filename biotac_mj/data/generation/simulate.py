@@ -14,7 +14,7 @@ from ...skin.per_world import make_worlds
 from ...skin.touched import Touched
 from ...skin.types import real, vec3
 from ..contact import contact_labels
-from ..objects import grid_of, make_object
+from ..objects import make_object
 from ..schema import DISPLACEMENT_SCALE, nodes_of
 from .clearance import Placed
 from .readings import Readings, Touch
@@ -264,27 +264,19 @@ class Scene:
     def __init__(self, names: list | tuple, device: str = "cpu", friction: float = 0.0):
         kinds = list(dict.fromkeys(names))
         self._which = np.array([kinds.index(name) for name in names])
-        self._placed = [Placed(name, 1) for name in kinds]
-        shapes, grids = [make_object(name) for name in kinds], [grid_of(name) for name in kinds]
-        self.geoms = GeomSet(
-            [s.type for s in shapes],
-            [s.size for s in shapes],
-            friction=[friction] * len(kinds),
-            rounding=[s.rounding for s in shapes],
-            grids=[g for g in grids if g is not None],
-            nworld=len(names),
-            device=device,
-        )
+        self._shapes = [make_object(name) for name in kinds]
+        geoms = {key: sum((shape.geom[key] for shape in self._shapes), []) for key in self._shapes[0].geom}
+        friction = [friction] * len(kinds)
+        self.geoms = GeomSet(**geoms, friction=friction, nworld=len(names), device=device)
 
     def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Moves each world's object to pos (nworld, 3) [m] with rotation mat (nworld, 3, 3)."""
         pos, mat = np.asarray(pos, float), np.asarray(mat, float)
-        at = np.tile([0.0, -_AWAY, 0.0], (len(pos), len(self._placed), 1))
-        turn = np.tile(np.eye(3), (len(pos), len(self._placed), 1, 1))
-        for k, placed in enumerate(self._placed):
+        at = np.tile([0.0, -_AWAY, 0.0], (len(pos), len(self._shapes), 1))
+        turn = np.tile(np.eye(3), (len(pos), len(self._shapes), 1, 1))
+        for k, shape in enumerate(self._shapes):
             mine = np.flatnonzero(self._which == k)
-            p, R = placed.pose(pos[mine], mat[mine])
-            at[mine, k], turn[mine, k] = p[:, 0], R[:, 0]
+            at[mine, k], turn[mine, k] = shape.pose(pos[mine], mat[mine])
         self.geoms.set_pose(at, turn)
 
 
