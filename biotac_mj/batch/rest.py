@@ -85,32 +85,43 @@ def _margin(laws: Laws, w: int):
 
 
 @wp.kernel
-def find_close(
+def find_clearance(
     # In:
     center: vec3,
     radius: real,
     touch: int,
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    core_vert: wp.array(dtype=vec3),
+    core: Geoms,
     geoms: Geoms,
     laws: Laws,
     on: wp.array(dtype=int),
+    x: wp.array2d(dtype=vec3),
+    # In and out:
+    touched: wp.array(dtype=int),
     seen: Seen,
     # Out:
     known_out: wp.array(dtype=int),
-    close_out: wp.array(dtype=int),
     clearance_out: wp.array(dtype=wp.vec2d),
 ):
-    """Finds in which of the worlds that are on the clearance is to be measured: a geom comes near the ball
+    """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core: as
+    `ProximityQuery` of one world, in the worlds that are on. It is measured where a geom comes near the ball
     around the skin, and may be near the skin after its motion since the last time. In others with finite
     poses it is infinite or, where a geom was near and may still be, a bound.
+
+    One block per world: each time its threads have measured a face each, they end if one is touched. They
+    begin with those among which the last touched face was.
 
     Args:
       touch: 1 where only contact matters, not what is near.
     """
-    w = wp.tid()
+    w, t = wp.tid()
     known = on[w]
     close = int(0)
     clearance = wp.vec2d(real(wp.inf), real(wp.inf))
     margin = _margin(laws, w)
+    reach = contact_range(laws, w)
     for g in range(geoms.count):
         if not is_finite(geoms.pos[g, w], geoms.mat[g, w]):
             known = 0
@@ -119,43 +130,18 @@ def find_close(
     close *= known
     if close == 1 and seen.clearance.shape[0] > 0:
         bound = _bound(seen, w, center, radius, geoms)
-        if bound[0] >= wp.where(touch == 1, contact_range(laws, w), margin) and bound[1] >= real(0.0):
+        if bound[0] >= wp.where(touch == 1, reach, margin) and bound[1] >= real(0.0):
             close = 0
         elif touch == 0 and seen.clearance[w][0] < margin and wp.isfinite(bound[0]):
             clearance = bound
             close = 0
-    known_out[w] = known
-    close_out[w] = close
-    clearance_out[w] = clearance
-
-
-@wp.kernel
-def measure_clearance(
-    # In:
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
-    core_vert: wp.array(dtype=vec3),
-    core: Geoms,
-    geoms: Geoms,
-    laws: Laws,
-    x: wp.array2d(dtype=vec3),
-    close: wp.array(dtype=int),
-    # In and out:
-    touched: wp.array(dtype=int),
-    seen: Seen,
-    # Out:
-    clearance_out: wp.array(dtype=wp.vec2d),
-):
-    """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core: as
-    `ProximityQuery` of one world. One block per world: each time its threads have measured a face each, they
-    end if one is touched. They begin with those among which the last touched face was."""
-    w, t = wp.tid()
-    if close[w] == 0:
+    if t == 0:
+        known_out[w] = known
+        clearance_out[w] = clearance
+    if close == 0:
         return
     threads = wp.block_dim()
     own = w % x.shape[1]
-    margin = _margin(laws, w)
-    reach = contact_range(laws, w)
     parts = (face.shape[0] + threads - 1) / threads
     part = touched[w]
     skin = real(wp.inf)
@@ -477,7 +463,7 @@ class Clearance:
         self.ball = vec3(*center), 1.1 * float(np.linalg.norm(vert - center, axis=1).max())
         with wp.ScopedDevice(model.device):
             self._seen = make_seen(0, 0) if seen is None else seen
-            self.known, self._close, self._touched = (wp.zeros(nworld, dtype=int) for _ in range(3))
+            self.known, self._touched = (wp.zeros(nworld, dtype=int) for _ in range(2))
             self.found = wp.zeros(nworld, dtype=wp.vec2d)
             core = [wp.zeros(0, dtype=vec3), Geoms()]
             if model.has_core:
@@ -486,12 +472,10 @@ class Clearance:
 
     def find(self, on: wp.array, geoms: Geoms, laws: Laws, x: wp.array, touch: int = 0) -> None:
         """Finds the clearance in worlds that are on (nworld,), of skins with nodes at (nvert, nworld or 1).
-        Launches only. touch: see `find_close`."""
-        n, launcher = len(on), Launcher(self._device)
-        known = [*self.ball, touch, geoms, laws, on, self._seen]
-        launcher.launch(find_close, n, known, [self.known, self._close, self.found])
-        known, found = [*self._skin, geoms, laws, x, self._close], [self._touched, self._seen, self.found]
-        launcher.launch_blocks(measure_clearance, [n], known, found)
+        Launches only. touch: see `find_clearance`."""
+        known = [*self.ball, touch, *self._skin, geoms, laws, on, x]
+        found = [self._touched, self._seen, self.known, self.found]
+        Launcher(self._device).launch_blocks(find_clearance, [len(on)], known, found)
 
 
 def make_seen(ngeom: int, nworld: int) -> Seen:

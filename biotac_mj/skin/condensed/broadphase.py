@@ -451,16 +451,7 @@ def find_inner_faces(
 
 
 @wp.func
-def find_nodes(
-    w: int,
-    t: int,
-    threads: int,
-    nface: int,
-    ncore: int,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-    s: Scratch,
-):
+def find_nodes(w: int, t: int, threads: int, nface: int, ncore: int, c: Constants, s: Scratch):
     """Numbers the free nodes of the candidate faces and their coordinates; how many outer and inner nodes
     there are, which are not listed where there is no room."""
     for i in range(t, c.node.shape[0], threads):

@@ -50,7 +50,7 @@ def whole_step(shapes: str) -> wp.Kernel:
         tier_out: wp.array(dtype=int),
     ):
         w = wp.tid()
-        begin_step(w, 0, 1, law, geoms, x, touch, c, s, r, st)
+        begin_step(w, 0, 1, law, geoms, s, st)
         while s.solve.phase[w] != DONE:
             if s.solve.phase[w] == SEARCH:
                 search(w, 0, 1, geoms, x, touch, c, s, r, st)
@@ -69,16 +69,12 @@ def _begin(
     # In:
     law: int,
     geoms: Geoms,
-    c: Constants,
-    x: wp.array2d(dtype=vec3),
-    touch: Contact,
-    r: Remembered,
     st: Worlds,
     # Out:
     s: Scratch,
 ):
     w, t = wp.tid()
-    begin_step(w, t, wp.block_dim(), law, geoms, x, touch, c, s, r, st)
+    begin_step(w, t, wp.block_dim(), law, geoms, s, st)
 
 
 @wp.kernel(module=f"{__name__}.search", enable_backward=False, launch_bounds=(LARGEST_BLOCK, 2))

@@ -126,7 +126,7 @@ class CondensedStep:
         m, d, geoms = self._model, self._data, self._geoms
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         if self._phases:
-            known = [m.law, geoms.struct, c, d.x, self.touch, self.remembered, d.worlds]
+            known = [m.law, geoms.struct, d.worlds]
             launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=self._block)
             return
         launcher.launch(  # a thread for each, and no tiles: several skins may be solved at a time

@@ -65,7 +65,7 @@ def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constant
 
 
 @wp.func
-def _load(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+def _load(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
     """Sets vector[F] of the candidates to the initial forces of a solve."""
     for k in range(t, nnode, threads):
         f = s.force[w, s.node[w, k]]
@@ -77,7 +77,7 @@ def _load(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: S
 
 
 @wp.func
-def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+def _store(w: int, t: int, threads: int, nnode: int, c: Constants, s: Scratch):
     """Stores vector[F] as forces of the nodes; nodes that are no candidates have none."""
     for i in range(t, c.node.shape[0], threads):
         f = vec3()
@@ -145,19 +145,7 @@ def _next_increment(last: Increment):
 
 
 @wp.func
-def begin_step(
-    w: int,
-    t: int,
-    threads: int,
-    law: int,
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    touch: Contact,
-    c: Constants,
-    s: Scratch,
-    r: Remembered,
-    st: Worlds,
-):
+def begin_step(w: int, t: int, threads: int, law: int, geoms: Geoms, s: Scratch, st: Worlds):
     """Starts a step: previous and new poses of the geoms."""
     if st.wanted[w] == 0:
         if t == 0:
@@ -312,7 +300,7 @@ def search(
             o.nface = nface
             o.ncore = ncore
     if looking == 1:
-        nnode, nin = find_nodes(w, t, threads, o.nface, o.ncore, x, c, s)
+        nnode, nin = find_nodes(w, t, threads, o.nface, o.ncore, c, s)
         o.nnode = nnode
         o.nin = nin
         if o.ncore > s.core_face.shape[1] or 3 * nnode + nin > s.coordinate.shape[1]:
@@ -327,7 +315,7 @@ def search(
     if looking == 1:
         measure_core(w, t, threads, o.nnode, o.nin, o.ncore, x, c, s)
         find_groups(w, t, threads, o.nnode, geoms, x, touch, c, s)
-        _load(w, t, threads, o.nnode, o.nin, c, s)
+        _load(w, t, threads, o.nnode, o.nin, s)
         foretold = int(0)
         before = o.linear
         count, own = gather_load(w, t, threads, 3 * o.nnode + o.nin, F, c, s)
@@ -475,7 +463,7 @@ def _conclude_pass(
             again = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
             s.solve.newton[w] = newton_from(2, d.before, again, p.left - o.spent, d.tolerance)
         return o, NEWTON
-    _store(w, t, threads, o.nnode, o.nin, c, s)
+    _store(w, t, threads, o.nnode, c, s)
     if o.ok != CUT:
         if may_be_touched(w, t, threads, o, geoms, x, c, s):
             return o, SEARCH
