@@ -70,6 +70,7 @@ class Hook:
             self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
         with wp.ScopedDevice(d.qpos.device):
             self._taking_part, self._going, self._next = (Marks(d.nworld) for _ in range(3))
+            self._films = wp.zeros(1, dtype=int)
             first = np.cumsum([0, *(one.groups[0] for one in moving)]).tolist()
             self._correction = integrator.corrections(first[-1], d.nworld, d.qvel.shape[1])
         for one, number in zip(moving, first):
@@ -178,16 +179,15 @@ class Hook:
         for batch in moving:
             batch.add_stiffness(self._stiffness)
         self._free.find(m, d, taking_part.world, d.M, own=self._rows)
-        for batch in moving:
-            batch.conclude(taking_part, self._stiffness, self._free.L)
+        known = taking_part, self._stiffness, self._free.L
+        self._fork.run(*(functools.partial(batch.conclude, *known) for batch in moving))
         end = self._ends.find(m, d, self._integrator.qacc)
         self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
 
     def _choose(self, moving, choose):
         """Selects the worlds that continue: those that any batch chooses."""
         self._next.clear()
-        for batch in moving:
-            choose(batch, self._next)
+        self._fork.run(*(functools.partial(choose, batch, self._next) for batch in moving))
         self._going.copy(self._next)
 
     def _go_on(self, m, d, moving):
@@ -299,9 +299,10 @@ class Hook:
             self._sensor(m, d, stage)
         batches = [batch for batch in self.batches if batch.active]
         if stage == Stage.VEL:
-            self._fork.run(*(batch.look for batch in batches))
-            for batch in batches:
-                batch.solve_film()
+            self._films.zero_()
+            self._fork.run(*(functools.partial(batch.look, self._films) for batch in batches))
+            films = [batch.solve_film for batch in batches]
+            wp.capture_if(self._films, lambda: self._fork.run(*films))
             self._fork.run(*(functools.partial(batch.sense, d.sensordata) for batch in batches))
         elif stage == Stage.ACC and batches:
             mjw.contact_force(m, d, self._contact, True, self._contact_force)

@@ -163,7 +163,6 @@ class Senses:
         self.heat = self.vibration = self._touched = None
         with wp.ScopedDevice(device):
             self._known, self._changed = (wp.zeros(nworld, dtype=int) for _ in range(2))
-            self._any = wp.zeros(1, dtype=int)
         self._rests, begins = [], None
         if warm:
             self.heat = Heat(rows[0].bodies, nworld=nworld, device=device)
@@ -246,22 +245,26 @@ class Senses:
         if self.vibration:
             self._touched.begin()
 
-    def look(self, wrench: wp.array, tangent: wp.array, awake: wp.array) -> None:
-        """After it; wrench, tangent (ngroup, nworld) of the skins ON the bodies, awake (nworld,) int, 1 where
-        the skin may have moved: heat, and which worlds want their film. Launches only."""
+    def look(self, wrench: wp.array, tangent: wp.array, awake: wp.array, any: wp.array) -> None:
+        """After it: heat, and which worlds want their film. Launches only.
+
+        Args:
+          wrench, tangent: (ngroup, nworld) of the skins ON the bodies. awake: (nworld,) int, 1 where the skin
+            may have moved.
+          any: (1,) int, becomes 1 where a world wants its film.
+        """
         if self._touched:
             self._touched.end(wrench, tangent)
         if self.heat:
             self.heat.advance(self._dt)
         due = self.acquisition.find_due(self._dt)
-        self._any.zero_()
         inputs = [due, awake]
-        outputs = [self._known, self._changed, self._any]
+        outputs = [self._known, self._changed, any]
         wp.launch(find_changed, self._skin.nworld, inputs, outputs, device=due.device)
 
     def solve_film(self) -> None:
-        """The films that are wanted, after `look`."""
-        wp.capture_if(self._any, lambda: self.film.solve_film(self._skin.x, self._changed))
+        """The films that are wanted, after `look`. Launches only."""
+        self.film.solve_film(self._skin.x, self._changed)
 
     def sample(self) -> wp.array:
         """The step's slots, after `solve_film`; returns the states (nworld, nstate). Launches only."""

@@ -170,10 +170,11 @@ class Skins:
             kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
         )
 
-    def look(self) -> None:
-        """Updates the sensors' inputs of the step, before `solve_film`. Launches only."""
+    def look(self, any: wp.array) -> None:
+        """Updates the sensors' inputs of the step, before `solve_film`; any: see `Senses.look`. Launches
+        only."""
         if self.senses:
-            self.senses.look(self.model.wrench0, self.model.tangent0, self.rest.awake)
+            self.senses.look(self.model.wrench0, self.model.tangent0, self.rest.awake, any)
 
     def solve_film(self) -> None:
         """The film, where electrodes are sampled and skins have moved, before `sense`. Launches only."""
@@ -236,7 +237,7 @@ class PoseBatch(Skins):
             )  # (w, x, y, z), as mujoco_warp keeps it
             self._pos = wp.zeros(self.groups, dtype=wp.vec3d)
             self._mat = wp.zeros(self.groups, dtype=wp.mat33d)
-            self._taking_part = Marks(self.nworld)
+            self._taking_part, self._films = Marks(self.nworld), wp.zeros(1, dtype=int)
             self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
             self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
 
@@ -276,8 +277,9 @@ class PoseBatch(Skins):
         self.end_step()
         bodies = [self._core, self._body, self.model.wrench0, xpos, xmat, xipos]
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])
-        self.look()
-        self.solve_film()
+        self._films.zero_()
+        self.look(self._films)
+        wp.capture_if(self._films, self.solve_film)
         self.sense(self.sensordata)
 
     def readings(self) -> dict:

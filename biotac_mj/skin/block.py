@@ -19,16 +19,20 @@ def sync():
 
 
 # One buffer of 40 kB, which functions of a kernel use in turn: a block may declare 48 kB of shared memory
-@wp.func_native("""
+MEMORY = wp.constant(5120)
+
+
+@wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ double memory[5120];
+    __shared__ double memory[{MEMORY}];
     return (uint64_t)memory;
 #else
     return 0;
 #endif
 """)
 def block_memory() -> wp.uint64:
-    """Address of shared memory of the block, on CUDA. Its contents last until another function takes it."""
+    """Address of shared memory of the block on CUDA, for MEMORY real numbers, else 0. Its contents last until
+    another function takes it."""
     ...
 
 

@@ -5,7 +5,7 @@ import typing
 import mujoco
 import warp as wp
 
-from ...coupling.implicit.compliance import factor
+from ...coupling.implicit.compliance import THREADS, factor
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
 
@@ -13,8 +13,6 @@ if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 wp.set_module_options({"enable_backward": False})
-
-_BLOCK = 64  # threads that factor a world's matrix
 
 _CONE = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE))
 _ELLIPTIC = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
@@ -99,7 +97,8 @@ class Cones:
 
     def __init__(self, m: "mjw.Model", d: "mjw.Data"):
         self._wanted, friction = m.opt.cone == _ELLIPTIC, d.contact.friction
-        shape = (d.nworld, d.njmax) if self._wanted else (d.nworld, 0)
+        self.rows = d.nworld, d.njmax
+        shape = self.rows if self._wanted else (d.nworld, 0)
         with wp.ScopedDevice(d.qpos.device):
             self.cone, self.hessian = wp.full(shape, -1, dtype=int), wp.zeros(shape, dtype=vec6)
         self._friction = wp.array(
@@ -134,6 +133,7 @@ class Factor:
         self._inertia_rows = [m.M_rownnz, m.M_rowadr, m.M_colind]
         with wp.ScopedDevice(m.qpos0.device):
             self.L = wp.zeros((nworld, m.nv, m.nv), dtype=real)
+            self._springs = wp.zeros(cones.rows, dtype=int)
             self._none = wp.zeros(nworld, dtype=int), wp.zeros((0, nworld), dtype=int)
 
     def find(
@@ -160,4 +160,5 @@ class Factor:
         if springs:
             self._cones.find(m, d, going)
         known = [going, inertia, *self._inertia_rows, *held]
-        Launcher(self.L.device).launch_blocks(factor, [len(self.L)], known, [self.L], block_dim=_BLOCK)
+        found = [self._springs, self.L]
+        Launcher(self.L.device).launch_blocks(factor, [len(self.L)], known, found, block_dim=THREADS)

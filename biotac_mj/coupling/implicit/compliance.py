@@ -11,12 +11,13 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from ...skin.block import sync
+from ...skin.block import MEMORY, block_memory, block_rank, sync
 from ...skin.types import real, vec6
 from .rounds import Model
 
 wp.set_module_options({"enable_backward": False})
 
+THREADS = 128  # that factor a world's matrix on CUDA
 
 _QUADRATIC, _CONE = (
     wp.constant(int(getattr(mujoco.mjtConstraintState, f"mjCNSTRSTATE_{name}")))
@@ -34,7 +35,52 @@ def _entry(J: wp.array3d(dtype=Any), w: int, r: int, k: int, sparse: int, J_rowa
     return real(J[w, r, k])
 
 
-@wp.kernel
+@wp.func
+def _stiffness(
+    w: int,
+    spring: int,
+    a: int,
+    b: int,
+    J: wp.array3d(dtype=Any),
+    D: wp.array2d(dtype=Any),
+    sparse: int,
+    J_rowadr: wp.array2d(dtype=int),
+    cone: wp.array2d(dtype=int),
+    hessian: wp.array2d(dtype=vec6),
+):
+    """What a row of `factor` adds between the degrees of freedom of its entries a and b."""
+    r = spring
+    push = real(0.0)
+    if spring < 0:
+        r = -1 - spring
+        for k in range(6):
+            if hessian[w, r][k] != real(0.0):
+                push += hessian[w, r][k] * _entry(J, w, cone[w, r] + k, b, sparse, J_rowadr)
+    else:
+        push = real(D[w, r]) * _entry(J, w, r, b, sparse, J_rowadr)
+    return push * _entry(J, w, r, a, sparse, J_rowadr)
+
+
+@wp.func
+def _is_spring(
+    r: int,
+    w: int,
+    own: wp.array2d(dtype=int),
+    state: wp.array2d(dtype=int),
+    D: wp.array2d(dtype=Any),
+    cone: wp.array2d(dtype=int),
+):
+    """Whether a constraint's row holds, 1 or 0: none of a skin's own, of which the first of six are `own`."""
+    spring = wp.where(state[w, r] == _QUADRATIC and real(D[w, r]) > _NONE, 1, 0)
+    if state[w, r] == _CONE:
+        spring = wp.where(cone[w, r] >= 0, 1, 0)
+    for k in range(own.shape[0]):
+        if own[k, w] >= 0 and r >= own[k, w] and r < own[k, w] + 6:
+            spring = 0
+    return spring
+
+
+@wp.kernel(launch_bounds=(THREADS, 5))
 def factor(
     # In:
     going: wp.array(dtype=int),
@@ -54,10 +100,11 @@ def factor(
     cone: wp.array2d(dtype=int),
     hessian: wp.array2d(dtype=vec6),
     # Out:
+    spring_out: wp.array2d(dtype=int),
     L_out: wp.array3d(dtype=real),
 ):
-    """Cholesky's factor of the inertia with what constraints now hold, but for a skin's own rows, of which
-    the first of six are `own`; by the threads of a block, in worlds that have not finished.
+    """Cholesky's factor of the inertia with what constraints now hold, and a list of their rows [world, k],
+    r or, of a cone, -1 - r; by the threads of a block, in worlds that have not finished.
 
     A contact that slides on its elliptic cone holds by its Hessian: `cone` is the first of its rows, or -1
     where it is not known, and `hessian` has a row for each. They have their entries in the same columns."""
@@ -66,60 +113,62 @@ def factor(
         return
     threads = wp.block_dim()
     n = L_out.shape[1]
+    count = int(0)
+    for begin in range(0, wp.min(rows[w], state.shape[1]), threads):
+        spring = int(0)
+        if begin + t < wp.min(rows[w], state.shape[1]):
+            spring = _is_spring(begin + t, w, own, state, D, cone)
+        rank = block_rank(spring)
+        if spring == 1:
+            r = begin + t
+            spring_out[w, count + rank[0]] = wp.where(state[w, r] == _CONE, -1 - r, r)
+        count += rank[1]
+    memory = block_memory()
+    if memory == wp.uint64(0) or n * n > MEMORY:
+        memory = L_out.ptr + wp.uint64(8 * n * n) * wp.uint64(w)
+    L = wp.array(ptr=memory, shape=(n, n), dtype=real)
     for i in range(t, n, threads):
         for j in range(n):
-            L_out[w, i, j] = real(0.0)
+            L[i, j] = real(0.0)
         for k in range(rownnz[i]):
-            L_out[w, i, colind[rowadr[i] + k]] = real(inertia[w, rowadr[i] + k])
+            L[i, colind[rowadr[i] + k]] = real(inertia[w, rowadr[i] + k])
     sync()
-    for r in range(wp.min(rows[w], state.shape[1])):
-        springs = wp.where(state[w, r] == _QUADRATIC and real(D[w, r]) > _NONE, 1, 0)
-        first = int(-1)
-        if state[w, r] == _CONE:
-            first = cone[w, r]
-            springs = wp.where(first >= 0, 1, 0)
-        for k in range(own.shape[0]):
-            if own[k, w] >= 0 and r >= own[k, w] and r < own[k, w] + 6:
-                springs = 0
-        if springs == 1:
-            size = n
-            if sparse == 1:
-                size = J_rownnz[w, r]
+    if sparse == 1:
+        for k in range(count):
+            spring = spring_out[w, k]
+            r = wp.where(spring < 0, -1 - spring, spring)
+            size = J_rownnz[w, r]
             for m in range(t, size * size, threads):
-                a = m / size
-                b = m % size
-                i = a
-                j = b
-                if sparse == 1:
-                    i = J_colind[w, 0, J_rowadr[w, r] + a]
-                    j = J_colind[w, 0, J_rowadr[w, r] + b]
-                if i < j:
-                    continue
-                push = real(0.0)
-                if first < 0:
-                    push = real(D[w, r]) * _entry(J, w, r, b, sparse, J_rowadr)
-                else:
-                    for k in range(6):
-                        if hessian[w, r][k] != real(0.0):
-                            push += hessian[w, r][k] * _entry(J, w, first + k, b, sparse, J_rowadr)
-                L_out[w, i, j] = L_out[w, i, j] + push * _entry(J, w, r, a, sparse, J_rowadr)
-            if sparse == 1:  # else each thread has the same entries in all rows
-                sync()
+                i = J_colind[w, 0, J_rowadr[w, r] + m / size]
+                j = J_colind[w, 0, J_rowadr[w, r] + m % size]
+                if i >= j:
+                    held = _stiffness(w, spring, m / size, m % size, J, D, sparse, J_rowadr, cone, hessian)
+                    L[i, j] = L[i, j] + held
+            sync()
+    else:
+        for m in range(t, n * n, threads):
+            held = real(0.0)
+            for k in range(wp.where(m / n >= m % n, count, 0)):
+                held += _stiffness(w, spring_out[w, k], m / n, m % n, J, D, sparse, J_rowadr, cone, hessian)
+            L[m / n, m % n] = L[m / n, m % n] + held
     sync()
     for j in range(n):
-        whole = L_out[w, j, j]
+        whole = L[j, j]
         sync()
         for i in range(j + t, n, threads):
-            total = L_out[w, i, j]
+            total = L[i, j]
             for k in range(j):
-                total -= L_out[w, i, k] * L_out[w, j, k]
-            L_out[w, i, j] = total
+                total -= L[i, k] * L[j, k]
+            L[i, j] = total
         sync()
-        pivot = wp.sqrt(wp.max(L_out[w, j, j], _LEAST * whole))
+        pivot = wp.sqrt(wp.max(L[j, j], _LEAST * whole))
         sync()
         for i in range(j + t, n, threads):
-            L_out[w, i, j] = wp.where(i == j, pivot, L_out[w, i, j] / pivot)
+            L[i, j] = wp.where(i == j, pivot, L[i, j] / pivot)
         sync()
+    for i in range(t, n, threads):
+        for j in range(i + 1):
+            L_out[w, i, j] = L[i, j]
 
 
 # an overload that a launch makes would change the module after it was compiled

@@ -56,7 +56,7 @@ class Springs:
         self._cone, self._hessian = cone.numpy()[0], hessian.numpy()[0]
         self._room, self._factors = (rows, entries), {}
         self._copies = {name: array.numpy().reshape(-1) for name, array in made.items()}
-        self._arrays = [*made.values(), cone, hessian]
+        self._arrays = [*made.values(), cone, hessian, wp.zeros_like(cone)]
         self._arrays.insert(3, 1)  # the Jacobian is sparse, also where MuJoCo's is not
 
     def take(self, inertia: np.ndarray | None) -> None:

@@ -255,7 +255,7 @@ _SOLVE_BAND = (
             for (int c = 0; c < TILE; ++c) own[c] = first[c * TILE + t];
             #pragma unroll
             for (int c = 0; c < TILE; ++c) {
-                const double pivot = 1.0 / sqrt(__shfl_sync(0xffffffffu, own[c], c));
+                const double pivot = rsqrt(__shfl_sync(0xffffffffu, own[c], c));
                 const double entry = own[c] * pivot;
                 factor[c * PITCH + t] = entry;
                 if (t == c) inverse[c] = pivot;
@@ -316,7 +316,14 @@ _SOLVE_BAND = (
                 // first factor, and two neighbours in one of the result
                 const int lane = t & 31, far = lane / 4, near = lane & 3;
                 const int row = t / 64 * 16 + far, column = t / 32 % 2 * 16;
-                double sum[2][2][2] = {};
+                double sum[2][2][2] = {}, before[2][2][2];
+                #pragma unroll
+                for (int m = 0; m < 2; ++m)
+                    #pragma unroll
+                    for (int n = 0; n < 2; ++n)
+                        #pragma unroll
+                        for (int b = 0; b < 2; ++b)
+                            before[m][n][b] = target[(row + 8 * m) * TILE + column + 8 * n + 2 * near + b];
                 #pragma unroll
                 for (int a = near; a < TILE; a += 4)
                     #pragma unroll
@@ -332,11 +339,11 @@ _SOLVE_BAND = (
                 #pragma unroll
                 for (int m = 0; m < 2; ++m)
                     #pragma unroll
-                    for (int n = 0; n < 2; ++n) {
-                        double* at = target + (row + 8 * m) * TILE + column + 8 * n + 2 * near;
-                        at[0] -= sum[m][n][0];
-                        at[1] -= sum[m][n][1];
-                    }
+                    for (int n = 0; n < 2; ++n)
+                        #pragma unroll
+                        for (int b = 0; b < 2; ++b)
+                            target[(row + 8 * m) * TILE + column + 8 * n + 2 * near + b] =
+                                before[m][n][b] - sum[m][n][b];
 #else
                 for (int part = t; part < size / 8; part += threads) {
                     const int c = part & (TILE - 1), r = part / TILE * 8;
