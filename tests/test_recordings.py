@@ -207,7 +207,18 @@ def test_units_in_names(tmp_path):
     assert unit_of("Fz_N") == ("N", 1.0)
 
 
-@pytest.mark.parametrize("unit, newtons", [("gf", 9.80665e-3), ("kgf", 9.80665), ("lbf", 4.4482216152605)])
+@pytest.mark.parametrize(
+    "unit, newtons",
+    [
+        ("gf", 9.80665e-3),
+        ("kgf", 9.80665),
+        ("lbf", 4.4482216152605),
+        ("g", 9.80665e-3),
+        ("kg", 9.80665),
+        ("cN", 0.01),
+        ("daN", 10.0),
+    ],
+)
 def test_forces_by_weight_are_newtons(unit, newtons, tmp_path):
     """In a column's name, with and without brackets, and in a row of units."""
     names = [f"e{i + 1}" for i in range(19)]

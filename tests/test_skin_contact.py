@@ -9,6 +9,7 @@ from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, S
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.contact.touch import CONSISTENT, CURRENT, LAGGED, RECORDED
+from biotac_mj.skin.touched import sample_areas
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -52,7 +53,7 @@ def hertz_force(d, R, E, nu):
 
 
 def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
-    """Forces of a sphere on a block with `cells` cells per contact radius under the sphere, coarser away from
+    """Forces and contact areas of a sphere on a block with `cells` cells per contact radius under the sphere, coarser away from
     it.
 
     The block is cut out of the half-space 4.5 contact radii away: sides and bottom go where the half-space's
@@ -63,7 +64,7 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
     options = SkinOptions(tolerance=1e-3, contact_stiffness=k * E, **TIGHT)
     data = SkinData(SkinModel(skin(vert, elem, held, outer_face=top), Material("linear", E, nu), options))
     geoms = GeomSet(["sphere"], [(R,)])
-    forces = []
+    forces, areas, nsample = [], [], len(data.model.sample)
     for d in depths:
         x, y, z = vert[held].T
         rho, F, G = np.linalg.norm(vert[held], axis=1), hertz_force(d, R, E, nu), E / 2 / (1 + nu)
@@ -82,7 +83,9 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
         step(data.model, data, geoms)
         assert data.converged.all()
         forces.append(data.wrench[0, 0, 2])
-    return np.array(forces)
+        touching = np.flatnonzero(data.outer.anchor_geom.numpy()[:, 0] >= 0)
+        areas.append(sample_areas(touching // nsample, data.model.outer.area.numpy()).sum())
+    return np.array(forces), np.array(areas)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +95,8 @@ def test_hertz(cells, largest):
     """From the stiff side, with order 1.5 or better: the contact's edge falls between nodes."""
     depths = np.array([30e-6, 60e-6])  # contact radii of 0.55 and 0.77 mm; `cells` are per 0.77 mm
     exact = hertz_force(depths, 10e-3, 1e6, 0.3)
-    forces = np.array([hertz(n, depths) for n in cells])
+    forces, areas = np.array([hertz(n, depths) for n in cells]).swapaxes(0, 1)
+    np.testing.assert_allclose(areas[1] / (np.pi * 10e-3 * depths), 1, atol=0.25)
     errors = forces / exact - 1
     assert (errors[1] > 0).all() and (errors[1] < largest).all(), errors
     ratio = cells[1] / cells[0]

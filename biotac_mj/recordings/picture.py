@@ -9,7 +9,7 @@ from ..sensor.acquisition_kernels import SLOT_RATE
 from ..sensor.colors import change_map, line_color
 from .recording import Recording, check_recording
 
-_REST = 0.02  # fraction of rows at the start whose median is the baseline
+_REST = 0.02  # fraction of rows whose median is the baseline
 _RATE = SLOT_RATE / 2  # [Hz] of samples
 _WINDOW = 176  # samples of a spectrum: 12.5 Hz apart
 _AXES = ("x", "y", "z")
@@ -93,12 +93,18 @@ def _short(recording, name):
 
 
 def _change(recording, name):
-    """Change of a channel from its baseline; tared values are unchanged."""
+    """Change of a channel from its baseline, and its description; tared values are unchanged. The baseline is
+    of the rows with the least force, or else PDC: a recording may start under load."""
     value = getattr(recording, name)
     if recording.unit(name).startswith("tared"):
         return value, f"[{_short(recording, name)}]"
-    rest = np.nanmedian(value[: max(5, int(_REST * len(value)))], axis=0)
-    return value - rest, f"since the start\n[{_short(recording, name)}]"
+    order, since = np.arange(len(value)), "since the start"
+    if recording.force is not None:
+        order, since = np.argsort(np.linalg.norm(recording.force, axis=1), kind="stable"), "from least force"
+    elif recording.pdc is not None:
+        order, since = np.argsort(recording.pdc, kind="stable"), "from least PDC"
+    rest = np.nanmedian(value[order[: max(5, int(_REST * len(value)))]], axis=0)
+    return value - rest, f"{since}\n[{_short(recording, name)}]"
 
 
 def _map(axis, time, recording):

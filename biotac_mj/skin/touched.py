@@ -23,6 +23,13 @@ _CHUNK = 96  # faces that one thread sums
 _LOAD, _AREA, _LASTING, _PATH = range(4)
 
 
+def sample_areas(face: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """(k,) area of each of k samples in contact, on faces number `face` (k,) of this area (nface,) [m^2]. A
+    stiff contact touches a flat face at a few samples, but its pressure acts on the whole face: these share
+    it."""
+    return area[face] / np.bincount(face, minlength=len(area))[face]
+
+
 def faces_of(modes: SkinModes, face: np.ndarray, nvert: int) -> np.ndarray:
     """Modal forces [N kg^-1/2 / N] and, last, steady pressure [Pa/N] by a unit force on each face (nface, 3)
     of the outer surface of nvert nodes: (nface, nmode + 1, 3)."""
@@ -59,6 +66,10 @@ def sum_chunks(
             sum_out[g, c, w] = vec6()
     for f in range(c * _CHUNK, wp.min((c + 1) * _CHUNK, kept.shape[0])):
         if kept[f, w] == 1:
+            touching = int(0)
+            for s in range(nsample):
+                if geom[f * nsample + s, w] >= 0:
+                    touching += 1
             for s in range(nsample):
                 i = f * nsample + s
                 k = geom[i, w]
@@ -70,7 +81,7 @@ def sum_chunks(
                     if m == 0:
                         one = vec6()
                         one[_LOAD] = load
-                        one[_AREA] = area[f] / real(nsample)
+                        one[_AREA] = area[f] / real(touching)  # see sample_areas
                         if geom_last[i, w] == k:
                             one[_LASTING] = load
                             path = load * (anchor[i, w] - anchor_last[i, w])

@@ -58,10 +58,9 @@ class Shaking:
         if not len(rows):
             return None
         drive, gain = np.zeros(NMODE), np.zeros((self._ngroup, NMODE + 1))
-        slip, area = np.zeros(self._ngroup), np.zeros(self._ngroup)
-        face_area, nsample = self._stepper.sample_area
+        slip, area = np.zeros(self._ngroup), self._stepper.touched_area(result.state)
         sample, geom = rows[:, :2].T.astype(int)
-        group, face = self._group[geom], sample // nsample
+        group, face = self._group[geom], sample // len(self._stepper.model.sample)
         moved, known = self._moved(self._stepper.contact_rows(before), rows, sample)
         for g in np.bincount(group).nonzero()[0]:
             force, mine = -result.wrench[g, :3], (group == g).nonzero()[0]
@@ -71,7 +70,6 @@ class Shaking:
             along, weight = force / size, np.bincount(face[mine], load / load.sum())
             at = weight.nonzero()[0]
             modal = (weight[at].astype(np.float32) @ self._faces.take(at, 0)).reshape(-1, 3) @ along
-            area[g] = face_area[face[mine]].sum()
             drive += size * modal[:-1]
             gain[g] = (along @ result.tangent[g, :3, :3] @ along) * modal
             also = known[mine] * load
@@ -81,8 +79,8 @@ class Shaking:
 
     @functools.cached_property
     def _place(self):
-        area, nsample = self._stepper.sample_area
-        return np.full(len(area) * nsample, -1)
+        model = self._stepper.model
+        return np.full(len(model.outer.face_np) * len(model.sample), -1)
 
     def _moved(self, old, new, sample):
         """Distances of the contacts' anchors (k, 5) over their geoms (k, 3) [m], and a mask (k,) of those

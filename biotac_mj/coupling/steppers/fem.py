@@ -19,6 +19,7 @@ from ...skin.model import solved_geometry
 from ...skin.settings import Settings, read_settings
 from ...skin.state import FULL, SavedState, StateLayout, options_of
 from ...skin.state_arrays import StateArrays
+from ...skin.touched import sample_areas
 from ..config import Config
 from ..shared import Shared
 from ..stepper import Geom, SkinResult, SkinStepper
@@ -168,12 +169,6 @@ class FemStepper(SkinStepper):
         """Contacts (k, 5) in a state: sample of the outer surface, geom, and anchor in its frame [m]."""
         return self._layout.rows(state, "contacts")
 
-    @functools.cached_property
-    def sample_area(self) -> tuple[np.ndarray, int]:
-        """Area of a contact sample of each face (nface,) [m^2], and number of samples of a face."""
-        nsample = len(self._model.sample)
-        return self._model.outer.area.numpy() / nsample, nsample
-
     def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3)
 
@@ -181,7 +176,7 @@ class FemStepper(SkinStepper):
         """Of the shape at rest."""
         group = np.array([g.group for g in self._geoms], int)
         geom = self.contact_rows(state)[:, 1].astype(int)
-        area = self.sample_area[0][self._touched_faces(state)]
+        area = sample_areas(self._touched_faces(state), self._model.outer.area.numpy())
         return np.bincount(group[geom], area, minlength=1 + max(group, default=-1))
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
@@ -204,7 +199,7 @@ class FemStepper(SkinStepper):
         return step.normal_force_of_faces(self._touched_faces(state))
 
     def _touched_faces(self, state):
-        return self.contact_rows(state)[:, 0].astype(int) // self.sample_area[1]
+        return self.contact_rows(state)[:, 0].astype(int) // len(self._model.sample)
 
     def solve_skin(
         self,

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ...skin import GeomSet, SkinModel, step
 from ...skin.modes import SkinModes
 from ...skin.per_world import make_worlds
-from ...skin.touched import Touched
+from ...skin.touched import Touched, sample_areas
 from ...skin.types import real, vec3
 from ..contact import contact_labels
 from ..objects import make_object
@@ -225,7 +225,7 @@ def _simulate_condensed(model, names, motions, progress):
     nstep = len(motions[0].pos)
     outer = nodes_of(model.geometry)
     fields = _empty(len(motions), nstep, model.nvert, len(outer), 0)
-    weight, nsample = model.outer.area.numpy() / len(model.sample), len(model.sample)
+    area = model.outer.area.numpy()
     skins = {}
     for k, (name, motion) in enumerate(zip(names, motions)):
         if name not in skins:
@@ -245,7 +245,8 @@ def _simulate_condensed(model, names, motions, progress):
                 )
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
                 fields.contact_force[k, row] = skin.contact_force(memory)[outer]
-                fields.area[k, row] = weight[memory.contacts[:, 0].astype(int) // nsample].sum()
+                face = memory.contacts[:, 0].astype(int) // len(model.sample)
+                fields.area[k, row] = sample_areas(face, area).sum()
         if progress:
             progress(nstep)
     return fields

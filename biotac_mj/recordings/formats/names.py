@@ -28,19 +28,16 @@ _BODIES = {
 }
 _BEFORE = r"(?P<who>(?:.*[_\d])?)"
 _COUNTS = r"(?:_(?:counts?|bits?|raw))?"
+_POUND = 0.45359237  # [kg]
+_MASSES = {"g": 1e-3, "kg": 1.0, "oz": _POUND / 16, "lb": _POUND}  # [kg] whose weights are units of force
 # units of force, torque and position in names of columns, by what is written, in N, Nm and m
 _UNITS = {
-    "force": {
-        "n": ("N", 1.0),
-        "newton": ("N", 1.0),
-        "newtons": ("N", 1.0),
-        "mn": ("mN", 1e-3),
-        "kn": ("kN", 1e3),
-        "gf": ("gf", 9.80665e-3),
-        "kgf": ("kgf", 9.80665),
-        "ozf": ("ozf", 0.45359237 / 16 * 9.80665),
-        "lbf": ("lbf", 0.45359237 * 9.80665),
-    },
+    "force": {"n": ("N", 1.0), "newton": ("N", 1.0), "newtons": ("N", 1.0)}
+    | {
+        f"{prefix}n": (f"{prefix}N", size)
+        for prefix, size in {"m": 1e-3, "c": 0.01, "da": 10.0, "k": 1e3}.items()
+    }
+    | {mass + end: (f"{mass}f", 9.80665 * size) for mass, size in _MASSES.items() for end in ("", "f")},
     "torque": {"nm": ("Nm", 1.0), "nmm": ("Nmm", 1e-3), "mnm": ("mNm", 1e-3), "ncm": ("Ncm", 1e-2)},
     "pos": {"m": ("m", 1.0), "cm": ("cm", 1e-2), "mm": ("mm", 1e-3), "um": ("um", 1e-6)},
 }
