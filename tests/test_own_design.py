@@ -337,3 +337,11 @@ def test_calibrate_s_own_data_are_of_the_design_of_its_skin(flat, tmp_path, caps
     assert "is of pad flat (0 electrodes), --truth-skin coarse of BioTac" in capsys.readouterr().err
     assert main(["lab", "compare", "--skin", "biotac_sp/coarse", "--count", "1"]) == 2
     assert "the configurations compared are the paper's of a BioTac" in capsys.readouterr().err
+
+
+def test_a_design_is_shown_with_the_electrodes_places(capsys):
+    assert main(["design", "show", "biotac"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    shown = {row[0]: row[1:] for row in rows}
+    places = [[float(length) for length in shown[f"e{k}"]] for k in range(1, 20)]
+    np.testing.assert_allclose(places, 1e3 * biotac_mj.load_skin("default").electrode_pos, atol=5.1e-3)

@@ -261,7 +261,8 @@ def csv():
     turns = lambda path: (odd(path), even(path))  # noqa: E731
     yield Row(CSV, "420 of 420 rows lack an electrode, mostly e3: a gap cannot", "r.csv", turns)
     dynes = replaced(",pdc,", ",Fx (dyn),")
-    yield Row(CSV, "column 'Fx (dyn)' has unit dyn: N, mN, cN, daN, kN, gf, kgf, ozf, lbf are known", "r.csv", dynes)
+    known = "N, mN, cN, daN, kN, gf, kgf, ozf, lbf are known"
+    yield Row(CSV, f"column 'Fx (dyn)' has unit dyn: {known}", "r.csv", dynes)
     volts = replaced(",e3,", ",e3 [mV],")
     yield Row(CSV, "the electrodes are in mV; raw counts 0..4095 are needed: give --scale", "r.csv", volts)
     untimed = lines(lambda v: [row.partition(",")[2] for row in v])

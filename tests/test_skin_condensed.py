@@ -653,7 +653,7 @@ def test_a_press_beyond_what_was_measured_warns_once():
             warned = [str(one.message) for one in said]
             assert len(warned) == (-1 in tiers), warned
     assert tiers[:4] == [1] * 4 and tiers[-1] == -1
-    assert "'biotac_core' is pressed beyond the range" in warned[0] and "tier='full'" in warned[0]
+    assert "'biotac_core': it is pressed beyond the range" in warned[0] and "tier='full'" in warned[0]
 
 
 def test_files_of_a_press_say_the_tier(synthetic_press, tmp_path):

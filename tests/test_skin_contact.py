@@ -53,8 +53,8 @@ def hertz_force(d, R, E, nu):
 
 
 def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
-    """Forces and contact areas of a sphere on a block with `cells` cells per contact radius under the sphere, coarser away from
-    it.
+    """Forces and contact areas of a sphere on a block with `cells` cells per contact radius under the sphere,
+    coarser away from it.
 
     The block is cut out of the half-space 4.5 contact radii away: sides and bottom go where the half-space's
     points go under Hertz's force at one point (the spread of the load matters less than 0.5 % there). Contact

@@ -408,7 +408,10 @@ def _show_design(args):
     skin = skin_reference(skin_of_design(args.design, None))[1]
     print(f"  {design.title}: {skin.nvert} nodes, {skin.nelem} tetrahedra")
     liquid = "liquid under the skin" if len(skin.inner_face) else "solid, leave the liquid out: liquid=False"
-    print(f"  {liquid}; {', '.join(design.discs) or 'no electrodes'}")
+    at = ", x y z [mm] in its frame:" if design.nelectrode else ""
+    print(f"  {liquid}; {', '.join(design.discs) or 'no electrodes'}{at}")
+    for name, pos in zip(design.electrodes, 1e3 * skin.electrode_pos):
+        print(f"  {name:4}" + "".join(f"{length:8.2f}" for length in pos))
     for what, source in design.sources.items():
         print(f"  {what}: {source}")
 

@@ -71,7 +71,7 @@ class Instance:
         # MuJoCo clears a user's sensors at their stage; they are written when the skin has been solved
         for name in self.sensor:
             model.sensor_needstage[sensors[name]] = int(mujoco.mjtStage.mjSTAGE_POS)
-        self._tier, self._said_unmeasured = TIERS.index(setup.config.tier), False
+        self._tier, self._said = TIERS.index(setup.config.tier), set()
         self.kinematics = Kinematics(model, data, setup.touching)
         self.two_way = two_way
         if self.two_way:
@@ -401,18 +401,26 @@ class Instance:
             out[self.sensor["contact_force"]] = wrench
         if "status" in self.sensor:
             tier = self._tier if result.measured else -self._tier
-            if good and not result.measured and not self._said_unmeasured:
-                self._said_unmeasured = True
-                warnings.warn(
-                    f"BioTac {self.model.name('body', self.touching.core)!r} is pressed beyond the range in "
-                    f"which the error of tier={TIERS[self._tier]!r} was measured, and status[4] is -1 there: "
-                    "press less, or take tier='full' (docs/concepts/tiers.md)",
-                    RuntimeWarning,
-                    stacklevel=2,
+            if not good:
+                self._warn_once(
+                    "a step did not settle, and status[1] counts these: if more do than one in a hundred, "
+                    "take a shorter time step or press more slowly (docs/concepts/coupling.md)"
+                )
+            elif not result.measured:
+                self._warn_once(
+                    f"it is pressed beyond the range in which the error of tier={TIERS[self._tier]!r} was "
+                    "measured, and status[4] is -1 there: press less, or take tier='full' "
+                    "(docs/concepts/tiers.md)"
                 )
             failed, way = self.state[FAILED] + (not good), result.load_factor
             of_step = good, failed, result.iterations, result.residual, tier, rounds, way, withheld
             out[self.sensor["status"]] = of_step
+
+    def _warn_once(self, text):
+        if text not in self._said:
+            self._said.add(text)
+            name = self.model.name("body", self.touching.core)
+            warnings.warn(f"BioTac {name!r}: {text}", RuntimeWarning, stacklevel=3)
 
     def _acting(self):
         """Wrench (6,) on the BioTac in its frame as it acts now, and whether skin, bodies and MuJoCo's

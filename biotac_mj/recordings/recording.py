@@ -296,7 +296,7 @@ def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
         raise ValueError(
             f"recordings need names of their own, {', '.join(twice) or 'none was given'}: rename"
         )
-    with hdf5(path) as file:
+    with hdf5(path, track_order=True) as file:
         file.attrs["schema"] = SCHEMA
         for one in recordings:
             group = file.create_group(one.name.replace("/", "_"))
