@@ -20,6 +20,13 @@ def turned(angle, axis=(0.0, 1.0, 0.0)):
     return quat
 
 
+def egg(around=16, along=10):
+    """Corners of an ellipsoid's facets [m]."""
+    turn, tilt = 2 * np.pi * np.arange(around) / around, np.pi * np.arange(along + 1)[:, None] / along
+    x, y, z = np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)
+    return np.stack([7.5e-3 * x, 5e-3 * y, 5e-3 * z + 0 * x], axis=-1).reshape(-1, 3)
+
+
 def lowest(half, quat):
     """Height of a box's centre above its lowest point [m]."""
     mat = np.zeros(9)
@@ -42,6 +49,12 @@ def shape(name):
         return 'type="box" size=".004 .004 .004"', quat, lowest(np.full(3, 4e-3), quat)
     if name == "rim":
         return 'type="cylinder" size=".004 .004"', turned(45), 4e-3 * 2**0.5
+    if name.startswith("facets"):  # as large as the faces of the skin
+        roll, yaw = (float(angle) for angle in name[6:].split(","))
+        quat, mat = np.zeros(4), np.zeros(9)
+        mujoco.mju_mulQuat(quat, turned(yaw, (0, 0, 1)), turned(roll, (1, 0, 0)))
+        mujoco.mju_quat2Mat(mat, quat)
+        return 'type="mesh" mesh="egg"', quat, -(egg() @ mat.reshape(3, 3).T)[:, 2].min()
     if name == "thin":  # an ellipsoid of 0.17 mm radius where it is sharpest
         return 'type="ellipsoid" size=".001 .004 .006"', turned(0), 6e-3
     return 'type="sphere" size=".0035"', turned(0), 3.5e-3
@@ -56,11 +69,11 @@ def cycle(name, tier, skin, steps=40):
     """
     kind, quat, height = shape(name)
     corners = np.array(list(itertools.product((1, -1), repeat=3))) * HALF
-    vert = " ".join(f"{c:.4f}" for c in corners.ravel())
+    vert, facets = (" ".join(f"{c:.6f}" for c in points.ravel()) for points in (corners, egg()))
     start = np.array([BEGIN, 0, SURFACE + height])
     spec = mujoco.MjSpec.from_string(f"""
         <mujoco><option timestep=".004" gravity="0 0 0"/>
-          <asset><mesh name="box" vertex="{vert}"/></asset>
+          <asset><mesh name="box" vertex="{vert}"/><mesh name="egg" vertex="{facets}"/></asset>
           <worldbody><site name="s" quat="1 -1 0 0"/>
             <body name="o" mocap="true" pos="{start[0]} 0 {start[2]}" quat="{" ".join(map(str, quat))}">
               <geom {kind} friction="0 0 0"/></body></worldbody></mujoco>""")
@@ -120,6 +133,14 @@ def test_a_cycle_on_the_default_skin_gives_back_its_work(name, tier):
     assert unsettled <= (2 if tier == "full" else 0)
     assert abs(apparent_friction(force)) < 0.01
     assert np.median(errors) < 0.02
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["facets90,30", "facets90,70"])
+def test_a_cycle_of_a_faceted_egg_gives_back_its_work(name, tier):
+    force, _errors, _unsettled = cycle(name, tier, "coarse")
+    assert force[:, 1].min() > 0.4
+    assert abs(apparent_friction(force)) < 0.01
 
 
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])

@@ -23,8 +23,9 @@ from .shapes import (
 wp.set_module_options({"enable_backward": False})
 
 WINDOW = 1.25  # radius around edges, over the distance of a face's corners from its samples, see `meet`
-# cosines of the angle between two normals: below the first it is a side of a solid, above the second an edge
-_SMOOTH, _SHARP = (wp.constant(real(math.cos(math.radians(angle)))) for angle in (10, 25))
+# cosines of the angle between two normals: below the first it is a side of a solid, above the second an edge.
+# Shallow edges of facets as large as the skin's faces lock with its edges if samples alone touch them
+_SMOOTH, _SHARP = (wp.constant(real(math.cos(math.radians(angle)))) for angle in (2, 6))
 _FIRM = wp.constant(real(4.0))  # stiffness at an edge, where few samples take part, over that of a side
 _BEYOND = wp.constant(real(0.3))  # barycentric distance outside a face at which an edge leaves it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
