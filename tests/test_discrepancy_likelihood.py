@@ -221,3 +221,18 @@ def test_fits_beside_a_law_that_errs_end_where_the_truth_is(laws):
     far, near = (fit_effects(other, start, chosen, null) for start in (none, hidden))
     assert far.score > near.score - 5 > null.score + 100
     assert far.effects[0][1]["g"] == pytest.approx(near.effects[0][1]["g"], abs=0.03)
+
+
+def test_effects_that_act_in_other_channels_do_not_overlap(plain):
+    """A drift of one electrode beside a gain of another and of the same one, and beside relaxation of all."""
+    comparison, _, chosen = plain
+    drift = by_id("electrode_drift").only(["e7"])
+    drift = drift, drift.default() | {"e7": 50.0}
+
+    def overlap(effect, **theta):
+        return fit_effects(comparison, [(effect, effect.default() | theta), drift], chosen).overlap
+
+    gain = by_id("gain")
+    elsewhere, same = overlap(gain.only(["e3"]), e3=0.2), overlap(gain.only(["e7"]), e7=0.2)
+    assert elsewhere < 0.05 < 0.3 < same
+    assert overlap(by_id("relax"), g=0.2) < 0.5 * same

@@ -8,7 +8,8 @@ import pytest
 from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose
-from biotac_mj.discrepancy.trajectories import proof
+from biotac_mj.discrepancy.report.text import summary
+from biotac_mj.discrepancy.trajectories import beliefs, proof
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
 from biotac_mj.discrepancy.trajectories.proof import _closed, borne_out, proved
@@ -123,3 +124,15 @@ def test_what_the_amended_sensor_leaves_out_has_no_name(monkeypatch):
     assert report.verdict.startswith("unknown (") and report.significant
     assert {(e.id, e.confirmed, e.confidence) for e in report.not_named} == {("latency", False, None)}
     assert not report.beliefs.told_apart and [e.ids for e in report.beliefs.explanations] == [[]]
+
+
+def test_what_is_less_likely_than_not_is_suspected(monkeypatch):
+    """As if what the likelihood leaves out made nearly all of the evidence."""
+    monkeypatch.setattr(beliefs, "_CONTACTS", 1e-3)
+    report = diagnose(Springs(), measured([LATE], n=8), effects=[LATE[0], by_id("lowpass")], progress=False)
+    assert not report.effects and not report.apply(Springs()).effects and not report.beliefs.decided
+    assert report.verdict.startswith("unknown (suspected, and less likely than not: ") and report.significant
+    (one,) = report.not_named
+    assert one.id == "latency" and one.confirmed and one.confidence < 0.5
+    assert one.name in report.next_experiment
+    assert f"suspected, less likely than not: {one.name}" in summary(report)

@@ -81,6 +81,9 @@ def test_weights_follow_the_evidence_and_the_number_of_effects():
     assert first / second == pytest.approx(np.exp(10))
     more = weights([-100.0, -100.0], [1, 2])
     assert more[0] / more[1] > 20
+    # what the likelihood leaves out comes again in every contact
+    ten, twenty = (weights([-100.0, -200.0], [1, 1], contacts) for contacts in (10, 20))
+    assert np.log(ten[0] / ten[1]) == pytest.approx(2 * np.log(twenty[0] / twenty[1]))
 
 
 def test_contacts_begin_at_the_skin_and_keep_within_bounds():
@@ -226,10 +229,9 @@ def test_excluded_effects_are_less_likely_than_unseen_ones():
 def test_too_little_for_a_name_is_not_agreement(alone, agrees):
     """Where the base model alone is less likely than one in twenty-one, what explains the data is said."""
     effects = [[(by_id(name), by_id(name).default())] for name in ("mount", "rocking")]
-    weights_ = [alone, 0.6 * (1 - alone), 0.4 * (1 - alone)]
     some = [
-        Explanation(effect, Nuisance(), 0.0, np.eye(1), weight)
-        for effect, weight in zip([[], *effects], weights_)
+        Explanation(effect, Nuisance(), np.log(weight * len(CATALOGUE) ** len(effect)), np.eye(1), weight)
+        for effect, weight in zip([[], *effects], [alone, 0.6 * (1 - alone), 0.4 * (1 - alone)])
     ]
     said = Beliefs(some, 5e-5, {}, 1.0).against_none
     assert (said == "") == agrees

@@ -872,6 +872,6 @@ def test_a_file_is_diagnosed_from_the_command_line(tmp_path, capsys):
 
 def test_what_to_do_next_with_an_unknown():
     for tier, again in (("condensed", True), ("full", False)):
-        text = next_experiment([], {}, True, tier)
+        text = next_experiment([], [], {}, True, tier)
         assert ("--tier full" in text) == again and "repeat some trajectories" in text
-        assert next_experiment([], {}, False, tier).startswith("none needed")
+        assert next_experiment([], [], {}, False, tier).startswith("none needed")

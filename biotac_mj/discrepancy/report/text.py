@@ -19,11 +19,14 @@ def summary(verdict: Verdict) -> str:
     lines.append(f"verdict: {v.verdict}")
     for f in v.effects:
         lines += _effect(f)
-    lines += [
-        f"  not confirmed by held-out data, left out: {f.name}, {f.where}"
-        for f in v.not_named
-        if f.confirmed is False
-    ]
+    for f in v.not_named:
+        if f.confirmed is not None:
+            why = (
+                "suspected, less likely than not"
+                if f.confirmed
+                else "not confirmed by held-out data, left out"
+            )
+            lines.append(f"  {why}: {f.name}, {f.where}")
     lines += _gaps(v)
     if v.tried:
         lines += [f"  tried ({v.tried_note}):", *_table(v.tried[:_TRIED])]

@@ -31,7 +31,9 @@ class Fit:
     Attributes:
       effects: list of (Effect, theta). nuisance: fitted with them. names: of the free parameters: (effect
       id, name); covariance: theirs.
-      score: log evidence of the data for these effects [nats]. amplitude: (width,) by how many times more
+      score: log evidence of the data for these effects [nats]. told: evidence over none [nats] that tells
+      these effects from what the laws of others lack. overlap: of where the last effect acts with where each
+      of the others does, 0 to 1 each, in sum. amplitude: (width,) by how many times more
       than `size` (width,) [counts, N], which is what is expected of a base model, the model with them is off;
       off: (width,) the same beside what the laws of the effects may lack.
       modulus_error: standard error of the logarithm of the modulus.
@@ -46,6 +48,7 @@ class Fit:
     names: list
     covariance: np.ndarray
     score: float = 0.0
+    overlap: float = 0.0
     amplitude: np.ndarray | None = None
     size: np.ndarray | None = None
     off: np.ndarray | None = None
@@ -55,6 +58,7 @@ class Fit:
     y: np.ndarray | None = None
     columns: np.ndarray | None = None
     offsets: np.ndarray | None = None
+    told: float = 0.0
 
     def posed(self, comparison: "Comparison") -> list:
         """Residuals (n, width) over noise and resolution, poses where they most probably are."""
@@ -293,6 +297,13 @@ class _Model:
             effects, nuisance = self._with(effects, nuisance, k, name, (away + by) * spread)
         return self._point(effects, nuisance, offsets, law_errors)
 
+    def _overlap(self, done) -> float:
+        """Correlation of how much the last effect does in each row and channel with how much each other one
+        does, in sum."""
+        acts = [(np.abs(change) / self.likelihood.noise).ravel() for change in done]
+        acts = [act / max(np.linalg.norm(act), 1e-30) for act in acts]
+        return float(sum(act @ acts[-1] for act in acts[:-1]))
+
     def _finished(self, point, amplitude, law_errors):
         likelihood, size = self.likelihood, self.likelihood.size
         columns, expected = self._columns(point), size
@@ -327,6 +338,7 @@ class _Model:
             [(point.effects[self.parameters[i][0]][0].id, self.parameters[i][1]) for i in own],
             covariance[np.ix_(own, own)] * np.outer(scale, scale),
             float(score),
+            self._overlap(point.done),
             amplitude,
             size,
             amplitude * size / expected,

@@ -130,18 +130,20 @@ def of_search(search: "Search") -> list[str]:
     return [f"too small to show in these data at a realistic size: {names}"] if names else []
 
 
-def next_experiment(effects: "list[Finding]", names: dict, unknown: bool, tier: str) -> str:
+def next_experiment(
+    effects: "list[Finding]", suspected: "list[Finding]", names: dict, unknown: bool, tier: str
+) -> str:
     """Recommends the next experiment.
 
     Args:
-      effects: Findings, the one that explains most first.
+      effects: Findings, the one that explains most first. suspected: those that are less likely than not.
       names: id -> name of the effects that were looked for.
       unknown: whether something is left that no effect explains.
       tier: of the skin with which the recording was compared.
     """
     pairs = [(e, t) for e in effects for t in e.ties]
-    if not pairs:
-        pairs = [(e, next((o for o in e.confusable if o in names), None)) for e in effects[:1]]
+    doubtful = suspected or ([] if pairs else effects[:1])
+    pairs = [(e, next((o for o in e.confusable if o in names), None)) for e in doubtful] + pairs
     out = []
     if tier == "condensed" and (effects or unknown):
         out.append("compare again with --tier full: what the condensed skin lacks may be taken for an effect")

@@ -113,7 +113,14 @@ def _other_shapes(comparison, one, current, chosen) -> Candidate:
         fit = fit_effects(comparison, begin, chosen, current)
         if fit.score > best.score and not effect.rejection_reason(fit.effects[-1][1]):
             best = fit
-    return dataclasses.replace(one, fit=best, gain=float(best.score - current.score))
+    gain = float(best.score - current.score)
+    return dataclasses.replace(one, fit=_beside(best, current, gain), gain=gain)
+
+
+def _beside(fit, current, gain) -> Fit:
+    """The Fit with what its evidence beside `current` tells: what the laws of other effects lack makes
+    evidence for one that acts where they do."""
+    return dataclasses.replace(fit, told=current.told + gain / (1 + fit.overlap))
 
 
 def _tied(best, other) -> bool:
@@ -187,7 +194,7 @@ def _candidate(comparison, effect, fit, current, usable):
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
     refused += ["little"] if _little(comparison, effect, theta) else []
-    return Candidate(effect, fit, gain, p, refused)
+    return Candidate(effect, _beside(fit, current, gain), gain, p, refused)
 
 
 def _little(comparison, effect, theta) -> bool:

@@ -33,10 +33,6 @@ if typing.TYPE_CHECKING:
 
 _GROUPS = {"electrodes": "the electrodes", "pdc": "the liquid's pressure (PDC)", "force": "the force"}
 _SURE = 1 - SETTINGS.rate  # the most that is stated: so many of all names are false
-# [nats] of evidence that what the likelihood leaves out makes for a wrong name, the mean of an exponential
-# distribution: of the first name, and of a further one, for which the first one's law lacks more. By greatest
-# likelihood from 98 names in 113 laboratories whose laws are not the catalogue's
-_LEFT_OUT = 28.0, 134.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -206,30 +202,37 @@ def _in_words(comparison, current, effects, named, chosen, refuted):
     return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder
 
 
+def _with(comparison, null, current, some, search, chosen):
+    """Fit of these Candidates of a Fit with all of them."""
+    pairs = [pair for pair in current.effects if pair[0].id in {one.effect.id for one in some}]
+    if len(pairs) == len(current.effects):
+        return current
+    fit = search.fits.get(frozenset(e.id for e, _ in pairs))
+    return fit_effects(comparison, pairs, chosen, null) if fit is None else fit
+
+
 def _upheld(comparison, null, current, found, search, chosen, aside):
     """Fit and Candidates of the effects that held-out trajectories confirm, one effect after another, and the
     other Candidates: an effect that explains the fitted ones alone has no name."""
     best, upheld = null, []
     for k in range(1, len(found) + 1):
         some = found[:k]
-        pairs = [pair for pair in current.effects if pair[0].id in {one.effect.id for one in some}]
-        fit = search.fits.get(frozenset(e.id for e, _ in pairs))
-        if k == len(found):
-            fit = current
-        elif fit is None:
-            fit = fit_effects(comparison, pairs, chosen, null)
+        fit = _with(comparison, null, current, some, search, chosen)
         starts = [null] if best is null else [best, null]
         if all(borne_out(comparison, start, fit, aside) for start in starts):
             best, upheld = fit, some
     return best, upheld, [one for one in found if one not in upheld]
 
 
-def _refuted(found):
-    """Line on effects that held-out trajectories do not confirm; "" if there are none."""
-    if not found:
-        return ""
-    what = " and ".join(one.effect.name for one in found)
-    return f"{what} would explain what was fitted, and held-out trajectories do not confirm it"
+def _unnamed(refuted, suspected):
+    """Line on Candidates that held-out trajectories do not confirm, and on Findings that are less likely than
+    not; "" if there are none."""
+    what = " and ".join(one.effect.name for one in refuted)
+    out = (
+        [f"{what} would explain what was fitted, and held-out trajectories do not confirm it"] if what else []
+    )
+    what = " and ".join(f"{one.name} ({one.confidence:.0%})" for one in suspected)
+    return "; ".join(out + ([f"suspected, and less likely than not: {what}"] if what else []))
 
 
 def _settle(given, comparison, null, search, chosen, aside, notes, usable):
@@ -243,6 +246,16 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         gone = {one.effect.id for one in refuted}
         some = {ids: fit for ids, fit in search.fits.items() if not ids & gone}
         search.fits = {k: fit for k, fit in some.items() if not k or borne_out(comparison, null, fit, aside)}
+    beliefs = believed(comparison, search, len(chosen))
+    sure = {one.effect.id: _sure(beliefs, one) for one in found}
+    likely = [one for one in found if sure[one.effect.id] >= 0.5]  # what has a name is there rather than not
+    doubtful = [one for one in found if one not in likely]
+    suspected = [_described(one, fitted, sure[one.effect.id], names, True) for one in doubtful]
+    if doubtful:
+        alone = _with(comparison, null, current, likely, search, chosen)
+        current, found, more = _upheld(comparison, null, alone, likely, search, chosen, aside)
+        refuted += more
+    without_name = _unnamed(refuted, suspected)
     named = not _wrong(comparison, current)
     # Another modulus has a name where it is all that is left: else it may be a part of what is not known.
     modulus, without = other_modulus(comparison, current, chosen) if named else (None, None)
@@ -257,24 +270,25 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     if not named:
         doubts.append("a part of what is missed has no name")
     if refuted:
-        doubts.append(_refuted(refuted))
-    beliefs = believed(comparison, search, doubts)
+        doubts.append(_unnamed(refuted, []))
+    beliefs = dataclasses.replace(beliefs, doubts=doubts)
     gaps = _gaps(comparison, proof)
-    effects = [_described(item, current, _sure(beliefs, item, item is not found[0]), names) for item in found]
+    effects = [_described(item, current, sure[item.effect.id], names) for item in found]
     effects = [_proved(one, proof, gaps) for one in effects]
     effects += [dataclasses.replace(modulus, confidence=_SURE)] if modulus else []
     stray = ""
     if seen:
-        verdict, remainder = _in_words(comparison, current, effects, named, chosen, _refuted(refuted))
+        verdict, remainder = _in_words(comparison, current, effects, named, chosen, without_name)
         few = few_off(null.mean_square(comparison)[chosen])
         stray = "" if effects or not few else strays(comparison, null, chosen, aside, search.rounds[0])
         verdict, remainder = (f"unknown ({stray})", stray) if stray else (verdict, remainder)
     else:
         stray = strays(comparison, null, chosen, aside, search.rounds[0])
-        stray = stray or _refuted(refuted) or beliefs.against_none
+        stray = stray or without_name or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
+    further = next_experiment(effects, suspected, names, more, comparison.sim.tier)
     notes = [*notes, *of_base(comparison, current, chosen), *of_search(search)]
     before, after = (dict(zip(("level", "peak"), _off(comparison, fit))) for fit in (null, current))
     trace = {
@@ -293,7 +307,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         verdict=verdict,
         significant=bool(seen or stray),
         effects=effects,
-        not_named=[_described(item, fitted, None, names, False) for item in refuted],
+        not_named=[_described(item, fitted, None, names, False) for item in refuted] + suspected,
         gap=gaps,
         aside=f"{len(aside)} trajectories that took no part in the search, errors of their poses taken out",
         closed=proof.closed,
@@ -312,7 +326,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         ],
         tried_note="evidence of each cause alone over the base model, its parameters marginalised",
         notes=notes,
-        next_experiment=f"{beliefs.text}; {next_experiment(effects, names, more, comparison.sim.tier)}",
+        next_experiment=f"{beliefs.text}; {further}",
         next_command="" if beliefs.decided else "biotac next REPORT --budget 20 --out plan.csv",
         amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
@@ -367,12 +381,10 @@ def _proved(finding, proof, gaps):
     return dataclasses.replace(finding, confirmed=True, gap=gap)
 
 
-def _sure(beliefs, item, further) -> float:
-    """Probability that a Candidate's effect, or one that it ties with, is there: by the explanations, and by
-    how seldom what the likelihood leaves out makes as much evidence; further: beside another name."""
+def _sure(beliefs, item) -> float:
+    """Probability that a Candidate's effect, or one that it ties with, is there."""
     names = {item.effect.id, *item.ties}
-    likely = sum(one.weight for one in beliefs.explanations if names & {*one.ids})
-    return _SURE * likely * -float(np.expm1(-max(item.gain, 0.0) / _LEFT_OUT[further]))
+    return _SURE * sum(one.weight for one in beliefs.explanations if names & {*one.ids})
 
 
 def _described(item, current, certain, names, confirmed=None) -> Finding:
