@@ -6,7 +6,7 @@ import math
 import numbers
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -32,6 +32,12 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], what: str) -> Non
             near = difflib.get_close_matches(str(name), known, 1)
             hint = f"did you mean {near[0]!r}? " if near else ""
             raise ValueError(f"{what} has {short_repr(name)}: {hint}choose from {', '.join(known)}")
+
+
+def check_choice(what: str, value: object, known: Collection[str], more: str = "") -> None:
+    """Raises ValueError for a value that is none of the known texts; more: what else can be given."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{what} {short_repr(value)}: choose one of {', '.join(known)}{more}")
 
 
 def check_types(settings: object, names: Iterable[str] | None = None, nan: bool = False) -> None:

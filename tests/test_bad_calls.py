@@ -185,7 +185,7 @@ def calls_of_tasks():
     yield row("task_kwargs has environment_kwargs, or task: give them as", {"environment_kwargs": {}})
     for wrong in ("a", -1, 1.5, [1], 2**32):
         yield row(f"random is {wrong!r}: give a whole number from 0 to {2**32 - 1}", {"random": wrong})
-    yield row("unknown preset observe=['electrodes']: choose one of tactile", {"observe": ["electrodes"]})
+    yield row("unknown preset of observe ['electrodes']: choose one of tactile", {"observe": ["electrodes"]})
     yield row("physics_timestep is 0.003: give seconds of which whole", {"physics_timestep": 0.003})
     yield row("physics_timestep is 1.0: give seconds of which whole", {"physics_timestep": 1.0})
     yield row("time_limit is 'a': give a finite number", {"time_limit": "a"})
@@ -195,7 +195,7 @@ def calls_of_tasks():
     yield row(
         "the settings of a BioTac has 'glue': choose from design, skin, material", {"biotac": {"glue": 1}}
     )
-    yield row("observe=array(shape=(3,), dtype=float32): choose", {"observe": others()})
+    yield row("observe array(shape=(3,), dtype=float32): choose", {"observe": others()})
     yield row("biotac has name 'a': leave it out", {"biotac": {"name": "a"}})
     yield row("noise is array([0., 0., 0.]): give True or False", {"biotac": {"noise": ARRAY}})
     yield row("options is array([0., 0., 0.]): give a dict", {"biotac": {"options": ARRAY}})

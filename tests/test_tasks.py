@@ -483,7 +483,7 @@ def test_an_entity_takes_settings_by_stage():
         (lambda: load("finger", "push"), "domain 'finger' has no task 'push': choose one of press"),
         (
             lambda: load("finger", "press", task_kwargs={"observe": "touch"}),
-            "unknown preset observe='touch': choose one of tactile",
+            "unknown preset of observe 'touch': choose one of tactile",
         ),
         (
             lambda: load("gripper", "hold", task_kwargs={"observ": "none"}),

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..fields import check_choice
 from ..geometry.assets import asset_path
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import load_skin
@@ -53,8 +54,7 @@ def configuration(
     Raises:
       ValueError: unknown name, a solid of another resolution, or a solid with liquid.
     """
-    if name not in CONFIGURATIONS:
-        raise ValueError(f"unknown configuration {name!r}: choose one of {', '.join(CONFIGURATIONS)}")
+    check_choice("unknown configuration", name, CONFIGURATIONS)
     body, core = CONFIGURATIONS[name]
     options = SkinOptions(**{"liquid": False, "core_contact": core, **options})
     if body is None:

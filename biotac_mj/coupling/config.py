@@ -8,7 +8,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from ..fields import as_real, as_whole, refuse_unknown
+from ..fields import as_real, as_whole, check_choice, refuse_unknown
 from ..short_repr import short_repr
 
 OWN = 1 << 30  # bit of contype and conaffinity that BioTacs alone have
@@ -90,9 +90,7 @@ class Config:
 
     def __post_init__(self):
         for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in choices:
-                raise ValueError(f"unknown {name} {short_repr(value)}: choose one of {', '.join(choices)}")
+            check_choice(f"unknown {name}", getattr(self, name), choices)
         for name in ("skin", "stepper", "readings", "device", "name"):
             if not isinstance(value := getattr(self, name), str):
                 raise ValueError(f"{name} is {short_repr(value)}: give its name")

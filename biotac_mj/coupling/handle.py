@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from ..effects.sensors import take_sensor
-from ..fields import as_whole
+from ..fields import as_whole, check_choice
 from ..geometry.design import BIOTAC, Design
 from ..geometry.skins import design_of
 from ..geometry.surface import face_areas, node_areas
@@ -55,10 +55,7 @@ class Handle:
           ValueError: no such channel.
         """
         own = [name for name, n in sensor_widths(self.design).items() if n]
-        if not isinstance(channel, str) or channel not in own:
-            raise ValueError(
-                f"a {self.design.title} has no channel {short_repr(channel)}: choose one of {', '.join(own)}"
-            )
+        check_choice(f"a {self.design.title} has no channel", channel, own)
         return self.prefix + channel + self.suffix
 
     @typing.overload

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ..fields import check_choice
 from ..geometry.design import BIOTAC, Design
 from ..geometry.skin_geometry import SkinGeometry
 
@@ -112,10 +113,8 @@ class Interaction:
             has the name.
         """
         where = f"interaction {self.id!r}"
-        if self.kind not in KINDS:
-            raise ValueError(f"{where} has kind {self.kind!r}: choose one of {', '.join(KINDS)}")
-        if self.split not in SPLITS:
-            raise ValueError(f"{where} has split {self.split!r}: choose one of {', '.join(SPLITS)}")
+        check_choice(f"{where} has kind", self.kind, KINDS)
+        check_choice(f"{where} has split", self.split, SPLITS)
         n = len(self.time)
         if not n:
             raise ValueError(f"{where} has no time steps: leave it out")

@@ -7,7 +7,7 @@ import dataclasses
 import pathlib
 from collections.abc import Sequence
 
-from ..fields import check_entries, refuse_unknown
+from ..fields import check_choice, check_entries, refuse_unknown
 from ..files import replacing
 from ..geometry.skins import design_of
 from ..reading import read_yaml
@@ -64,8 +64,7 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
     refuse_unknown(document, _KEYS, str(path))
     check_entries(str(path), document, _KEYS, _KEYS)
     for name, known in _CHOICES.items():  # also if the reader has a choice of its own
-        if document.get(name, known[0]) not in known:
-            raise ValueError(f"{name} of {path} is {document[name]!r}: choose one of {', '.join(known)}")
+        check_choice(f"{name} of {path} is", document.get(name, known[0]), known)
     effects, intervals = [], {}
     design = design_of(document.get("skin") or "default")
     for stage, items in document.get("stages", {}).items():

@@ -2,6 +2,7 @@
 
 import os
 
+from ..fields import check_choice
 from ..short_repr import short_repr
 
 SIGNALS = ("physics", "latent_projection", "learned")
@@ -26,10 +27,7 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
         if weights is not None:
             raise ValueError(f"signal {short_repr(signal)} and weights {weights!r} are two models: give one")
         return "learned", str(signal)
-    if signal not in SIGNALS:
-        raise ValueError(
-            f"unknown signal {short_repr(signal)}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
-        )
+    check_choice("unknown signal", signal, SIGNALS, f", or a file *{_WEIGHTS}")
     if signal != "learned" and weights is not None:
         raise ValueError(f"weights {weights!r} are given but the signal is {signal!r}: take signal='learned'")
     if signal == "latent_projection":

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..fields import check_choice
 from ..threads import single_thread
 from .bodies import make_bodies
 from .contact.broadphase import ClearanceCache
@@ -495,8 +496,7 @@ def _choose(model, preconditioner):
     known = {"sparse": SparsePreconditioner, "dense": DensePreconditioner}
     if preconditioner is None:
         preconditioner = "dense" if model.device.is_cuda else "sparse"
-    if preconditioner not in known:
-        raise ValueError(f"unknown preconditioner {preconditioner!r}: choose one of {', '.join(known)}")
+    check_choice("unknown preconditioner", preconditioner, known)
     if preconditioner == "sparse" and model.device.is_cuda:
         raise ValueError("the sparse preconditioner runs on the CPU: choose 'dense', or make the model there")
     return known[preconditioner]

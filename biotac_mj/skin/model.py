@@ -10,7 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..fields import check_types
+from ..fields import check_choice, check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import face_areas
@@ -105,11 +105,8 @@ class SkinOptions:
         check_types(self)
         if self.dynamics not in ("quasistatic", "implicit"):
             raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
-        if self.element not in (None, *ELEMENTS):
-            raise ValueError(
-                f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the "
-                "material's choice"
-            )
+        if self.element is not None:
+            check_choice("unknown element", self.element, ELEMENTS, ", or None for the material's choice")
         if not self.bulk_modulus > 0:
             raise ValueError(
                 f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf"

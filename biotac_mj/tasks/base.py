@@ -8,7 +8,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
-from ..fields import as_real
+from ..fields import as_real, check_choice
 from ..short_repr import short_repr
 from .biotac import ESTIMATED, PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
@@ -77,10 +77,7 @@ class TouchTask(composer.Task, abc.ABC):
         physics_timestep: float = 5e-3,
         biotac: dict | None = None,
     ):
-        if not isinstance(observe, str) or observe not in _OBSERVE:
-            raise ValueError(
-                f"unknown preset observe={short_repr(observe)}: choose one of {', '.join(_OBSERVE)}"
-            )
+        check_choice("unknown preset of observe", observe, _OBSERVE)
         as_real("physics_timestep", physics_timestep)
         steps = CONTROL_TIMESTEP / physics_timestep if physics_timestep > 0 else 0.0
         if steps < 0.5 or abs(steps - round(steps)) > 1e-6:

@@ -6,7 +6,7 @@ import dm_env
 import numpy as np
 from dm_control import composer
 
-from ..fields import as_real, as_whole, refuse_unknown
+from ..fields import as_real, as_whole, check_choice, refuse_unknown
 from ..short_repr import short_repr
 from . import copying
 from .base import TouchTask
@@ -137,13 +137,9 @@ def load(
     Raises:
       ValueError: no such domain or task, or a setting that the task does not have.
     """
-    if not isinstance(domain_name, str) or domain_name not in _TASKS:
-        raise ValueError(f"no domain {short_repr(domain_name)}: choose one of {', '.join(_TASKS)}")
+    check_choice("no domain", domain_name, _TASKS)
     known = _TASKS[domain_name]
-    if not isinstance(task_name, str) or task_name not in known:
-        raise ValueError(
-            f"domain {domain_name!r} has no task {short_repr(task_name)}: choose one of {', '.join(known)}"
-        )
+    check_choice(f"domain {domain_name!r} has no task", task_name, known)
     settings = _dict("task_kwargs", task_kwargs)
     if "environment_kwargs" in settings or "task" in settings:
         raise ValueError("task_kwargs has environment_kwargs, or task: give them as arguments of their own")

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from ...fields import check_types
+from ...fields import check_choice, check_types
 from .law import LAWS
 
 ELEMENTS = ("linear", "quadratic")
@@ -57,13 +57,9 @@ class Material:
         self._check_memory()
         self._check_hysteresis()
         check_types(self)
-        if self.law not in LAWS:
-            raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
-        if self.element not in (None, *ELEMENTS):
-            raise ValueError(
-                f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the "
-                "geometry's"
-            )
+        check_choice("unknown material law", self.law, LAWS)
+        if self.element is not None:
+            check_choice("unknown element", self.element, ELEMENTS, ", or None for the geometry's")
         numbers = "youngs_modulus", "poissons_ratio", "friction", "density", "stiffening", "rest_pressure"
         for name in numbers:
             if not math.isfinite(getattr(self, name)):
@@ -180,8 +176,5 @@ def material(choice: str | Material) -> Material:
     """Converts the name of a preset, or a Material, to a Material; ValueError names the presets."""
     if isinstance(choice, Material):
         return choice
-    if choice not in PRESETS:
-        raise ValueError(
-            f"unknown material {choice!r}: choose one of {', '.join(PRESETS)}, or pass a Material"
-        )
+    check_choice("unknown material", choice, PRESETS, ", or pass a Material")
     return PRESETS[choice]

@@ -11,8 +11,7 @@ import inspect
 import typing
 
 from ...coupling.settings import SettingKeywords
-from ...fields import refuse_unknown
-from ...short_repr import short_repr
+from ...fields import check_choice, refuse_unknown
 from .follow_edge import FollowEdge
 from .insert_peg import InsertPeg
 from .libraries import gymnasium_env, rsl_rl_env, skrl_env
@@ -44,8 +43,7 @@ def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
     Raises:
       ValueError: there is no such task. TypeError: there is no such keyword.
     """
-    if task not in TASKS:
-        raise ValueError(f"no task {short_repr(task)}: choose one of {', '.join(TASKS)}")
+    check_choice("no task", task, TASKS)
     try:
         refuse_unknown(keywords, _keywords(TASKS[task]), f"a call of make({task!r})")
     except ValueError as error:
