@@ -14,9 +14,10 @@ from scipy.optimize import brentq
 
 import biotac_mj
 from biotac_mj.coupling import attach
-from biotac_mj.coupling.implicit import coupled, group
+from biotac_mj.coupling.implicit import group
 from biotac_mj.coupling.implicit import world as coupled_world
 from biotac_mj.geometry.rigid import cross, displace, displacement, rotation
+from biotac_mj.geometry.rigid_warp import LEVER
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
 GHOST = 'contype="0" conaffinity="0"'  # a geom that nothing collides with
@@ -163,13 +164,13 @@ def test_a_damped_ball_moves_as_newmark_says(damping, integrator, timestep):
 def test_what_a_correction_lacks_is_in_the_account_of_energy(monkeypatch):
     """The integrator's accelerations are met by a fixed point: what it has not reached acts on the bodies
     too."""
-    seen, conclude = [], coupled.Coupled.conclude
+    seen, conclude = [], group.SkinGroup.conclude
 
     def watch(self, *how):
         seen.append(self.arrays.acting.ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
         conclude(self, *how)
 
-    monkeypatch.setattr(coupled.Coupled, "conclude", watch)
+    monkeypatch.setattr(group.SkinGroup, "conclude", watch)
     monkeypatch.setattr(coupled_world, "MAX_CORRECTIONS", 0)
     model, data, _ = scene(
         ball(0.001, '<joint type="slide" axis="0 0 1" damping="0.5"/>', "0 0 .0178"), 0.004, "0 0 0", "Euler"
@@ -258,7 +259,8 @@ def test_bodies_are_where_an_unfinished_solver_sends_them(integrator, damping, m
     seen = []
 
     def finish(world, after=coupled_world.World._finish):
-        seen.extend(skin.acceleration for skin in world._acting)
+        if world._acting:
+            seen.append(world._group.arrays.qacc.copy())
         after(world)
 
     monkeypatch.setattr(coupled_world.World, "_finish", finish)
@@ -411,12 +413,12 @@ def displacement_at_once(pos, mat, pos0, mat0, here, spin):
 def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
     """Two fingers under balls of other weights that also spin: where bodies go and what models say there, by
     the definitions, of one skin."""
-    seen, conclude = [], coupled.Coupled.conclude
+    seen, conclude = [], group.SkinGroup.conclude
 
     def watch(self, *how):
         J, a = self.jacobian, self.arrays
-        drift = a.horizon[:, None] * (J @ self.data.qvel)
-        moved = a.square[:, None] * (J @ self.acceleration)
+        drift = a.horizon[:, None] * (J @ data.qvel)
+        moved = a.square[:, None] * (J @ a.qacc)
         target = displace(a.start_pos, a.start_mat, moved, a.here_pos, drift[:, 3:])
         way = displacement_at_once(a.pos0, a.mat0, a.start_pos, a.start_mat, a.here_pos, drift[:, 3:])
         wrench = a.wrench0 + np.einsum("nij,nj->ni", a.tangent0, way)
@@ -429,11 +431,12 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
         )
         for one, other in wanted:
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-15)
-        assert self.off == pytest.approx(coupled.size(displacement(*target, a.pos0, a.mat0)), abs=1e-15)
-        seen.append(np.abs(a.wrench).max())
+        off = np.abs(displacement(*target, a.pos0, a.mat0) * ([1.0] * 3 + [LEVER] * 3))
+        for skin in self.skins:
+            assert skin.off == pytest.approx(off[skin.bodies].max(), abs=1e-15)
+            seen.append(np.abs(skin.of("wrench")).max())
         conclude(self, *how)
 
-    monkeypatch.setattr(coupled.Coupled, "conclude", watch)
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="left"/>'
         '<body name="right" pos="0 .1 0"/>'
@@ -449,8 +452,8 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
             stepper="springs", readings="none", geoms=ball, options={"stiffness": 1e3},
         )  # fmt: skip
     model = spec.compile()
-    seen.clear()  # of the compiler's step, which is one without contact
     data = mujoco.MjData(model)
+    monkeypatch.setattr(group.SkinGroup, "conclude", watch)
     data.qvel[:] = np.tile([0.01, 0, 0, 0.5, 1.0, 2.0], 2) * np.repeat([1, -1], 6)
     mujoco.mj_step(model, data, 10)
     assert len(seen) >= 20 and min(seen) > 0.05
@@ -477,11 +480,13 @@ def test_bodies_give_way_as_all_else_lets_them(jacobian, monkeypatch):
         holds[: data.ne] = True
         for skin in skins:
             others = holds.copy()
-            others[skin.instance.metric.numbers] = False
-            J = skin.jacobian.reshape(-1, model.nv)
+            own = np.isin(data.efc_id[: data.ne], list(skin.instance.slots.values()))
+            others[: data.ne] = ~own
+            J = self.jacobian[skin.bodies].reshape(-1, model.nv)
             springs = rows[others].T @ (data.efc_D[others, None] * rows[others])
-            wanted = skin.square[0] * J @ np.linalg.solve(H + springs, J.T)
-            np.testing.assert_allclose(skin.compliance[0, 0], wanted, rtol=1e-9, atol=1e-15)
+            wanted = skin.of("square")[0] * J @ np.linalg.solve(H + springs, J.T)
+            found = self.arrays.compliance[skin.number][0, 0]
+            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15)
             seen.append(np.abs(springs).max())
 
     fingers = "".join(
@@ -514,20 +519,20 @@ def test_bodies_give_way_as_a_sliding_contact_lets_them(jacobian, monkeypatch):
 
     def watch(self, skins, inertia):
         find(self, skins, inertia)
-        (skin,) = skins
-        if len(skin.touching):  # its own rows hold them, too
+        if len(self.touching):  # its own rows hold them, too
             return
-        J, passive = skin.jacobian.reshape(-1, model.nv), data.qfrc_passive.copy()
+        J, passive = self.jacobian.reshape(-1, model.nv), data.qfrc_passive.copy()
         scale = np.tile([1, 1, 1, 0.01, 0.01, 0.01], 2)  # compares turning with going
-        answers = [skin.data.acceleration(again=True)]
+        view = skins[0].instance.data
+        answers = [view.acceleration(again=True)]
         for force in 1e-6 * scale[:, None] * J:
             data.qfrc_passive[:] = passive + force
-            answers.append(skin.data.acceleration(again=True))
-        sliding = skin.data.row_states() == mujoco.mjtConstraintState.mjCNSTRSTATE_CONE
+            answers.append(view.acceleration(again=True))
+        sliding = view.row_states() == mujoco.mjtConstraintState.mjCNSTRSTATE_CONE
         data.qfrc_passive[:] = passive
-        skin.data.acceleration(again=True)
-        wanted = 1e6 * skin.square[0] * (scale[:, None] * J) @ (np.array(answers[1:]) - answers[0]).T
-        found = skin.compliance.transpose(0, 2, 1, 3).reshape(12, 12) * np.outer(scale, scale)
+        view.acceleration(again=True)
+        wanted = 1e6 * self.arrays.square[0] * (scale[:, None] * J) @ (np.array(answers[1:]) - answers[0]).T
+        found = self.arrays.compliance[0].transpose(0, 2, 1, 3).reshape(12, 12) * np.outer(scale, scale)
         np.testing.assert_allclose(found, wanted, atol=1e-4 * np.abs(wanted).max())
         seen.append(sliding.sum())
 
@@ -549,13 +554,14 @@ def test_bodies_give_way_as_a_sliding_contact_lets_them(jacobian, monkeypatch):
 def test_two_biotacs_hold_a_light_box_against_gravity(timestep, monkeypatch):
     """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction
     there is. Both skins make it bounce, and each knows how fast."""
-    seen, conclude = {}, coupled.Coupled.conclude
+    seen, conclude = [], group.SkinGroup.conclude
 
     def watch(self, rounds):
         conclude(self, rounds)
-        seen[self.instance.index] = self.jacobian, self.tangent, self.instance.frequency
+        frequency = [skin.instance.frequency for skin in self.skins]
+        seen[:] = self.jacobian, self.arrays.tangent0.copy(), np.concatenate(frequency)
 
-    monkeypatch.setattr(coupled.Coupled, "conclude", watch)
+    monkeypatch.setattr(group.SkinGroup, "conclude", watch)
     fingers = "".join(
         f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5"/>'
         f'<geom size=".003" mass=".03" {GHOST}/></body>'
@@ -590,11 +596,11 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep, monkeypatch):
     mujoco.mj_step(model, data, int(0.3 / timestep))
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
-    jacobian, tangent, frequency = zip(*seen.values())
-    J = np.concatenate(jacobian).reshape(-1, model.nv)
-    modes = J @ np.linalg.solve(inertia, J.T) @ block_diag(*(S for own in tangent for S in own))
+    jacobian, tangent, frequency = seen
+    J = jacobian.reshape(-1, model.nv)
+    modes = J @ np.linalg.solve(inertia, J.T) @ block_diag(*tangent)
     stiffest = np.sqrt(np.linalg.eigvals(modes).real.max())
-    np.testing.assert_allclose(np.concatenate(frequency), stiffest, rtol=0.1)
+    np.testing.assert_allclose(frequency, stiffest, rtol=0.1)
     np.testing.assert_allclose(data.body("box").xpos, start, atol=1e-6)
     for handle in handles:
         assert handle.read(data, "contact_force")[1] == pytest.approx(1.0, rel=0.01)

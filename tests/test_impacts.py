@@ -10,7 +10,7 @@ from grids import covering, first
 
 import biotac_mj
 from biotac_mj import plugin
-from biotac_mj.coupling.implicit.coupled import Coupled
+from biotac_mj.coupling.implicit.group import SkinGroup
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
 GHOST = 'contype="0" conaffinity="0"'
@@ -565,13 +565,13 @@ def test_a_thrown_box_takes_nothing_from_an_untouched_skin(monkeypatch):
     data.qvel[:] = 0.253901, 0.100407, -0.544565, -8.408973, 55.940941, -5.622781
     mujoco.mj_forward(model, data)
     has = kinetic(model, data)
-    energy, lent, stiffness, conclude = [], [], [], Coupled.conclude
+    energy, lent, stiffness, conclude = [], [], [], SkinGroup.conclude
 
     def watch(self, *how):
-        stiffness.extend(np.linalg.eigvalsh(self.tangent))
+        stiffness.extend(np.linalg.eigvalsh(self.arrays.tangent0))
         conclude(self, *how)
 
-    monkeypatch.setattr(Coupled, "conclude", watch)
+    monkeypatch.setattr(SkinGroup, "conclude", watch)
     for _ in range(8):
         mujoco.mj_step(model, data)
         energy.append(data.energy.sum())

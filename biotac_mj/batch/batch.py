@@ -139,7 +139,7 @@ class Batch(Skins):
             write_rows,
             (*self._row.shape, self._jacobian.shape[2]),
             [self._of_step.square, self._group_slot, self._row, self._jacobian, self.model.tangent0]
-            + [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
+            + [self._jacobian.shape[2], int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
             [efc.J, efc.D, efc.aref, efc.pos, self._no_basis],
         )
 

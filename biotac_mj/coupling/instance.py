@@ -17,10 +17,21 @@ from ..geometry.surface import face_areas
 from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.kinematics import Kinematics
-from .implicit.metric import Metric
+from .implicit.metric import assign_slots
 from .implicit.rules import EULER, PATIENCE, stayed
-from .implicit.step_arrays import StepArrays
-from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, SLACK, STARTED, STAYED, Setup
+from .setup import (
+    CONVERGED,
+    ENERGY,
+    FAILED,
+    FREQUENCY,
+    OUT_OF_REACH,
+    REACHED,
+    SLACK,
+    STARTED,
+    STAYED,
+    Setup,
+    models_of,
+)
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
@@ -47,9 +58,8 @@ class Instance:
       frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s]; None leaves the stored one.
       state: (nstate,) view of the plugin state, which stays where it is; parts: its parts, see `Setup.parts`;
         state_address: where it is.
-      kinematics: `Kinematics` of the touching bodies.
+      slots: of a two-way one, see `assign_slots`. keep_held: `StepArrays.held` of it, set by its group.
       sensed: whether the readings of this step are written.
-      number: among the two-way instances; springs: `Springs` of the mjData.
       stays: whether the last solve left the skin as it was.
       put: the skin's state after bodies were placed before this step; None: none was.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
@@ -72,7 +82,6 @@ class Instance:
         for name in self.sensor:
             model.sensor_needstage[sensors[name]] = int(mujoco.mjtStage.mjSTAGE_POS)
         self._tier, self._said = TIERS.index(setup.config.tier), set()
-        self.kinematics = Kinematics(model, data, setup.touching)
         self.two_way = two_way
         if self.two_way:
             slots = sorted(
@@ -80,7 +89,7 @@ class Instance:
                 for n, i in setup.named("eq").items()
                 if n.startswith("couple") and n[6:].isdigit()
             )
-            self.metric = Metric(model, setup.touching, [i for _, i in slots])
+            self.slots = assign_slots(model, setup.touching, [i for _, i in slots])
         start, size = int(model.plugin_stateadr[index]), int(model.plugin_statenum[index])
         if size < setup.nstate:
             raise ValueError(
@@ -93,7 +102,7 @@ class Instance:
         self._forget()
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
-        self.skins_met, self.number, self.springs = (), -1, None
+        self.skins_met = ()
         self._stages = []  # of Runge-Kutta: what acted, and where
         self._shown = None
 
@@ -144,50 +153,25 @@ class Instance:
         self.put, self.sensed, self.stays = None, False, False
         self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
 
-    def last_model(self) -> tuple:
-        """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3),
-        (ngroup, 3, 3), slack (ngroup,)."""
-        models = self.parts[1]
-        return (
-            models[:, :6],
-            models[:, 6:42].reshape(-1, 6, 6),
-            models[:, 42:45],
-            models[:, 45:54].reshape(-1, 3, 3),
-            models[:, SLACK],
-        )
-
     @functools.cached_property
-    def _arrays(self):
-        arrays = StepArrays(self.kinematics, self.setup, self.springs, self.inertial)
-        self.metric.record(*arrays.stiffness)
-        return arrays
+    def kinematics(self) -> Kinematics:
+        """Of the touching bodies."""
+        return Kinematics(self.model, self.data, [self.touching])
 
-    def begin_arrays(self) -> StepArrays:
-        """The arrays of a coupled step that begins: the linear model in force is that of the last step."""
-        arrays, (head, models, *_) = self._arrays, self.parts
-        arrays.record(self.model.opt.timestep, 0.5 * self.by_stages)
+    def begin(self) -> None:
+        """Begins a coupled step in the frame of now."""
         self._begun = self._frame()
-        for (last, now), part in zip(arrays.models, self.last_model()):
-            last[:] = now[:] = part
-        arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)
-        arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
-        arrays.began[0] = head[STARTED] != 0.0
-        arrays.begin()
-        self.touching.check(arrays.start_pos, arrays.start_mat)
-        if arrays.placed.any():
-            self._take_placed(arrays)
-        return arrays
 
-    def _take_placed(self, arrays):
-        """Bodies that were placed begin where they were put, which may lie behind where the step begins."""
+    def take_placed(self, placed: np.ndarray) -> bool | None:
+        """Bodies that were placed, (ngroup,) of int, begin where they were put, which may lie behind where
+        the step begins. Returns whether they leave the skin alone; None where it is not known."""
         where = self.touching.geom_pose(*self.kinematics.predict(-self.lead))
-        placed = (arrays.placed > 0) & ~(self.touching.by_mocap & (self.parts[0][STARTED] != 0.0))
+        placed = (placed > 0) & ~(self.touching.by_mocap & (self.parts[0][STARTED] != 0.0))
         stepper = self.setup.skin.stepper
         with self.setup.skin.lock:
-            if stepper.is_clear(*where):
-                arrays.inside[0] = 0
             if placed.any():
                 self.put = stepper.put(self._skin, placed[self.touching.group], *where)
+            return stepper.is_clear(*where)
 
     def _frame(self):
         core = self.touching.core
@@ -207,23 +191,18 @@ class Instance:
         """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
         return self.setup.skin.stepper.inertial
 
-    def is_out_of_reach(self, pos: np.ndarray, mat: np.ndarray) -> bool:
+    def stay_at_rest(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not
-        reach it within the step."""
+        reach it within the step. It then needs no `solve_for_pose`, and costs next to nothing."""
         stepper, skin = self.setup.skin.stepper, self.parts[2]
         if not stepper.resting(skin):
             return False
         self._geom_pose = self.touching.geom_pose(pos, mat)
         with self.setup.skin.lock:
-            return stepper.is_out_of_reach(skin, *self._geom_pose)
-
-    def stay_at_rest(self, pos: np.ndarray, mat: np.ndarray) -> None:
-        """Instead of `solve_for_pose`, of a skin that is out of reach of bodies at these poses: costs next
-        to nothing."""
-        skin = self.setup.skin
-        with skin.lock:
-            self._result = skin.untouched
-        self._pose, self._reading = (pos, mat), None
+            stays = stepper.is_out_of_reach(skin, *self._geom_pose)
+            if stays:
+                self._result, self._pose, self._reading = self.setup.skin.untouched, (pos, mat), None
+        return stays
 
     def stay(self) -> SkinResult | None:
         """Instead of `solve_for_pose`, for bodies where the skin was solved in the last step: the result is
@@ -234,7 +213,7 @@ class Instance:
         pressure = skin.stepper.pressure(state) if known else None
         if pressure is None:
             return None
-        wrench, tangent, *pose, slack = (part.copy() for part in self.last_model())
+        wrench, tangent, *pose, slack = (part.copy() for part in models_of(self.parts[1]))
         with skin.lock:
             vert = skin.stepper.vert_xpos(state)
         known = {"measured": reach > 0, "pose": tuple(pose), "slack": slack}
@@ -284,7 +263,7 @@ class Instance:
             result.wrench = fraction[:, None] * result.wrench
             result.tangent = (fraction * path)[:, None, None] * result.tangent
             if self.two_way:
-                result.tangent = self._arrays.held(result.tangent)
+                result.tangent = self.keep_held(result.tangent)
             if not result.converged:
                 result = self._as_far_as_known(result, before)
             if len(self._solved) > 8:
@@ -320,7 +299,7 @@ class Instance:
             return dataclasses.replace(result, pose=pose)
         if not self.parts[0][STARTED]:  # the first step
             return result
-        wrench, tangent, *last, _ = self.last_model()
+        wrench, tangent, *last, _ = models_of(self.parts[1])
         state = before.copy()
         if self.parts[0][CONVERGED] <= -PATIENCE:
             stepper.reset(state)
@@ -356,11 +335,11 @@ class Instance:
         rounds, settled, withheld, _, acting = self._outcome
         self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, acting
 
-    def arrive(self) -> None:
-        """Keeps the poses of the bodies at the end of the step: a body that the next step finds elsewhere was
-        moved by others. MuJoCo's poses must be those with which that begins."""
+    def arrive(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Keeps the poses of the bodies at the end of the step, (ngroup, 3), (ngroup, 3, 3): a body that the
+        next step finds elsewhere was moved by others."""
         if not self._error and self._result is not None:
-            self._ends = self.kinematics.predict(0.0)
+            self._ends = pos, mat
 
     def _counts(self):
         if self._reading is None:

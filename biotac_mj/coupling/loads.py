@@ -16,6 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from .implicit.metric import Metric
 from .solid_contacts import CONTACT, contact_frame
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
@@ -31,8 +32,8 @@ class Loads:
     """Force quantities with all two-way skins of one mjData. Sensors with a delay have MuJoCo's contacts
     alone."""
 
-    def __init__(self, model: ModelView, data: DataView, coupled: list):
-        self.model, self.data, self.coupled = model, data, coupled
+    def __init__(self, model: ModelView, data: DataView, coupled: list, metric: Metric):
+        self.model, self.data, self._metric = model, data, metric
         self._core_geom = {t.touching.core: core_geom(model, t.touching.core) for t in coupled}
         found = passes(model, list(self._core_geom))
         self._again = [_with_sensors(model, *one) for one in found]
@@ -77,8 +78,7 @@ class Loads:
         ctypes.memmove(contact.ctypes.data, data.contact, data.ncon * CONTACT.itemsize)
         ctypes.memmove(force.ctypes.data, data.efc_force, data.nefc * 8)
         contact[data.ncon :] = self._touch
-        for one in self.coupled:
-            force[one.metric.numbers] = 0.0
+        force[self._metric.numbers] = 0.0
         pyramidal = self.model.opt.cone == _PYRAMIDAL
         k, row = data.ncon, data.nefc
         for touching, which, vectors in touches:

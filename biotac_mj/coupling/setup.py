@@ -30,6 +30,13 @@ _MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1 + 1 + 1
 ENERGY, FREQUENCY, SLACK = (_MODEL - k for k in (3, 2, 1))
 
 
+def models_of(table: np.ndarray) -> tuple:
+    """Linear models of bodies in rows (n, 69) of a plugin state, as views: wrench (n, 6), tangent (n, 6, 6),
+    pose (n, 3), (n, 3, 3), slack (n,)."""
+    tangent, mat = table[:, 6:42].reshape(-1, 6, 6), table[:, 45:54].reshape(-1, 3, 3)
+    return table[:, :6], tangent, table[:, 42:45], mat, table[:, SLACK]
+
+
 class _Skin:
     """A stepper and readings with the lock that lets one thread at a time use them: they share constants and
     scratch memory."""

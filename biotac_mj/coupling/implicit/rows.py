@@ -56,6 +56,7 @@ def write_rows(
     row: wp.array2d(dtype=int),
     jacobian: wp.array3d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
+    threads: int,
     sparse: int,
     rownnz: wp.array2d(dtype=int),
     rowadr: wp.array2d(dtype=int),
@@ -70,8 +71,9 @@ def write_rows(
     """beta h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L,
     which is written to basis [row, world] where that has room.
 
-    Each thread writes one column of the rows: loads and stores in turn take ten times the sums."""
-    s, w, n = wp.tid()
+    The columns of the rows of a slot are written by so many threads in turn: on CUDA by one for each, since
+    loads and stores in turn take ten times the sums."""
+    s, w, t = wp.tid()
     first = row[s, w]
     if first < 0:
         return
@@ -86,17 +88,18 @@ def write_rows(
         pivot, column = _pivot(S, whole, k)
         S -= pivot * wp.outer(column, column)
         r = first + k
-        if n == 0:
+        if t == 0:
             D_out[w, r] = type(D_out[w, r])(wp.max(pivot, _NEGLIGIBLE))
             aref_out[w, r] = type(aref_out[w, r])(0.0)
             pos_out[w, r] = type(pos_out[w, r])(0.0)
             if r < basis_out.shape[0]:
                 basis_out[r, w] = column
-        if sparse == 0:
-            J_out[w, r, n] = type(J_out[w, r, n])(wp.dot(column, jacobian[group, w, n]))
-        elif n < rownnz[w, r]:
-            at = rowadr[w, r] + n
-            J_out[w, 0, at] = type(J_out[w, 0, at])(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
+        for n in range(t, jacobian.shape[2], threads):
+            if sparse == 0:
+                J_out[w, r, n] = type(J_out[w, r, n])(wp.dot(column, jacobian[group, w, n]))
+            elif n < rownnz[w, r]:
+                at = rowadr[w, r] + n
+                J_out[w, 0, at] = type(J_out[w, 0, at])(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
 
 
 # an overload that a launch makes would change the module after it was compiled

@@ -25,7 +25,7 @@ class Springs:
       nslot: how many slots of six rows each skin has.
 
     Attributes:
-      own: of each skin, the first row of each slot, (nslot,) views to write to.
+      own: (nslot,) first row of each slot of all skins, to write to.
       L: (1, nv, nv) wp.array, the factor that was found last. stiffness: (1, nv, nv) of all skins; held:
         a view of it.
     """
@@ -41,7 +41,7 @@ class Springs:
             self.L, self.stiffness = (wp.zeros((1, model.nv, model.nv), dtype=real) for _ in range(2))
             none = wp.zeros((0, 1), dtype=int)
         self._parts = [self._own[a:b] if a < b else none for a, b in zip(ends, ends[1:])]
-        self.own = [part.numpy()[:, 0] for part in self._parts]
+        self.own = self._own.numpy()[:, 0]
         self._here = {"inertia": self._inertia.numpy(), "rows": self._rows.numpy()}
         self.held = self.stiffness.numpy()
         self._make_room(1, 1)

@@ -1,7 +1,9 @@
-"""The coupled step of one skin in one world: the arrays and kernels of `rounds` and `energy` for MuJoCo, seen
-from numpy."""
+"""The coupled step of all skins of one mjData: the arrays and kernels of `rounds` and `energy`, seen from
+numpy."""
 
 import math
+import types
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -11,8 +13,8 @@ from ...skin.types import mat66, real, vec6
 from ..setup import Setup
 from . import energy, rounds
 from .compliance import Response, add_stiffness
-from .kinematics import Kinematics, row
-from .marks import Marks
+from .kinematics import Kinematics, row, rows_of
+from .marks import MarkedWorlds, Marks
 from .rounds import Model, Rounds, Solid
 from .rows import keep_held
 from .rules import LOSS_FREQUENCY
@@ -35,110 +37,134 @@ def find_off(
 
 
 class StepArrays:
-    """Arrays (ngroup, ...) of a skin's step, views of what kernels work on; their names are those of `Rounds`
-    and `Model`. A launch takes 1 us, several numpy calls on so few numbers.
+    """Arrays of the step of all skins of an mjData, the bodies of one after those of another, (nbody, ...):
+    views of what kernels work on; their names are those of `Rounds` and `Model`. A stage of all skins is one
+    call: a launch takes 1 us, several numpy calls on so few numbers.
 
     Args:
-      kinematics: of the bodies. setup: of the BioTac. springs: of the mjData. inertial: whether its skin has
-        inertia.
+      kinematics: of the bodies. setups: of the BioTacs. springs: of the mjData.
 
     Attributes:
-      qacc: (nv,) accelerations for `evaluate`. wrench: (ngroup, 6) of `rounds.wrenches`.
-      compliance: (ngroup, ngroup, 6, 6) of `Coupled`.
-      stiffness: of the rows, see `Metric.record`.
-      off: (2,) [m] of `evaluate`, see `find_off`. left_out: (ngroup,) of `energy.conclude` [J].
-      find_energy, restrain, gains: functions that do the energy balance. They return whether the skin is
+      awake: (nskin,) int, 1: the skin takes part in the step. began, inside: (nskin,) of `Rounds`.
+      qacc: (nv,) accelerations for `evaluate`. wrench: (nbody, 6) of `rounds.wrenches`.
+      compliance: of each skin, (ngroup, ngroup, 6, 6) of `Coupled`; find_compliance: functions that find it.
+      stiffness: of the rows, see `Metric`.
+      off: (nskin, 2) [m] of `evaluate`, see `find_off`. left_out: (nbody,) of `conclude` [J].
+      find_energy, restrain, gains: functions that do the energy balance. They return whether a skin is
         greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
       models: views of wrench0, tangent0, pos0, mat0 and slack, in the last step and in this one.
     """
 
-    def __init__(self, kinematics: Kinematics, setup: Setup, springs: Springs, inertial: bool):
-        self._kinematics, shape = kinematics, (setup.ngroup, 1)
-        self._loss, self._key, solid = setup.config.loss, None, Solid()
-        solid.thickness, solid.area, solid.inertial = setup.thickness, 1.0, int(inertial)
-        self._solid = solid
+    def __init__(self, kinematics: Kinematics, setups: Sequence[Setup], springs: Springs):
+        self._kinematics, self._key, shape = kinematics, None, kinematics.jacobian.shape[:2]
         with wp.ScopedDevice("cpu"):
-            self._rounds = rounds.make_rounds(*shape)
-            tangent = wp.zeros(shape, dtype=mat66)
-            self._model, self._last = (rounds.make_model(*shape) for _ in range(2))
-            self._rounds.surface = wp.array([setup.surface_energy], dtype=real)
-            self._wrench, self._qacc = wp.zeros(shape, dtype=vec6), wp.zeros_like(kinematics.d.qvel)
-            self._left_out = wp.zeros(shape, dtype=real)
-            self._compliance = wp.zeros((setup.ngroup, *shape), dtype=wp.spatial_matrixd)
-            self._off = wp.zeros(2, dtype=real)
-            self._one, self._greedy = (wp.zeros(1, dtype=int) for _ in range(2))
-            self._reason, self._marks = wp.zeros(1, dtype=int), Marks(1)
-            self._led = wp.array(setup.touching.by_mocap, dtype=bool)
-        self._one.fill_(1)
-        self._tangent, self._keep_held = _seen(tangent), row((keep_held, shape, [tangent]))
-        self.wrench, self.left_out = _seen(self._wrench), _seen(self._left_out)
-        self.qacc, self.compliance = self._qacc.numpy()[0], self._compliance.numpy()[:, :, 0]
-        self.off, self._is_marked, self._found = (
-            a.numpy() for a in (self._off, self._marks.any, self._reason)
-        )
-        self._respond(springs)
-        for part, names in ((self._rounds, Rounds.vars), (self._model, Model.vars)):
-            for name in names:
-                array = getattr(part, name)
-                if isinstance(array, wp.array):
+            whole = rounds.make_rounds(*shape)
+            model, last = (rounds.make_model(*shape) for _ in range(2))
+            tangent, wrench = wp.zeros(shape, dtype=mat66), wp.zeros(shape, dtype=vec6)
+            left_out, self._qacc = wp.zeros(shape, dtype=real), wp.zeros_like(kinematics.d.qvel)
+            n, self._marks, off = len(setups), Marks(len(setups)), wp.zeros((len(setups), 2), dtype=real)
+            names = "awake", "began", "inside", "reason", "greedy"
+            flags = {name: wp.zeros(n, dtype=int) for name in names}
+            self._skins = [types.SimpleNamespace() for _ in setups]
+            for k, (skin, setup, part) in enumerate(zip(self._skins, setups, kinematics.parts)):
+                skin.jacobian, skin.tangent = rows_of(kinematics.jacobian, part), rows_of(tangent, part)
+                skin.wrench, skin.left_out, skin.off = rows_of(wrench, part), rows_of(left_out, part), off[k]
+                skin.flags = {name: array[k : k + 1] for name, array in flags.items()}
+                skin.rounds = _of_skin(Rounds, whole, part)
+                skin.model, skin.last = (_of_skin(Model, one, part) for one in (model, last))
+                skin.rounds.began, skin.rounds.inside = skin.flags["began"], skin.flags["inside"]
+                skin.rounds.surface = wp.array([setup.surface_energy], dtype=real)
+                skin.marks = MarkedWorlds()
+                skin.marks.world, skin.marks.any = self._marks.world[k : k + 1], self._marks.any
+                skin.compliance = wp.zeros((setup.ngroup, setup.ngroup, 1), dtype=wp.spatial_matrixd)
+                skin.led = wp.array(setup.touching.by_mocap, dtype=bool)
+                skin.bodies, skin.loss, skin.solid = kinematics.bodies[k], setup.config.loss, Solid()
+                skin.solid.thickness, skin.solid.area = setup.thickness, 1.0
+                skin.solid.inertial = int(setup.skin.stepper.inertial)
+        self._tangent = [_seen(skin.tangent) for skin in self._skins]
+        self._keep_held = [row((keep_held, skin.tangent.shape, [skin.tangent])) for skin in self._skins]
+        self.wrench, self.left_out, self.qacc = _seen(wrench), _seen(left_out), self._qacc.numpy()[0]
+        self.compliance, self.off = [skin.compliance.numpy()[:, :, 0] for skin in self._skins], off.numpy()
+        self.awake, self.began, self.inside, self._reason, _ = (a.numpy() for a in flags.values())
+        for kind, struct in ((Rounds, whole), (Model, model)):
+            for name in kind.vars:
+                if _is_of_bodies(array := getattr(struct, name)):
                     setattr(self, name, _seen(array))
-        self.models = [(_seen(getattr(self._last, name)), getattr(self, name)) for name in Model.vars]
+        self.models = [(_seen(getattr(last, name)), getattr(self, name)) for name in Model.vars]
+        self.stiffness = whole.square, kinematics.jacobian, model.tangent0
+        self._respond(springs, (kinematics.jacobian, model))
 
-    def held(self, tangent: np.ndarray) -> np.ndarray:
-        """The part of tangents (ngroup, 6, 6) that rows represent, see `rows.hold_by_rows`."""
-        self._tangent[:] = tangent
-        self._keep_held()
-        return self._tangent.copy()
+    def held(self, skin: int, tangent: np.ndarray) -> np.ndarray:
+        """The part of tangents (ngroup, 6, 6) of a skin that rows represent, see `rows.hold_by_rows`."""
+        self._tangent[skin][:] = tangent
+        self._keep_held[skin]()
+        return self._tangent[skin].copy()
 
-    def _respond(self, springs):
+    def _respond(self, springs, whole):
         """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
-        one, jacobian, r, L = self._one, self._kinematics.jacobian, self._rounds, springs.L
-        self.stiffness, response = (r.square, jacobian, self._model.tangent0), Response(jacobian, self._model)
-        self.find_compliance = row(*response.compliance(one, L, r.square, self._compliance))
-        dim, stiffness = (1, jacobian.shape[2]), springs.stiffness
-        self.add_stiffness = row((add_stiffness, dim, [jacobian, self._model, stiffness]))
-        self.find_frequencies = row(*response.frequencies(one, stiffness, L, r.frequency))
+        L, stiffness = springs.L, springs.stiffness
+        self.find_compliance, frequencies = [], []
+        for skin in self._skins:
+            response, r, awake = Response(skin.jacobian, skin.model), skin.rounds, skin.flags["awake"]
+            self.find_compliance.append(row(*response.compliance(awake, L, r.square, skin.compliance)))
+            frequencies += response.frequencies(awake, stiffness, L, r.frequency)
+        self.find_frequencies = row((add_stiffness, stiffness.shape[:2], [*whole, stiffness]), *frequencies)
 
     def record(self, step: float, ahead: float) -> None:
         """Makes the launches for a time step [s]; ahead: see `rounds.choose_gamma`."""
         if self._key == (step, ahead):
             return
-        self._key, r, n = (step, ahead), self._rounds, self.wrench.shape[0]
-        delay = self._loss / (2 * math.pi * LOSS_FREQUENCY * step)
+        self._key, k = (step, ahead), self._kinematics
 
-        forces = rounds.wrenches, (n, 1), [self._model, r, self._wrench]
-        one = [self._one]
-        k = self._kinematics
-        drift = k.bodies.drift(k.m, k.d, step, k.jacobian, r)
-        self.begin = row(
-            k.bodies.here(k.d, r.here_pos, r.here_mat),
-            *drift,
-            (rounds.begin_rounds, 1, [*one, self._led, r, self._last, self._model]),
-            (rounds.choose_gamma, (n, 1), [step, ahead, delay, self._solid, self._last, r]),
-            *drift,
-        )
-        self.use_euler = row((rounds.use_euler, 1, [step, *one, r]), *drift)
-        self.find_wrenches = row(forces)
-        self.evaluate = row(
-            k.bodies.accelerate(step, k.jacobian, self._qacc, r),
-            (find_off, 1, [self._model, r, self._off]),
-            forces,
-        )
-        marks = self._marks.struct
-        self.find_energy = self._marking(energy.find_energy, self._last, self._solid, r, self._greedy, marks)
-        self.restrain = self._marking(energy.restrain, self._model, self._compliance, r, marks)
-        self.gains = self._marking(energy.find_gain, 0.0, self._solid, r, marks)
-        self._conclude = row((energy.conclude, 1, [*one, self._reason, r, self._left_out]))
+        def drift(skin):
+            return skin.bodies.drift(k.m, k.d, step, skin.jacobian, skin.rounds)
 
-    def conclude(self, converged: bool) -> np.ndarray:
-        """(ngroup,) energy that is left to the bodies [J]."""
-        self._found[0] = CONVERGED if converged else NOT_CONVERGED
+        def begin(skin):
+            r, awake = skin.rounds, skin.flags["awake"]
+            delay = skin.loss / (2 * math.pi * LOSS_FREQUENCY * step)
+            return (
+                skin.bodies.here(k.d, r.here_pos, r.here_mat),
+                *drift(skin),
+                (rounds.begin_rounds, 1, [awake, skin.led, r, skin.last, skin.model]),
+                (rounds.choose_gamma, r.pos.shape, [step, ahead, delay, skin.solid, skin.last, r]),
+                *drift(skin),
+            )
+
+        def forces(skin):
+            return [(rounds.wrenches, skin.wrench.shape, [skin.model, skin.rounds, skin.wrench])]
+
+        def evaluate(skin):
+            moved = skin.bodies.accelerate(step, skin.jacobian, self._qacc, skin.rounds)
+            return moved, (find_off, 1, [skin.model, skin.rounds, skin.off]), *forces(skin)
+
+        def use_euler(skin):
+            return (rounds.use_euler, 1, [step, skin.flags["greedy"], skin.rounds]), *drift(skin)
+
+        def conclude(skin):
+            flags = skin.flags["awake"], skin.flags["reason"]
+            return [(energy.conclude, 1, [*flags, skin.rounds, skin.left_out])]
+
+        stages = begin, use_euler, forces, evaluate, conclude
+        self.begin, self.use_euler, self.find_wrenches, self.evaluate, self._conclude = map(self._row, stages)
+        self.find_energy = self._marking(
+            energy.find_energy, lambda s: (s.last, s.solid, s.rounds, s.flags["greedy"])
+        )
+        self.restrain = self._marking(energy.restrain, lambda s: (s.model, s.compliance, s.rounds))
+        self.gains = self._marking(energy.find_gain, lambda s: (0.0, s.solid, s.rounds))
+
+    def conclude(self, converged: Sequence[bool]) -> None:
+        """Finds `left_out`, the energy that is left to the bodies. converged: whether each skin has."""
+        self._reason[:] = np.where(converged, CONVERGED, NOT_CONVERGED)
         self._conclude()
-        return self.left_out.copy()
 
-    def _marking(self, kernel, *known):
-        """A function that runs a kernel and returns whether it has marked the world."""
-        run, marked = row((kernel, 1, [self._one, *known])), self._is_marked
+    def _row(self, launches):
+        """One call for the launches of all skins."""
+        return row(*(launch for skin in self._skins for launch in launches(skin)))
+
+    def _marking(self, kernel, known):
+        """A function that runs a kernel and returns whether it has marked a skin."""
+        run = self._row(lambda s: [(kernel, 1, [s.flags["awake"], *known(s), s.marks])])
+        marked = self._marks.any.numpy()
 
         def find():
             marked[0] = 0
@@ -148,7 +174,19 @@ class StepArrays:
         return find
 
 
+def _of_skin(kind, whole, part):
+    """A struct with rows `part` of the arrays [body, world] of another, and its other fields."""
+    one = kind()
+    for name in kind.vars:
+        value = getattr(whole, name)
+        setattr(one, name, rows_of(value, part) if _is_of_bodies(value) else value)
+    return one
+
+
+def _is_of_bodies(value):
+    return isinstance(value, wp.array) and value.ndim == 2
+
+
 def _seen(array):
-    """A view of the only world of an array [item, world] or [world]."""
-    view = array.numpy()
-    return view[:, 0] if array.ndim == 2 else view
+    """A view of the only world of an array [item, world]."""
+    return array.numpy()[:, 0]

@@ -24,11 +24,10 @@ from ..loads import Loads
 from ..solid import SOLVED
 from ..solid_contacts import SolidContacts, contacts_of
 from ..structs import MINVAL, DataView, ModelView
-from .coupled import Coupled
 from .group import SkinGroup
 from .integrator import Integrator
+from .metric import Metric
 from .rules import MAX_CORRECTIONS, TOLERANCE, poorly_corrected
-from .springs import Springs
 
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
@@ -61,12 +60,9 @@ class World:
                 if other.touching.body[k] == t.touching.core
             ]
         self.first = self.coupled[0].index if self.coupled else -1
-        if self.coupled:
-            self._springs = Springs(model, data, [len(t.metric.slot) for t in self.coupled])
-        for number, t in enumerate(self.coupled):
-            t.number, t.springs = number, self._springs
+        self.metric = Metric(model, [t.touching for t in self.coupled], [t.slots for t in self.coupled])
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
-        self._acting, self._now = (), None  # skins whose bodies are under way, and from where
+        self._acting, self._now = False, None  # whether bodies are under way, and from where
         self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
         self._loads = None
         self._solids = [SolidContacts(model, one.touching) for one in self.instances.values()]
@@ -76,6 +72,10 @@ class World:
         self.integrator = Integrator(
             model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)}
         )
+
+    @functools.cached_property
+    def _group(self):
+        return SkinGroup(self.model, self.data, self.coupled, self.metric)
 
     def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
@@ -94,7 +94,7 @@ class World:
         elif index == self.first:
             self._go_on()
         if instance.by_stages:
-            instance.end_stage(self._stage == 1, self._stage > 1 and bool(self._acting))
+            instance.end_stage(self._stage == 1, self._stage > 1 and self._acting)
 
     def _amend_contacts(self):
         amended = [one.amend(self.data) for one in self._solids] if self.data.ncon else []
@@ -135,9 +135,12 @@ class World:
         if not self.coupled:
             return
         if self._loads is None:
-            self._loads = Loads(self.model, self.data, self.coupled)
-        acting = {one.instance: one.instance.seen(one.acting_with(self.data.qacc)) for one in self._acting}
-        self._loads.write({t: acting[t] if t in acting else t.acting_wrench() for t in self.coupled})
+            self._loads = Loads(self.model, self.data, self.coupled, self.metric)
+        acting = {t: t.acting_wrench() for t in self.coupled}
+        if self._acting:
+            found = self._group.acting_with(self.data.qacc)
+            acting |= {one.instance: one.instance.seen(found[one.bodies]) for one in self._group.skins}
+        self._loads.write(acting)
 
     def _next_stage(self):
         """Number of the Runge-Kutta stage that MuJoCo evaluates: two in the middle and one at the end of the
@@ -179,76 +182,62 @@ class World:
             other.failed()
 
     def _take_rows(self):
-        # of all skins before any looks at its rows, which the arena may hold elsewhere afterwards
-        if sum(t.metric.switch_on(self.data) for t in self.coupled):
+        if self.metric.switch_on(self.data):
             self.data.make_constraints()
-        for t in self.coupled:
-            t.metric.find_rows(self.data)
-        self.data.reference_constraints()  # of all rows
-        for t, own in zip(self.coupled, self._springs.own):
-            t.metric.take_references()
-            own[:] = t.metric.first
+        self.metric.find_rows(self.data)
 
     def _step(self):
-        self._acting, self._weights = (), None
+        self._acting, self._weights = False, None
         self._now, self._began_with = self.data.qpos.copy(), self.data.qvel.copy()
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
         with self.data.ahead(self.coupled[0].lead):
-            skins = [Coupled(t, self.data) for t in self.coupled]
+            self._group.begin()
         try:
-            self._newton(skins, outside)
+            self._newton(self._group, outside)
             self._pushes = self.data.qfrc_passive - outside
         except BaseException:
             self.data.qfrc_passive[:] = outside
-            for skin in skins:
-                skin.instance.metric.release()
+            self.metric.release()
             raise
 
-    def _newton(self, skins, outside):
-        self._damped = None
-        for skin in skins:
-            if skin.idle:
-                skin.leave_at_rest()
-        skins = [skin for skin in skins if not skin.idle]
+    def _newton(self, group, outside):
+        self._damped, skins = None, group.skins
         if not skins:
+            self.metric.release()
             return
-        self._group = SkinGroup(skins, self._springs)
+        group.springs.own[:] = self.metric.first
         if self.model.opt.timestep > 0 and self.model.nv > 0:
-            rounds = self._find_balance(skins, outside)
-            rounds += self._damp(skins, outside)
-            self._restrain(skins, outside)
+            rounds = self._find_balance(outside)
+            rounds += self._damp(outside)
+            self._restrain(outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
             if self.data.is_dual:  # its iterations would leave the rows open: forces act in their place
-                for skin in skins:
-                    skin.hold(self._found)
-                self._forces(skins, outside)
-            self._group.find_frequencies()
-            self._acting = skins
+                group.hold(self._found)
+                self._forces(outside)
+            group.find_frequencies()
+            self._acting = True
             if skins[0].instance.by_stages:
-                self._held_trees, self._ties = self._touched_trees(skins), self._force_of_ties()
+                self._held_trees, self._ties = self._touched_trees(group), self._force_of_ties()
         else:
             rounds = 1
-            self._group.evaluate(np.zeros(self.model.nv))
+            group.evaluate(np.zeros(self.model.nv))
             self._solve_all({skin: skin.finish for skin in skins})
-            self._forces(skins, outside)
-            for skin in skins:
-                skin.evaluate(np.zeros(self.model.nv))
-                skin.arrays.find_energy()
-        for skin in skins:
-            skin.conclude(rounds)
+            self._forces(outside)
+            group.evaluate(np.zeros(self.model.nv))
+            group.arrays.find_energy()
+        group.conclude(rounds)
 
-    def _touched_trees(self, skins):
+    def _touched_trees(self, group):
         """(ntree,) kinematic trees that skins touch, or core, nail and clamp, and those that constraints link
         to them."""
         tree, trees = self.model.dof_treeid, np.zeros(self.model.ntree, bool)
-        for skin in skins:
-            trees[tree[skin.jacobian[skin.touching].any(axis=(0, 1))]] = True
+        trees[tree[group.jacobian[group.touching].any(axis=(0, 1))]] = True
         contacts = contacts_of(self.data)
         pairs = contacts["geom"][contacts["efc_address"] >= 0]
         bodies = self.model.geom_bodyid[pairs[(pairs >= 0).all(axis=1)]]  # -1: a flex
-        solid = np.isin(bodies, [skin.instance.touching.core for skin in skins]).any(axis=1)
+        solid = np.isin(bodies, [skin.instance.touching.core for skin in group.skins]).any(axis=1)
         touched = self.model.body_treeid[bodies[solid]]
         trees[touched[touched >= 0]] = True
         return self.data.linked_trees(trees)
@@ -257,8 +246,7 @@ class World:
         """(nv,) generalised forces of equality constraints, as the last solve left them."""
         force = self.data.rows().efc_force.copy()
         force[self.data.ne :] = 0.0
-        for t in self.coupled:
-            force[t.metric.numbers] = 0.0
+        force[self.metric.numbers] = 0.0
         return self.data.pushed_by(force)
 
     def _go_on(self):
@@ -268,8 +256,7 @@ class World:
         constraints turn with what they hold, and answer to the others."""
         data = self.data
         self._take_rows()
-        for t in self.coupled:
-            t.metric.release()
+        self.metric.release()
         self._now = data.qpos.copy()
         if self._acting:
             if self._stage == 2:
@@ -294,17 +281,16 @@ class World:
         before, self._now = self._now, None
         if before is None:  # MuJoCo has not called the skins
             return
-        skins, self._acting = self._acting, ()
+        acting, self._acting = self._acting, False
         if self._weights is not None:
             self._leave_constraint_forces()
         moved = 0.5 * self.model.opt.timestep * (self._began_with + self.data.qvel)
         after = self.data.qpos.copy()
         self.data.go_on(self.coupled[0].lead)
         self.data.find_poses()
-        for skin in skins:
-            skin.settle(moved, ASTRAY)
-        for t in self.coupled:
-            t.arrive()
+        if acting:
+            self._group.settle(moved, ASTRAY)
+        self._group.arrive()
         self.data.qpos[:] = before
         self.data.find_poses()  # those that MuJoCo leaves after a step
         self.data.qpos[:] = after
@@ -312,19 +298,20 @@ class World:
     def _solved(self, skin):
         """Whether a skin's rows push what its model says, and MuJoCo's constraint solver found what holds its
         bodies."""
-        rows = np.abs(_SCALE * skin.excess).max(initial=0.0)
-        if rows > SOLVED * np.abs(_SCALE * skin.arrays.acting).max(initial=0.0):
+        rows = np.abs(_SCALE * self._group.excess[skin.bodies]).max(initial=0.0)
+        if rows > SOLVED * np.abs(_SCALE * skin.of("acting")).max(initial=0.0):
             return False
         return self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
 
-    def _find_balance(self, skins, outside):
+    def _find_balance(self, outside):
         """Finds models of the skins that hold where these lead; returns how many rounds that took.
 
         Their forces are left in place.
         """
+        skins = self._group.skins
         most = max(skin.instance.setup.config.rounds for skin in skins)
         for rounds in range(most + 1):
-            self._predict(skins, outside)
+            self._predict(outside)
             going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_act]
             if rounds == most or not going:
                 break
@@ -344,61 +331,59 @@ class World:
             run_in_threads(shared.pop(one), 1)
             one.solved = True
         run_in_threads([functools.partial(run_in_threads, mine, 1) for mine in shared.values()], threads)
+        self._group.use_models()
 
-    def _predict(self, skins, outside):
+    def _predict(self, outside):
         """Finds where MuJoCo will move the bodies under the skins' linear models, and how far that is from
         where the skins were solved; leaves the forces that do this in place.
 
         The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
         (a - a') corrects it."""
-        self._found, moved = self._corrected(skins, outside)
-        for skin in skins:
-            skin.excess[:] = skin.instance.metric.excess(self._found)
+        self._found, moved = self._corrected(outside)
+        self._group.excess[:] = self.metric.excess(self._found)
         self._group.evaluate(moved)
 
-    def _damp(self, skins, outside):
+    def _damp(self, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
         how many rounds that took."""
-        greedy = [skin for skin in skins if skin.arrays.find_energy()]
-        if not greedy:
+        group = self._group
+        if not group.arrays.find_energy():
             return 0
-        for skin in greedy:
-            skin.use_euler()
-        self._group.find_compliance(skins, self._inertia)
-        rounds = self._find_balance(skins, outside)
-        for skin in skins:
-            skin.arrays.find_energy()
+        group.use_euler()
+        group.find_compliance(group.skins, self._inertia)
+        rounds = self._find_balance(outside)
+        group.arrays.find_energy()
         return rounds
 
-    def _restrain(self, skins, outside):
+    def _restrain(self, outside):
         """Withholds so much of the push on bodies that they get no more energy than they have put in.
 
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself.
         """
-        while [skin for skin in skins if skin.arrays.restrain()]:
-            self._predict(skins, outside)
-        if any(skin.arrays.gains() for skin in skins):
-            for skin in skins:
-                skin.withdraw()
-            self._predict(skins, outside)
+        while self._group.arrays.restrain():
+            self._predict(outside)
+        if self._group.arrays.gains():
+            self._group.withdraw()
+            self._predict(outside)
 
-    def _corrected(self, skins, outside):
+    def _corrected(self, outside):
         """Accelerations a and a'."""
-        self._forces(skins, outside)
+        self._forces(outside)
         found = self.data.acceleration(again=self._damped is not None, primal=True)
         if self._damped is None:  # known only after the actuation stage
             self._damped = self.integrator.take_matrices(self.data)
             self._inertia = self.integrator.inertia if self._damped else None
         if not self._damped and not self.integrator.by_forces:
             return found, found
-        group, touching = self._group, self._group.touching
+        group = self._group
+        touching = group.touching
         group.amiss[:] = 0.0
         if not len(touching):
             return found, self.integrator.accelerations(self.data, found)
         jacobian, held = group.held(touching)
         correction = group.correction[touching].ravel()
-        largest = max(np.abs(_SCALE * s.arrays.wrench0).max(initial=0.0) for s in skins)
+        largest = np.abs(_SCALE * group.arrays.wrench0).max(initial=0.0)
         for last in range(MAX_CORRECTIONS, -1, -1):
             excess = held @ (found - self.integrator.integrated(found))
             wrong = excess - correction
@@ -408,14 +393,14 @@ class World:
                 group.amiss[touching] = (correction - held @ (found - moved)).reshape(-1, 6)
                 return found, moved
             # what the constraint solver would find if the rows answered to the integrator
-            known = self._springs, jacobian.T @ held, correction @ jacobian
+            known = group.springs, jacobian.T @ held, correction @ jacobian
             found = self.integrator.answer(found, *known)
             correction = held @ (found - self.integrator.integrated(found))
             group.correction[touching] = correction.reshape(-1, 6)
-            self._forces(skins, outside)
+            self._forces(outside)
             found = self.data.acceleration(again=True, primal=True)
 
-    def _forces(self, skins, outside):
+    def _forces(self, outside):
         self.data.qfrc_passive[:] = outside
         self.data.qfrc_passive += self._group.apply()
         if self.data.is_dual:  # it works on what the rows were before

@@ -52,13 +52,13 @@ class Bodies:
         seen = DataView(self.data._address, view)
         self.instances, self._kinematics = (
             instances,
-            [Kinematics(view, seen, one.touching) for one in instances],
+            [Kinematics(view, seen, [one.touching]) for one in instances],
         )
         nv, na, nu, nm = model.nv, model.na, model.nu, model.nmocap
         names = "qpos", "qvel", "act", "ctrl", "qfrc_applied", "mocap_pos", "mocap_quat"
         self.sizes = dict(zip(names, (nv, nv, na, nu, nv, 3 * nm, 3 * nm)))
         self.ny, self.nv = 2 * nv + na, nv
-        slots = [slot for one in instances if one.two_way for slot in one.metric.slot.values()]
+        slots = [slot for one in instances if one.two_way for slot in one.slots.values()]
         self._slots = np.array(slots, int)
 
     def _put(self, start, moved):
