@@ -136,7 +136,7 @@ def _energy_kernel(kind):
 
 def energy_of(elements, rubber, options, x) -> np.ndarray:
     """Elastic energy (nelem, nworld) of each of `Tetrahedra` by its law [J], at x [nvert, nworld]."""
-    kind = Kind(elements.corners, elements.law == 0, DOUBLE, options)
+    kind = Kind(elements.corners, elements.law == 0, DOUBLE, bool(options))
     out = wp.zeros((elements.nelem, x.shape[1]), dtype=real, device=x.device)
     inputs = [elements.cap, rubber, elements.mesh, x]
     wp.launch(_energy_kernel(kind), out.shape, inputs, [out], device=x.device)

@@ -310,7 +310,7 @@ class SkinModel:
 
     @property
     def rubber_options(self) -> tuple[str, ...]:
-        """Effects of the rubber beyond its law, see `rubber.points.point_functions`."""
+        """Effects of the rubber beyond its law: of modulus, prony, mullins, hysteresis and stiffening."""
         return (*([] if self.modulus is None else ["modulus"]), *self.material.extensions)
 
     def _moduli(self, modulus, given):

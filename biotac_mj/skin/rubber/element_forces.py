@@ -18,7 +18,7 @@ if typing.TYPE_CHECKING:
 def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
     """Module of the kernels for many worlds, and its block size, for `program.compile_ahead`. options: as in
     `ElementForces`."""
-    kernels = element_kernels(elements.corners, elements.law == 0, SINGLE, options)
+    kernels = element_kernels(elements.corners, elements.law == 0, SINGLE, bool(options))
     return kernels.force.module, BOUNDS[0]
 
 
@@ -28,7 +28,7 @@ class ElementForces:
     Args:
       elements: Tetrahedra.
       rubber: `points.Rubber` of all worlds.
-      options: of the rubber beyond its law, see `points.point_functions`.
+      options: of the rubber beyond its law, see `SkinModel.rubber_options`.
       precision: of directions.
 
     Attributes:
@@ -42,7 +42,7 @@ class ElementForces:
         self._elements, self._rubber, self.device = elements, rubber, elements.device
         self._nworld, self._count = len(rubber.mu), elements.nelem
         self.start, self.slot = elements.start, elements.slot
-        self._kernels = element_kernels(elements.corners, elements.law == 0, precision, options)
+        self._kernels = element_kernels(elements.corners, elements.law == 0, precision, bool(options))
         # in double precision on CUDA they are for gradients of few worlds: small blocks use more
         # multiprocessors
         self._block_dim = 64 if self.device.is_cuda and precision.name == "double" else BOUNDS[0]

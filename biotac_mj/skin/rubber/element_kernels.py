@@ -28,11 +28,11 @@ def _deep_module():
 
 @functools.cache
 def element_kernels(
-    corners: int, corotational: bool, precision: Precision, options: tuple
+    corners: int, corotational: bool, precision: Precision, extended: bool
 ) -> types.SimpleNamespace:
     """Kernels of one kind of element, law and rubber. The corotational law has kernels of its own, since the
     other laws need more registers."""
-    kind = Kind(corners, corotational, precision, options)
+    kind = Kind(corners, corotational, precision, extended)
     found = {"force": _force_kernel(kind), "product": _product_kernel(kind), **_reading_kernels(kind)}
     return types.SimpleNamespace(gradients=kind.gradients, **found)
 
@@ -85,7 +85,7 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
         for q in range(npoint):
             i = npoint * e + q
             F = X * shape[q] * mesh.inverse[e, q]
-            bad = flaw(rubber.law, F)
+            bad = flaw(rubber, F)
             if bad > 0:
                 wp.atomic_max(inverted_out, w, bad)
             R = rotation(F)

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..types import Precision, mat33, real, vec3
 from .law import (
-    LAWS,
+    Law,
     barrier_derivative,
     barrier_stress,
     dilatation,
@@ -20,7 +20,7 @@ from .law import (
     stress,
     stress_derivative,
 )
-from .points import Mesh, Rubber, deformation_of, point_functions
+from .points import Mesh, Rubber, beyond_derivative, beyond_stress, deformation_of, has_effects
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,7 +37,7 @@ class Kind(NamedTuple):
     corners: int
     corotational: bool
     precision: Precision
-    options: tuple
+    extended: bool  # by effects beyond the law, or a modulus that differs between elements
 
     @property
     def npoint(self) -> int:
@@ -55,7 +55,8 @@ class Kind(NamedTuple):
     @property
     def module(self) -> str:
         law = "corotational" if self.corotational else "laws"
-        return f"{__package__}.elements.{self.corners}_{law}_{self.precision.name}_{'_'.join(self.options)}"
+        rubber = "extended" if self.extended else "plain"
+        return f"{__package__}.elements.{self.corners}_{law}_{self.precision.name}_{rubber}"
 
     def gradients(self, precision: Precision) -> type:
         """Type of the shape functions' gradients by parent coordinates."""
@@ -70,21 +71,13 @@ class Kind(NamedTuple):
 @functools.cache
 def material_functions(kind: Kind) -> types.SimpleNamespace:
     """Stress, its derivative and dilatation at an integration point."""
-    corotational, averaged, options, is_single = (
-        kind.corotational,
-        kind.averaged,
-        kind.options,
-        kind.is_single,
-    )
+    corotational, averaged, extended = kind.corotational, kind.averaged, kind.extended
     scalar, vec, mat = kind.precision.scalar, kind.precision.vec, kind.precision.mat
     thin, wide = kind.precision.narrow, kind.precision.widen
-    polar_thin = polar_single if is_single else polar
+    polar_thin = polar_single if kind.is_single else polar
     # no step ends with an inverted element: on CUDA registers matter more than the digits of its rotation
-    polar_full = polar_upright if is_single else polar
-    beyond = [name for name in options if name != "modulus"]
-    uneven = "modulus" in options
-    at, deformation = point_functions(options), deformation_of(kind.corners)
-    beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
+    polar_full = polar_upright if kind.is_single else polar
+    deformation = deformation_of(kind.corners)
 
     @wp.func
     def rotation(F: mat33):
@@ -125,8 +118,9 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
             P = stress(rubber.law, mu, lam, F, R)
             if wp.static(averaged):
                 P += pressure * dilatation_gradient(rubber.law, F, R)
-        if wp.static(len(beyond) > 0):
-            P += beyond_stress(rubber, e, i, w, mu, lam, F, R)
+        if wp.static(extended):
+            if has_effects(rubber, w):
+                P += beyond_stress(rubber, e, i, w, mu, lam, F, R)
         return P + barrier_stress(rubber.law, mu, F)
 
     @wp.func
@@ -155,8 +149,9 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
                 + l * wp.trace(A) * R
                 + (l * (trace_s - scalar(3.0)) + scalar(pressure)) * dR
             )
-            if wp.static(len(beyond) > 0):
-                dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
+            if wp.static(extended):
+                if has_effects(rubber, w):
+                    dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
             return dP + barrier_derivative(rubber.law, m, F, dF)
         D = wide(dF)
         Q = wide(R)
@@ -164,15 +159,17 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
         total = stress_derivative(rubber.law, mu, lam, G, Q, D)
         if wp.static(averaged):
             total += pressure * dilatation_hessian(rubber.law, G, Q, D)
-        if wp.static(len(beyond) > 0):
-            total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
+        if wp.static(extended):
+            if has_effects(rubber, w):
+                total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
         return thin(total) + barrier_derivative(rubber.law, scalar(mu), F, dF)
 
     @wp.func
     def weighted_volume(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):
         """Volume of point q times the element's factor on the modulus [m^3]."""
-        if wp.static(uneven):
-            return mesh.weight[e, q] * rubber.modulus[e, w]
+        if wp.static(extended):
+            if rubber.modulus.shape[0] > 0:
+                return mesh.weight[e, q] * rubber.modulus[e, w]
         return mesh.weight[e, q]
 
     @wp.func
@@ -182,16 +179,15 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
         return lam
 
     @wp.func
-    def flaw(law: int, F: mat33):
+    def flaw(rubber: Rubber, F: mat33):
         """Defect of a point: 2 inverted, 1 flatter than the law allows, 3 both. Small strain has none."""
         found = int(0)
-        if law != wp.static(LAWS["linear"]):
+        if rubber.law != Law.LINEAR:
             volume = wp.determinant(F)
             if not (volume > real(0.0)):
                 found = 2
-            if wp.static("hysteresis" in options):
-                if law == wp.static(LAWS["neo_hookean"]) and not (volume > real(_FLAT)):
-                    found += 1
+            if rubber.branch.shape[0] > 0 and rubber.law == Law.NEO_HOOKEAN and not (volume > real(_FLAT)):
+                found += 1
         return found
 
     return types.SimpleNamespace(

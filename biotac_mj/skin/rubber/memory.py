@@ -14,7 +14,15 @@ from ..types import mat33, real, vec3
 from .friction import deviator, sticking_fraction, strain
 from .law import Law, polar
 from .material import Material
-from .points import Mesh, Rubber, deformation_of, point_functions
+from .points import (
+    Mesh,
+    Rubber,
+    deformation_of,
+    remembered,
+    remembered_derivative,
+    remembered_energy,
+    softening,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,34 +78,37 @@ def begin_points(rubber: Rubber, dt: wp.array(dtype=real)):
     rubber.past[i, w] = H
 
 
+@wp.func
+def rotation(law: int, F: mat33):
+    """Rotation of a deformation gradient, where the law uses it."""
+    if law == Law.COROTATIONAL:
+        return polar(F)
+    return mat33()
+
+
+@wp.func
+def relaxing_stress(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
+    """Second Piola stress that relaxes [Pa], at the largest energy density `worst`."""
+    R = rotation(rubber.law, F)
+    S = pull_back(rubber.law, F, remembered(rubber, e, w, mu, lam, F, R))
+    if rubber.mullins[w][0] > real(0.0):
+        W = remembered_energy(rubber, e, w, mu, lam, F, R)
+        S *= softening(rubber, e, w, W, worst)[0]
+    return S
+
+
+@wp.func
+def largest_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
+    """Largest energy density, including the present one [J/m^3]."""
+    if rubber.mullins[w][0] <= real(0.0):
+        return worst
+    return wp.max(worst, remembered_energy(rubber, e, w, mu, lam, F, rotation(rubber.law, F)))
+
+
 @functools.cache
-def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
-    module = f"{__name__}.{corners}_{'_'.join(options)}"
+def _kernels(corners: int) -> types.SimpleNamespace:
+    module = f"{__name__}.{corners}"
     deformation = deformation_of(corners)
-    at = point_functions(options)
-    has = {name: name in options for name in ("prony", "mullins", "hysteresis")}
-
-    @wp.func
-    def relaxing_stress(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
-        """Second Piola stress that relaxes [Pa], at the largest energy density `worst`."""
-        R = mat33()
-        if rubber.law == Law.COROTATIONAL:
-            R = polar(F)
-        S = pull_back(rubber.law, F, at.remembered(rubber, e, w, mu, lam, F, R))
-        if wp.static(has["mullins"]):
-            W = at.remembered_energy(rubber, e, w, mu, lam, F, R)
-            S *= at.softening(rubber, e, w, W, worst)[0]
-        return S
-
-    @wp.func
-    def largest_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
-        """Largest energy density, including the present one [J/m^3]."""
-        if wp.static(not has["mullins"]):
-            return worst
-        R = mat33()
-        if rubber.law == Law.COROTATIONAL:
-            R = polar(F)
-        return wp.max(worst, at.remembered_energy(rubber, e, w, mu, lam, F, R))
 
     @wp.kernel(module=module, enable_backward=False)
     def commit(
@@ -117,7 +128,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         F = deformation(mesh, e, q, x, w)
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
-        if wp.static(has["prony"] or has["mullins"]):
+        if rubber.last.shape[0] > 0:
             worst = largest_energy(rubber, e, w, mu, lam, F, rubber.worst[i, w])
             S = relaxing_stress(rubber, e, w, mu, lam, F, worst)
             for k in range(rubber.prony.shape[0]):
@@ -126,7 +137,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
                 rubber.overstress[k, i, w] = Q + prony_weight(term, dt[w]) * (S - rubber.last[i, w])
             rubber.last[i, w] = S
             rubber.worst[i, w] = worst
-        if wp.static(has["hysteresis"]):
+        if rubber.branch.shape[0] > 0:
             A = strain(rubber.law, F)
             for b in range(rubber.branch.shape[0]):
                 E = rubber.slip[b, i, w]
@@ -143,7 +154,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         F = deformation(mesh, e, q, x, w)
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
-        if wp.static(has["prony"] or has["mullins"]):
+        if rubber.last.shape[0] > 0:
             worst = largest_energy(rubber, e, w, mu, lam, F, real(0.0))
             rubber.worst[i, w] = worst
             rubber.last[i, w] = relaxing_stress(rubber, e, w, mu, lam, F, worst)
@@ -182,12 +193,10 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         F = deformation(mesh, e, q, x, w)
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
-        R = mat33()
-        if rubber.law == Law.COROTATIONAL:
-            R = polar(F)
-        stress_out[i, w] = at.remembered(rubber, e, w, mu, lam, F, R)
-        change_out[i, w] = at.remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])
-        energy_out[i, w] = at.remembered_energy(rubber, e, w, mu, lam, F, R)
+        R = rotation(rubber.law, F)
+        stress_out[i, w] = remembered(rubber, e, w, mu, lam, F, R)
+        change_out[i, w] = remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])
+        energy_out[i, w] = remembered_energy(rubber, e, w, mu, lam, F, R)
 
     return types.SimpleNamespace(commit=commit, forget=forget, recall=recall, point_slopes=point_slopes)
 
@@ -232,7 +241,7 @@ class RubberMemory:
     Args:
       model: SkinModel.
       rubber: constants of the worlds, to which the arrays are added.
-      options: of the rubber beyond its law, see `points.point_functions`.
+      options: of the rubber beyond its law, see `SkinModel.rubber_options`.
     """
 
     def __init__(self, model: Any, rubber: Rubber, options: tuple[str, ...]):
@@ -246,7 +255,7 @@ class RubberMemory:
             rubber.gain = wp.zeros(nworld, dtype=real)
             rubber.past = wp.zeros((self.npoint if timed else 0, nworld), dtype=mat33)
             self._all = wp.full(nworld, True, dtype=bool)
-        self._kernels = _kernels(options, model.elements.corners)
+        self._kernels = _kernels(model.elements.corners)
 
     def begin_step(self, program: Launcher, dt: wp.array, softness: wp.array) -> None:
         """Starts a step; updates the compliance scale `softness` (nworld,) of the preconditioner."""

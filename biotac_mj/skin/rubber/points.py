@@ -19,11 +19,10 @@ elastic law, stiffer and with an initial stress, so that the tangent is symmetri
 Stiffening (`stiffening`) is part of the elastic law, so that it relaxes and softens, too; friction
 (`friction`) acts in parallel.
 
-Effects that a material does not have are not compiled.
+Kernels of rubber without any effect are compiled without them; the others look in the arrays of `Rubber`.
 """
 
 import functools
-import types
 
 import warp as wp
 
@@ -89,127 +88,117 @@ def remembering(law: int, lam: real):
     return lam
 
 
-@functools.cache
-def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
-    """Functions of a point for rubber with these options beyond its law.
+@wp.func
+def has_effects(rubber: Rubber, w: int):
+    """Whether the rubber has an effect beyond its law, of all but the modulus."""
+    return rubber.last.shape[0] > 0 or rubber.branch.shape[0] > 0 or rubber.stiffening[w] != real(0.0)
 
-    Args:
-      options: of "modulus", "prony", "mullins", "hysteresis", "stiffening".
 
-    Returns:
-      beyond_stress, beyond_derivative: added to the law's stress and to its derivative.
-      remembered, remembered_derivative, remembered_energy: stress, derivative and energy density of the part
-        of the law with history.
-      softening: factor eta on a stress, and its derivative by the energy.
-    """
-    has = {name: name in options for name in ("modulus", "prony", "mullins", "hysteresis", "stiffening")}
+@wp.func
+def remembered(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
+    """Stress of the part of the law with history [Pa]."""
+    P = stress(rubber.law, mu, remembering(rubber.law, lam), F, R)
+    if rubber.stiffening[w] != real(0.0):
+        P += added_stress(rubber.law, mu, rubber.stiffening[w], F, R)
+    return P
 
-    @wp.func
-    def remembered(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
-        part = remembering(rubber.law, lam)
-        P = stress(rubber.law, mu, part, F, R)
-        if wp.static(has["stiffening"]):
-            P += added_stress(rubber.law, mu, rubber.stiffening[w], F, R)
-        return P
 
-    @wp.func
-    def remembered_derivative(
-        rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33
-    ):
-        dP = stress_derivative(rubber.law, mu, remembering(rubber.law, lam), F, R, dF)
-        if wp.static(has["stiffening"]):
-            dP += added_derivative(rubber.law, mu, rubber.stiffening[w], F, R, dF)
-        return dP
+@wp.func
+def remembered_derivative(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33):
+    """Derivative of `remembered` along dF [Pa]."""
+    dP = stress_derivative(rubber.law, mu, remembering(rubber.law, lam), F, R, dF)
+    if rubber.stiffening[w] != real(0.0):
+        dP += added_derivative(rubber.law, mu, rubber.stiffening[w], F, R, dF)
+    return dP
 
-    @wp.func
-    def remembered_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
-        W = energy_density(rubber.law, mu, remembering(rubber.law, lam), F, R)
-        if wp.static(has["stiffening"]):
-            W += added_energy(rubber.law, mu, rubber.stiffening[w], F, R)
-        if wp.static(has["modulus"]):
-            W *= rubber.modulus[e, w]
-        return W
 
-    @wp.func
-    def softening(rubber: Rubber, e: int, w: int, W: real, worst: real):
-        eta = real(1.0)
-        slope = real(0.0)
-        mullins = rubber.mullins[w]
-        if mullins[0] > real(0.0) and W < worst:
-            width = mullins[1] + mullins[2] * worst
-            s = (worst - W) / width
-            eta = real(1.0) - wp.erf(s) / mullins[0]
-            # 2 / sqrt(pi)
-            slope = real(1.1283791670955126) * wp.exp(-s * s) / (mullins[0] * width)
-            if wp.static(has["modulus"]):
-                slope *= rubber.modulus[e, w]
-        return wp.vec2d(eta, slope)
+@wp.func
+def remembered_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
+    """Energy density of the part of the law with history [J/m^3]."""
+    W = energy_density(rubber.law, mu, remembering(rubber.law, lam), F, R)
+    if rubber.stiffening[w] != real(0.0):
+        W += added_energy(rubber.law, mu, rubber.stiffening[w], F, R)
+    if rubber.modulus.shape[0] > 0:
+        W *= rubber.modulus[e, w]
+    return W
 
-    @wp.func
-    def beyond_stress(rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
-        own = stress(rubber.law, mu, remembering(rubber.law, lam), F, R)
-        factor = real(1.0)
-        if wp.static(has["prony"]):
-            factor += rubber.gain[w]
-        if wp.static(has["mullins"]):
-            W = remembered_energy(rubber, e, w, mu, lam, F, R)
-            factor *= softening(rubber, e, w, W, rubber.worst[i, w])[0]
-        P = factor * remembered(rubber, e, w, mu, lam, F, R) - own
-        if wp.static(has["prony"]):
-            H = rubber.past[i, w]
-            if rubber.law != Law.LINEAR:
-                H = F * H
-            P += H
-        if wp.static(has["hysteresis"]):
-            A = strain(rubber.law, F)
-            Q = mat33()
-            for b in range(rubber.branch.shape[0]):
-                T = deviator(A - rubber.slip[b, i, w])
-                branch = rubber.branch[b, w]
-                Q += (real(2.0) * branch[0] * mu * sticking_fraction(T, branch[1])) * T
-            P += push_forward(rubber.law, F, Q)
-        return P
 
-    @wp.func
-    def beyond_derivative(
-        rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33
-    ):
-        own = stress_derivative(rubber.law, mu, remembering(rubber.law, lam), F, R, dF)
-        dP = remembered_derivative(rubber, e, w, mu, lam, F, R, dF)
-        factor = real(1.0)
-        if wp.static(has["prony"]):
-            factor += rubber.gain[w]
-        if wp.static(has["mullins"]):
-            W = remembered_energy(rubber, e, w, mu, lam, F, R)
-            soft = softening(rubber, e, w, W, rubber.worst[i, w])
-            P = remembered(rubber, e, w, mu, lam, F, R)
-            dP = soft[0] * dP + (soft[1] * wp.ddot(P, dF)) * P
-        dP = factor * dP - own
-        if wp.static(has["prony"]):
-            if rubber.law != Law.LINEAR:  # for `linear`, H is a constant stress
-                dP += dF * rubber.past[i, w]
-        if wp.static(has["hysteresis"]):
-            A = strain(rubber.law, F)
-            dA = deviator(strain_change(rubber.law, F, dF))
-            Q = mat33()
-            dQ = mat33()
-            for b in range(rubber.branch.shape[0]):
-                T = deviator(A - rubber.slip[b, i, w])
-                branch = rubber.branch[b, w]
-                sticking = sticking_fraction(T, branch[1])
-                modulus = real(2.0) * branch[0] * mu * sticking
-                Q += modulus * T
-                dQ += modulus * dA
-                if sticking < real(1.0):
-                    dQ -= (modulus * wp.ddot(T, dA) / wp.ddot(T, T)) * T
-            dP += push_forward_change(rubber.law, F, Q, dF, dQ)
-        return dP
+@wp.func
+def softening(rubber: Rubber, e: int, w: int, W: real, worst: real):
+    """Factor eta on a stress of rubber that softens, and its derivative by the energy."""
+    eta = real(1.0)
+    slope = real(0.0)
+    mullins = rubber.mullins[w]
+    if W < worst:
+        width = mullins[1] + mullins[2] * worst
+        s = (worst - W) / width
+        eta = real(1.0) - wp.erf(s) / mullins[0]
+        # 2 / sqrt(pi)
+        slope = real(1.1283791670955126) * wp.exp(-s * s) / (mullins[0] * width)
+        if rubber.modulus.shape[0] > 0:
+            slope *= rubber.modulus[e, w]
+    return wp.vec2d(eta, slope)
 
-    return types.SimpleNamespace(
-        beyond_stress=beyond_stress,
-        beyond_derivative=beyond_derivative,
-        remembered=remembered,
-        remembered_derivative=remembered_derivative,
-        remembered_energy=remembered_energy,
-        softening=softening,
-    )
+
+@wp.func
+def beyond_stress(rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
+    """Stress that the effects add to the law's [Pa]."""
+    own = stress(rubber.law, mu, remembering(rubber.law, lam), F, R)
+    factor = real(1.0)
+    if rubber.prony.shape[0] > 0:
+        factor += rubber.gain[w]
+    if rubber.mullins[w][0] > real(0.0):
+        W = remembered_energy(rubber, e, w, mu, lam, F, R)
+        factor *= softening(rubber, e, w, W, rubber.worst[i, w])[0]
+    P = factor * remembered(rubber, e, w, mu, lam, F, R) - own
+    if rubber.prony.shape[0] > 0:
+        H = rubber.past[i, w]
+        if rubber.law != Law.LINEAR:
+            H = F * H
+        P += H
+    if rubber.branch.shape[0] > 0:
+        A = strain(rubber.law, F)
+        Q = mat33()
+        for b in range(rubber.branch.shape[0]):
+            T = deviator(A - rubber.slip[b, i, w])
+            branch = rubber.branch[b, w]
+            Q += (real(2.0) * branch[0] * mu * sticking_fraction(T, branch[1])) * T
+        P += push_forward(rubber.law, F, Q)
+    return P
+
+
+@wp.func
+def beyond_derivative(
+    rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33
+):
+    """Derivative of `beyond_stress` along dF [Pa]."""
+    own = stress_derivative(rubber.law, mu, remembering(rubber.law, lam), F, R, dF)
+    dP = remembered_derivative(rubber, e, w, mu, lam, F, R, dF)
+    factor = real(1.0)
+    if rubber.prony.shape[0] > 0:
+        factor += rubber.gain[w]
+    if rubber.mullins[w][0] > real(0.0):
+        W = remembered_energy(rubber, e, w, mu, lam, F, R)
+        soft = softening(rubber, e, w, W, rubber.worst[i, w])
+        P = remembered(rubber, e, w, mu, lam, F, R)
+        dP = soft[0] * dP + (soft[1] * wp.ddot(P, dF)) * P
+    dP = factor * dP - own
+    if rubber.prony.shape[0] > 0:
+        if rubber.law != Law.LINEAR:  # for `linear`, H is a constant stress
+            dP += dF * rubber.past[i, w]
+    if rubber.branch.shape[0] > 0:
+        A = strain(rubber.law, F)
+        dA = deviator(strain_change(rubber.law, F, dF))
+        Q = mat33()
+        dQ = mat33()
+        for b in range(rubber.branch.shape[0]):
+            T = deviator(A - rubber.slip[b, i, w])
+            branch = rubber.branch[b, w]
+            sticking = sticking_fraction(T, branch[1])
+            modulus = real(2.0) * branch[0] * mu * sticking
+            Q += modulus * T
+            dQ += modulus * dA
+            if sticking < real(1.0):
+                dQ -= (modulus * wp.ddot(T, dA) / wp.ddot(T, T)) * T
+        dP += push_forward_change(rubber.law, F, Q, dF, dQ)
+    return dP
