@@ -85,7 +85,6 @@ def test_no_face_that_meets_the_core_is_passed_over(name, share):
 def ask(
     share: real,
     c: Constants,
-    x: wp.array2d(dtype=vec3),
     geoms: Geoms,
     s: Scratch,
     may_out: wp.array(dtype=bool),
@@ -94,7 +93,7 @@ def ask(
     o = Increment()
     o.reach = real(1.0)
     o.fraction = share
-    may_out[w] = may_be_touched(w, 0, 1, o, geoms, x, c, s)
+    may_out[w] = may_be_touched(w, 0, 1, o, geoms, c, s)
 
 
 def test_faces_that_come_to_the_core_unsought_were_candidates():
@@ -106,8 +105,8 @@ def test_faces_that_come_to_the_core_unsought_were_candidates():
     way *= np.linalg.norm(last - rest, axis=2, keepdims=True) / np.linalg.norm(way, axis=2, keepdims=True)
     x = last + share / 3**0.5 * np.where(np.arange(60) < 30, 0.999, 1.001)[:, None] * way
     s, may = Scratch(), wp.zeros(60, dtype=bool, device="cpu")
-    nodes, s.sought_x = (wp.array(a, dtype=vec3, device="cpu") for a in (x, last))
-    wp.launch(ask, 60, [share, c, nodes, Geoms(), s], [may], device="cpu")
+    s.x, s.sought_x = (wp.array(a, dtype=vec3, device="cpu") for a in (x, last))
+    wp.launch(ask, 60, [share, c, Geoms(), s], [may], device="cpu")
     np.testing.assert_array_equal(may.numpy(), np.arange(60) >= 30)
     candidate, before, now = near_core(share, c, last)[0], near_core(0, c, last)[1], near_core(0, c, x)[1]
     assert (now > before).sum() > 20

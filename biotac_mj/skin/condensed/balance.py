@@ -161,7 +161,6 @@ def _take_step(
     d: Newton,
     o: Increment,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -192,7 +191,7 @@ def _take_step(
             for j in range(t, wp.where(good == 1, n, 0), threads):
                 s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
             sync()
-            pose_by_load(w, t, threads, s.solve.stepping[w].to, o.nnode, geoms, x, c, s)
+            pose_by_load(w, t, threads, s.solve.stepping[w].to, o.nnode, geoms, c, s)
             d.fresh = U
             good = 3
             d.foretold = 0
@@ -258,7 +257,6 @@ def newton_method(shapes: str) -> wp.Function:
         d: Newton,
         o: Increment,
         geoms: Geoms,
-        x: wp.array2d(dtype=vec3),
         touch: Contact,
         c: Constants,
         s: Scratch,
@@ -281,8 +279,8 @@ def newton_method(shapes: str) -> wp.Function:
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
             u = vec3(s.vector[w, d.at, 3 * k], s.vector[w, d.at, 3 * k + 1], s.vector[w, d.at, 3 * k + 2])
-            most = wp.max(most, wp.length_sq(c.rest[i, 0] + u - x[i, w]))
-            x[i, w] = c.rest[i, 0] + u
+            most = wp.max(most, wp.length_sq(c.rest[i, 0] + u - s.x[i, w]))
+            s.x[i, w] = c.rest[i, 0] + u
         d.travel = wp.where(anew == 1, real(0.0), d.travel + ROOT3 * wp.sqrt(block_max(most)))
         count = int(0)
         for begin in range(0, o.nface, threads):
@@ -297,7 +295,7 @@ def newton_method(shapes: str) -> wp.Function:
             count += rank[1]
         sync()
         several = s.bodies.compliance.shape[0] > 1
-        touch_faces(w, t, threads, count, s.look, s.close_to, geoms, x, touch, 1 - d.ends, d.travel, s.free)
+        touch_faces(w, t, threads, count, s.look, s.close_to, geoms, s.x, touch, 1 - d.ends, d.travel, s.free)
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
@@ -359,7 +357,6 @@ def newton_method(shapes: str) -> wp.Function:
         t: int,
         threads: int,
         geoms: Geoms,
-        x: wp.array2d(dtype=vec3),
         touch: Contact,
         c: Constants,
         s: Scratch,
@@ -372,10 +369,10 @@ def newton_method(shapes: str) -> wp.Function:
         while going == 1:
             sync()
             if evaluated == 1:
-                d = _take_step(w, t, threads, d, o, geoms, x, touch, c, s)
+                d = _take_step(w, t, threads, d, o, geoms, touch, c, s)
             sync()
             going = 1 - d.ends
-            d = evaluate_contact(w, t, threads, d, o, geoms, x, touch, c, s)
+            d = evaluate_contact(w, t, threads, d, o, geoms, touch, c, s)
             evaluated = 1
         if t == 0:
             s.solve.newton[w] = d

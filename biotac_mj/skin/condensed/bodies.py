@@ -43,7 +43,6 @@ def find_groups(
     threads: int,
     nnode: int,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -52,7 +51,7 @@ def find_groups(
     it."""
     groups = s.bodies.compliance.shape[0]
     for k in range(t, wp.where(groups > 0, nnode, 0), threads):
-        s.arm[w, k] = x[c.node[s.node[w, k]], w]
+        s.arm[w, k] = s.x[c.node[s.node[w, k]], w]
         s.group[w, k] = 0
         if groups > 1:
             s.group[w, k] = _group_of(w, s.node[w, k], geoms, touch, c)
@@ -174,7 +173,6 @@ def pose_by_load(
     load_factor: real,
     nnode: int,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
@@ -185,7 +183,7 @@ def pose_by_load(
     if groups == 0:
         return real(0.0)
     for k in range(t, nnode, threads):
-        s.arm[w, k] = x[c.node[s.node[w, k]], w]
+        s.arm[w, k] = s.x[c.node[s.node[w, k]], w]
     sync()
     _list_loads(w, t, threads, F, nnode, s)
     for h in range(t, groups, threads):
@@ -203,16 +201,7 @@ def pose_by_load(
 
 
 @wp.func
-def sum_forces(
-    w: int,
-    t: int,
-    threads: int,
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    touch: Contact,
-    c: Constants,
-    s: Scratch,
-):
+def sum_forces(w: int, t: int, threads: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
     """Makes the wrenches `posed` those of the forces on all outer nodes that a solve begins with."""
     b = s.bodies
     groups = b.compliance.shape[0]
@@ -220,14 +209,14 @@ def sum_forces(
         mine = int(-1)
         if wp.length_sq(s.force[w, i]) > real(0.0):
             mine = wp.where(groups > 1, _group_of(w, i, geoms, touch, c), 0)
-        s.place[w, i] = mine  # which has no other use before the candidates are known
+        s.look[w, i] = mine  # which has no other use before faces are sought
     for h in range(groups):
         force = vec3()
         torque = vec3()
         for i in range(t, c.node.shape[0], threads):  # as above: each thread reads what it wrote
-            if s.place[w, i] == h:
+            if s.look[w, i] == h:
                 force += s.force[w, i]
-                torque += wp.cross(x[c.node[i], w], s.force[w, i])
+                torque += wp.cross(s.x[c.node[i], w], s.force[w, i])
         force = block_sum(force)
         torque = block_sum(torque)
         if t == 0:

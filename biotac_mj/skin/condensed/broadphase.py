@@ -107,15 +107,14 @@ def forget_faces(
     t: int,
     threads: int,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     kept: wp.array2d(dtype=int),
     c: Constants,
     s: Scratch,
     touching: wp.array2d(dtype=int),
 ):
     """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
-    for i in range(t, x.shape[0], threads):
-        s.sought_x[i, w] = x[i, w]
+    for i in range(t, s.x.shape[0], threads):
+        s.sought_x[i, w] = s.x[i, w]
     for g in range(t, geoms.count, threads):
         s.sought_pos[g, w] = geoms.pos[g, w]
         s.sought_mat[g, w] = geoms.mat[g, w]
@@ -152,13 +151,12 @@ def _seen_from(
     view: int,
     travel: real,
     near: wp.int64,
-    x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
     """The near geoms that may be within reach [m] of a face, by a view and the face's displacement."""
     room = _SEEN - reach - ROOT3 * travel
-    if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, x, c):
+    if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, s.x, c):
         return near & s.seen[w, view, f]
     return near
 
@@ -235,7 +233,6 @@ def find_faces(
     moved: real,
     near: wp.int64,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
@@ -257,7 +254,7 @@ def find_faces(
             left = wp.where(s.near[w, f] > 0 or s.far[w, view, f] < most, 1, 0)
             if left == 1 and s.near[w, f] == 0:
                 room = s.far[w, view, f] - free  # by which it has to move
-                if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, x, c):
+                if room > real(0.0) and room * room > ROOT3 * ROOT3 * _moved(f, w, c.face, s.x, c):
                     left = 0
         rank = block_rank(left)
         if left == 1:
@@ -274,8 +271,8 @@ def find_faces(
             f = s.look[w, begin + t]
             near_by = wp.where(s.near[w, f] > 0, wp.max(reach, real(0.0)), reach)
             face = c.face[f]
-            center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-            within = _seen_from(f, w, near_by, view, travel, near, x, c, s)
+            center, radius = face_ball(s.x[face[0], w], s.x[face[1], w], s.x[face[2], w])
+            within = _seen_from(f, w, near_by, view, travel, near, c, s)
             left, within = geoms_within(center, radius + near_by, w, geoms, within)
             if s.near[w, f] > 0:
                 left = 0
@@ -294,9 +291,9 @@ def find_faces(
         if s.near[w, f] == 0:
             face = c.face[f]
             b = c.sample[m % nsample]
-            x0 = x[face[0], w]
-            x1 = x[face[1], w]
-            x2 = x[face[2], w]
+            x0 = s.x[face[0], w]
+            x1 = s.x[face[1], w]
+            x2 = s.x[face[2], w]
             p = b[0] * x0 + b[1] * x1 + b[2] * x2
             if sample_within(p, reach, face_radius(x1 - x0, x2 - x0), w, geoms, s.close_to[w, f]):
                 s.near[w, f] = 1
@@ -309,16 +306,7 @@ def find_faces(
 
 
 @wp.func
-def find_slack(
-    w: int,
-    t: int,
-    threads: int,
-    o: Increment,
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-    s: Scratch,
-):
+def find_slack(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """Finds how far each group of geoms can go without touching the skin [m], its turns times LEVER."""
     for group in range(t, s.slack.shape[0], threads):
         s.slack[group, w] = wp.where(o.ok == 1, _REGION, real(0.0))
@@ -332,15 +320,16 @@ def find_slack(
     others = o.near & ~close
     moved = _REGION + ROOT3 * _moved_since(w, o.view, o.near, geoms, c, s)
     for f in range(t, c.face.shape[0], threads):
-        moves = ROOT3 * wp.sqrt(_moved(f, w, c.face, x, c)) + moved
-        within = others
-        if moves < s.far[w, o.view, f]:
-            within = wp.int64(0)
-        elif moves < _SEEN:
-            within = others & s.seen[w, o.view, f]
+        within = wp.int64(0)
+        if ROOT3 * o.largest + moved >= s.far[w, o.view, f]:
+            moves = ROOT3 * wp.sqrt(_moved(f, w, c.face, s.x, c)) + moved
+            if moves >= s.far[w, o.view, f]:
+                within = others
+                if moves < _SEEN:
+                    within = others & s.seen[w, o.view, f]
         if within != wp.int64(0):
             face = c.face[f]
-            center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+            center, radius = face_ball(s.x[face[0], w], s.x[face[1], w], s.x[face[2], w])
             for g in range(geoms.count):
                 if has(within, g):
                     y = place_on(geoms, g, w, center)
@@ -353,22 +342,13 @@ def find_slack(
 
 
 @wp.func
-def may_be_touched(
-    w: int,
-    t: int,
-    threads: int,
-    o: Increment,
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-    s: Scratch,
-):
+def may_be_touched(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """Whether a face that was no candidate when they were sought may have come to a geom since, or an inner
     one to the core, by how far nodes and near geoms have moved at most."""
     nodes = real(0.0)
     for k in range(t, c.node.shape[0], threads):
         i = c.node[k]
-        nodes = wp.max(nodes, wp.length_sq(x[i, w] - s.sought_x[i, w]))
+        nodes = wp.max(nodes, wp.length_sq(s.x[i, w] - s.sought_x[i, w]))
     posed = real(0.0)
     for g in range(geoms.count):
         if has(o.near, g):
@@ -381,7 +361,7 @@ def may_be_touched(
     over = real(0.0)
     for k in range(t, c.inner.shape[0], threads):
         i = c.inner[k]
-        went = wp.length_sq(x[i, w] - s.sought_x[i, w])
+        went = wp.length_sq(s.x[i, w] - s.sought_x[i, w])
         before = wp.length_sq(s.sought_x[i, w] - c.rest[i, 0])
         over = wp.max(over, ROOT3 * ROOT3 * went - o.fraction * o.fraction * before)
     return block_max(over) > real(0.0)
@@ -394,7 +374,6 @@ def is_known(
     threads: int,
     o: Increment,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     kept: wp.array2d(dtype=int),
     c: Constants,
     s: Scratch,
@@ -409,19 +388,11 @@ def is_known(
             other = real(1.0)
     if block_max(other) > real(0.0):
         return 0
-    return wp.where(may_be_touched(w, t, threads, o, geoms, x, c, s), 0, 1)
+    return wp.where(may_be_touched(w, t, threads, o, geoms, c, s), 0, 1)
 
 
 @wp.func
-def find_inner_faces(
-    w: int,
-    t: int,
-    threads: int,
-    fraction: real,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-    s: Scratch,
-):
+def find_inner_faces(w: int, t: int, threads: int, fraction: real, c: Constants, s: Scratch):
     """Adds the inner faces that are nearer to the core than a fraction of their displacement; how many there
     are, and how many are new. Beyond capacity none is listed."""
     nsample = c.sample.shape[0]
@@ -431,7 +402,7 @@ def find_inner_faces(
         f = begin + t
         left = int(0)
         if f < c.inner_face.shape[0]:
-            if s.near_core[w, f] == 0 and _may_meet_core(f, w, fraction, x, c):
+            if s.near_core[w, f] == 0 and _may_meet_core(f, w, fraction, s.x, c):
                 left = 1
         rank = block_rank(left)
         if left == 1:
@@ -440,7 +411,7 @@ def find_inner_faces(
     sync()
     for m in range(t, inside * nsample, threads):
         f = s.look[w, m / nsample]
-        if s.near_core[w, f] == 0 and _meets_core(f, m % nsample, w, fraction, x, c):
+        if s.near_core[w, f] == 0 and _meets_core(f, m % nsample, w, fraction, s.x, c):
             s.near_core[w, f] = 1
     sync()
     for k in range(t, inside, threads):
@@ -487,31 +458,21 @@ def find_nodes(w: int, t: int, threads: int, nface: int, ncore: int, c: Constant
 
 
 @wp.func
-def measure_core(
-    w: int,
-    t: int,
-    threads: int,
-    nnode: int,
-    nin: int,
-    ncore: int,
-    x: wp.array2d(dtype=vec3),
-    c: Constants,
-    s: Scratch,
-):
+def measure_core(w: int, t: int, threads: int, nnode: int, nin: int, ncore: int, c: Constants, s: Scratch):
     """Gaps of the candidates' samples from the core, where the skin is now."""
     k = int(0)
     if ncore > 0:  # else there may be no core
         k = c.core.grid[0]
     for j in range(t, nin, threads):
         i = c.inner[s.core_node[w, j]]
-        s.vector[w, BACK, 3 * nnode + j] = wp.dot(x[i, w] - c.rest[i, 0], c.away[s.core_node[w, j]])
+        s.vector[w, BACK, 3 * nnode + j] = wp.dot(s.x[i, w] - c.rest[i, 0], c.away[s.core_node[w, j]])
     for j in range(t, ncore * c.sample.shape[0], threads):
         at = j / c.sample.shape[0]
         i = j % c.sample.shape[0]
         f = s.core_face[w, at]
         face = c.inner_face[f]
         b = c.sample[i]
-        p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
+        p = b[0] * s.x[face[0], w] + b[1] * s.x[face[1], w] + b[2] * s.x[face[2], w]
         s.gap[w, at, i] = smooth_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i]
     sync()
 

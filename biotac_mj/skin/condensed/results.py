@@ -29,13 +29,13 @@ def place_nodes(
     count: int,
     pressure: real,
     l: Linear,
-    x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
     """Puts all nodes where count listed loads and a pressure above that at rest [Pa] bring them; what that
-    adds to the cavity's volume, and its linear part [m^3]."""
+    adds to the cavity's volume, and its linear part [m^3]; the largest displacement [m]."""
     linear = real(0.0)
+    largest = real(0.0)
     swollen = l.swell * pressure
     if threads == 1:
         sum_rows(c.row, c.largest, w, 3 * c.free.shape[0], count, s.loaded, s.load, s.sum)
@@ -47,14 +47,15 @@ def place_nodes(
             u = dot_columns(c.row, c.largest, 3 * i, w, count, s.loaded, s.load)
         v = c.free[i]
         d = l.scale * vec3(u) + swollen * c.give[i]
-        x[v, w] = c.rest[v, 0] + d
+        s.x[v, w] = c.rest[v, 0] + d
+        largest = wp.max(largest, wp.length_sq(d))
         linear += wp.dot(c.gradient[i], d)
     linear = block_sum(linear)
     volume = real(0.0)
     for f in range(t, c.wet.shape[0], threads):
         face = c.wet[f]
-        volume -= wp.dot(x[face[0], w], wp.cross(x[face[1], w], x[face[2], w])) / real(6.0)
-    return block_sum(volume) - c.cavity, linear
+        volume -= wp.dot(s.x[face[0], w], wp.cross(s.x[face[1], w], s.x[face[2], w])) / real(6.0)
+    return block_sum(volume) - c.cavity, linear, wp.sqrt(block_max(largest))
 
 
 @wp.func
@@ -65,7 +66,6 @@ def correct(
     nnode: int,
     pressure: real,
     modulus: real,
-    x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
@@ -96,8 +96,8 @@ def correct(
             if weight > real(0.0):
                 i = c.node[s.node[w, k]]
                 j = c.opposite[s.node[w, k]]
-                depth = wp.max(depth, wp.length(x[i, w] - c.rest[i, 0]))
-                thin = real(1.0) - wp.length(x[i, w] - x[j, w]) / wp.length(c.rest[i, 0] - c.rest[j, 0])
+                depth = wp.max(depth, wp.length(s.x[i, w] - c.rest[i, 0]))
+                thin = real(1.0) - wp.length(s.x[i, w] - s.x[j, w]) / wp.length(c.rest[i, 0] - c.rest[j, 0])
                 sums += weight / total * vec3(wp.length_sq(c.rest[i, 0] - mean), thin, real(0.0))
         sums = block_sum(sums)
         spread = sums[0]
@@ -125,7 +125,6 @@ def find_wrenches(
     nface: int,
     nnode: int,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -159,13 +158,13 @@ def find_wrenches(
                 # what pushes elsewhere than at a sample, at an edge of a geom, has another torque
                 other = vec3()
                 for a in range(3):
-                    other += wp.cross(x[face[a], w], touch.corner[3 * f + a, w])
+                    other += wp.cross(s.x[face[a], w], touch.corner[3 * f + a, w])
                 mine = int(-1)
                 for i in range(nsample):
                     g = touch.trial_geom[f * nsample + i, w]
                     if g >= 0:
                         b = c.sample[i]
-                        p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
+                        p = b[0] * s.x[face[0], w] + b[1] * s.x[face[1], w] + b[2] * s.x[face[2], w]
                         moment = wp.cross(p, touch.sample_force[f * nsample + i, w])
                         other -= moment
                         mine = geoms.group[g]
@@ -181,7 +180,7 @@ def find_wrenches(
                 for a in range(3):
                     rest[a] = s.vector[w, F, 3 * k + a] - s.vector[w, G, 3 * k + a]
                 force += fraction * rest
-                torque += fraction * wp.cross(x[c.node[s.node[w, k]], w], rest)
+                torque += fraction * wp.cross(s.x[c.node[s.node[w, k]], w], rest)
         force = block_sum(force)
         torque = block_sum(torque)
         if t == 0:
@@ -221,7 +220,6 @@ def find_tangents(
     nin: int,
     l: Linear,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -255,7 +253,7 @@ def find_tangents(
             fill_contact(w, t, threads, outer, inner, nnode, nin, wide, 1.0, 1, l, c, s)
             for k in range(t, outer, threads):
                 D = s.vector[w, DU, k] * widen(s.block[w, k, 0])
-                turned = -D * wp.skew(x[c.node[s.node[w, s.touched[w, k]]], w])
+                turned = -D * wp.skew(s.x[c.node[s.node[w, s.touched[w, k]]], w])
                 for a in range(3):
                     begin = (3 * k + a) * wide + equations
                     for b in range(3):
@@ -274,7 +272,7 @@ def find_tangents(
                 right = vec3()
                 for k in range(t, outer, threads):
                     fraction = s.vector[w, DU, k]
-                    at = x[c.node[s.node[w, s.touched[w, k]]], w]
+                    at = s.x[c.node[s.node[w, s.touched[w, k]]], w]
                     v = vec3()
                     for b in range(3):
                         v[b] = real(s.matrix[w, (3 * k + b) * wide + equations + a])
@@ -299,7 +297,6 @@ def conclude(
     geoms: Geoms,
     c: Constants,
     wanted: wp.array(dtype=int),
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     s: Scratch,
     # Out:
@@ -313,10 +310,10 @@ def conclude(
         return
     threads = wp.block_dim()
     o = s.solve.increment[w]
-    find_wrenches(w, t, threads, o.nface, o.nnode, geoms, x, touch, c, s, touched_by_out, wrench_out)
+    find_wrenches(w, t, threads, o.nface, o.nnode, geoms, touch, c, s, touched_by_out, wrench_out)
     if tangent_out.shape[0] > 0:
         find_tangents(
-            w, t, threads, o.nnode, o.nin, o.linear, geoms, x, touch, c, s, touched_by_out, tangent_out
+            w, t, threads, o.nnode, o.nin, o.linear, geoms, touch, c, s, touched_by_out, tangent_out
         )
 
 
@@ -329,7 +326,6 @@ def recall(
     r: Remembered,
     # Out:
     s: Scratch,
-    x_out: wp.array2d(dtype=vec3),
 ):
     """Nodes under the remembered forces; equal to the last digit to `place_nodes`, by one thread."""
     w = wp.tid()
@@ -351,4 +347,4 @@ def recall(
     l = Linear()
     l.scale = r.solved[w][0] / modulus
     l.swell = r.solved[w][1] / modulus
-    place_nodes(w, 0, 1, count, r.pressure[w], l, x_out, c, s)
+    place_nodes(w, 0, 1, count, r.pressure[w], l, c, s)

@@ -40,7 +40,6 @@ def whole_step(shapes: str) -> wp.Kernel:
         rest_pressure: wp.array(dtype=real),
         c: Constants,
         # In and out:
-        x: wp.array2d(dtype=vec3),
         touch: Contact,
         s: Scratch,
         r: Remembered,
@@ -53,12 +52,12 @@ def whole_step(shapes: str) -> wp.Kernel:
         begin_step(w, 0, 1, law, geoms, s, st)
         while s.solve.phase[w] != DONE:
             if s.solve.phase[w] == SEARCH:
-                search(w, 0, 1, geoms, x, touch, c, s, r, st)
+                search(w, 0, 1, geoms, touch, c, s, r, st)
             if s.solve.phase[w] == NEWTON:
-                balance(w, 0, 1, geoms, x, touch, c, s)
+                balance(w, 0, 1, geoms, touch, c, s)
             if s.solve.phase[w] == BALANCED:
                 conclude_balance(
-                    w, 0, 1, geoms, rest_pressure, x, touch, c, s, r, st, node_force_out, tier_out
+                    w, 0, 1, geoms, rest_pressure, touch, c, s, r, st, node_force_out, tier_out
                 )  # fmt: skip
 
     return step
@@ -82,7 +81,6 @@ def _search(
     # In:
     geoms: Geoms,
     c: Constants,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     r: Remembered,
     st: Worlds,
@@ -91,7 +89,7 @@ def _search(
 ):
     w, t = wp.tid()
     if s.solve.phase[w] == SEARCH:
-        search(w, t, wp.block_dim(), geoms, x, touch, c, s, r, st)
+        search(w, t, wp.block_dim(), geoms, touch, c, s, r, st)
 
 
 @functools.cache
@@ -103,14 +101,13 @@ def _balance(shapes):
         # In:
         geoms: Geoms,
         c: Constants,
-        x: wp.array2d(dtype=vec3),
         touch: Contact,
         # Out:
         s: Scratch,
     ):
         w, t = wp.tid()
         if s.solve.phase[w] == NEWTON:
-            balance(w, t, wp.block_dim(), geoms, x, touch, c, s)
+            balance(w, t, wp.block_dim(), geoms, touch, c, s)
 
     return _balance
 
@@ -122,7 +119,6 @@ def _conclude(
     rest_pressure: wp.array(dtype=real),
     c: Constants,
     # In and out:
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     s: Scratch,
     r: Remembered,
@@ -136,7 +132,7 @@ def _conclude(
     w, t = wp.tid()
     if s.solve.phase[w] == BALANCED:
         conclude_balance(
-            w, t, wp.block_dim(), geoms, rest_pressure, x, touch, c, s, r, st, node_force_out, tier_out
+            w, t, wp.block_dim(), geoms, rest_pressure, touch, c, s, r, st, node_force_out, tier_out
         )  # fmt: skip
     if t == 0 and s.solve.phase[w] != DONE:
         going_out[0] = 1

@@ -61,6 +61,7 @@ class Increment:
     near: wp.int64
     reach: real  # faces closer than this are candidates when the increment begins [m]
     fraction: real  # inner faces closer to the core than this times their displacement are
+    largest: real  # displacement of a node [m]
     spent: real
     error: real
     pressure: real

@@ -93,7 +93,7 @@ class CondensedStep:
             allocate("condensed", self.remembered, sizes, tier=CONDENSED)
             allocate("step", self, sizes)
             room = room or Room.of_worlds(nworld)
-            self._scratch = _scratch(model, linear, nworld, geoms.count, room, groups)
+            self._scratch = _scratch(model, linear, data, geoms.count, room, groups)
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
         self.most, self.spent = self._scratch.most, self._scratch.spent
         self.bodies, self.previous = self._scratch.bodies, self._scratch.previous
@@ -133,7 +133,7 @@ class CondensedStep:
             whole_step(geoms.shapes),
             [n],
             [m.law, geoms.struct, d.rest_pressure, c],
-            [d.x, self.touch, s, self.remembered, d.worlds] + [d.outer.node_force, self.tier],
+            [self.touch, s, self.remembered, d.worlds, d.outer.node_force, self.tier],
         )
 
     def go_on(self, going: wp.array, launcher: Launcher | None = None) -> None:
@@ -141,7 +141,7 @@ class CondensedStep:
         if a world has not finished."""
         m, d, k = self._model, self._data, self._phases
         launcher = launcher or Launcher(m.device)
-        known = [self._geoms.struct, self._constants, d.x, self.touch]
+        known = [self._geoms.struct, self._constants, self.touch]
         of_world = [self.remembered, d.worlds]
         out = [self._scratch, *of_world, d.outer.node_force, self.tier, going]
         for kernel, inputs, outputs in (
@@ -157,7 +157,7 @@ class CondensedStep:
         _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
         launcher = launcher or Launcher(m.device)
-        known = [geoms.struct, self._constants, d.worlds.wanted, d.x, self.touch, self._scratch]
+        known = [geoms.struct, self._constants, d.worlds.wanted, self.touch, self._scratch]
         found = [touched_by, wrench, tangent]
         launcher.launch_blocks(conclude, [d.nworld], known, found, block_dim=self._block)
 
@@ -165,7 +165,7 @@ class CondensedStep:
         """Computes positions of the nodes from `remembered`, on the CPU."""
         d = self._data
         known = [self._model.law, self._constants, d.worlds, self.remembered]
-        launcher.launch(recall, d.nworld, known, [self._scratch, d.x])
+        launcher.launch(recall, d.nworld, known, [self._scratch])
 
     @property
     def holders(self) -> dict:
@@ -173,8 +173,9 @@ class CondensedStep:
         return {"condensed": self.remembered, "step": self}
 
 
-def _scratch(model, linear, nworld, ngeom, room, groups):
-    s = Scratch()
+def _scratch(model, linear, data, ngeom, room, groups):
+    s, nworld = Scratch(), data.nworld
+    s.x = data.x
     nface, nouter, ninner = len(model.outer.face_np), len(linear.node), len(linear.inner)
     ncore = len(model.core_surface.face_np) if model.has_core else 0
     touched, core_faces = min(room.touched, nouter + ninner), min(room.core_faces, ncore)

@@ -138,6 +138,8 @@ def _next_increment(last: Increment):
     o = Increment()
     o.nface = last.nface
     o.ncore = last.ncore
+    o.nnode = last.nnode
+    o.nin = last.nin
     o.near = last.near
     o.reach = last.reach
     o.fraction = last.fraction
@@ -232,7 +234,6 @@ def search(
     t: int,
     threads: int,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -255,7 +256,7 @@ def search(
             o = _begin_at(w, t, threads, o, at.balance, at.pos, at.mat, p.modulus, c, s, st)
         else:
             o = _begin_at(w, t, threads, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
-        sum_forces(w, t, threads, geoms, x, touch, c, s)
+        sum_forces(w, t, threads, geoms, touch, c, s)
         if p.at == real(0.0):  # where the step begins
             for h in range(t, s.bodies.begun.shape[0], threads):
                 s.bodies.begun[h, w] = s.bodies.posed[h, w]
@@ -269,18 +270,18 @@ def search(
             o.deep = 1
             looking = 0
         elif near & o.near == near:
-            known = is_known(w, t, threads, o, geoms, x, touch.kept, c, s)
+            known = is_known(w, t, threads, o, geoms, touch.kept, c, s)
         o.view = view
         o.travel = travel
         o.near = near
         if known == 0:
-            forget_faces(w, t, threads, geoms, x, touch.kept, c, s, touch.touching)
+            forget_faces(w, t, threads, geoms, touch.kept, c, s, touch.touching)
             o.reach = _REACH + moved
             if p.holds == 1 or looking == 0:  # what touched
                 o.reach = real(-1.0)
             o.nface = 0
     if looking == 1 and known == 0:
-        largest = largest_displacement(w, t, threads, x, c)
+        largest = largest_displacement(w, t, threads, s.x, c)
         reach = real(0.0)
         fraction = real(0.0)
         if first == 1:
@@ -291,15 +292,15 @@ def search(
             fraction = o.fraction
         else:
             o.reach = real(-1.0)  # which nodes have left
-        nface, new = find_faces(w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, x, c, s)
-        ncore, inner = find_inner_faces(w, t, threads, fraction, x, c, s)
+        nface, new = find_faces(w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, c, s)
+        ncore, inner = find_inner_faces(w, t, threads, fraction, c, s)
         new += inner
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
         else:
             o.nface = nface
             o.ncore = ncore
-    if looking == 1:
+    if looking == 1 and known == 0:
         nnode, nin = find_nodes(w, t, threads, o.nface, o.ncore, c, s)
         o.nnode = nnode
         o.nin = nin
@@ -313,8 +314,8 @@ def search(
             looking = 0
             o.ok = 0
     if looking == 1:
-        measure_core(w, t, threads, o.nnode, o.nin, o.ncore, x, c, s)
-        find_groups(w, t, threads, o.nnode, geoms, x, touch, c, s)
+        measure_core(w, t, threads, o.nnode, o.nin, o.ncore, c, s)
+        find_groups(w, t, threads, o.nnode, geoms, touch, c, s)
         _load(w, t, threads, o.nnode, o.nin, s)
         foretold = int(0)
         before = o.linear
@@ -371,7 +372,6 @@ def _commit(
     threads: int,
     found: Increment,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -385,8 +385,8 @@ def _commit(
         _remember(w, t, threads, found, geoms, c, s, s.previous.balance, s.previous.pos, s.previous.mat)
     for f in range(t, c.face.shape[0], threads):
         commit_face(f, w, touch)
-    for i in range(t, x.shape[0], threads):
-        touch.x_last[i, w] = x[i, w]
+    for i in range(t, s.x.shape[0], threads):
+        touch.x_last[i, w] = s.x[i, w]
     if t == 0:
         st.pressure[w] = found.pressure + rest_pressure
         st.last_pressure[w] = st.pressure[w]
@@ -401,7 +401,6 @@ def _conclude_pass(
     p: LoadStepping,
     o: Increment,
     geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -433,8 +432,9 @@ def _conclude_pass(
     if count == 0:  # nothing touches any more
         o.bulge = real(0.0)
     o.pressure = -l.bulk_stiffness * (l.scale * own + o.bulge)
-    volume, part = place_nodes(w, t, threads, count, o.pressure, l, x, c, s)
-    after, squeezed, spread = correct(w, t, threads, o.nnode, o.pressure, p.modulus, x, c, s)
+    volume, part, largest = place_nodes(w, t, threads, count, o.pressure, l, c, s)
+    o.largest = largest
+    after, squeezed, spread = correct(w, t, threads, o.nnode, o.pressure, p.modulus, c, s)
     o.after = after
     o.measured = wp.where(_is_measured(squeezed, spread, c.squeezed, c.narrow), 1, -1)
     if count == 0:
@@ -444,7 +444,7 @@ def _conclude_pass(
         s.held_mat[g, w] = geoms.mat[g, w]
     sync()
     done = int(1)
-    if pose_by_load(w, t, threads, p.to, o.nnode, geoms, x, c, s) >= _STANDS:
+    if pose_by_load(w, t, threads, p.to, o.nnode, geoms, c, s) >= _STANDS:
         done = 0
     if wp.abs(after[0] - o.solved[0]) >= _SETTLED:
         done = 0
@@ -465,7 +465,7 @@ def _conclude_pass(
         return o, NEWTON
     _store(w, t, threads, o.nnode, c, s)
     if o.ok != CUT:
-        if may_be_touched(w, t, threads, o, geoms, x, c, s):
+        if may_be_touched(w, t, threads, o, geoms, c, s):
             return o, SEARCH
     return o, BALANCED
 
@@ -510,7 +510,6 @@ def conclude_balance(
     threads: int,
     geoms: Geoms,
     rest_pressure: wp.array(dtype=real),
-    x: wp.array2d(dtype=vec3),
     touch: Contact,
     c: Constants,
     s: Scratch,
@@ -525,7 +524,7 @@ def conclude_balance(
     sync()
     phase = BALANCED
     if o.solving == 1:
-        o, phase = _conclude_pass(w, t, threads, p, o, geoms, x, touch, c, s, st)
+        o, phase = _conclude_pass(w, t, threads, p, o, geoms, touch, c, s, st)
     if phase != BALANCED:
         if t == 0:
             s.solve.increment[w] = o
@@ -534,10 +533,10 @@ def conclude_balance(
     if p.holds == 0 and o.ok != 0:
         if t == 0:
             tier[w] = o.measured
-        _commit(w, t, threads, o, geoms, x, touch, c, s, r, st, rest_pressure[w])
+        _commit(w, t, threads, o, geoms, touch, c, s, r, st, rest_pressure[w])
     else:
-        for i in range(t, x.shape[0], threads):
-            x[i, w] = touch.x_last[i, w]
+        for i in range(t, s.x.shape[0], threads):
+            s.x[i, w] = touch.x_last[i, w]
         sync()
     p, on = _go_on(s.most[w], p, o)
     if on == 1:
@@ -547,7 +546,7 @@ def conclude_balance(
             s.solve.phase[w] = SEARCH
         return
     if s.slack.shape[0] > 0:
-        find_slack(w, t, threads, o, geoms, x, c, s)
+        find_slack(w, t, threads, o, geoms, c, s)
         sync()
     for i in range(t, c.node.shape[0], threads):
         node_force[c.node[i], w] = r.force[i, w]

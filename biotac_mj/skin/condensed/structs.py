@@ -99,6 +99,7 @@ class Scratch:
     """Scratch arrays of a solve [world, item]: candidates, nodes and faces that may touch, and their
     results."""
 
+    x: wp.array2d(dtype=vec3)  # nodes, those of the state [node, world] [m]
     near: wp.array2d(dtype=int)  # which faces are candidates, by their place among them plus one; 0: none
     near_core: wp.array2d(dtype=int)  # which inner ones
     free: wp.array2d(dtype=real)  # `Newton.travel` until which a candidate face touches nothing [m]
