@@ -70,11 +70,12 @@ def _record(report, seconds):
         "verdict": report.verdict,
         "named": [[e.id, *e.ties] for e in report.effects],
         "confidence": [e.confidence for e in report.effects],
+        "suspected": [[e.id, e.confidence] for e in report.not_named if e.confirmed],
         "closed": report.closed,
         "decided": beliefs.decided,
         "explanations": [[one.ids, one.weight] for one in beliefs.explanations],
         "tried": [
-            [{key: one[key] for key in ("id", "gain", "p", "refused", "ties")} for one in step]
+            [{key: one[key] for key in ("id", "gain", "overlap", "p", "refused", "ties")} for one in step]
             for step in report.trace["rounds"]
         ],
         "contacts": len(report.selection) + len(report.locked),

@@ -2,6 +2,7 @@
 adds up."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -123,6 +124,18 @@ def test_a_plan_looks_for_effects_that_no_contact_has_shown():
     assert [one.ids for one in beliefs.unseen] == [["lowpass", "friction"]]
     plan = planned(beliefs, Springs(), BOUNDS, 4, 24, progress=False)
     assert any(one.contact.slide for one in plan.contacts)
+
+
+def test_a_plan_tells_whether_a_suspected_effect_is_there(first):
+    """It contradicts nothing that has a name, and is a question all the same."""
+    _, some, report = first
+    found, *_ = report.beliefs.explanations
+    later = some[1], some[1].default() | {"delay": 0.02}
+    both = dataclasses.replace(found, effects=[*found.effects, later], weight=0.3, information=None)
+    both = dataclasses.replace(both, information=np.eye(len(list(both.moves()))))
+    beliefs = dataclasses.replace(report.beliefs, explanations=[found, both], unseen=[])
+    plan = planned(beliefs, Springs(), BOUNDS, 2, 12, progress=False)
+    assert plan.nats[found.name, both.name] > 0
 
 
 def test_a_contact_that_shows_what_no_data_show_is_chosen():

@@ -17,7 +17,7 @@ from .whitening import Comparison
 _PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
 _BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
 _REPEATS = 2  # of a contact: where the true law has another form, repeats give less than expected
-_LIKELY = 0.01  # probability from which on explanations that cannot be distinguished are reported
+_LIKELY = 0.01  # probability from which on explanations are distinguished
 _NOTHING = 1e-3  # [nats] below which a further contact is useless
 
 
@@ -165,13 +165,14 @@ def planned(
     for k, (contact, at, mat) in enumerate(some):
         trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}", n))
         clock += float(trajectories[-1].time[-1]) + _BETWEEN
-    used = {name for one in beliefs.rivals for _, theta in one.effects for name in theta}
+    # one that has a further effect is a question as much as one that contradicts the likeliest
+    first, *others = beliefs.explanations
+    asked = [first, *(one for one in others if one.weight > _LIKELY)]
+    used = {name for one in asked for _, theta in one.effects for name in theta}
     spots = sorted(name for name in used if name.startswith(SPOT))
     fields = quick.fields(trajectories, progress, spots)
-    able = [one for one in beliefs.rivals if _solved(one, fields)]
-    unseen = [
-        one for one in beliefs.unseen if able[:1] == beliefs.rivals[:1] and _shows(one, trajectories, fields)
-    ]
+    able = [one for one in asked if _solved(one, fields)]
+    unseen = [one for one in beliefs.unseen if able[:1] == [first] and _shows(one, trajectories, fields)]
     runs = [
         quick.run(trajectories, fields, False, [*quick.effects, *one.effects], nuisance=one.nuisance)
         for one in able

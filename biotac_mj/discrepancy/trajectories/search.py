@@ -48,6 +48,7 @@ class Candidate:
         return {
             "id": self.effect.id,
             "gain": self.gain,
+            "overlap": self.fit.overlap,
             "p": self.p,
             "refused": self.refused,
             "ties": self.ties,
