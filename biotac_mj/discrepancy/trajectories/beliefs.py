@@ -27,7 +27,7 @@ _MOST = 6  # explanations, the likeliest ones, and the base model alone
 # as this part of one would if nothing were left out; over their number it is the power of the likelihood (a
 # coarsened posterior, Miller and Dunson 2019). By greatest likelihood from 299 names in 227 laboratories
 # whose laws are not the catalogue's.
-_CONTACTS = 0.9
+_CONTACTS = 0.8
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
 
 
