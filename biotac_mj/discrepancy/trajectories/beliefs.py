@@ -279,7 +279,8 @@ def believed(comparison: Comparison, search: Search, contacts: int) -> Beliefs:
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     unseen, hidden = _unseen(out, search), {effect.id for effect in search.hidden}
     beside = sum(one.weight for one in unseen if one.ids[-1] not in hidden)
-    beside += sum(one.weight for one in out if {*one.ids} > {*out[0].ids})
+    named = {one.effect.id for one in search.found}
+    beside += sum(one.weight for one in out if {*out[0].ids} < {*one.ids} <= named)
     beside = float(beside / (out[0].weight + beside))
     return Beliefs(out, comparison.repeatability, comparison.noise, end, [], unseen, beside)
 

@@ -2,6 +2,7 @@
 explanations, averaged over their parameters."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,13 +12,13 @@ from ..evidence import ODDS
 from .beliefs import Beliefs, Explanation
 from .contacts import Bounds, Contact, drawn, trajectory_of
 from .model.simulator import Simulator
+from .settings import SETTINGS
 from .trajectory import Trajectory
 from .whitening import Comparison
 
 _PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
 _BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
 _REPEATS = 2  # of a contact: where the true law has another form, repeats give less than expected
-_LIKELY = 0.01  # probability from which on explanations are distinguished
 _NOTHING = 1e-3  # [nats] below which a further contact is useless
 
 
@@ -122,12 +123,10 @@ class Separation:
         return out
 
     def alike(self, budget: int) -> list[tuple[int, int]]:
-        """Pairs (a, b) of explanations, both likely, that no contact, repeated `budget` times, distinguishes
-        by `ODDS`."""
+        """Pairs (a, b) of explanations that no contact, repeated `budget` times, distinguishes by `ODDS`."""
         most = np.max([self.nats(budget * one) for one in np.eye(len(self.gram))], axis=0)
         most = np.maximum(most, most.T)
-        likely = np.flatnonzero(self.weight[: self.seen] > _LIKELY)
-        pairs = [(a, b) for a in likely for b in likely if a < b]
+        pairs = itertools.combinations(range(self.seen), 2)
         return [(a, b) for a, b in pairs if most[a, b] < np.log(ODDS)]
 
 
@@ -167,7 +166,7 @@ def planned(
         clock += float(trajectories[-1].time[-1]) + _BETWEEN
     # one that has a further effect is a question as much as one that contradicts the likeliest
     first, *others = beliefs.explanations
-    asked = [first, *(one for one in others if one.weight > _LIKELY)]
+    asked = [first, *(one for one in others if one.weight >= SETTINGS.rate)]
     used = {name for one in asked for _, theta in one.effects for name in theta}
     spots = sorted(name for name in used if name.startswith(SPOT))
     fields = quick.fields(trajectories, progress, spots)
