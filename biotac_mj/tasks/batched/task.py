@@ -11,12 +11,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from ...fields import as_whole
+from ...fields import as_whole, check_choice
 from ...view.offscreen import stage
 from .bank import Bank
-from .touch import Touch, as_deviations, check_observe
+from .touch import OBSERVE, Touch, as_deviations
 
 _FELT = 0.02  # force of a finger that holds something, at least [N]
+_STAYS = 0.85  # correlation of errors of the model in consecutive decisions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +66,9 @@ class BatchTask(abc.ABC):
         latent projections in place of the film's.
       history: number of decisions in "body" and "touch", the last one first; a younger episode repeats its
         first decision.
-      model_error: standard deviations of factors on changes of counts, drawn in each episode, for the error
-        of this tier: of a finger's electrodes (one factor for all, one for each), PDC and PAC; or one number.
+      model_error: standard deviations of relative errors of changes of counts, which drift within an
+        episode, for the error of this tier: of electrodes, PDC and PAC, see `Touch.with_errors`; or one
+        number.
       settings: numbers of the task; None: the class's own.
       biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`; by default coarse and condensed.
 
@@ -100,7 +102,8 @@ class BatchTask(abc.ABC):
 
         from ... import batch
 
-        self.num_envs, self.observes = as_whole("num_envs", num_envs, 1), check_observe(observe)
+        check_choice("observe is", observe, OBSERVE)
+        self.num_envs, self.observes = as_whole("num_envs", num_envs, 1), observe
         self.history = as_whole("history", history, 1)
         self.model_error = as_deviations(model_error)
         self.cfg = s = self.settings if settings is None else settings
@@ -148,7 +151,6 @@ class BatchTask(abc.ABC):
         # decisions since the last frame in which nothing was touched
         self._age = torch.zeros(n, dtype=torch.long, device=self.device)
         self._bank = self._past = self._blur = None
-        self._gain = torch.ones_like(self._touch.tare)
         with wp.ScopedDevice(where):
             self._read(mjm, prefixes)
             self._begin(self._everyone)
@@ -316,15 +318,15 @@ class BatchTask(abc.ABC):
         Args:
           choice: of `touch.OBSERVE` in place of the environment's own, of the same sensors.
         """
-        body, noise, changes = self._past
-        touch = self._touch.observe(choice or self.observes, changes * self._gain[:, None])
+        body, noise, changes, errors = self._past
+        touch = self._touch.observe(choice or self.observes, self._touch.with_errors(changes, errors))
         state, body = torch.cat(self._state(), dim=1), body + noise
         return {"body": body.flatten(1), "touch": touch.flatten(1), "state": state}
 
     def sensed(self) -> dict:
         """{"body" (num_envs, history, n), "changes" (num_envs, history, nfinger, k), "world" (num_envs,)} of
         the last decisions, without the encoders' error and the model's, for `sense_anew`."""
-        body, _, changes = self._past
+        body, _, changes, _ = self._past
         return {"body": body, "changes": changes, "world": torch.arange(self.num_envs, device=self.device)}
 
     def sense_anew(
@@ -332,13 +334,16 @@ class BatchTask(abc.ABC):
     ) -> torch.Tensor:
         """Observations (n, m) of body and touch for what was `sensed` in n worlds, with new errors of
         encoders and model; choice: of `touch.OBSERVE`."""
-        gain = self._touch.draw_gains(len(body), self.model_error, self._draw)
-        touch = self._touch.observe(choice, changes * gain[:, None], world)
-        # an episode that is young repeats its first decision, with its noise
+        errors = self._touch.draw_errors(body.shape[:2], self.model_error, self._draw)
+        for k in range(self.history - 1, 0, -1):  # the last decision comes first
+            errors[:, k - 1] = _later(errors[:, k], errors[:, k - 1])
+        # an episode that is young repeats its first decision, with its errors
         repeats = (body[:, 1:] == body[:, :-1]).all(2)
         first = torch.arange(1, self.history, device=self.device).where(~repeats, 0)
         first = torch.nn.functional.pad(first, (1, 0)).cummax(1).values
         noise = self._noise(body).gather(1, first[..., None].expand_as(body))
+        errors = errors.gather(1, first[..., None, None].expand_as(errors))
+        touch = self._touch.observe(choice, self._touch.with_errors(changes, errors), world)
         return torch.cat([(body + noise).flatten(1), touch.flatten(1)], dim=1)
 
     def prepare_held(self, seed: int | None = None) -> int:
@@ -400,7 +405,10 @@ class BatchTask(abc.ABC):
         touched = (self._age > 0)[:, None, None]
         changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
         body = torch.cat(self._sense_body(0.0, 0.0), dim=1)
-        now = [body, self._noise(body), changes]
+        errors = self._touch.draw_errors((self.num_envs,), self.model_error, self._draw)
+        if self._past is not None:
+            errors = errors.where(begun[:, None, None], _later(self._past[3][:, 0], errors))
+        now = [body, self._noise(body), changes, errors]
         first = [one[:, None].expand(-1, self.history, *one.shape[1:]) for one in now]
         if self._past is None:
             self._past = first
@@ -422,8 +430,6 @@ class BatchTask(abc.ABC):
         if not which.any():
             return
         self.episode_length_buf[which] = 0
-        gain = self._touch.draw_gains(self.num_envs, self.model_error, self._draw)
-        self._gain = gain.where(which[:, None, None], self._gain)
         worlds = which.nonzero()[:, 0]
         if self._bank:
             self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])
@@ -479,3 +485,9 @@ class BatchTask(abc.ABC):
             setattr(m, field, wp.array(many, dtype=one.dtype))
             made.append(getattr(m, field))
         return made
+
+
+def _later(errors, drawn):
+    """Errors of the model one decision after `errors`, from new ones: they drift as the contact's place and
+    force do, because a policy reads changes within an episode."""
+    return _STAYS * errors + (1 - _STAYS**2) ** 0.5 * drawn

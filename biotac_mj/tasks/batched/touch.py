@@ -19,17 +19,6 @@ _COUNTS = 100.0  # unit of changes
 _SIGMA = 50.0  # PDC beyond so many deviations of its noise is a touch, as drivers of real sensors have it
 
 
-def check_observe(value: object) -> str:
-    """Returns the value if it is one of OBSERVE.
-
-    Raises:
-      ValueError: it is none.
-    """
-    if not isinstance(value, str) or value not in OBSERVE:
-        raise ValueError(f"observe is {short_repr(value)}: choose one of {', '.join(OBSERVE)}")
-    return value
-
-
 def as_deviations(value: object) -> tuple[float, ...]:
     """Deviations for electrodes, PDC and PAC, of one number or three.
 
@@ -58,6 +47,7 @@ class Touch:
         address = [[np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in finger] for finger in sensors]
         self._sensed, self._place = sensordata, tensor(np.array([np.concatenate(a) for a in address]))
         self._split = [len(a) for a in address[0]]
+        self._kind = tensor(np.repeat(np.arange(len(_CHANNELS)), self._split))
         geometry = load_skin(skin)
         each = np.eye(len(geometry.electrode_pos))
         self._pos = tensor(geometry.electrode_pos, dtype=torch.float32)
@@ -74,15 +64,23 @@ class Touch:
         """(nworld, nfinger, k) counts of electrodes, PDC and PAC."""
         return self._sensed[:, self._place]
 
-    def draw_gains(self, count: int, deviation: tuple[float, ...], draw: torch.Generator) -> torch.Tensor:
-        """Factors (count, nfinger, k) on changes of the channels, 1 +- deviation: of each finger one for all
-        electrodes times one for each, one for PDC and one for PAC."""
-        shape, more = (count, self.tare.shape[1]), {"generator": draw, "device": draw.device}
-        common = torch.tensor(deviation, device=draw.device) * torch.randn(*shape, 3, **more)
-        gain = 1 + common.repeat_interleave(torch.tensor(self._split, device=draw.device), dim=2)
+    def draw_errors(
+        self, shape: tuple[int, ...], deviation: tuple[float, ...], draw: torch.Generator
+    ) -> torch.Tensor:
+        """Errors (*shape, nfinger, 3 + nelectrode) for `with_errors`, of these deviations: of all electrodes
+        of a finger, PDC and PAC, and of each electrode."""
+        each = torch.tensor(deviation + deviation[:1] * self._split[0], device=draw.device)
+        return each * torch.randn(*shape, len(self._seeds), len(each), generator=draw, device=draw.device)
+
+    def with_errors(self, changes: torch.Tensor, errors: torch.Tensor) -> torch.Tensor:
+        """Changes of the channels (..., nfinger, k) with errors: of electrodes, PDC and PAC as fractions of
+        themselves, of each electrode as a fraction of the RMS of its finger's, since the tier is off by as
+        much where electrodes hardly change."""
         n = self._split[0]
-        gain[..., :n] *= 1 + deviation[0] * torch.randn(*shape, n, **more)
-        return gain
+        common, own = errors.split([3, n], dim=-1)
+        out = changes * (1 + common[..., self._kind])
+        out[..., :n] += own * changes[..., :n].square().mean(-1, keepdim=True).sqrt()
+        return out
 
     def observe(
         self, choice: str, changes: torch.Tensor, worlds: torch.Tensor | slice = slice(None)
