@@ -25,7 +25,7 @@ from .whitening import Comparison
 _MOST = 6  # explanations, the likeliest ones, and the base model alone
 # What the likelihood leaves out comes again in every contact. All contacts together tell explanations apart
 # as this part of one would if nothing were left out; over their number it is the power of the likelihood (a
-# coarsened posterior, Miller and Dunson 2019). By greatest likelihood from 299 names in 227 laboratories
+# coarsened posterior, Miller and Dunson 2019). By greatest likelihood from 299 names in 187 laboratories
 # whose laws are not the catalogue's.
 _CONTACTS = 0.8
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew

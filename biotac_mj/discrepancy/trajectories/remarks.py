@@ -105,10 +105,7 @@ def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
     """Remarks on effects that trajectories like these cannot show."""
     notes = []
     if len(data) < 12:
-        notes.append(
-            f"{len(data)} trajectories: "
-            f"p-values cannot fall below {2.0 ** -len(data):.3g}, small effects stay unseen"
-        )
+        notes.append(f"{len(data)} trajectories: small effects stay unseen")
     unloading = any(phases(t)["unload"].any() for t in data)
     if not unloading:
         notes.append("no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known")

@@ -60,10 +60,6 @@ class Nuisance:
         """The part that a sensor file holds: the modulus, and the baselines of electrodes."""
         return Nuisance(log_modulus=self.log_modulus, stands_off=self.stands_off)
 
-    def vector(self) -> np.ndarray:
-        """(8,)"""
-        return np.array(dataclasses.astuple(self))
-
     def at_bound(self, name: str) -> bool:
         """Whether a parameter is as far off as it may be: it takes up no more of what is like it."""
         k, value = [f.name for f in dataclasses.fields(self)].index(name), getattr(self, name)
