@@ -176,7 +176,7 @@ class Judge:
     def __init__(self, folder: str, data: str, half: str, seed: int):
         self.given = folder, data, half, seed
 
-    def __call__(self, values, folder, say):
+    def __call__(self, values, folder, report):
         authors = Authors(*self.given[:2], [])
         labs = plan(authors, *self.given[2:])
         for number in values:
@@ -189,7 +189,7 @@ class Judge:
             except ValueError as refused:
                 record["refused"] = str(refused)
             yield record
-            say(1)
+            report(1)
 
 
 def main(argv=None):

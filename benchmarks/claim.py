@@ -372,7 +372,7 @@ def _found(at, batch, rows):
     }
 
 
-def mesh_vae(t, split, seconds, say):
+def mesh_vae(t, split, seconds, report):
     """Trains the mesh VAE of a split until it is flat, or the time is up; keeps the codes of all rows, gives
     what it came to."""
     begun = time.time()
@@ -402,7 +402,7 @@ def mesh_vae(t, split, seconds, say):
 
     def said(found):
         step, rate, now = found["curve"][-1]
-        say(
+        report(
             f"{found['seconds']:6.0f} s  mesh_vae {split}: step {step}, {found['epochs']} epochs, "
             f"rate {rate:g}, {1e3 * now:.1f} um"
         )
@@ -454,7 +454,7 @@ class Work:
         self.table, self.until = (str(folder), device, steps), until
         self.splits, self.vae_seconds = tuple(splits), vae_seconds
 
-    def __call__(self, names, folder, say):
+    def __call__(self, names, folder, report):
         torch.set_num_threads(1)
         t, rows = Table(*self.table), jobs(self.splits)
         for name in names:
@@ -466,11 +466,11 @@ class Work:
                     found = self._row(t, *rows[name])
                 else:
                     seconds = min(self.vae_seconds, self.until - begun)
-                    found = {"": mesh_vae(t, name.removeprefix("mesh_vae "), seconds, say)}
+                    found = {"": mesh_vae(t, name.removeprefix("mesh_vae "), seconds, report)}
                 yield name, {"seconds": round(time.time() - begun, 1), "steps": t.steps, "found": found}
             except (ValueError, RuntimeError) as error:  # one row less, not all
-                say(f"{name}: {type(error).__name__}: {error}")
-            say(1)
+                report(f"{name}: {type(error).__name__}: {error}")
+            report(1)
 
     def _row(self, t, work, splits):
         found = {}

@@ -128,19 +128,19 @@ class Worker:
     def __init__(self, args, fields=None):
         self.args, self.generators, self.fields = args, {}, fields or {}
 
-    def __call__(self, values, folder, say):
+    def __call__(self, values, folder, report):
         if not hasattr(self, "sim"):
             self._begin()
         for value in values:
             if isinstance(value, int):
                 yield value, self.fields_of(value)
-                say(1)
+                report(1)
                 continue
             try:
                 yield self.run(value)
             except Exception as error:  # one bad case must not end the run: it is tried again next time
                 yield {"case": value["case"], "error": f"{type(error).__name__}: {error}"}
-            say(1)
+            report(1)
 
     def _begin(self):
         import warp as wp

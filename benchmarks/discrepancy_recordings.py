@@ -161,7 +161,7 @@ class Judge:
     def __init__(self, folder: str, data: str, counts: list[int]):
         self.given = folder, data, counts
 
-    def __call__(self, values, folder, say):
+    def __call__(self, values, folder, report):
         authors = Authors(*self.given)
         pieces = functools.cache(authors.pieces)
         for half, number in values:
@@ -173,7 +173,7 @@ class Judge:
                 yield {"half": half, "key": [*key], "refused": str(refused)}
             else:
                 yield {"half": half, "key": [*key], **judge(case, recording, authors)}
-            say(1)
+            report(1)
 
 
 def judge(case, recording, authors: Authors, protocol=None) -> dict:

@@ -112,7 +112,7 @@ def main(argv=None):
     print(f"  {'':<26}{'rows':>6}{'median':>9}{'lowest tenth':>14}{'same state':>12}")
     found = {"real": {}, "synthetic": {}}
 
-    def say(kind, name, change, same=None):
+    def report(kind, name, change, same=None):
         value = agreement(change, states)
         row = {"rows": len(value), "median": np.median(value), "lowest_tenth": np.percentile(value, 10)}
         row |= {} if same is None else {"same_state": np.median(correlation(change, same))}
@@ -122,13 +122,13 @@ def main(argv=None):
         print(f"  {kind + ' ' + name:<26}{text}", flush=True)
 
     for name, electrodes, force in given.real:
-        say("real", name, real(name, electrodes, force))
+        report("real", name, real(name, electrodes, force))
     parts = []
     for seed in range(given.sensors):
         parts.append(synthetic(seed, given.skin, given.presses, given.device))
-        say("synthetic", f"number {seed}", *parts[-1])
+        report("synthetic", f"number {seed}", *parts[-1])
     if parts:
-        say("synthetic", "all", *(np.concatenate(part) for part in zip(*parts)))
+        report("synthetic", "all", *(np.concatenate(part) for part in zip(*parts)))
     if given.json:
         write_json(given.json, {"settings": {**vars(given), "json": None}, **found})
 

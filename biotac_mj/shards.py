@@ -1,8 +1,8 @@
 """Runs a list of independent tasks in this process, in several, or on a Ray cluster, with one progress bar.
 The files that they write do not depend on that.
 
-`work` is a picklable object that is called in each process: `work(values, folder, say)` takes an iterator
-over the values of tasks, writes files to the folder and yields results. `say` takes a number, by which the
+`work` is a picklable object that is called in each process: `work(values, folder, report)` takes an iterator
+over the values of tasks, writes files to the folder and yields results. `report` takes a number, by which the
 bar moves, or a line of text."""
 
 import contextlib
@@ -77,18 +77,18 @@ def run_tasks(
     total = sum(task.size for task in tasks)
     with tqdm.tqdm(total=total, desc=name, unit=unit, disable=not progress or None, leave=False) as bar:
 
-        def say(news):
+        def report(news):
             if not isinstance(news, str):
                 bar.update(news)
             elif progress:
                 bar.write(news)
 
         if ray is not None:
-            yield from _on_ray(work, tasks, folder, say, ray, cpus, gpus)
+            yield from _on_ray(work, tasks, folder, report, ray, cpus, gpus)
         elif processes:
-            yield from _in_processes(work, tasks, folder, say, processes)
+            yield from _in_processes(work, tasks, folder, report, processes)
         else:
-            yield from work((task.value for task in tasks), folder, say)
+            yield from work((task.value for task in tasks), folder, report)
 
 
 def one_per_gpu(devices: Iterable[str]) -> dict[str, dict[str, str]]:
@@ -111,7 +111,7 @@ def _end(parent):
     os._exit(1)
 
 
-def _in_processes(work, tasks, folder, say, processes):
+def _in_processes(work, tasks, folder, report, processes):
     """Runs tasks in processes that take them from one queue; results and messages come through another."""
     context = multiprocessing.get_context("spawn")
     todo, news = context.Queue(), context.Queue()
@@ -134,7 +134,7 @@ def _in_processes(work, tasks, folder, say, processes):
             if what == "result":
                 yield value
             elif what == "news":
-                say(f"{name}: {value}" if isinstance(value, str) else value)
+                report(f"{name}: {value}" if isinstance(value, str) else value)
             elif what == "end":
                 running.pop(name).join()
             else:
@@ -175,7 +175,7 @@ def _describe(error):
     return RuntimeError, traceback.format_exc()
 
 
-def _on_ray(work, tasks, folder, say, address, cpus, gpus):
+def _on_ray(work, tasks, folder, report, address, cpus, gpus):
     with _cluster(address) as ray:
         remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_TRIES)(_task)
         kept, key, here = ray.put(work), uuid.uuid4().hex, versions()
@@ -194,8 +194,8 @@ def _on_ray(work, tasks, folder, say, address, cpus, gpus):
                 with replacing(folder / name) as temporary:
                     temporary.write_bytes(files[name])
             for line in lines:
-                say(line)
-            say(task.size)
+                report(line)
+            report(task.size)
             yield from results
 
 

@@ -606,7 +606,7 @@ def test_an_effect_is_searched_or_listed_as_not_identifiable():
     for effect in (*entries("poses"), *LOGGED):
         effect = KINDS.get(effect.id, effect)
         has = {"rest", "sign", "time"}  # raw counts for a minute, and nothing else
-        assert (effect.name in missing) == bool(effect.asks - has), effect.id
+        assert (effect.name in missing) == bool(effect.requires - has), effect.id
 
 
 def test_what_no_bound_allows_has_no_name():

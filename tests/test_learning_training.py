@@ -123,7 +123,7 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
             raise KeyboardInterrupt
 
     same = dict(paper=False, progress=False)
-    monkeypatch.setattr(Checkpoints, "__init__", lambda self, folder, say: begin(self, folder, counted))
+    monkeypatch.setattr(Checkpoints, "__init__", lambda self, folder, report: begin(self, folder, counted))
     monkeypatch.setattr(fitting, "_BETWEEN", 0.0)
     with pytest.raises(KeyboardInterrupt):
         train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
@@ -143,8 +143,8 @@ def test_the_bar_reaches_its_end(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # elsewhere no bar is drawn
     begin, steps = Checkpoints.__init__, []
 
-    def counted(self, folder, say):
-        begin(self, folder, lambda n: [steps.append(n), say(n)])
+    def counted(self, folder, report):
+        begin(self, folder, lambda n: [steps.append(n), report(n)])
 
     monkeypatch.setattr(Checkpoints, "__init__", counted)
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False)

@@ -10,7 +10,7 @@ class Write:
 
     begun: int = 0
 
-    def __call__(self, values, folder, say):
+    def __call__(self, values, folder, report):
         self.begun += 1
         for value in values:
             if value == 13:
@@ -18,6 +18,6 @@ class Write:
             if value == 99:
                 os._exit(9)
             (folder / f"{value}.txt").write_text(f"{value} in a folder of its own")
-            say(f"{value} is there")
-            say(2)
+            report(f"{value} is there")
+            report(2)
             yield value**2

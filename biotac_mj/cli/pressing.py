@@ -111,14 +111,14 @@ def _press(args):
     check_device(args.device)
     said = set()
 
-    def say(message, *_, **__):  # at once: a press that meets the core takes long
+    def warn(message, *_, **__):  # at once: a press that meets the core takes long
         if str(message) not in said:
             said.add(str(message))
             print(f"biotac: note: {message}", file=sys.stderr, flush=True)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        warnings.showwarning = say
+        warnings.showwarning = warn
         record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
@@ -136,7 +136,7 @@ def _press(args):
     if 2 * failed > steps:
         raise ValueError(wrong)
     if failed:
-        say(wrong)
+        warn(wrong)
 
 
 def add_samples(verbs: argparse._SubParsersAction) -> None:

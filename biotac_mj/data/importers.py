@@ -106,7 +106,7 @@ def import_recordings(
     out: pathlib.Path | str,
     seed: int = 0,
     block: float | None = None,
-    say: Callable[[str], object] | None = None,
+    report: Callable[[str], object] | None = None,
     **options: object,
 ) -> int:
     """Reads files and writes a set, a shard for each file, with a split by interaction.
@@ -114,7 +114,7 @@ def import_recordings(
     Args:
       paths: files. out: folder of the set; it must not contain one.
       seed: of the split. block: see `interactions`. options: of `recordings.load`.
-      say: called with each remark on a recording.
+      report: called with each remark on a recording.
 
     Returns:
       number of interactions.
@@ -131,8 +131,8 @@ def import_recordings(
         found = load(path, **options)
         kinds |= {r.design for r in found}
         groups.append([one for r in found for one in interactions(r, block)])
-        for one, line in [(r, line) for r in found for line in warnings(r) if say]:
-            say(f"{one.name}: {line}")
+        for one, line in [(r, line) for r in found for line in warnings(r) if report]:
+            report(f"{one.name}: {line}")
     if len(kinds) > 1:
         titles = " and of ".join(sorted(one.title for one in kinds))
         raise ValueError(f"the files hold sensors of {titles}: make a set of each")

@@ -39,7 +39,7 @@ def import_verb(args: argparse.Namespace) -> None:
         args.out,
         args.seed,
         args.block,
-        say=lambda line: print(f"warning: {line}"),
+        report=lambda line: print(f"warning: {line}"),
         force=args.force,
         rate=args.rate,
         scale=args.scale,

@@ -191,9 +191,9 @@ class Effect(abc.ABC):
         electrode has one value under any contact.
       alike: whether a running sensor has it equally on all electrodes. most: {parameter: largest value that a
         running sensor can have}.
-      asks: what a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of the counts;
-        "time" in which touches are told from drift; "load"; "change", that it begins or ends there;
-        "poses", where nothing else will do; "search", where nothing searches it.
+      requires: data that a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of
+        the counts; "time" to separate touches from drift; "load"; "change", that it begins or ends in the
+        recording; "poses", where nothing else suffices; "search", where no detector searches it.
       detector: class of evidence in logs, which sets a name's confidence
         (`discrepancy.recordings.confidence`).
     """
@@ -218,7 +218,7 @@ class Effect(abc.ABC):
     sound = 0.0
     drifts = in_noise = is_noise = silent = alike = False
     most: dict = {}
-    asks: frozenset = frozenset({"poses"})
+    requires: frozenset = frozenset({"poses"})
     detector = ""
 
     @abc.abstractmethod

@@ -39,7 +39,7 @@ class ElectrodeDrift(Effect):
         "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
     }
     grid = ({"q": 0.4}, {"q": 1.0})
-    equivalents, per_channel, asks = ("warmup",), True, frozenset()
+    equivalents, per_channel, requires = ("warmup",), True, frozenset()
     confusable = {
         "warmup": "free segments over the session: one electrode or all",
         "gain": "the same probe at the beginning and the end of the session",

@@ -30,7 +30,7 @@ class Logged(Effect):
     """
 
     stage = "A"
-    fits, asks = _LOG, frozenset()
+    fits, requires = _LOG, frozenset()
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class SharedLevel(Effect):
 
 class CountOffset(Logged, SharedLevel):
     id, name, detector = "count_offset", "common offset in counts", "supply"
-    asks = frozenset({"rest", "change"})
+    requires = frozenset({"rest", "change"})
     physics = "reference or supply: adds the same counts to every electrode"
     params = {"change": _COUNTS}
     confusable = {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}
@@ -111,7 +111,7 @@ class CountOffset(Logged, SharedLevel):
 
 class CountGain(Logged, SharedLevel):
     id, name, detector = "count_gain", "common gain in counts", "supply"
-    asks = frozenset({"rest", "change"})
+    requires = frozenset({"rest", "change"})
     physics = "reference or supply: scales every count"
     params = {"change": Param("1", -0.9, 0.9, "supplies")}
     confusable = {"count_offset": "rest levels that differ more"}
@@ -130,7 +130,7 @@ class Level(Logged):
     """A step if it ends where it begins, else a ramp to a constant level."""
 
     id, name = "drift", "drift or jump of an electrode"
-    drifts, asks = True, frozenset({"time"})
+    drifts, requires = True, frozenset({"time"})
     physics = "an offset of one channel's amplifier or contact"
     params = {"change": _COUNTS}
     confusable = {
@@ -148,7 +148,7 @@ class Level(Logged):
 
 class Flip(Logged):
     id, name = "flip", "sign of an electrode reversed"
-    asks = frozenset({"sign", "change"})
+    requires = frozenset({"sign", "change"})
     physics = "an electrode responds to the load with the opposite sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
     confusable = {"gain": "press next to the electrode"}
@@ -161,7 +161,7 @@ class ExchangeInLog(Logged):
     """Each of its electrodes shows the next one, from the start on."""
 
     id, name = "swap", "exchanged channels"
-    wiring, asks = True, frozenset({"change"})
+    wiring, requires = True, frozenset({"change"})
     physics = "electrodes carry each other's signal: cable or channel order"
     params = {"onset": _TIME}
     confusable = {"gain": "an exchange changes two channels at once"}
@@ -210,7 +210,7 @@ class LostRows(Logged):
 
 
 class SaturationInLog(Saturation, Logged):
-    fits, asks = _LOG, frozenset({"time", "load"})
+    fits, requires = _LOG, frozenset({"time", "load"})
     params = {"level": _COUNTS}
     grid = ({},)
     confusable = Saturation.confusable | {
@@ -261,7 +261,7 @@ class Hum(Logged):
 
 
 class NoiseInLog(Noise, Logged):
-    fits, asks = _LOG, frozenset()
+    fits, requires = _LOG, frozenset()
     params = {"size": Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)}
     confusable = Noise.confusable | {"gain": "press next to the electrode: a gain makes touches larger, too"}
     apply = Logged.apply
@@ -273,7 +273,8 @@ class NoiseInLog(Noise, Logged):
 class CommonNoise(Logged):
     """Not searched."""
 
-    id, name, fits, asks = "common_noise", "noise common to all channels", frozenset(), frozenset({"search"})
+    id, name = "common_noise", "noise common to all channels"
+    fits, requires = frozenset(), frozenset({"search"})
     physics = "one noise is added to every channel: reference, supply"
     params = {"correlation": Param("1", 0.05, 1, "0.001 in a real sensor")}
     confusable = {"crosstalk": "cross-talk falls off with distance"}
@@ -291,7 +292,7 @@ _LEVELS = {
 
 
 class WarmUpInLog(WarmUp, SharedLevel):
-    fits, asks, detector, drifts = _LOG, frozenset(), "shared", True
+    fits, requires, detector, drifts = _LOG, frozenset(), "shared", True
     params = {"a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source), "tau": Param("s", 1, 1e5, "minutes")}
     confusable = WarmUp.confusable | _LEVELS
 
@@ -315,7 +316,7 @@ class WarmUpInLog(WarmUp, SharedLevel):
 
 
 class FluidLossInLog(FluidLoss, SharedLevel):
-    fits, asks, detector, drifts = _LOG, frozenset({"sign"}), "loss", True
+    fits, requires, detector, drifts = _LOG, frozenset({"sign"}), "loss", True
     rises = True
     params = FluidLoss.params | {
         "rate": Param("1/h", 0.0, 60.0, "0-15 % a day from permeability; a leak empties it in a minute", 0.2)

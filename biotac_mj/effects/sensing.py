@@ -96,7 +96,7 @@ class FluidLoss(Effect):
 
 class Thermal(Effect):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
-    fits, asks, detector = frozenset({"poses", "log"}), frozenset({"tdc"}), "shared"
+    fits, requires, detector = frozenset({"poses", "log"}), frozenset({"tdc"}), "shared"
     physics = "ln Z = ... - alpha (T - T0), T from TDC"
     params = {
         "alpha": Param(
@@ -305,7 +305,7 @@ class Saturation(Effect):
 
 class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
-    fits, asks = frozenset({"poses", "log"}), frozenset({"load"})
+    fits, requires = frozenset({"poses", "log"}), frozenset({"load"})
     physics = "electrodes follow their input with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     equivalents, alike = ("latency",), True
@@ -321,7 +321,7 @@ class LowPass(Effect):
 
 class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
-    fits, asks = frozenset({"poses", "log"}), frozenset({"force"})
+    fits, requires = frozenset({"poses", "log"}), frozenset({"force"})
     alike, most = True, {"delay": MOST_LATENCY}
     physics = "electrodes are read with a delay: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}

@@ -153,13 +153,13 @@ class Prompter:
     """Announces each step of a plan when it is due, during a recording, and notes the time.
 
     Args:
-      plan: the steps and their durations. say: prints a line.
+      plan: the steps and their durations. report: prints a line.
 
     Use as a context manager around the recording.
     """
 
-    def __init__(self, plan: Protocol, say: Callable[[str], None] = print):
-        self.plan, self.say, self.spoken = plan, say, []
+    def __init__(self, plan: Protocol, report: Callable[[str], None] = print):
+        self.plan, self.report, self.spoken = plan, report, []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -177,15 +177,15 @@ class Prompter:
         before = 0.0
         for one in self.plan.segments:
             ready = f" against {one.against}" if one.against and STEPS[one.kind].touched else ""
-            self.say(f"next, {one.stop - one.start:g} s{ready}: {STEPS[one.kind].line}")
+            self.report(f"next, {one.stop - one.start:g} s{ready}: {STEPS[one.kind].line}")
             if self._stop.wait(max(self.begun + one.start - clock.time(), 0)):
                 return
             self.spoken.append((one, clock.time()))
-            self.say(f"now: {one.kind}")
+            self.report(f"now: {one.kind}")
             before = one.stop
             if self._stop.wait(max(self.begun + before - clock.time(), 0)):
                 return
-        self.say("done")
+        self.report("done")
 
     def timeline(self, time: Sequence[float]) -> Protocol:
         """The segments as announced, since the first of the recording's rows (n,) [s].

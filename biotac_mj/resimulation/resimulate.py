@@ -210,7 +210,7 @@ class _Drive:
     about: dict
     workers: int
 
-    def __call__(self, values, folder, say):
+    def __call__(self, values, folder, report):
         if not hasattr(self, "_model"):
             *skin, modulus = self.skins
             self._model = SkinModel(*skin, self.options.device, modulus=modulus)
@@ -220,14 +220,14 @@ class _Drive:
         ) as pool:
             waiting = None
             for value in values:
-                begun = self._begin(value[1], pool, say)
+                begun = self._begin(value[1], pool, report)
                 if waiting is not None:  # its readings were computed during the next solve
                     yield self._end(*waiting, folder)
                 waiting = *value, begun
             if waiting is not None:
                 yield self._end(*waiting, folder)
 
-    def _begin(self, members, pool, say):
+    def _begin(self, members, pool, report):
         """Simulates touches; for each: (fields, index, pending readings)."""
         groups = [members] if self._model.device.is_cuda else [[i] for i in members]
         out = []
@@ -242,7 +242,7 @@ class _Drive:
                 seed = int(np.random.SeedSequence([i, 1]).generate_state(1, np.uint64)[0])
                 read = (fields.displacement[k, :n], touch.time, fields.pressure[k, :n], seed)
                 out.append((fields, k, pool.submit(read_in_worker, *read)))
-                say(n)
+                report(n)
         return out
 
     def _end(self, path, members, parts, folder):

@@ -89,10 +89,10 @@ class MakeShards:
     device: str
     workers: int
 
-    def __call__(self, values: Iterable, folder: pathlib.Path, say: Callable) -> Iterator[dict]:
+    def __call__(self, values: Iterable, folder: pathlib.Path, report: Callable) -> Iterator[dict]:
         if not hasattr(self, "_maker"):
             self._maker = Maker(self.options, self.settings, self.device)
-        return self._maker.run(values, folder, self.workers, say)
+        return self._maker.run(values, folder, self.workers, report)
 
 
 @dataclasses.dataclass
@@ -169,10 +169,10 @@ class Maker:
         self._count("start", clock)
 
     def run(
-        self, todo: Iterable, out: pathlib.Path, workers: int, say: Callable[[int | str], object]
+        self, todo: Iterable, out: pathlib.Path, workers: int, report: Callable[[int | str], object]
     ) -> Iterator[dict]:
         """Makes the shards of an iterator of batches in folder `out` with that many worker processes; yields
-        the seconds of each stage. say: gets completed time steps, and a line on each batch."""
+        the seconds of each stage. report: gets completed time steps, and a line on each batch."""
         from . import readings, synthetic_sensor
 
         rest = None if self._untouched is self.geometry else self._untouched.vert
@@ -181,7 +181,7 @@ class Maker:
         with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:
-                waiting.append(self._begin(batch, pool, say))
+                waiting.append(self._begin(batch, pool, report))
                 while waiting and (len(waiting) > _LOOKAHEAD or waiting[0].done()):
                     written.append(self._end(waiting.pop(0), pool, out))
                 for one in written:  # a failed write stops the run now, not at its end
@@ -198,7 +198,7 @@ class Maker:
         seconds, self.seconds = self.seconds, dict.fromkeys(_STAGES, 0.0)
         return seconds
 
-    def _begin(self, batch, pool, say) -> _Running:
+    def _begin(self, batch, pool, report) -> _Running:
         """Plans and simulates a batch and submits its readings to the workers."""
         from . import readings, simulate, synthetic_sensor
 
@@ -232,7 +232,7 @@ class Maker:
             senses.append(sense)
             motion.parameters.update(drawn)
         fields = running.fields = simulate.simulate(
-            self.model, batch.names, motions, say, self.time, *skins, self.modes, o.tier
+            self.model, batch.names, motions, report, self.time, *skins, self.modes, o.tier
         )
         clock = self._count("skin", clock)
         running.reads = [
@@ -250,7 +250,7 @@ class Maker:
         ]
         if batch.measured:
             self._free()
-            answer = running.answer = self.measured.simulate(batch.names, motions, say)
+            answer = running.answer = self.measured.simulate(batch.names, motions, report)
             self._count("measured skin", clock)
             # contacts of the session follow each other after some seconds, while the sensor warms up
             running.labels = [
@@ -267,7 +267,7 @@ class Maker:
         spent = ", ".join(
             f"{name} {s - before[name]:.1f} s" for name, s in self.seconds.items() if s - before[name] > 0.05
         )
-        say(f"{batch.path}: {len(motions)} worlds, {spent}")
+        report(f"{batch.path}: {len(motions)} worlds, {spent}")
         return running
 
     def _free(self):

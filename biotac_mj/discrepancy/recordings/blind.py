@@ -10,18 +10,18 @@ from .session import Session
 
 
 def not_identifiable(session: Session) -> list[str]:
-    """A line for each kind of data that the recording lacks (`Effect.asks`), with the names of the effects
-    that require it. An effect is listed in the first of them."""
+    """A line for each kind of data that the recording lacks (`Effect.requires`), with the names of the
+    effects that require it. An effect is listed in the first of them."""
     known = {e.id: e for e in (*entries("poses"), *LOGGED, *entries("log"))}
     lacking, names = _lacking(session), {}
     for effect in known.values():
-        first = next((need for need in lacking if need in effect.asks), None)
+        first = next((need for need in lacking if need in effect.requires), None)
         names.setdefault(first, []).append(effect.name)
     return [f"{text}: {', '.join(names[need])}" for need, text in lacking.items() if need in names]
 
 
 def _lacking(session):
-    """Keys of `Effect.asks` that the recording lacks, with a description each."""
+    """Keys of `Effect.requires` that the recording lacks, with a description each."""
     r, out = session.recording, {}
     if r.force is None:
         out["force"] = "no force"

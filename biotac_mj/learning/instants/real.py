@@ -191,7 +191,7 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
         return ((read(net.decode(net.encode(y)[0])) - read(y)) ** 2).sum(1).mean()
 
     options = TrainingOptions(_BATCH, steps, 1e-3, seed=seed)
-    train(net, loss, torch.arange(ntrain), options, checkpoints=Checkpoints(say=bar.update))
+    train(net, loss, torch.arange(ntrain), options, checkpoints=Checkpoints(report=bar.update))
     with torch.no_grad():
         return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
 

@@ -107,26 +107,26 @@ class _Train:
     settings: dict
     device: str
 
-    def __call__(self, values, folder, say):
+    def __call__(self, values, folder, report):
         with _one_thread():
             for split, seed in values:
                 if not hasattr(self, "_features"):
-                    self._features = self._read(say)
+                    self._features = self._read(report)
                 given = self.settings
                 name = hashlib.sha256(json.dumps([given, self.device, split, seed]).encode()).hexdigest()[:16]
-                checkpoints = Checkpoints(folder / f"unfinished-{name}", say)
+                checkpoints = Checkpoints(folder / f"unfinished-{name}", report)
                 train_split(self._features, split, seed, folder, given, checkpoints)
                 shutil.rmtree(checkpoints.folder, ignore_errors=True)
                 yield split, seed
 
-    def _read(self, say):
+    def _read(self, report):
         begun = time.time()
         given = self.settings
         config = LearningConfig(**given["config"])
         arrays = load_arrays(given["set"], self.device, given["limit"])
         features = Features(arrays, config)
         text = f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps"
-        say(f"{text} read in {time.time() - begun:.0f} s")
+        report(f"{text} read in {time.time() - begun:.0f} s")
         return features
 
 

@@ -39,13 +39,13 @@ class Checkpoints:
     and an interrupted one continues, on the CPU bit-equal.
 
     Args:
-      folder: of checkpoints, None: no checkpoints. say: progress callback, called with 1 at each step.
+      folder: of checkpoints, None: no checkpoints. report: progress callback, called with 1 at each step.
     """
 
     def __init__(
-        self, folder: pathlib.Path | None = None, say: Callable[[int], object] = lambda n: None
+        self, folder: pathlib.Path | None = None, report: Callable[[int], object] = lambda n: None
     ) -> None:
-        self.folder, self.say = folder, say
+        self.folder, self.report = folder, report
         self.number = 0
         self._kept = time.perf_counter()
 
@@ -54,7 +54,7 @@ class Checkpoints:
         self.number += 1
         path = self._path()
         kept = torch.load(path, weights_only=True) if path is not None and path.is_file() else None
-        self.say(kept["step"] if kept else 0)
+        self.report(kept["step"] if kept else 0)
         return kept
 
     def keep(self, last: bool, **state: object) -> None:
@@ -110,7 +110,7 @@ def train(
       rows: (k,) rows to draw from, on the device.
       validate: () -> float, called twelve times; the state with its smallest value is restored at the end.
         None keeps the last.
-      checkpoints: says and saves the steps. curve: gets [step, value] of each validation.
+      checkpoints: reports and saves the steps. curve: gets [step, value] of each validation.
 
     Returns:
       smallest value of validate, or None.
@@ -162,7 +162,7 @@ def train(
         else:
             value = _on_side_stream(one) if cuda and options.graph else one()
         schedule.step()
-        checkpoints.say(1)
+        checkpoints.report(1)
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(
