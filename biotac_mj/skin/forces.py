@@ -222,7 +222,9 @@ class Forces:
         m, d, k, s, on_cuda = self.m, self.d, self.k, state.surface, self.m.device.is_cuda
         cache, contact = self._surfaces[surface]
         laws = contact.laws
-        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), geoms.shapes)
+        # fewer shapes save registers, of which the CPU needs none: it has one kernel for all
+        shapes = geoms.shapes if on_cuda or geoms.shapes == touch.CORE else touch.SKINS
+        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), shapes)
         dim, nsample = state.touching.shape, len(m.sample)
         threads = min(_LISTED, dim[0] * dim[1]) if on_cuda else 1
         self.launch(program, broadphase.track_geoms, d.nworld, [self._mark, geoms.struct, on], [cache])

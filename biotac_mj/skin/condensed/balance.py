@@ -15,7 +15,7 @@ from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
 from .broadphase import ROOT3
-from .states import BALANCED, Increment, Linear, Newton
+from .states import BALANCED, Increment, Linear, Newton, Predictor
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system
 
@@ -83,20 +83,20 @@ def _find_motion(
 
 
 @wp.func
-def newton_from(foretold: int, before: Linear, l: Linear, most: real, tolerance: real):
+def newton_from(predictor: int, before: Linear, l: Linear, most: real, tolerance: real):
     """Newton's method for balanced forces vector[F] from those there, displacements vector[U], and the
     contact there with a symmetric tangent. Where it may cost nothing it finds the contact of the forces as
     they are.
 
-    Where it is `foretold`, vector[F] is an equilibrium of the skin as it was `before` with the geoms at
-    `held_pos`, and Newton's first step starts there. 2: contact has been evaluated there, at vector[U]."""
+    With a `Predictor`, vector[F] is an equilibrium of the skin as it was `before` with the geoms at
+    `held_pos`, and Newton's first step starts there; vector[U] is where its contact has been evaluated."""
     d = Newton()
-    d.foretold = foretold
+    d.predictor = predictor
     d.before = before
     d.linear = l
     d.most = most
     d.tolerance = tolerance
-    d.fresh = wp.where(foretold == 2, TRY, U)
+    d.fresh = wp.where(predictor == Predictor.EVALUATED, TRY, U)
     d.at = U
     d.alpha = real(1.0)
     d.error = real(wp.inf)
@@ -167,7 +167,7 @@ def _take_step(
 ):
     """After an evaluation of contact, tests a step, computes the next one, or ends."""
     n = 3 * o.nnode + o.nin
-    if d.foretold == 2:
+    if d.predictor == Predictor.EVALUATED:
         multiply(w, t, threads, o.nnode, n, F, d.fresh, 1, d.linear, c, s)
         d.fresh = -1
         _find_motion(w, t, threads, o.nnode, o.nin, geoms, touch, c, s)
@@ -178,23 +178,23 @@ def _take_step(
         steps = 0
         d.last = d.error
         good = int(0)
-        if d.spent >= d.most and d.most > real(0.0) and d.foretold == 0:
+        if d.spent >= d.most and d.most > real(0.0) and d.predictor == Predictor.NONE:
             d.found = CUT
         elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.viscosity <= _FIXED:
-            moved = wp.where(d.foretold > 0, 1, 0)
+            moved = wp.where(d.predictor != Predictor.NONE, 1, 0)
             good, equations = solve_system(
                 w, t, threads, o.nnode, o.nin, d.viscosity, moved, d.linear, touch, c, s
             )  # fmt: skip
             dear = real(equations) / _DEAR
             d.spent += dear * dear
-        if d.foretold > 0:
+        if d.predictor != Predictor.NONE:
             for j in range(t, wp.where(good == 1, n, 0), threads):
                 s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
             sync()
             pose_by_load(w, t, threads, s.solve.stepping[w].to, o.nnode, geoms, c, s)
             d.fresh = U
             good = 3
-            d.foretold = 0
+            d.predictor = int(Predictor.NONE)
         if good == 1:
             own = vec3()
             for j in range(t, n, threads):
@@ -263,16 +263,16 @@ def newton_method(shapes: str) -> wp.Function:
     ):
         """Finds the displacements that the forces bring about, where they are not known, and there the forces
         vector[G] of the contact law, and flags of the candidates that touch: in the end with a symmetric
-        tangent, and where a step is foretold with the geoms where they are held. Unless geoms have moved,
+        tangent, and for a pending predictor with the geoms at `held_pos`. Unless geoms have moved,
         faces are left out that nothing can have reached."""
         nnode = o.nnode
         anew = wp.where(d.fresh >= 0, 1, 0)
         if anew == 1:
             skin = d.linear
-            if d.foretold == 1:
+            if d.predictor == Predictor.PENDING:
                 skin = d.before
             multiply(w, t, threads, nnode, 3 * nnode + o.nin, F, d.fresh, 1, skin, c, s)
-        if d.foretold == 1:
+        if d.predictor == Predictor.PENDING:
             _swap_poses(w, t, threads, geoms, s)
         sync()
         most = real(0.0)
@@ -345,9 +345,9 @@ def newton_method(shapes: str) -> wp.Function:
         sync()
         d.fresh = -1
         d.spent += real(1.0)
-        if d.foretold == 1:
+        if d.predictor == Predictor.PENDING:
             _swap_poses(w, t, threads, geoms, s)
-            d.foretold = 2
+            d.predictor = int(Predictor.EVALUATED)
             d.fresh = TRY
         return d
 
@@ -364,7 +364,7 @@ def newton_method(shapes: str) -> wp.Function:
         """Newton's method from `newton_from` to its end."""
         d = s.solve.newton[w]
         o = s.solve.increment[w]
-        evaluated = wp.where(d.foretold == 2, 1, 0)
+        evaluated = wp.where(d.predictor == Predictor.EVALUATED, 1, 0)
         going = int(1)
         while going == 1:
             sync()

@@ -281,7 +281,7 @@ def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int):
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
     int* __restrict old = last.data + (long long)world * last.shape[1];
-    int* __restrict there = known.data + (long long)world * known.shape[1];
+    int* __restrict there = ready.data + (long long)world * ready.shape[1];
     bool same = old[0] == m;
     for (int j = 0; j < m && same; ++j) same = old[1 + j] == at[j];
     if (same) return;
@@ -294,7 +294,7 @@ def keep_rows(
     m: int,
     coordinate: wp.array2d(dtype=int),
     last: wp.array2d(dtype=int),
-    known: wp.array2d(dtype=int),
+    ready: wp.array2d(dtype=int),
 ):
     """Forgets the rows of B where the candidates are others than the last ones."""
     ...
@@ -303,7 +303,7 @@ def keep_rows(
 _ROWS = """
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
-    int* __restrict there = known.data + (long long)world * known.shape[1];
+    int* __restrict there = ready.data + (long long)world * ready.shape[1];
     for (int i = row; i < row + count; ++i) {{
         float* __restrict b = B.data + (long long)world * B.shape[1] + (long long)i * m;
         const float* __restrict c = C.data + at[i] * (long long)C.shape[1];
@@ -325,7 +325,7 @@ def gather_rows(
     coordinate: wp.array2d(dtype=int),
     row: int,
     count: int,
-    known: wp.array2d(dtype=int),
+    ready: wp.array2d(dtype=int),
     B: wp.array2d(dtype=float),
 ):
     """Makes `count` rows of B from `row` on the entries of C at the candidates' coordinates."""
@@ -350,13 +350,13 @@ def gather_rows(  # noqa: F811
     coordinate: wp.array2d(dtype=int),
     row: int,
     count: int,
-    known: wp.array2d(dtype=int),
+    ready: wp.array2d(dtype=int),
     B: wp.array2d(dtype=float),
     n: int,
     place: wp.array2d(dtype=int),
     P: wp.array2d(dtype=float),
 ):
-    """The same, and of P what these rows have at n listed places, unless `known` says 2."""
+    """The same, and of P what these rows have at n listed places, unless `ready` is 2."""
     ...
 
 

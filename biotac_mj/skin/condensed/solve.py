@@ -9,6 +9,7 @@ import warp as wp
 
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
+from ..contact.touch import SKINS
 from ..newton.worlds import Worlds
 from ..types import real, vec3
 from .balance import newton_method
@@ -28,11 +29,11 @@ def block_of(samples: int) -> int:
 
 
 @functools.cache
-def whole_step(shapes: str) -> wp.Kernel:
-    """Kernel with all phases, for the CPU. shapes: see `contact.touch`."""
-    balance = newton_method(shapes)
+def whole_step() -> wp.Kernel:
+    """Kernel with all phases and all shapes of geoms, for the CPU."""
+    balance = newton_method(SKINS)
 
-    @wp.kernel(module=f"{__name__}.{shapes}", enable_backward=False)
+    @wp.kernel(module=f"{__name__}.whole", enable_backward=False)
     def step(
         # In:
         law: int,

@@ -1,6 +1,8 @@
 """State of a solve of one skin between its phases. A kernel can thus have some of them, and skip worlds that
 have finished or are in another phase."""
 
+import enum
+
 import warp as wp
 
 from ..types import real
@@ -71,13 +73,21 @@ class Increment:
     linear: Linear
 
 
+class Predictor(enum.IntEnum):
+    """Where Newton's first step starts, see `newton_from`."""
+
+    NONE = 0  # from the forces and poses as they are
+    PENDING = 1  # from the last equilibrium, at which contact is still to be evaluated
+    EVALUATED = 2  # from the last equilibrium, at which contact has been evaluated
+
+
 @wp.struct
 class Newton:
     """State of Newton's method, see `balance`."""
 
     found: int  # whether an equilibrium was found, as `Increment.ok`
     iterations: int
-    foretold: int  # 1: contact is to be evaluated where the geoms are held, 2: it has been
+    predictor: int  # a `Predictor`
     fresh: int  # vector of displacements that the forces bring about, to be found; -1: none
     at: int  # vector of displacements at which contact is to be evaluated
     searching: int  # whether a line search is in progress

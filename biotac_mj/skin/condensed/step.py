@@ -130,7 +130,7 @@ class CondensedStep:
             launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=self._block)
             return
         launcher.launch(  # a thread for each, and no tiles: several skins may be solved at a time
-            whole_step(geoms.shapes),
+            whole_step(),
             [n],
             [m.law, geoms.struct, d.rest_pressure, c],
             [self.touch, s, self.remembered, d.worlds, d.outer.node_force, self.tier],
@@ -209,7 +209,7 @@ def _scratch(model, linear, data, ngeom, room, groups):
     s.sum = wp.zeros((nworld, 3 * max(alone, len(model.free))), dtype=float)
     s.between = wp.empty((nworld, alone * alone), dtype=float)
     s.columns = wp.empty((nworld, alone * min(alone, 3 * touched)), dtype=float)
-    s.known, s.last = wp.zeros((nworld, alone), dtype=int), wp.zeros((nworld, alone + 1), dtype=int)
+    s.ready, s.last = wp.zeros((nworld, alone), dtype=int), wp.zeros((nworld, alone + 1), dtype=int)
     s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
     s.stiff = wp.zeros((nworld, ninner), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))

@@ -26,7 +26,7 @@ from .broadphase import (
 )
 from .correction import is_measured
 from .results import correct, place_nodes
-from .states import BALANCED, DONE, NEWTON, SEARCH, Increment, Linear, LoadStepping
+from .states import BALANCED, DONE, NEWTON, SEARCH, Increment, Linear, LoadStepping, Predictor
 from .structs import Constants, F, G, Remembered, Scratch
 from .system import count_contacts, gather_load
 
@@ -317,19 +317,19 @@ def search(
         measure_core(w, t, threads, o.nnode, o.nin, o.ncore, c, s)
         find_groups(w, t, threads, o.nnode, geoms, touch, c, s)
         _load(w, t, threads, o.nnode, o.nin, s)
-        foretold = int(0)
+        predictor = int(Predictor.NONE)
         before = o.linear
         count, own = gather_load(w, t, threads, 3 * o.nnode + o.nin, F, c, s)
         l = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
         if first == 1 and count > 0 and p.holds == 0:
-            foretold = 1
+            predictor = int(Predictor.PENDING)
             if before.bulk_stiffness > real(0.0):  # what it was when the pressure was found
                 before.bulge = -o.pressure / before.bulk_stiffness - before.scale * own
         if p.holds == 1 and l.bulk_stiffness > real(0.0):
             l.bulge = -r.pressure[w] / l.bulk_stiffness - l.scale * own
         if t == 0:
             exact = wp.where(p.to < real(1.0), _PASSING, TOLERANCE)
-            s.solve.newton[w] = newton_from(foretold, before, l, p.left - o.spent, exact)
+            s.solve.newton[w] = newton_from(predictor, before, l, p.left - o.spent, exact)
     o.searches += 1
     o.passes = 0
     o.solving = looking
@@ -461,7 +461,9 @@ def _conclude_pass(
         o.solved = after
         if t == 0:
             again = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
-            s.solve.newton[w] = newton_from(2, d.before, again, p.left - o.spent, d.tolerance)
+            s.solve.newton[w] = newton_from(
+                int(Predictor.EVALUATED), d.before, again, p.left - o.spent, d.tolerance
+            )
         return o, NEWTON
     _store(w, t, threads, o.nnode, c, s)
     if o.ok != CUT:

@@ -130,11 +130,11 @@ class Scratch:
     column: wp.array2d(dtype=int)  # contact coordinates of the equations
     column_place: wp.array2d(dtype=int)  # and their places among the candidates'
     # by one thread, see `lanes.gather_rows`: compliance between candidates, and in the columns of the
-    # equations; which rows of both are known, the number of the candidates' coordinates and these; sums of
-    # rows
+    # equations; which rows are ready (1: of the first, 2: of both); the number of the candidates'
+    # coordinates and these; sums of rows
     between: wp.array2d(dtype=float)
     columns: wp.array2d(dtype=float)
-    known: wp.array2d(dtype=int)
+    ready: wp.array2d(dtype=int)
     last: wp.array2d(dtype=int)
     sum: wp.array2d(dtype=float)
     held: wp.array2d(dtype=float)  # of the equations, how they are held against the liquid's pressure
@@ -147,7 +147,7 @@ class Scratch:
     sought_x: wp.array2d(dtype=vec3)  # where nodes and geoms were when candidates were sought first
     sought_pos: wp.array2d(dtype=vec3)
     sought_mat: wp.array2d(dtype=mat33)
-    held_pos: wp.array2d(dtype=vec3)  # where they were at the equilibrium from which another is foretold
+    held_pos: wp.array2d(dtype=vec3)  # where they were at the equilibrium from which a predictor starts
     held_mat: wp.array2d(dtype=mat33)
     # of `broadphase.choose_view` [view, geom, world]: where geoms were when it was taken; [world, view]: how
     # far faces of the resting skin were from them at least [m], which geoms were near each; how deep they

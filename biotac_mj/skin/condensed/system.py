@@ -63,7 +63,7 @@ def multiply(
         push += l.bulk_stiffness * l.swell * l.bulge
     if threads == 1:
         for a in range(count):
-            gather_rows(c.compliance, w, n, s.coordinate, s.loaded_place[w, a], 1, s.known, s.between)
+            gather_rows(c.compliance, w, n, s.coordinate, s.loaded_place[w, a], 1, s.ready, s.between)
         sum_rows(s.between, w, n, count, s.loaded_place, s.load, s.sum)
     for j in range(t, n, threads):
         cj = s.coordinate[w, j]
@@ -179,7 +179,7 @@ def _fill_by_rows(
     n = 3 * outer + inner
     m = 3 * nnode + nin
     for j in range(m):
-        s.known[w, j] = wp.min(s.known[w, j], 1)  # the columns are others now
+        s.ready[w, j] = wp.min(s.ready[w, j], 1)  # the columns are others now
     for i in range(n):
         begin_row(s.matrix, w, n, wide, i, soft * s.held[w, i], s.push)
     for k in range(outer):
@@ -189,7 +189,7 @@ def _fill_by_rows(
             if wp.ddot(block, block) > 0.0:
                 row = 3 * wp.where(lumped == 1, s.touched[w, k], s.place[w, c.ring[e]])
                 gather_rows(
-                    c.compliance, w, m, s.coordinate, row, 3, s.known, s.between, n, s.column_place, s.columns
+                    c.compliance, w, m, s.coordinate, row, 3, s.ready, s.between, n, s.column_place, s.columns
                 )
                 add_rows(s.matrix, w, n, wide, 3 * k, scale * block, s.columns, row)
     for k in range(inner):
@@ -203,7 +203,7 @@ def _fill_by_rows(
                 one = wp.where(row == place, float(s.stiff[w, place - 3 * nnode]), 0.0)
             if one != 0.0:
                 gather_rows(
-                    c.compliance, w, m, s.coordinate, row, 1, s.known, s.between, n, s.column_place, s.columns
+                    c.compliance, w, m, s.coordinate, row, 1, s.ready, s.between, n, s.column_place, s.columns
                 )
                 add_row(s.matrix, w, n, wide, i, scale * one, s.columns, row)
 
