@@ -19,7 +19,7 @@ SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1
 <body pos="0 0 .15"><freejoint/><geom type="mesh" mesh="tet"/></body></worldbody></mujoco>"""
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def count(out: wp.array(dtype=int)):
     out[0] = 7
 
@@ -51,7 +51,8 @@ def test_all_that_a_step_launches_is_found_and_nothing_runs(monkeypatch):
             def launch(kernel, *given, real=real, **named):
                 if np.prod(named["dim"] if "dim" in named else given[0]):
                     launched.add(kernel.module)
-                return real(kernel, *given, **named)
+                if "ccd" not in kernel.module.name:  # which would only take 7 s to compile
+                    real(kernel, *given, **named)
 
             monkeypatch.setattr(wp, name, launch)
         mjw.step(m, d)

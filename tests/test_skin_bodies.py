@@ -96,7 +96,7 @@ def test_bodies_that_cannot_move_are_posed(pad):
     np.testing.assert_allclose(data.wrench, there.wrench, rtol=1e-4, atol=1e-5)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def inverted(n: int, M: wp.array3d(dtype=real), pivot: wp.array2d(dtype=int)):
     w, t = wp.tid()
     bodies._invert(w, t, n, M, pivot)

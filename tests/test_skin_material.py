@@ -78,7 +78,7 @@ def central(f, h):
     return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def rotate(F: wp.array(dtype=mat33), double_out: wp.array(dtype=mat33), single_out: wp.array(dtype=mat33)):
     i = wp.tid()
     double_out[i] = polar(F[i])

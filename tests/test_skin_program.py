@@ -14,18 +14,18 @@ from biotac_mj.skin.program import Launcher, Program
 CPU = "cpu"
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def add(a: wp.array(dtype=int), k: int, out: wp.array(dtype=int)):
     i = wp.tid()
     out[i] = out[i] + k * a[i]
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def count_down(flag: wp.array(dtype=int)):
     flag[0] = wp.max(flag[0] - 1, 0)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def sum_block(a: wp.array2d(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
     i, t = wp.tid()
     s = wp.float64(0.0)

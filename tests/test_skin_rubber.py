@@ -38,7 +38,7 @@ def model():
     return SkinModel(load_skin("coarse"), "ansys")
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _bound(geoms: Geoms, p: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.float64)):
     i = wp.tid()
     out[i] = distance_bound(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], p[i])

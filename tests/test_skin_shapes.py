@@ -23,7 +23,7 @@ SIZES = {
 }
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _distances(
     geoms: Geoms,
     point: wp.array(dtype=wp.vec3d),

@@ -224,15 +224,15 @@ class Settings:
         options = keywords.pop("options", None)
         if not isinstance(options, dict | None) or not all(isinstance(key, str) for key in options or ()):
             raise ValueError(f"options is {short_repr(options)}: give a dict of names and values")
-        keywords, options = _sensor_said_once(keywords, dict(options or {}))
+        keywords, options = _sensor_moved(keywords, dict(options or {}))
         changes = {_PLACES[name]: value for name, value in keywords.items()}
         return settings._with_options(options)._with(changes)
 
     @property
     def options(self) -> dict:
         """The settings that were given, as the keyword `options` takes them."""
-        said = {name: self._at(place) for name, place in _OPTIONS.items()}
-        return {**self.more, **{name: value for name, value in said.items() if value is not None}}
+        given = {name: self._at(place) for name, place in _OPTIONS.items()}
+        return {**self.more, **{name: value for name, value in given.items() if value is not None}}
 
     @property
     def keywords(self) -> dict:
@@ -406,8 +406,9 @@ for _stage, _kind in (*_STAGES.items(), ("", Settings)):
             _PLACES[_one.metadata.get("keyword") or _one.name] = _stage, _one.name
 
 
-def _sensor_said_once(keywords, options):
-    """Keywords and options with the sensor's settings of `readings` and options["readings"] moved to them."""
+def _sensor_moved(keywords, options):
+    """Keywords and options, with the settings of a sensor inside `readings` and options["readings"] moved to
+    the keywords."""
     signal, readings = keywords.get("signal"), keywords.get("readings")
     if signal is not None and not isinstance(signal, (str, pathlib.Path)):
         raise ValueError(

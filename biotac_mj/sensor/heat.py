@@ -56,7 +56,7 @@ _FOUR_PI = 4 * math.pi
 
 
 def state_size(ngroup: int) -> int:
-    """Length of the state of a sensor that up to `ngroup` bodies touch."""
+    """Length of the state of a sensor in contact with at most `ngroup` bodies."""
     return BODIES + BODY * ngroup
 
 

@@ -157,11 +157,8 @@ def wrenches(
 
 @wp.func
 def follow(r: Rounds, g: int, w: int, h: real, gain: vec6):
-    """Finds where a body goes with an acceleration `gain` of itself, and where the skin is solved for it:
-    from the pose without acceleration, moved by beta h^2 times that. The travel is that of the mean velocity
-    in the step.
-
-    Bodies turn by both at once, see `displace_at_once`."""
+    """Predicts a body's travel in the step for its acceleration `gain`, and the pose at which the skin is
+    solved: the pose without acceleration, displaced by beta h^2 `gain` (`displace_at_once`)."""
     m = r.square[g, w] * gain
     r.moved[g, w] = m
     r.travel[g, w] = r.straight[g, w] + real(0.5) * h * h * gain

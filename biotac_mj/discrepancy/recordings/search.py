@@ -160,8 +160,8 @@ def _refined(session, finding, same):
 
 
 def _proved(session):
-    """The session without the findings that the held-out rows contradict, or that are one too many of all
-    that was tested."""
+    """The session without the findings that held-out rows contradict or that exceed the false-discovery
+    rate."""
     for finding in session.findings:
         prove(session, finding)
     tested = [*session.findings, *session.weak]

@@ -105,6 +105,6 @@ class Session:
 
 
 def _taken(finding):
-    """Counts RMS that a candidate takes away from held-out rows, 0 of what is measured in another unit."""
+    """Decrease of the held-out rows' RMS by a finding [counts]; 0 for findings in other units."""
     gap = finding.gap
     return gap.taken if gap is not None and gap.unit == "counts" and np.isfinite(gap.after) else 0.0

@@ -66,7 +66,7 @@ class Fields:
         return Fields([self.quick[i] for i in which], slopes, some, deeper=deeper, film=film)
 
     def shifted(self, i: int, offset: np.ndarray) -> np.ndarray:
-        """(n, nelectrode + 4) what an offset (n, 3) of the poses changes of trajectory i [m]."""
+        """Changes (n, nelectrode + 4) of trajectory i by an offset (n, 3) of its poses [m]."""
         heading, change = self.trajectories[i].heading, 0.0
         if self.deeper is not None:
             along = offset @ heading
