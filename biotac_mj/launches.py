@@ -1,4 +1,5 @@
-"""Kernel launches on the CPU, packed once and run many times."""
+"""Kernel launches on the CPU, packed once and run many times. Not by Warp's own capture on the CPU: while
+that records, it takes the launches of all threads."""
 
 import ctypes
 import functools

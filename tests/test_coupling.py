@@ -558,7 +558,7 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep, monkeypatch):
 
     def watch(self, rounds):
         conclude(self, rounds)
-        frequency = [skin.instance.frequency for skin in self.skins]
+        frequency = [skin.instance.outcome.frequency for skin in self.skins]
         seen[:] = self.jacobian, self.arrays.tangent0.copy(), np.concatenate(frequency)
 
     monkeypatch.setattr(group.SkinGroup, "conclude", watch)

@@ -3,7 +3,6 @@
 The state between steps is in `mjData.plugin_state`. Everything else in an `Instance` can be recomputed from
 it, so mj_getState, mj_copyData, mj_resetData, rollouts and threads work on MuJoCo's own state alone."""
 
-import copy
 import dataclasses
 import functools
 import math
@@ -42,11 +41,32 @@ NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.
 # flag with which nothing in the model touches, the skin neither
 NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
-# how a step went in which bodies and skin do not meet: see `concluded`
-_ALONE = 1, True, 0.0, 0.0, None
 _RK4, _DISCRETE = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("RK4", "DISCRETE"))
 NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
+
+
+@dataclasses.dataclass
+class Outcome:
+    """How a coupled step went; the defaults are of a step in which bodies and skin do not meet.
+
+    Attributes:
+      rounds: through MuJoCo's solver and the skin.
+      settled: whether the skin was solved where the bodies go.
+      withheld: fraction of the skin's push on a body that was, for lack of energy.
+      energy: (ngroup,) left to each body in the skin at most [J].
+      acting: wrenches (ngroup, 6) that the bodies get, None: those of the skin's last solve.
+      gamma: (ngroup,) Newmark's. frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s];
+        None leaves the stored one.
+    """
+
+    rounds: int = 1
+    settled: bool = True
+    withheld: float = 0.0
+    energy: np.ndarray | float = 0.0
+    acting: np.ndarray | None = None
+    gamma: np.ndarray | float = EULER
+    frequency: np.ndarray | None = None
 
 
 class Instance:
@@ -54,8 +74,9 @@ class Instance:
 
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
-      step_gamma: (ngroup,) Newmark's gamma of the bodies in the last step that was solved.
-      frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s]; None leaves the stored one.
+      outcome: `Outcome` of the last step. ends: poses (ngroup, 3), (ngroup, 3, 3) of the bodies at its end,
+        None: the predicted ones. A body that the next step finds elsewhere was moved by others.
+      begun: frame in which a coupled step began.
       state: (nstate,) view of the plugin state, which stays where it is; parts: its parts, see `Setup.parts`;
         state_address: where it is.
       slots: of a two-way one, see `assign_slots`. keep_held: `StepArrays.held` of it, set by its group.
@@ -149,18 +170,13 @@ class Instance:
 
     def _forget(self):
         self._error, self._result, self._reading = False, None, None
-        self._outcome, self._ends = _ALONE, None
+        self.outcome, self.ends = Outcome(), None
         self.put, self.sensed, self.stays = None, False, False
-        self.step_gamma, self.frequency = np.full(self.setup.ngroup, EULER), None
 
     @functools.cached_property
     def kinematics(self) -> Kinematics:
         """Of the touching bodies."""
         return Kinematics(self.model, self.data, [self.touching])
-
-    def begin(self) -> None:
-        """Begins a coupled step in the frame of now."""
-        self._begun = self._frame()
 
     def take_placed(self, placed: np.ndarray) -> bool | None:
         """Bodies that were placed, (ngroup,) of int, begin where they were put, which may lie behind where
@@ -173,13 +189,14 @@ class Instance:
                 self.put = stepper.put(self._skin, placed[self.touching.group], *where)
             return stepper.is_clear(*where)
 
-    def _frame(self):
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose (3,) [m], (3, 3) of the BioTac in the world."""
         core = self.touching.core
         return self.data.xpos[core].copy(), self.data.xmat[core].reshape(3, 3).copy()
 
     def seen(self, wrench: np.ndarray) -> np.ndarray:
         """Wrenches (n, 6) in the BioTac frame with which the step began, in that of now."""
-        return _carried(wrench, self._begun, self._frame()) if self.lead else wrench.copy()
+        return _carried(wrench, self.begun, self.frame()) if self.lead else wrench.copy()
 
     @property
     def _skin(self):
@@ -257,13 +274,16 @@ class Instance:
             geom_pose = self.touching.geom_pose(pos, mat)
             with self.setup.skin.lock:
                 result = stepper.solve_skin(before, *geom_pose, dt, **more)
+            pose = (pos, mat) if bodies is None else self._came_to(result.state)
             fraction, path = self.touching.fraction, self.touching.path
-            result = copy.copy(result)  # a stepper may keep it
-            result.pose = (pos, mat) if bodies is None else self._came_to(result.state)
-            result.wrench = fraction[:, None] * result.wrench
-            result.tangent = (fraction * path)[:, None, None] * result.tangent
+            wrench, tangent = (
+                fraction[:, None] * result.wrench,
+                (fraction * path)[:, None, None] * result.tangent,
+            )
             if self.two_way:
-                result.tangent = self.keep_held(result.tangent)
+                tangent = self.keep_held(tangent)
+            # a stepper may keep its own
+            result = dataclasses.replace(result, pose=pose, wrench=wrench, tangent=tangent)
             if not result.converged:
                 result = self._as_far_as_known(result, before)
             if len(self._solved) > 8:
@@ -314,33 +334,6 @@ class Instance:
             vert_xpos=stepper.vert_xpos(state),
         )
 
-    def concluded(
-        self, rounds: int, settled: bool, withheld: float, energy: np.ndarray, acting: np.ndarray
-    ) -> None:
-        """Keeps for the readings and `commit_step` how the coupled step went.
-
-        Args:
-          rounds: through MuJoCo's solver and the skin.
-          settled: whether the skin was solved where the bodies go.
-          withheld: fraction of the skin's push on a body that was, for lack of energy.
-          energy: (ngroup,) left to each body in the skin at most [J].
-          acting: wrenches (ngroup, 6) that the bodies get in this step; where it did not settle or push was
-            withheld, not those of the skin's last solve.
-        """
-        self._outcome = rounds, settled, withheld, energy, acting
-
-    def settle(self, energy: np.ndarray, near: bool) -> None:
-        """Corrects the outcome by the poses that the integrator has reached. near: whether they are close to
-        the predicted ones; used with Runge-Kutta only, whose status is written when the step ends."""
-        rounds, settled, withheld, _, acting = self._outcome
-        self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, acting
-
-    def arrive(self, pos: np.ndarray, mat: np.ndarray) -> None:
-        """Keeps the poses of the bodies at the end of the step, (ngroup, 3), (ngroup, 3, 3): a body that the
-        next step finds elsewhere was moved by others."""
-        if not self._error and self._result is not None:
-            self._ends = pos, mat
-
     def _counts(self):
         if self._reading is None:
             skin, result = self.setup.skin, self._result
@@ -374,7 +367,6 @@ class Instance:
         for name, counts in self._counts()[1].items():
             if name in self.sensor:
                 out[self.sensor[name]] = counts
-        rounds, _, withheld, *_ = self._outcome
         wrench, good = self._stages[0] if self._stages else self._acting()
         if "contact_force" in self.sensor:
             out[self.sensor["contact_force"]] = wrench
@@ -392,7 +384,8 @@ class Instance:
                     "(docs/concepts/tiers.md)"
                 )
             failed, way = self.state[FAILED] + (not good), result.load_factor
-            of_step = good, failed, result.iterations, result.residual, tier, rounds, way, withheld
+            of_solve = result.iterations, result.residual
+            of_step = good, failed, *of_solve, tier, self.outcome.rounds, way, self.outcome.withheld
             out[self.sensor["status"]] = of_step
 
     def _warn_once(self, text):
@@ -408,16 +401,15 @@ class Instance:
         force = solid - self.acting_wrench().sum(axis=0)
         for other, group in self.skins_met:
             push = other.acting_wrench()[[group]]
-            force += _carried(push, other._frame(), self._frame())[0]
-        return force, self._result.converged and self._outcome[1] and solved
+            force += _carried(push, other.frame(), self.frame())[0]
+        return force, self._result.converged and self.outcome.settled and solved
 
     def acting_wrench(self) -> np.ndarray:
         """(ngroup, 6) that the touching bodies get from the skin in this step, in the BioTac frame; zeros
         after an error."""
         if self._error or self._result is None:
             return np.zeros((self.setup.ngroup, 6))
-        acting = self._outcome[-1]
-        return self._result.wrench if acting is None else acting
+        return self._result.wrench if self.outcome.acting is None else self.outcome.acting
 
     @functools.cached_property
     def _touches(self):
@@ -448,13 +440,13 @@ class Instance:
         if self._error:
             return
         if first:
-            self._stages, self._first = [], self._frame()
+            self._stages, self._first = [], self.frame()
         if held:
             wrench, good = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
             before, settled = self._stages[0]
         else:
             (wrench, good), before, settled = self._acting(), 0.0, True
-        wrench = before + _carried(wrench[None], self._frame(), self._first)[0]
+        wrench = before + _carried(wrench[None], self.frame(), self._first)[0]
         self._stages.append((wrench, good and settled))
 
     def _sum_up(self, settled):
@@ -496,20 +488,23 @@ class Instance:
             return
         readings, _ = self._counts()
         head, models, skin, readings_state = self.parts
-        _, settled, _, energy, acting = self._outcome
-        good = self._sum_up(result.converged and settled)
+        good = self._sum_up(result.converged and self.outcome.settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
-        reach = OUT_OF_REACH if acting is None else REACHED
+        reach = OUT_OF_REACH if self.outcome.acting is None else REACHED
         if good and self.stays:
             reach = STAYED if result.measured else -STAYED
         head[:] = head[FAILED] + (not good), good - steps, reach
-        n, ends = self.setup.ngroup, self._ends or self._pose
+        n, ends = self.setup.ngroup, self.ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, SLACK] = result.slack
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
-        models[:, 54:57], models[:, 57:66], models[:, ENERGY] = ends[0], ends[1].reshape(n, 9), energy
-        if self.frequency is not None:
-            models[:, FREQUENCY] = self.frequency
+        models[:, 54:57], models[:, 57:66], models[:, ENERGY] = (
+            ends[0],
+            ends[1].reshape(n, 9),
+            self.outcome.energy,
+        )
+        if self.outcome.frequency is not None:
+            models[:, FREQUENCY] = self.outcome.frequency
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

@@ -36,6 +36,7 @@ solve_rest = None
 
 _GRID_SPACING = 4e-4  # of the core's distance grid [m], whose spline smooths the edges of triangles
 _GRID_MARGIN = 3e-3  # of the core's distance grid around the core [m]
+_COLUMN = 1e-3  # width of the columns in which points of the core follow each other [m]
 # pressure of the core over E above which skin counts as passing through the core, if it is also deeper in it
 # than a geom may be; confined rubber may have such a pressure
 _CRUSHED = 50.0
@@ -300,7 +301,9 @@ class SkinModel:
         if self.has_core:
             faces = self._core_faces() if core_faces is None else geometry.inner_face[core_faces]
             self.core_surface = Surface.create(vert, faces, self.device)
-            self.core_vert = wp.array(geometry.core_vert, dtype=vec3, device=self.device)
+            # neighbours follow each other: `penetration.geoms_core_clearance` passes over those of a far one
+            order = np.lexsort((geometry.core_vert[:, 2], *geometry.core_vert[:, :2].T // _COLUMN))
+            self.core_vert = wp.array(geometry.core_vert[order], dtype=vec3, device=self.device)
             center = geometry.core_vert.mean(0)
             self.core_center = vec3(*center)
             self.core_radius = float(np.linalg.norm(geometry.core_vert - center, axis=1).max())

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...skin.bodies import BodyMotion
-from ..instance import Instance
+from ..instance import Instance, Outcome
 from ..structs import DataView
 from .rules import FORETOLD, STILL, TOLERANCE
 from .step_arrays import StepArrays
@@ -85,6 +85,6 @@ class Coupled:
         """Tells the instance how the step went."""
         acting = self.instance.seen(self.of("acting"))
         withheld = 1.0 - self.of("push").min(initial=1.0)
-        self.instance.concluded(rounds, self.settled, withheld, self.of("left_out").copy(), acting)
-        gamma, frequency = self.of("gamma").copy(), self.of("frequency").copy()
-        self.instance.step_gamma, self.instance.frequency = gamma, frequency
+        of_bodies = (self.of(name).copy() for name in ("gamma", "frequency"))
+        energy = self.of("left_out").copy()
+        self.instance.outcome = Outcome(rounds, self.settled, withheld, energy, acting, *of_bodies)

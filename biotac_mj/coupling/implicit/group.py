@@ -83,7 +83,7 @@ class SkinGroup:
                 if skin.of("placed").any() and skin.instance.take_placed(skin.of("placed")):
                     arrays.inside[skin.number] = 0
         for skin in self.skins:
-            skin.instance.begin()
+            skin.instance.begun = skin.instance.frame()
 
     @property
     def touching(self) -> np.ndarray:
@@ -178,21 +178,23 @@ class SkinGroup:
 
         Args:
           moved: (nv,) displacement of the degrees of freedom by their mean velocity in the step.
-          near: [m] from where they were to go.
+          near: [m] from where they were to go, by Runge-Kutta's stages.
         """
         travel = self.jacobian @ moved
         error = np.abs((travel - self.arrays.travel) * _SCALE)
         self.arrays.travel[:] = travel
         self._find_left()
         for skin in self.skins:
-            is_near = error[skin.bodies].max(initial=0.0) < near
-            skin.instance.settle(skin.of("left_out").copy(), is_near)
+            outcome = skin.instance.outcome
+            outcome.energy = skin.of("left_out").copy()
+            if skin.instance.by_stages:  # whose status is written when the step ends
+                outcome.settled &= bool(error[skin.bodies].max(initial=0.0) < near)
 
     def arrive(self) -> None:
         """Keeps where the bodies are when MuJoCo's poses are those at the end of the step."""
         pos, mat = self._kinematics.predict(0.0)
         for skin in self._all:
-            skin.instance.arrive(pos[skin.bodies], mat[skin.bodies])
+            skin.instance.ends = pos[skin.bodies], mat[skin.bodies]
 
     def _find_left(self):
         converged = np.zeros(len(self._all), bool)
