@@ -17,7 +17,7 @@ from .rounds import Model
 
 wp.set_module_options({"enable_backward": False})
 
-THREADS = 128  # that factor a world's matrix on CUDA
+THREADS = 64  # that factor a world's matrix on CUDA
 
 _QUADRATIC, _CONE = (
     wp.constant(int(getattr(mujoco.mjtConstraintState, f"mjCNSTRSTATE_{name}")))
@@ -80,7 +80,7 @@ def _is_spring(
     return spring
 
 
-@wp.kernel(launch_bounds=(THREADS, 5))
+@wp.kernel(launch_bounds=(THREADS, 10))
 def factor(
     # In:
     going: wp.array(dtype=int),

@@ -9,7 +9,6 @@ import functools
 import warp as wp
 
 from ..block import block_max, block_rank, block_sum, sync
-from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
@@ -48,17 +47,7 @@ def _swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
 
 
 @wp.func
-def _find_motion(
-    w: int,
-    t: int,
-    threads: int,
-    nnode: int,
-    nin: int,
-    geoms: Geoms,
-    touch: Contact,
-    c: Constants,
-    s: Scratch,
-):
+def _find_motion(w: int, t: int, threads: int, nnode: int, nin: int, geoms: Geoms, c: Constants, s: Scratch):
     """Replaces displacements vector[TRY] by the motion from vector[U], for touching nodes relative to the
     geoms, which have moved since the last equilibrium."""
     nsample = c.sample.shape[0]
@@ -69,9 +58,9 @@ def _find_motion(
         g = int(-1)
         for m in range(c.start[i], c.start[i + 1]):
             f = c.slot[m] / 3
-            if touch.touching[f, w] == 1:
+            if s.touch.touching[f, w] == 1:
                 for n in range(nsample):
-                    g = wp.max(g, touch.trial_geom[f * nsample + n, w])
+                    g = wp.max(g, s.touch.trial_geom[f * nsample + n, w])
         if g >= 0:
             turn = geoms.mat[g, w] * wp.transpose(s.held_mat[g, w])
             u += geoms.pos[g, w] + turn * (p - s.held_pos[g, w]) - p
@@ -154,23 +143,13 @@ def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
 
 
 @wp.func
-def _take_step(
-    w: int,
-    t: int,
-    threads: int,
-    d: Newton,
-    o: Increment,
-    geoms: Geoms,
-    touch: Contact,
-    c: Constants,
-    s: Scratch,
-):
+def _take_step(w: int, t: int, threads: int, d: Newton, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """After an evaluation of contact, tests a step, computes the next one, or ends."""
     n = 3 * o.nnode + o.nin
     if d.predictor == Predictor.EVALUATED:
         multiply(w, t, threads, o.nnode, n, F, d.fresh, 1, d.linear, c, s)
         d.fresh = -1
-        _find_motion(w, t, threads, o.nnode, o.nin, geoms, touch, c, s)
+        _find_motion(w, t, threads, o.nnode, o.nin, geoms, c, s)
     elif d.searching == 1:
         d = _look_along(w, t, threads, n, d, s)
     steps = 1 - d.searching  # whether a step is to be found
@@ -182,9 +161,7 @@ def _take_step(
             d.found = CUT
         elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.viscosity <= _FIXED:
             moved = wp.where(d.predictor != Predictor.NONE, 1, 0)
-            good, equations = solve_system(
-                w, t, threads, o.nnode, o.nin, d.viscosity, moved, d.linear, touch, c, s
-            )  # fmt: skip
+            good, equations = solve_system(w, t, threads, o.nnode, o.nin, d.viscosity, moved, d.linear, c, s)
             dear = real(equations) / _DEAR
             d.spent += dear * dear
         if d.predictor != Predictor.NONE:
@@ -257,7 +234,6 @@ def newton_method(shapes: str) -> wp.Function:
         d: Newton,
         o: Increment,
         geoms: Geoms,
-        touch: Contact,
         c: Constants,
         s: Scratch,
     ):
@@ -295,7 +271,9 @@ def newton_method(shapes: str) -> wp.Function:
             count += rank[1]
         sync()
         several = s.bodies.compliance.shape[0] > 1
-        touch_faces(w, t, threads, count, s.look, s.close_to, geoms, s.x, touch, 1 - d.ends, d.travel, s.free)
+        touch_faces(
+            w, t, threads, count, s.look, s.close_to, geoms, s.x, s.touch, 1 - d.ends, d.travel, s.free
+        )
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
@@ -303,10 +281,10 @@ def newton_method(shapes: str) -> wp.Function:
             on = int(0)
             for m in range(c.start[i], c.start[i + 1]):
                 f = c.slot[m] / 3
-                if touch.touching[f, w] == 1:
-                    total += touch.corner[c.slot[m], w]
+                if s.touch.touching[f, w] == 1:
+                    total += s.touch.corner[c.slot[m], w]
                     if on == 0 and several:
-                        s.group[w, k] = touching_group(f, w, geoms, touch, c.sample.shape[0], s.group[w, k])
+                        s.group[w, k] = touching_group(f, w, geoms, s.touch, c.sample.shape[0], s.group[w, k])
                     on = 1
             s.on[w, k] = on
             for a in range(3):
@@ -332,7 +310,7 @@ def newton_method(shapes: str) -> wp.Function:
                 f = c.inner_slot[m] / 3
                 place = s.near_core[w, f] - 1
                 if place >= 0:
-                    weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    weight = s.touch.stiffness[w] * c.inner_area[f] / real(nsample)
                     for n in range(nsample):
                         gap = s.now[w, place, n]
                         if gap < real(0.0):
@@ -357,7 +335,6 @@ def newton_method(shapes: str) -> wp.Function:
         t: int,
         threads: int,
         geoms: Geoms,
-        touch: Contact,
         c: Constants,
         s: Scratch,
     ):
@@ -369,10 +346,10 @@ def newton_method(shapes: str) -> wp.Function:
         while going == 1:
             sync()
             if evaluated == 1:
-                d = _take_step(w, t, threads, d, o, geoms, touch, c, s)
+                d = _take_step(w, t, threads, d, o, geoms, c, s)
             sync()
             going = 1 - d.ends
-            d = evaluate_contact(w, t, threads, d, o, geoms, touch, c, s)
+            d = evaluate_contact(w, t, threads, d, o, geoms, c, s)
             evaluated = 1
         if t == 0:
             s.solve.newton[w] = d

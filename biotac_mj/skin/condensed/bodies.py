@@ -37,16 +37,7 @@ def _group_of(w: int, i: int, geoms: Geoms, touch: Contact, c: Constants):
 
 
 @wp.func
-def find_groups(
-    w: int,
-    t: int,
-    threads: int,
-    nnode: int,
-    geoms: Geoms,
-    touch: Contact,
-    c: Constants,
-    s: Scratch,
-):
+def find_groups(w: int, t: int, threads: int, nnode: int, geoms: Geoms, c: Constants, s: Scratch):
     """Finds the position of each candidate node, and its group of geoms, kept until another one touches
     it."""
     groups = s.bodies.compliance.shape[0]
@@ -54,7 +45,7 @@ def find_groups(
         s.arm[w, k] = s.x[c.node[s.node[w, k]], w]
         s.group[w, k] = 0
         if groups > 1:
-            s.group[w, k] = _group_of(w, s.node[w, k], geoms, touch, c)
+            s.group[w, k] = _group_of(w, s.node[w, k], geoms, s.touch, c)
     sync()
 
 
@@ -72,19 +63,22 @@ def touching_group(f: int, w: int, geoms: Geoms, touch: Contact, nsample: int, g
 def number_bodies(w: int, t: int, threads: int, outer: int, s: Scratch):
     """Gives the bodies that touched nodes answer to, and that give way, their equations."""
     b = s.bodies
-    column = int(0)
-    for h in range(b.compliance.shape[0]):
+    groups = b.compliance.shape[0]
+    for h in range(t, groups, threads):
+        b.column[h, w] = -1
+    sync()
+    for m in range(t, wp.where(groups > 0, outer, 0), threads):
+        h = s.group[w, s.touched[w, m]]
         gives = b.compliance[h, h, w]
-        members = real(0.0)
-        for m in range(t, outer, threads):
-            if s.group[w, s.touched[w, m]] == h:
-                members = real(1.0)
-        on = block_sum(members) > real(0.0) and wp.ddot(gives, gives) > real(0.0)
-        if t == 0:
-            b.column[h, w] = wp.where(on, column, -1)
-        if on:
-            column += 6
+        if wp.ddot(gives, gives) > real(0.0):
+            b.column[h, w] = 0
+    sync()
     if t == 0:
+        column = int(0)
+        for h in range(groups):
+            if b.column[h, w] == 0:
+                b.column[h, w] = column
+                column += 6
         s.borders[w] = column
     sync()
 
@@ -105,10 +99,10 @@ def _set_motions(w: int, t: int, threads: int, b: Bodies):
 
 @wp.func
 def _list_loads(w: int, t: int, threads: int, p: int, nnode: int, s: Scratch):
-    """Makes the wrench of each body that on the nodes of its group that vector[p] of the candidates is: by a
-    warp for each, on the CPU by the one thread."""
+    """Makes the wrench of each body that on the nodes of its group that vector[p] of the candidates is: by
+    eight threads for each, on the CPU by the one."""
     b = s.bodies
-    lanes = wp.min(threads, 32)
+    lanes = wp.min(threads, 8)
     for h in range(t / lanes, b.wrench.shape[0], threads / lanes):
         force = vec3()
         torque = vec3()
@@ -201,14 +195,14 @@ def pose_by_load(
 
 
 @wp.func
-def sum_forces(w: int, t: int, threads: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
+def sum_forces(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
     """Makes the wrenches `posed` those of the forces on all outer nodes that a solve begins with."""
     b = s.bodies
     groups = b.compliance.shape[0]
     for i in range(t, wp.where(groups > 0, c.node.shape[0], 0), threads):
         mine = int(-1)
         if wp.length_sq(s.force[w, i]) > real(0.0):
-            mine = wp.where(groups > 1, _group_of(w, i, geoms, touch, c), 0)
+            mine = wp.where(groups > 1, _group_of(w, i, geoms, s.touch, c), 0)
         s.look[w, i] = mine  # which has no other use before faces are sought
     for h in range(groups):
         force = vec3()

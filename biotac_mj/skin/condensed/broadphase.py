@@ -102,16 +102,7 @@ def largest_displacement(w: int, t: int, threads: int, x: wp.array2d(dtype=vec3)
 
 
 @wp.func
-def forget_faces(
-    w: int,
-    t: int,
-    threads: int,
-    geoms: Geoms,
-    kept: wp.array2d(dtype=int),
-    c: Constants,
-    s: Scratch,
-    touching: wp.array2d(dtype=int),
-):
+def forget_faces(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
     """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
     for i in range(t, s.x.shape[0], threads):
         s.sought_x[i, w] = s.x[i, w]
@@ -119,9 +110,9 @@ def forget_faces(
         s.sought_pos[g, w] = geoms.pos[g, w]
         s.sought_mat[g, w] = geoms.mat[g, w]
     for f in range(t, c.face.shape[0], threads):
-        s.near[w, f] = kept[f, w]
+        s.near[w, f] = s.touch.kept[f, w]
         s.close_to[w, f] = wp.int64(0)
-        touching[f, w] = 0
+        s.touch.touching[f, w] = 0
     for f in range(t, c.inner_face.shape[0], threads):
         loaded = int(0)
         for k in range(3):
@@ -368,20 +359,11 @@ def may_be_touched(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: 
 
 
 @wp.func
-def is_known(
-    w: int,
-    t: int,
-    threads: int,
-    o: Increment,
-    geoms: Geoms,
-    kept: wp.array2d(dtype=int),
-    c: Constants,
-    s: Scratch,
-):
+def is_known(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """Whether the candidates that were found last are all that can touch."""
     other = real(0.0)
     for f in range(t, c.face.shape[0], threads):
-        if kept[f, w] == 1 and s.near[w, f] == 0:
+        if s.touch.kept[f, w] == 1 and s.near[w, f] == 0:
             other = real(1.0)
     for k in range(t, c.inner.shape[0], threads):
         if s.core_force[w, k] != real(0.0) and s.core_place[w, k] < 0:

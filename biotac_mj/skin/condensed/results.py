@@ -4,7 +4,6 @@ bodies and their tangents."""
 import warp as wp
 
 from ..block import block_max, block_sum, sync
-from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
@@ -125,7 +124,6 @@ def find_wrenches(
     nface: int,
     nnode: int,
     geoms: Geoms,
-    touch: Contact,
     c: Constants,
     s: Scratch,
     touched_by: wp.array2d(dtype=int),
@@ -139,8 +137,8 @@ def find_wrenches(
     nsample = c.sample.shape[0]
     for k in range(t, nface, threads):
         f = s.face[w, k]
-        for i in range(wp.where(touch.touching[f, w] == 1, nsample, 0)):
-            g = touch.trial_geom[f * nsample + i, w]
+        for i in range(wp.where(s.touch.touching[f, w] == 1, nsample, 0)):
+            g = s.touch.trial_geom[f * nsample + i, w]
             if g >= 0:
                 touched_by[g, w] = 1
     sync()
@@ -153,28 +151,28 @@ def find_wrenches(
         torque = vec3()
         for k in range(t, nface, threads):
             f = s.face[w, k]
-            if touch.touching[f, w] == 1:
+            if s.touch.touching[f, w] == 1:
                 face = c.face[f]
                 # what pushes elsewhere than at a sample, at an edge of a geom, has another torque
                 other = vec3()
                 for a in range(3):
-                    other += wp.cross(s.x[face[a], w], touch.corner[3 * f + a, w])
+                    other += wp.cross(s.x[face[a], w], s.touch.corner[3 * f + a, w])
                 mine = int(-1)
                 for i in range(nsample):
-                    g = touch.trial_geom[f * nsample + i, w]
+                    g = s.touch.trial_geom[f * nsample + i, w]
                     if g >= 0:
                         b = c.sample[i]
                         p = b[0] * s.x[face[0], w] + b[1] * s.x[face[1], w] + b[2] * s.x[face[2], w]
-                        moment = wp.cross(p, touch.sample_force[f * nsample + i, w])
+                        moment = wp.cross(p, s.touch.sample_force[f * nsample + i, w])
                         other -= moment
                         mine = geoms.group[g]
                         if mine == group:
-                            force += touch.sample_force[f * nsample + i, w]
+                            force += s.touch.sample_force[f * nsample + i, w]
                             torque += moment
                 if mine == group:
                     torque += other
         for k in range(t, nnode, threads):
-            fraction = fraction_of(w, k, group, geoms, touch, c, s)
+            fraction = fraction_of(w, k, group, geoms, c, s)
             if fraction > real(0.0):
                 rest = vec3()
                 for a in range(3):
@@ -190,7 +188,7 @@ def find_wrenches(
 
 
 @wp.func
-def fraction_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
+def fraction_of(w: int, k: int, group: int, geoms: Geoms, c: Constants, s: Scratch):
     """Fraction of a candidate node that a group of geoms touches."""
     i = c.node[s.node[w, k]]
     nsample = c.sample.shape[0]
@@ -198,9 +196,9 @@ def fraction_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Con
     whole = real(0.0)
     for m in range(c.start[i], c.start[i + 1]):
         f = c.slot[m] / 3
-        if touch.touching[f, w] == 1:
+        if s.touch.touching[f, w] == 1:
             for n in range(nsample):
-                g = touch.trial_geom[f * nsample + n, w]
+                g = s.touch.trial_geom[f * nsample + n, w]
                 if g >= 0:
                     b = c.sample[n][c.slot[m] % 3]
                     whole += b
@@ -220,7 +218,6 @@ def find_tangents(
     nin: int,
     l: Linear,
     geoms: Geoms,
-    touch: Contact,
     c: Constants,
     s: Scratch,
     touched_by: wp.array2d(dtype=int),
@@ -229,7 +226,7 @@ def find_tangents(
     """Stiffness against rigid motions of each group of geoms about the origin, with springs D lumped at the
     nodes: (1 + D W)^-1 D, which is symmetric and positive semi-definite. Springs have no stiffness along
     which their nodes slip, and their inverse would drown W in its rounding."""
-    outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
+    outer, inner = gather_blocks(w, t, threads, nnode, nin, c, s)
     for k in range(t, wp.min(outer, s.touched.shape[1]), threads):
         p = s.node[w, s.touched[w, k]]
         lumped = wp.mat33()
@@ -244,7 +241,7 @@ def find_tangents(
         most = real(0.0)
         if room == 1 and _touches(w, group, geoms, touched_by) == 1:
             for k in range(t, outer, threads):
-                fraction = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                fraction = fraction_of(w, s.touched[w, k], group, geoms, c, s)
                 s.vector[w, DU, k] = fraction  # no longer needed
                 most = wp.max(most, fraction)
         most = block_max(most)
@@ -297,7 +294,6 @@ def conclude(
     geoms: Geoms,
     c: Constants,
     wanted: wp.array(dtype=int),
-    touch: Contact,
     s: Scratch,
     # Out:
     touched_by_out: wp.array2d(dtype=int),
@@ -310,11 +306,9 @@ def conclude(
         return
     threads = wp.block_dim()
     o = s.solve.increment[w]
-    find_wrenches(w, t, threads, o.nface, o.nnode, geoms, touch, c, s, touched_by_out, wrench_out)
+    find_wrenches(w, t, threads, o.nface, o.nnode, geoms, c, s, touched_by_out, wrench_out)
     if tangent_out.shape[0] > 0:
-        find_tangents(
-            w, t, threads, o.nnode, o.nin, o.linear, geoms, touch, c, s, touched_by_out, tangent_out
-        )
+        find_tangents(w, t, threads, o.nnode, o.nin, o.linear, geoms, c, s, touched_by_out, tangent_out)
 
 
 @wp.kernel

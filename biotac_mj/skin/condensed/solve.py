@@ -7,7 +7,6 @@ import types
 
 import warp as wp
 
-from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import SKINS
 from ..newton.worlds import Worlds
@@ -41,7 +40,6 @@ def whole_step() -> wp.Kernel:
         rest_pressure: wp.array(dtype=real),
         c: Constants,
         # In and out:
-        touch: Contact,
         s: Scratch,
         r: Remembered,
         st: Worlds,
@@ -53,13 +51,11 @@ def whole_step() -> wp.Kernel:
         begin_step(w, 0, 1, law, geoms, s, st)
         while s.solve.phase[w] != DONE:
             if s.solve.phase[w] == SEARCH:
-                search(w, 0, 1, geoms, touch, c, s, r, st)
+                search(w, 0, 1, geoms, c, s, r, st)
             if s.solve.phase[w] == NEWTON:
-                balance(w, 0, 1, geoms, touch, c, s)
+                balance(w, 0, 1, geoms, c, s)
             if s.solve.phase[w] == BALANCED:
-                conclude_balance(
-                    w, 0, 1, geoms, rest_pressure, touch, c, s, r, st, node_force_out, tier_out
-                )  # fmt: skip
+                conclude_balance(w, 0, 1, geoms, rest_pressure, c, s, r, st, node_force_out, tier_out)
 
     return step
 
@@ -82,7 +78,6 @@ def _search(
     # In:
     geoms: Geoms,
     c: Constants,
-    touch: Contact,
     r: Remembered,
     st: Worlds,
     # Out:
@@ -90,7 +85,7 @@ def _search(
 ):
     w, t = wp.tid()
     if s.solve.phase[w] == SEARCH:
-        search(w, t, wp.block_dim(), geoms, touch, c, s, r, st)
+        search(w, t, wp.block_dim(), geoms, c, s, r, st)
 
 
 @functools.cache
@@ -102,13 +97,12 @@ def _balance(shapes):
         # In:
         geoms: Geoms,
         c: Constants,
-        touch: Contact,
         # Out:
         s: Scratch,
     ):
         w, t = wp.tid()
         if s.solve.phase[w] == NEWTON:
-            balance(w, t, wp.block_dim(), geoms, touch, c, s)
+            balance(w, t, wp.block_dim(), geoms, c, s)
 
     return _balance
 
@@ -120,7 +114,6 @@ def _conclude(
     rest_pressure: wp.array(dtype=real),
     c: Constants,
     # In and out:
-    touch: Contact,
     s: Scratch,
     r: Remembered,
     st: Worlds,
@@ -132,9 +125,7 @@ def _conclude(
     """Sets going[0] if a world has not finished."""
     w, t = wp.tid()
     if s.solve.phase[w] == BALANCED:
-        conclude_balance(
-            w, t, wp.block_dim(), geoms, rest_pressure, touch, c, s, r, st, node_force_out, tier_out
-        )  # fmt: skip
+        conclude_balance(w, t, wp.block_dim(), geoms, rest_pressure, c, s, r, st, node_force_out, tier_out)
     if t == 0 and s.solve.phase[w] != DONE:
         going_out[0] = 1
 

@@ -104,7 +104,7 @@ class CondensedStep:
         self._block = block_of(model.options.samples)
         law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
         no_bound = wp.zeros((0, 0), dtype=real, device=model.device)
-        self.touch = data.outer.contact(*law, data.x_last, no_bound)
+        self.touch = self._scratch.touch = data.outer.contact(*law, data.x_last, no_bound)
 
     def launch(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
         """Launches only: may be captured in a CUDA graph, as the parts below may.
@@ -133,7 +133,7 @@ class CondensedStep:
             whole_step(),
             [n],
             [m.law, geoms.struct, d.rest_pressure, c],
-            [self.touch, s, self.remembered, d.worlds, d.outer.node_force, self.tier],
+            [s, self.remembered, d.worlds, d.outer.node_force, self.tier],
         )
 
     def go_on(self, going: wp.array, launcher: Launcher | None = None) -> None:
@@ -141,7 +141,7 @@ class CondensedStep:
         if a world has not finished."""
         m, d, k = self._model, self._data, self._phases
         launcher = launcher or Launcher(m.device)
-        known = [self._geoms.struct, self._constants, self.touch]
+        known = [self._geoms.struct, self._constants]
         of_world = [self.remembered, d.worlds]
         out = [self._scratch, *of_world, d.outer.node_force, self.tier, going]
         for kernel, inputs, outputs in (
@@ -157,7 +157,7 @@ class CondensedStep:
         _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
         launcher = launcher or Launcher(m.device)
-        known = [geoms.struct, self._constants, d.worlds.wanted, self.touch, self._scratch]
+        known = [geoms.struct, self._constants, d.worlds.wanted, self._scratch]
         found = [touched_by, wrench, tangent]
         launcher.launch_blocks(conclude, [d.nworld], known, found, block_dim=self._block)
 

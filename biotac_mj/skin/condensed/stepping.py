@@ -5,7 +5,7 @@ phases of `states`; `solve` launches them."""
 import warp as wp
 
 from ..block import sync
-from ..contact.faces import Contact, balanced_fraction, commit_face
+from ..contact.faces import balanced_fraction, commit_face
 from ..contact.posed import Geoms
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import mat33, real, vec3
@@ -229,17 +229,7 @@ def _begin_at(
 
 
 @wp.func
-def search(
-    w: int,
-    t: int,
-    threads: int,
-    geoms: Geoms,
-    touch: Contact,
-    c: Constants,
-    s: Scratch,
-    r: Remembered,
-    st: Worlds,
-):
+def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch, r: Remembered, st: Worlds):
     """The phase SEARCH: finds the candidates, first at the start of an increment, then at its displacements
     while there are new ones. Where those of a long motion find no room it begins anew with nearer ones:
     the searches that follow find which of the others are touched."""
@@ -256,7 +246,7 @@ def search(
             o = _begin_at(w, t, threads, o, at.balance, at.pos, at.mat, p.modulus, c, s, st)
         else:
             o = _begin_at(w, t, threads, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
-        sum_forces(w, t, threads, geoms, touch, c, s)
+        sum_forces(w, t, threads, geoms, c, s)
         if p.at == real(0.0):  # where the step begins
             for h in range(t, s.bodies.begun.shape[0], threads):
                 s.bodies.begun[h, w] = s.bodies.posed[h, w]
@@ -270,12 +260,12 @@ def search(
             o.deep = 1
             looking = 0
         elif near & o.near == near:
-            known = is_known(w, t, threads, o, geoms, touch.kept, c, s)
+            known = is_known(w, t, threads, o, geoms, c, s)
         o.view = view
         o.travel = travel
         o.near = near
         if known == 0:
-            forget_faces(w, t, threads, geoms, touch.kept, c, s, touch.touching)
+            forget_faces(w, t, threads, geoms, c, s)
             o.reach = _REACH + moved
             if p.holds == 1 or looking == 0:  # what touched
                 o.reach = real(-1.0)
@@ -315,7 +305,7 @@ def search(
             o.ok = 0
     if looking == 1:
         measure_core(w, t, threads, o.nnode, o.nin, o.ncore, c, s)
-        find_groups(w, t, threads, o.nnode, geoms, touch, c, s)
+        find_groups(w, t, threads, o.nnode, geoms, c, s)
         _load(w, t, threads, o.nnode, o.nin, s)
         predictor = int(Predictor.NONE)
         before = o.linear
@@ -372,7 +362,6 @@ def _commit(
     threads: int,
     found: Increment,
     geoms: Geoms,
-    touch: Contact,
     c: Constants,
     s: Scratch,
     r: Remembered,
@@ -384,9 +373,9 @@ def _commit(
     if s.previous.pos.shape[0] > 0:
         _remember(w, t, threads, found, geoms, c, s, s.previous.balance, s.previous.pos, s.previous.mat)
     for f in range(t, c.face.shape[0], threads):
-        commit_face(f, w, touch)
+        commit_face(f, w, s.touch)
     for i in range(t, s.x.shape[0], threads):
-        touch.x_last[i, w] = s.x[i, w]
+        s.touch.x_last[i, w] = s.x[i, w]
     if t == 0:
         st.pressure[w] = found.pressure + rest_pressure
         st.last_pressure[w] = st.pressure[w]
@@ -401,7 +390,6 @@ def _conclude_pass(
     p: LoadStepping,
     o: Increment,
     geoms: Geoms,
-    touch: Contact,
     c: Constants,
     s: Scratch,
     st: Worlds,
@@ -424,7 +412,7 @@ def _conclude_pass(
             _bound(w, t, threads, o.nnode, o.nin, s)
         else:  # further from an equilibrium than where the path began
             o.ok = 0
-    if count_contacts(w, t, threads, o.nface, touch, c, s) > s.most_contacts:
+    if count_contacts(w, t, threads, o.nface, c, s) > s.most_contacts:
         o.ok = 0
     if o.ok == 0:
         return o, BALANCED
@@ -512,7 +500,6 @@ def conclude_balance(
     threads: int,
     geoms: Geoms,
     rest_pressure: wp.array(dtype=real),
-    touch: Contact,
     c: Constants,
     s: Scratch,
     r: Remembered,
@@ -526,7 +513,7 @@ def conclude_balance(
     sync()
     phase = BALANCED
     if o.solving == 1:
-        o, phase = _conclude_pass(w, t, threads, p, o, geoms, touch, c, s, st)
+        o, phase = _conclude_pass(w, t, threads, p, o, geoms, c, s, st)
     if phase != BALANCED:
         if t == 0:
             s.solve.increment[w] = o
@@ -535,10 +522,10 @@ def conclude_balance(
     if p.holds == 0 and o.ok != 0:
         if t == 0:
             tier[w] = o.measured
-        _commit(w, t, threads, o, geoms, touch, c, s, r, st, rest_pressure[w])
+        _commit(w, t, threads, o, geoms, c, s, r, st, rest_pressure[w])
     else:
         for i in range(t, s.x.shape[0], threads):
-            s.x[i, w] = touch.x_last[i, w]
+            s.x[i, w] = s.touch.x_last[i, w]
         sync()
     p, on = _go_on(s.most[w], p, o)
     if on == 1:

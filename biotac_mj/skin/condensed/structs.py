@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..bodies import Bodies
+from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..state import declared
 from ..types import mat33, real, vec3
@@ -100,6 +101,7 @@ class Scratch:
     results."""
 
     x: wp.array2d(dtype=vec3)  # nodes, those of the state [node, world] [m]
+    touch: Contact  # of the outer surface
     near: wp.array2d(dtype=int)  # which faces are candidates, by their place among them plus one; 0: none
     near_core: wp.array2d(dtype=int)  # which inner ones
     free: wp.array2d(dtype=real)  # `Newton.travel` until which a candidate face touches nothing [m]

@@ -4,7 +4,6 @@ liquid make of the coordinates that touch."""
 import warp as wp
 
 from ..block import block_rank, block_sum, sync
-from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3, vec6
 from .bodies import move_nodes, number_bodies
 from .lanes import add_row, add_rows, begin_row, dot_column, eliminate, gather_rows, sum_rows
@@ -104,9 +103,7 @@ def _find_touched(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch
 
 
 @wp.func
-def gather_blocks(
-    w: int, t: int, threads: int, nnode: int, nin: int, touch: Contact, c: Constants, s: Scratch
-):
+def gather_blocks(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
     """Lists what touches, and the stiffness of the pairs of outer nodes of which the first does; how many
     outer and inner nodes do, which are not listed where there is no room."""
     outer, inner = _find_touched(w, t, threads, nnode, nin, s)
@@ -120,11 +117,11 @@ def gather_blocks(
             total = mat33()
             for i in range(c.term_start[e], c.term_start[e + 1]):
                 f = c.term[i] / 9
-                if touch.touching[f, w] == 1:
+                if s.touch.touching[f, w] == 1:
                     a = (c.term[i] / 3) % 3
                     b = c.term[i] % 3
                     low = wp.min(a, b)
-                    total += touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
+                    total += s.touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
             s.block[w, k, m % most] = narrow(total)
     sync()
     nsample = c.sample.shape[0]
@@ -141,7 +138,7 @@ def gather_blocks(
                 b = c.inner_term[i] % 3
                 place = s.near_core[w, f] - 1
                 if place >= 0:
-                    weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    weight = s.touch.stiffness[w] * c.inner_area[f] / real(nsample)
                     for n in range(nsample):
                         if s.now[w, place, n] < real(0.0):
                             stiff += weight * c.sample[n][a] * c.sample[n][b]
@@ -151,13 +148,13 @@ def gather_blocks(
 
 
 @wp.func
-def count_contacts(w: int, t: int, threads: int, nface: int, touch: Contact, c: Constants, s: Scratch):
+def count_contacts(w: int, t: int, threads: int, nface: int, c: Constants, s: Scratch):
     """Number of touching samples of the candidates."""
     nsample = c.sample.shape[0]
     own = int(0)
     for k in range(t, nface * nsample, threads):
         f = s.face[w, k / nsample]
-        if touch.touching[f, w] == 1 and touch.trial_geom[f * nsample + k % nsample, w] >= 0:
+        if s.touch.touching[f, w] == 1 and s.touch.trial_geom[f * nsample + k % nsample, w] >= 0:
             own += 1
     return block_rank(own)[1]
 
@@ -337,7 +334,6 @@ def solve_system(
     viscosity: real,
     moved: int,
     l: Linear,
-    touch: Contact,
     c: Constants,
     s: Scratch,
 ):
@@ -346,7 +342,7 @@ def solve_system(
     and D resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + viscosity)
-    outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
+    outer, inner = gather_blocks(w, t, threads, nnode, nin, c, s)
     equations = 3 * outer + inner
     number_bodies(w, t, threads, wp.min(outer, s.touched.shape[1]), s)
     wide = equations + s.borders[w] + 1  # of a row, the right-hand side being its last entry
