@@ -238,19 +238,6 @@ def test_excluded_effects_are_less_likely_than_unseen_ones():
     )
 
 
-@pytest.mark.parametrize("alone, agrees", [(0.02, False), (0.06, True), (0.9, True)])
-def test_too_little_for_a_name_is_not_agreement(alone, agrees):
-    """Where the base model alone is less likely than one in twenty-one, what explains the data is said."""
-    effects = [[(by_id(name), by_id(name).default())] for name in ("mount", "rocking")]
-    some = [
-        Explanation(effect, Nuisance(), np.log(weight * len(CATALOGUE) ** len(effect)), np.eye(1), weight)
-        for effect, weight in zip([[], *effects], [alone, 0.6 * (1 - alone), 0.4 * (1 - alone)])
-    ]
-    said = Beliefs(some, 5e-5, {}, 1.0).against_none
-    assert (said == "") == agrees
-    assert agrees or by_id("mount").name in said and by_id("rocking").name in said
-
-
 @pytest.mark.parametrize("entry", CATALOGUE, ids=lambda e: e.id)
 def test_an_effect_that_is_read_back_has_its_parameters(entry):
     """Of a realistic size, as in what may be there unseen; every parameter can be moved."""

@@ -6,7 +6,7 @@ from ...effects.catalogue import name_of
 from ...effects.sensor_file import SensorFile
 from ...recordings.protocol import Protocol
 from ...recordings.recording import REST_LIKE
-from ..report.verdict import Estimate, Finding, Picture, Verdict
+from ..report.verdict import Estimate, Finding, Picture, Verdict, experiments
 from .amended import amended_sensor, running
 from .blind import not_identifiable
 from .candidates import Candidate
@@ -15,7 +15,7 @@ from .recording import PlainRecording
 from .rest import Rest, rest
 from .session import Session
 
-_NEXT = 3  # experiments
+_CHECKUP = "three minutes of touches that isolate one effect each tell what a plain log mixes"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,6 +64,7 @@ def concluded(
     seconds = len(r) / r.rate
     data = f"read as {r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
     data += ", with force" if r.force is not None else ""
+    further = experiments([_finding(f) for f in session.ordered])
     return RecordingDiagnosis(
         kind="plain recording",
         name=r.name,
@@ -80,7 +81,7 @@ def concluded(
         remainder=left.text,
         unknown=left.significant,
         notes=not_identifiable(session) + _order(r),
-        next_experiment=_next(session.ordered, protocol),
+        next_experiment="; ".join(further + ([] if protocol else [_CHECKUP])),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(session),
         details={
@@ -130,20 +131,6 @@ def _finding(f: Candidate) -> Finding:
         start=f.start,
         end=f.end,
     )
-
-
-def _next(findings, protocol):
-    """Measurements that distinguish the named effects from those they are confused with, and what a checkup
-    would add."""
-    tied = [(f.kind, i) for f in findings for i in f.ties]
-    rivals = [(kind, i) for kind in dict.fromkeys(f.kind for f in findings) for i in [*kind.confusable][:1]]
-    out = {
-        f"to tell {kind.name} from {name_of(i)}: {kind.confusable.get(i, 'no experiment is known')}": None
-        for kind, i in (tied or rivals)[:_NEXT]
-    }
-    if protocol is None:
-        out["three minutes of touches that isolate one effect each tell what a plain log mixes"] = None
-    return "; ".join(out)
 
 
 def _amended(session):

@@ -14,6 +14,7 @@ import typing
 
 import numpy as np
 
+from ...effects.catalogue import entries, name_of
 from ...effects.effect import STAGES
 
 if typing.TYPE_CHECKING:
@@ -23,6 +24,7 @@ if typing.TYPE_CHECKING:
 SCHEMA, VERSION = "biotac_mj.verdict", 3
 _NOISELESS = 2e-6  # counts or newtons: a simulated force has no noise, which is taken for half of that
 _ABOVE = 1.05  # times noise and resolution, from which on something is above them
+_NEXT = 3  # experiments
 _EVERYWHERE = 12  # electrodes, beyond which they are not listed
 
 
@@ -187,7 +189,12 @@ class Finding:
     @property
     def apart(self) -> dict[str, str]:
         """Name of each effect that it ties with -> experiment that would distinguish them."""
-        return {name: self.confusable.get(i, "no experiment is known") for i, name in self.ties.items()}
+        return {name: self.experiment(i) for i, name in self.ties.items()}
+
+    def experiment(self, other: str) -> str:
+        """What would distinguish it from another effect, by either one's entry."""
+        back = (effect.confusable.get(self.id) for effect in entries("poses") if effect.id == other)
+        return self.confusable.get(other) or next(back, None) or "no experiment is known"
 
     @property
     def title(self) -> str:
@@ -361,6 +368,16 @@ class Verdict:
         }
         written = json.dumps(document, default=lambda array: array.tolist())
         return json.loads(written, parse_constant=lambda _: None)
+
+
+def experiments(findings: typing.Sequence[Finding], known: typing.Container[str] | None = None) -> list[str]:
+    """A line for each experiment that would distinguish Findings from what they tie with, or else from the
+    first that each is confused with; known: ids of such, None: all."""
+    out = {}
+    for f in findings:
+        for other in f.ties or [i for i in f.confusable if known is None or i in known][:1]:
+            out[f"to tell {f.name} from {name_of(other)}: {f.experiment(other)}"] = None
+    return list(out)[:_NEXT]
 
 
 def electrode_names(electrodes: typing.Sequence[int]) -> list[str]:

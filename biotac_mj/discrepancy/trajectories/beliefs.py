@@ -166,21 +166,6 @@ class Beliefs:
         return self.told_apart and self.beside < SETTINGS.rate
 
     @property
-    def against_none(self) -> str:
-        """Line on the likeliest explanations, if none is named although the odds exclude the base model
-        alone: too little evidence for any one name is no agreement."""
-        exact = weights(
-            [one.score for one in self.explanations], [len(one.effects) for one in self.explanations]
-        )
-        alone = sum(w for w, one in zip(exact, self.explanations) if not one.effects)
-        if alone * (1 + ODDS) >= 1:
-            return ""
-        likely = ", ".join(
-            f"{one.name} {one.weight:.0%}" for one in self.explanations if one.effects and one.weight > 0.02
-        )
-        return f"{likely} would explain it, each too little for a name; the base model alone {alone:.1%}"
-
-    @property
     def text(self) -> str:
         """The decision as text."""
         first, *others = self.rivals

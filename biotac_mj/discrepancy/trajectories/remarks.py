@@ -5,7 +5,7 @@ import typing
 
 import numpy as np
 
-from ...effects.catalogue import CATALOGUE
+from ..report.verdict import experiments
 from .base.nuisance import OTHER_MESH
 from .where import phases
 
@@ -138,21 +138,10 @@ def next_experiment(
       unknown: whether something is left that no effect explains.
       tier: of the skin with which the recording was compared.
     """
-    pairs = [(e, t) for e in effects for t in e.ties]
-    doubtful = suspected or ([] if pairs else effects[:1])
-    pairs = [(e, next((o for o in e.confusable if o in names), None)) for e in doubtful] + pairs
     out = []
     if tier == "condensed" and (effects or unknown):
         out.append("compare again with --tier full: what the condensed skin lacks may be taken for an effect")
-    for effect, other in pairs[:3]:
-        if other is None:
-            continue
-        text = effect.confusable.get(other) or next(
-            (e.confusable.get(effect.id) for e in CATALOGUE if e.id == other), None
-        )
-        name = next((e.name for e in CATALOGUE if e.id == other), other)
-        how = text or "vary load, speed and hold together less"
-        out.append(f"to tell {effect.name} from {name}: {how}")
+    out += experiments([*suspected, *effects], names)
     if unknown and not effects:
         out.append("repeat some trajectories unchanged: what does not come again is no effect of the sensor")
     return "; ".join(out) or "none needed: nothing is tied, and nothing is left"

@@ -284,7 +284,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         verdict, remainder = (f"unknown ({stray})", stray) if stray else (verdict, remainder)
     else:
         stray = strays(comparison, null, chosen, aside, search.rounds[0])
-        stray = stray or without_name or beliefs.against_none
+        stray = stray or without_name
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
