@@ -43,8 +43,6 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
     corotational, gradients = kind.corotational, kind.gradients(DOUBLE)
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     f = material_functions(kind)
-    rotation, stress_of, weighted_volume = f.rotation, f.stress_of, f.weighted_volume
-    local_lame, flaw, averaged_pressure = f.local_lame, f.flaw, f.averaged_pressure
 
     @wp.kernel(enable_backward=False, **kind.placement)
     def force(
@@ -72,30 +70,30 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
                 X[c, a] = v[c]
         mu = rubber.mu[w]
         lam = rubber.lam[w]
-        local = local_lame(mu, lam, cap)
+        local = f.local_lame(mu, lam, cap)
         npoint = wp.static(kind.npoint)
         if wp.static(is_single):  # no constant: unrolled, a loop would need more registers than there are
             npoint = mesh.weight.shape[1]
         pressure = real(0.0)
         if wp.static(averaged):
             if lam > local:
-                pressure = averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
+                pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
                 pressure_out[e, w] = pressure
         C = positions()
         for q in range(npoint):
             i = npoint * e + q
             F = X * shape[q] * mesh.inverse[e, q]
-            bad = flaw(rubber, F)
+            bad = f.flaw(rubber, F)
             if bad > 0:
                 wp.atomic_max(inverted_out, w, bad)
-            R = rotation(F)
+            R = f.rotation(F)
             if wp.static(not is_single):
                 deformation_out[i, w] = F
                 if wp.static(corotational):
                     rotation_out[i, w] = R
-            P = stress_of(rubber, e, i, w, mu, local, pressure, F, R)
+            P = f.stress_of(rubber, e, i, w, mu, local, pressure, F, R)
             C -= (
-                weighted_volume(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])
+                f.weighted_volume(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])
             ) * wp.transpose(shape[q])
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec3(C[0, a], C[1, a], C[2, a])
@@ -110,8 +108,6 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
     scalar, vec, thin = precision.scalar, precision.vec, precision.narrow
     directions, deformation = wp.types.matrix(shape=(3, corners), dtype=scalar), deformation_of(corners)
     f = material_functions(kind)
-    rotation_thin, direction_of, change_of = f.rotation_thin, f.direction_of, f.change_of
-    weighted_volume, local_lame = f.weighted_volume, f.local_lame
 
     @wp.func
     def point_state(
@@ -127,7 +123,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         i = wp.static(kind.npoint) * e + q
         if wp.static(is_single):
             here = thin(deformation(mesh, e, q, x, w))
-            return here, rotation_thin(here)
+            return here, f.rotation_thin(here)
         elif wp.static(corotational):
             return F[i, w], R[i, w]
         else:
@@ -161,7 +157,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
                 D[c, a] = d[c]
         mu = rubber.mu[w]
         lam = rubber.lam[w]
-        local = local_lame(mu, lam, cap)
+        local = f.local_lame(mu, lam, cap)
         npoint = wp.static(kind.npoint)
         if wp.static(is_single):  # as in `force`
             npoint = mesh.weight.shape[1]
@@ -175,7 +171,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
                     B = thin(mesh.inverse[e, q])
                     F, R = point_state(e, q, w, mesh, x, deformation_in, rotation_in)
                     dF = D * shape[q] * B
-                    mean += scalar(mesh.weight[e, q]) * wp.ddot(direction_of(rubber.law, F, R), dF)
+                    mean += scalar(mesh.weight[e, q]) * wp.ddot(f.direction_of(rubber.law, F, R), dF)
                 stiff = scalar((lam - local) / mesh.volume[e]) * mean
         C = directions()
         for q in range(npoint):
@@ -183,11 +179,11 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
             B = thin(mesh.inverse[e, q])
             F, R = point_state(e, q, w, mesh, x, deformation_in, rotation_in)
             dF = D * shape[q] * B
-            dP = change_of(rubber, e, i, w, mu, local, mean_pressure, F, R, dF)
+            dP = f.change_of(rubber, e, i, w, mu, local, mean_pressure, F, R, dF)
             if wp.static(averaged):
                 if lam > local:
-                    dP += stiff * direction_of(rubber.law, F, R)
-            C += (scalar(weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(
+                    dP += stiff * f.direction_of(rubber.law, F, R)
+            C += (scalar(f.weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(
                 shape[q]
             )
         for a in range(wp.static(corners)):
@@ -201,9 +197,6 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
     npoint, module, deformation = kind.npoint, kind.module, deformation_of(kind.corners)
     thin, wide = kind.precision.narrow, kind.precision.widen
     f = material_functions(kind)
-    rotation, theta, stress_of, direction_of = f.rotation, f.theta, f.stress_of, f.direction_of
-    change_of, weighted_volume, local_lame = f.change_of, f.weighted_volume, f.local_lame
-    averaged_pressure = f.averaged_pressure
 
     @wp.kernel(module=f"{module}.read", enable_backward=False)
     def cauchy(
@@ -220,13 +213,13 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
         e, w = wp.tid()
         mu = rubber.mu[w]
         lam = rubber.lam[w]
-        local = local_lame(mu, lam, cap)
-        pressure = averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
+        local = f.local_lame(mu, lam, cap)
+        pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
         sigma = mat33()
         for q in range(wp.static(npoint)):
             F = deformation(mesh, e, q, x, w)
-            P = stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, rotation(F))
-            fraction = weighted_volume(rubber, mesh, e, q, w) / mesh.volume[e] / wp.determinant(F)
+            P = f.stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, f.rotation(F))
+            fraction = f.weighted_volume(rubber, mesh, e, q, w) / mesh.volume[e] / wp.determinant(F)
             sigma += fraction * (P * wp.transpose(F))
         deviator = sigma - wp.trace(sigma) / real(3.0) * wp.identity(n=3, dtype=real)
         cauchy_out[e, w] = sigma
@@ -250,16 +243,16 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
         e, w = wp.tid()
         mu = rubber.mu[w]
         lam = rubber.lam[w]
-        local = local_lame(mu, lam, cap)
-        pressure = averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
+        local = f.local_lame(mu, lam, cap)
+        pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
         for q in range(wp.static(npoint)):
             i = wp.static(npoint) * e + q
             F = deformation(mesh, e, q, x, w)
-            R = rotation(F)
-            stress_out[i, w] = stress_of(rubber, e, i, w, mu, local, pressure, F, R)
-            dP = change_of(rubber, e, i, w, mu, local, pressure, thin(F), thin(R), thin(change[i, w]))
+            R = f.rotation(F)
+            stress_out[i, w] = f.stress_of(rubber, e, i, w, mu, local, pressure, F, R)
+            dP = f.change_of(rubber, e, i, w, mu, local, pressure, thin(F), thin(R), thin(change[i, w]))
             change_out[i, w] = wide(dP)
-            dilatation_out[i, w] = theta(rubber.law, F, R)
-            direction_out[i, w] = wide(direction_of(rubber.law, thin(F), thin(R)))
+            dilatation_out[i, w] = f.theta(rubber.law, F, R)
+            direction_out[i, w] = wide(f.direction_of(rubber.law, thin(F), thin(R)))
 
     return {"cauchy": cauchy, "point_slopes": point_slopes}

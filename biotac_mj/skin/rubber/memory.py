@@ -11,18 +11,11 @@ import warp as wp
 from ..program import Launcher
 from ..state import allocate
 from ..types import mat33, real, vec3
+from . import points
 from .friction import deviator, sticking_fraction, strain
 from .law import Law, polar
 from .material import Material
-from .points import (
-    Mesh,
-    Rubber,
-    deformation_of,
-    remembered,
-    remembered_derivative,
-    remembered_energy,
-    softening,
-)
+from .points import Mesh, Rubber, deformation_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,10 +83,10 @@ def rotation(law: int, F: mat33):
 def relaxing_stress(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
     """Second Piola stress that relaxes [Pa], at the largest energy density `worst`."""
     R = rotation(rubber.law, F)
-    S = pull_back(rubber.law, F, remembered(rubber, e, w, mu, lam, F, R))
+    S = pull_back(rubber.law, F, points.remembered(rubber, e, w, mu, lam, F, R))
     if rubber.mullins[w][0] > real(0.0):
-        W = remembered_energy(rubber, e, w, mu, lam, F, R)
-        S *= softening(rubber, e, w, W, worst)[0]
+        W = points.remembered_energy(rubber, e, w, mu, lam, F, R)
+        S *= points.softening(rubber, e, w, W, worst)[0]
     return S
 
 
@@ -102,7 +95,7 @@ def largest_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33
     """Largest energy density, including the present one [J/m^3]."""
     if rubber.mullins[w][0] <= real(0.0):
         return worst
-    return wp.max(worst, remembered_energy(rubber, e, w, mu, lam, F, rotation(rubber.law, F)))
+    return wp.max(worst, points.remembered_energy(rubber, e, w, mu, lam, F, rotation(rubber.law, F)))
 
 
 @functools.cache
@@ -194,9 +187,9 @@ def _kernels(corners: int) -> types.SimpleNamespace:
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
         R = rotation(rubber.law, F)
-        stress_out[i, w] = remembered(rubber, e, w, mu, lam, F, R)
-        change_out[i, w] = remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])
-        energy_out[i, w] = remembered_energy(rubber, e, w, mu, lam, F, R)
+        stress_out[i, w] = points.remembered(rubber, e, w, mu, lam, F, R)
+        change_out[i, w] = points.remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])
+        energy_out[i, w] = points.remembered_energy(rubber, e, w, mu, lam, F, R)
 
     return types.SimpleNamespace(commit=commit, forget=forget, recall=recall, point_slopes=point_slopes)
 
