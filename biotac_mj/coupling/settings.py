@@ -127,8 +127,8 @@ class SensorSettings:
     textures: dict | Sequence[dict] | None = None
 
     def __post_init__(self):
-        told = self.signal is not None or self.individual is not None or self.randomise is not None
-        if self.left_out and told:
+        has_sensor = self.signal is not None or self.individual is not None or self.randomise is not None
+        if self.left_out and has_sensor:
             raise ValueError("readings is False: leave signal, sensor and randomise out")
 
     @property

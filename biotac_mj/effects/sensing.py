@@ -224,7 +224,7 @@ class DeadTaxels(Linear):
         run.counts = rest + (run.counts - rest) * (1 - np.array([theta[k] for k in self.params]))
 
 
-def _heard(i, j):
+def _pair(i, j):
     return f"e{i + 1}_hears_e{j + 1}"
 
 
@@ -253,7 +253,7 @@ class CrossTalk(Linear):
 
     def __init__(self, hears: Sequence[tuple[int, int]] = ()):
         """hears: (electrode, the one that couples into it), numbers from 0."""
-        self.hears = {_heard(i, j): (i, j) for i, j in hears}
+        self.hears = {_pair(i, j): (i, j) for i, j in hears}
         self.params = CrossTalk.params | dict.fromkeys(self.hears, _LEADS)
 
     @property
@@ -262,7 +262,7 @@ class CrossTalk(Linear):
         at = electrode_positions(self.design)
         near = np.linalg.norm(at[:, None] - at, axis=2) < _NEAR
         near |= np.eye(len(at), k=1, dtype=bool) | np.eye(len(at), k=-1, dtype=bool)
-        return {_heard(i, j): _LEADS for i, j in np.argwhere(near & ~np.eye(len(at), dtype=bool))}
+        return {_pair(i, j): _LEADS for i, j in np.argwhere(near & ~np.eye(len(at), dtype=bool))}
 
     def given(self, names: Sequence[str]) -> "CrossTalk":
         """With pairs; with these alone where no name is of another parameter."""

@@ -190,7 +190,7 @@ class SkinGroup:
             if skin.instance.by_stages:  # whose status is written when the step ends
                 outcome.settled &= bool(error[skin.bodies].max(initial=0.0) < near)
 
-    def arrive(self) -> None:
+    def keep_poses(self) -> None:
         """Keeps where the bodies are when MuJoCo's poses are those at the end of the step."""
         pos, mat = self._kinematics.predict(0.0)
         for skin in self._all:

@@ -77,7 +77,7 @@ class StepArrays:
                 skin.marks = MarkedWorlds()
                 skin.marks.world, skin.marks.any = self._marks.world[k : k + 1], self._marks.any
                 skin.compliance = wp.zeros((setup.ngroup, setup.ngroup, 1), dtype=wp.spatial_matrixd)
-                skin.led = wp.array(setup.touching.by_mocap, dtype=bool)
+                skin.by_mocap = wp.array(setup.touching.by_mocap, dtype=bool)
                 skin.bodies, skin.loss, skin.solid = kinematics.bodies[k], setup.config.loss, Solid()
                 skin.solid.thickness, skin.solid.area = setup.thickness, 1.0
                 skin.solid.inertial = int(setup.skin.stepper.inertial)
@@ -125,7 +125,7 @@ class StepArrays:
             return (
                 skin.bodies.here(k.d, r.here_pos, r.here_mat),
                 *drift(skin),
-                (rounds.begin_rounds, 1, [awake, skin.led, r, skin.last, skin.model]),
+                (rounds.begin_rounds, 1, [awake, skin.by_mocap, r, skin.last, skin.model]),
                 (rounds.choose_gamma, r.pos.shape, [step, ahead, delay, skin.solid, skin.last, r]),
                 *drift(skin),
             )

@@ -9,8 +9,8 @@ that follow, while the bodies yield by the compliance of their inertia and of th
 One round is enough, at impacts too, unless what else holds a body changes within it: a joint's friction
 begins to slip, another skin lets go.
 
-Where the rounds never arrive, the last models act. Whatever acts, no skin gives back more energy than was put
-into it (`_damp`, `_restrain`)."""
+Where the rounds do not converge, the last models act. No skin gives back more energy than was put into it
+(`_damp`, `_restrain`)."""
 
 import functools
 
@@ -290,7 +290,7 @@ class World:
         self.data.find_poses()
         if acting:
             self._group.settle(moved, ASTRAY)
-        self._group.arrive()
+        self._group.keep_poses()
         self.data.qpos[:] = before
         self.data.find_poses()  # those that MuJoCo leaves after a step
         self.data.qpos[:] = after

@@ -13,7 +13,7 @@ from ...sensor.channels import check_counts, check_force
 _SINGLE = tuple(SINGLES.index(name) - len(SINGLES) for name in ("pdc", "tdc"))
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
 _STILL = 1e-6, 5e-6  # [m] from row to row that may be no motion: a count or less of the electrodes
-_CREEP = 0.1  # of the median step, where that is more: measured poses tremble by as much as they are worth
+_LEAST_TRAVEL = 0.1  # of the median step, where that is more: measured poses have noise of that size
 _TREMBLE = 5.0  # times the tenth smallest step in a hundred
 
 
@@ -218,7 +218,7 @@ def _still(t):
     measured pose."""
     step = np.abs(np.diff(t.pos, axis=0)).max(1)
     least, most = _STILL
-    most = max(most, _CREEP * np.median(step))
+    most = max(most, _LEAST_TRAVEL * np.median(step))
     return step < np.clip(_TREMBLE * np.percentile(step, 10), least, most)
 
 

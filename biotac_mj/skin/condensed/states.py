@@ -56,7 +56,7 @@ class Increment:
     nin: int
     solving: int  # whether Newton's method has started
     searches: int  # number of searches for candidates by the broad phase
-    halved: int  # how often the first one began anew with half of the reach, for lack of room
+    cutbacks: int  # of the first one, to half of its reach, for lack of room
     passes: int  # number of updates of pressure and softening
     view: int  # of `broadphase.choose_view`
     travel: real

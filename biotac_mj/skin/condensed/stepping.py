@@ -252,7 +252,7 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
                 s.bodies.begun[h, w] = s.bodies.posed[h, w]
             sync()
         place_bodies(w, t, threads, p.to, geoms, s)
-        moved = wp.pow(real(0.5), real(o.halved - 1)) * _largest_motion(w, geoms)
+        moved = wp.pow(real(0.5), real(o.cutbacks - 1)) * _largest_motion(w, geoms)
         view, travel, near = choose_view(w, t, threads, geoms, c, s)
         if p.holds == 1:
             o.solved = r.solved[w]
@@ -297,7 +297,7 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
         if o.ncore > s.core_face.shape[1] or 3 * nnode + nin > s.coordinate.shape[1]:
             o.reach = real(-1.0)  # not all are listed
             if first == 1 and moved > _REACH:
-                o.halved += 1
+                o.cutbacks += 1
                 if t == 0:
                     s.solve.increment[w] = o
                 return
@@ -464,7 +464,6 @@ def _conclude_pass(
 def _go_on(most: real, p: LoadStepping, o: Increment):
     """Accepts or cuts back the load increment, and chooses the next; returns whether there is one."""
     on = int(1)
-    arrived = o.ok  # whether what was found last is where the load goes on
     if p.holds == 1:
         return p, 0
     p.again = 0
@@ -486,7 +485,7 @@ def _go_on(most: real, p: LoadStepping, o: Increment):
             on = 0
     if on == 0 or p.spent >= most:
         on = 0
-        if arrived == 0:  # the skin as it is remembered
+        if o.ok == 0:  # the skin as it is remembered
             p.holds = 1
             p.part = real(0.0)
             on = 1

@@ -28,7 +28,7 @@ _ALONE = 0.7
 _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _WARMER = 0.05  # [K] by which the thermistor has to change
 _ALIKE = 0.9  # correlation of a trend with the thermistor's
-_TOLD = 0.35  # of the evidence that the thermistor alone has to explain
+_EXPLAINED = 0.35  # of the evidence that the thermistor alone has to explain
 _NATS = 12.0  # of a drift beside a load
 _ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
@@ -348,11 +348,11 @@ def _by_temperature(session, finding, trend, ties):
         out[~rest] = (series - A @ np.linalg.lstsq(A[rest], series[rest], rcond=None)[0])[~rest]
     scale = max(1.4826 * np.median(np.abs(np.diff(series))) / np.sqrt(2), 1e-9)
     gain = compare(series - series.mean(), out, block, scale)
-    told = sign_flip(gain) < 0.02
+    predicted = sign_flip(gain) < 0.02
     alike = abs(np.corrcoef(trend(time), warm)[0, 1]) > _ALIKE  # where both go one way they are not parted
-    if not told:
+    if not predicted:
         return [*ties, "thermal"] if alike else ties
-    if gain.sum() <= _TOLD * finding.nats:
+    if gain.sum() <= _EXPLAINED * finding.nats:
         return [*ties, "thermal"]
     finding.detector = Thermal.detector  # another channel predicts it, whatever its cause
     slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
