@@ -14,7 +14,7 @@ import biotac_mj
 from biotac_mj.geometry import load_skin
 from biotac_mj.tasks.hands import HANDS
 from biotac_mj.tasks.mounting import side_view
-from biotac_mj.view.offscreen import Offscreen, find_gl, stage
+from biotac_mj.view.offscreen import Offscreen, find_gl, frame_bodies, stage
 
 MODELS = {  # in the Menagerie
     "shadow_hand": "shadow_hand/right_hand.xml",
@@ -25,8 +25,8 @@ MODELS = {  # in the Menagerie
 }
 RADIUS, DEPTH, PLACE = 3.5e-3, 1e-3, -12e-3  # [m] of the ball, how deep it goes, x of the BioTac frame
 STEPS = 25
-SIZE = 360, 300  # of a finger's picture [pixel]
-EYE = -1.0, -0.8, 0.35  # looks from before the tip onto the pad: neighbours stand beside it
+SIZE = 720, 540  # of a hand's picture [pixel]
+EYE = -1.0, -0.8, 0.35  # looks from before a tip onto its pad: neighbours stand beside it
 
 
 def model_of(hand):
@@ -94,11 +94,12 @@ def main():
             import matplotlib.image
 
             with Offscreen(model, *SIZE, gl) as screen:
-                bodies = [data.body(handle.body) for handle in handles.values()]
-                cameras = [side_view(b.xpos, b.xmat.reshape(3, 3), EYE) for b in bodies]
-                row = np.concatenate([screen.render(data, camera) for camera in cameras], axis=1)
+                first = data.body(next(iter(handles.values())).body)
+                camera = side_view(first.xpos, first.xmat.reshape(3, 3), EYE)
+                frame_bodies(model, data, range(model.nbody), camera, SIZE[0] / SIZE[1])
+                picture = screen.render(data, camera)
             pathlib.Path(args.pictures).mkdir(parents=True, exist_ok=True)
-            matplotlib.image.imsave(pathlib.Path(args.pictures) / f"mount_{hand}.png", row)
+            matplotlib.image.imsave(pathlib.Path(args.pictures) / f"mount_{hand}.png", picture)
     from records import write_json
 
     write_json(args.json, out)
