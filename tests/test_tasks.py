@@ -506,7 +506,7 @@ def test_an_entity_takes_settings_by_stage():
         ),
         (
             lambda: touch.load_estimator("juggle"),
-            "no calibration of task 'juggle': run `python -m biotac_mj.tasks.calibrate --estimators juggle`",
+            "no calibration of task 'juggle': run `python scripts/fit_estimators.py --estimators juggle`",
         ),
     ],
 )

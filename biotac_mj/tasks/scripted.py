@@ -223,7 +223,7 @@ def make_controller(
       task: its name.
       env: environment; a `CalibrationWarning` is issued if its BioTacs differ from those of the estimator's
         fit.
-      calibration: file of `python -m biotac_mj.tasks.calibrate --out`; None: the package's.
+      calibration: file of `python scripts/fit_estimators.py --out`; None: the package's.
 
     Raises:
       ValueError: the task has none.

@@ -158,7 +158,7 @@ def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
         warnings.warn(
             f"the estimator {name!r} was fitted on a BioTac with {was}: how far its estimates are off is "
             "unknown. Fit it for this one with "
-            f"`python -m biotac_mj.tasks.calibrate --estimators {name} --skin SKIN --tier TIER --material "
+            f"`python scripts/fit_estimators.py --estimators {name} --skin SKIN --tier TIER --material "
             "MATERIAL --out FILE`, "
             "then make_controller(task, env, calibration=FILE)",
             CalibrationWarning,
@@ -168,12 +168,12 @@ def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
 
 @functools.cache
 def load_calibration(path: str | None = None) -> dict:
-    """Arrays of a file of `python -m biotac_mj.tasks.calibrate`; None: the package's,
+    """Arrays of a file of `python scripts/fit_estimators.py`; None: the package's,
     `biotac_mj/tasks/calibration.npz`."""
     if path is None:
         with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as own:
             return load_calibration(str(own))
-    return read_npz(path, "calibration", "make one with `python -m biotac_mj.tasks.calibrate`")
+    return read_npz(path, "calibration", "make one with `python scripts/fit_estimators.py`")
 
 
 def load_estimator(task: str, stored: dict | None = None) -> Estimator:
@@ -185,6 +185,6 @@ def load_estimator(task: str, stored: dict | None = None) -> Estimator:
     stored = load_calibration() if stored is None else stored
     if f"{task}/weight" not in stored:
         raise ValueError(
-            f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --estimators {task}`"
+            f"no calibration of task {task!r}: run `python scripts/fit_estimators.py --estimators {task}`"
         )
     return Estimator(*(stored[f"{task}/{part}"] for part in ("scale", "weight", "error")))
