@@ -127,7 +127,7 @@ def test_errors_of_the_model_differ_between_episodes():
     def felt():
         """(3, 42) of changes of 100 counts in all channels."""
         env.step(torch.zeros(3, 4))
-        env._sensed[:, env._touch._place] = env.rest_counts + 100.0
+        env.sensordata[:, env._touch._place] = env.rest_counts + 100.0
         env._sense(~env._everyone)
         return env.observe()["touch"]
 

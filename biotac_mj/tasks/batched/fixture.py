@@ -94,12 +94,12 @@ class HeldTask(BatchTask):
     @property
     def pos(self) -> torch.Tensor:
         """(num_envs, 3) of the body [m], a view."""
-        return self._qpos[:, self._at : self._at + 3]
+        return self.qpos[:, self._at : self._at + 3]
 
     @property
     def quat(self) -> torch.Tensor:
         """(num_envs, 4) of the body, w x y z, a view."""
-        return self._qpos[:, self._at + 3 : self._at + 7]
+        return self.qpos[:, self._at + 3 : self._at + 7]
 
     def _closing(self):
         """Closed fraction of the fingers (num_envs, 1), 0 to 1."""

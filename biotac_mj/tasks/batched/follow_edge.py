@@ -4,7 +4,6 @@ import dataclasses
 
 import mujoco
 import torch
-import warp as wp
 
 from .machine import carriage, new_spec, servo
 from .task import BatchTask, TaskSettings
@@ -76,7 +75,7 @@ class FollowEdge(BatchTask):
         return spec, {"finger": "biotac_"}, {"geoms": ["plate"], "rounding": {"plate": _ROUNDING}}
 
     def _read(self, mjm, prefixes):
-        self._plate = wp.to_torch(self._d.mocap_pos)[:, 0]
+        self._plate = self.mocap_pos[:, 0]
         self._along, self._last = (torch.zeros(self.num_envs, *k, device=self.device) for k in ((), (2,)))
 
     def _moves(self, actions):
@@ -86,8 +85,8 @@ class FollowEdge(BatchTask):
 
     def _pad(self):
         """(num_envs, 2) place of the pad's point [m]."""
-        yaw = self._qpos[:, 3]
-        return self._qpos[:, :2] + _POINT * torch.stack([yaw.cos(), yaw.sin()], dim=1)
+        yaw = self.qpos[:, 3]
+        return self.qpos[:, :2] + _POINT * torch.stack([yaw.cos(), yaw.sin()], dim=1)
 
     def _pose(self):
         """(num_envs,) distance outside the rim [m], turn of the finger against it [rad], and (num_envs, 2)
@@ -95,7 +94,7 @@ class FollowEdge(BatchTask):
         away = self._pad() - self._plate[:, :2]
         distance = away.norm(dim=1)
         tangent = torch.stack([away[:, 1], -away[:, 0]], dim=1) / distance[:, None]
-        yaw = self._qpos[:, 3]
+        yaw = self.qpos[:, 3]
         c, s = yaw.cos(), yaw.sin()
         turn = torch.atan2(tangent[:, 1] * c - tangent[:, 0] * s, -tangent[:, 0] * c - tangent[:, 1] * s)
         return distance - self.cfg.radius, turn, tangent
@@ -129,14 +128,14 @@ class FollowEdge(BatchTask):
         self._ctrl[:] = self._moved
 
     def _sense_body(self, off, speed_off):
-        place, speed = self._qpos + off, self._qvel + speed_off
+        place, speed = self.qpos + off, self.qvel + speed_off
         scale = torch.tensor([100.0, 100.0, 100.0, 1.0], device=self.device)
         time = self.episode_length_buf[:, None] / self.cfg.decisions
         return [place * scale, speed * scale, self._moved / self._reach, time]
 
     def _state(self):
         off, turn, _ = self._pose()
-        height = self._qpos[:, 2] - _PAD - self._plate[:, 2]
+        height = self.qpos[:, 2] - _PAD - self._plate[:, 2]
         return [1e3 * off[:, None], turn[:, None], 1e3 * height[:, None], self.force]
 
     def _place(self, some):

@@ -4,7 +4,6 @@ import dataclasses
 
 import mujoco
 import torch
-import warp as wp
 
 from .fixture import HeldSettings, HeldTask
 from .machine import carriage, new_spec, servo
@@ -98,7 +97,7 @@ class InsertPeg(HeldTask):
         self._dofs = torch.tensor([int(mjm.joint(k).dofadr[0]) for k in names], device=self.device)
         self._moving = torch.tensor([mjm.actuator(k).id for k in names], device=self.device)
         self._fingers = torch.tensor([mjm.actuator(k).id for k in prefixes], device=self.device)
-        self._plate = wp.to_torch(self._d.mocap_pos)[:, 0]
+        self._plate = self.mocap_pos[:, 0]
 
     @property
     def axis(self) -> torch.Tensor:
@@ -119,7 +118,7 @@ class InsertPeg(HeldTask):
     @property
     def held(self) -> torch.Tensor:
         """(num_envs,) whether the peg is still between the fingers."""
-        joints = self._qpos[:, self._joints]
+        joints = self.qpos[:, self._joints]
         grip = torch.stack([joints[:, 0], 0 * joints[:, 0], joints[:, 1] + self._grip_height], dim=1)
         away = self.pos + _ABOVE * self.axis - grip
         return away.norm(dim=1) < self.cfg.lost
@@ -147,14 +146,14 @@ class InsertPeg(HeldTask):
         self._ctrl[:, self._fingers] = (self._closing() * (_GAP + self.cfg.squeeze)).expand(-1, 2)
 
     def _sense_body(self, off, speed_off):
-        place, speed = self._qpos[:, self._joints] + off, self._qvel[:, self._dofs] + speed_off
+        place, speed = self.qpos[:, self._joints] + off, self.qvel[:, self._dofs] + speed_off
         scale = torch.tensor([100.0, 100.0, 1.0], device=self.device)
         time = self.episode_length_buf[:, None] / self.cfg.decisions
         return [place * scale, speed * scale, self._moved / self._reach, time]
 
     def _state(self):
         tilt, tip = torch.atan2(self.axis[:, 0], self.axis[:, 2]), self.tip
-        pitch = self._qpos[:, self._joints[2]]
+        pitch = self.qpos[:, self._joints[2]]
         columns = [tilt, 1e3 * tip[:, 0], 1e3 * self.depth, pitch - tilt]
         return [torch.stack(columns, dim=1), self.force]
 

@@ -159,8 +159,8 @@ class RollRod(HeldTask):
 
     def _sense_body(self, off, speed_off):
         s = self.cfg
-        angles = self._qpos[:, self._joints] - self._start[self._joints] + off
-        velocities = self._qvel[:, self._dofs] + speed_off
+        angles = self.qpos[:, self._joints] - self._start[self._joints] + off
+        velocities = self.qvel[:, self._dofs] + speed_off
         time = self.episode_length_buf[:, None] / s.decisions
         return [angles, velocities / 10.0, self._moved / s.reach, 1e3 * self._target[:, None], time]
 

@@ -75,6 +75,8 @@ class BatchTask(abc.ABC):
     Attributes:
       num_envs, num_actions, max_episode_length, device, observes, history, model_error, biotac.
       model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}. prefixes: {finger: of its names}.
+      qpos (num_envs, nq), qvel (num_envs, nv), sensordata (num_envs, nsensordata), mocap_pos (num_envs,
+        nmocap, 3) [m]: of the model, views.
       good: (k,) worlds whose states were stored for the beginning of episodes.
       episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
 
@@ -137,11 +139,11 @@ class BatchTask(abc.ABC):
                 for i, (finger, p) in enumerate(prefixes.items())
             }
         tensor = functools.partial(torch.as_tensor, device=self.device)
-        self._qpos, self._qvel, self._ctrl = (wp.to_torch(a) for a in (d.qpos, d.qvel, d.ctrl))
-        self._sensed = wp.to_torch(d.sensordata)
+        self.qpos, self.qvel, self._ctrl = (wp.to_torch(a) for a in (d.qpos, d.qvel, d.ctrl))
+        self.sensordata, self.mocap_pos = wp.to_torch(d.sensordata), wp.to_torch(d.mocap_pos)
         self._start = tensor(start.qpos, dtype=torch.float32)
         of_prefix = dict(zip(prefixes.values(), self.batches.values(), strict=True))
-        self._touch = Touch(mjm, self._sensed, of_prefix, biotac["skin"])
+        self._touch = Touch(mjm, self.sensordata, of_prefix, biotac["skin"])
         forces = [mjm.sensor(f"{p}contact_force").adr[0] + np.arange(3) for p in prefixes.values()]
         self._forces = tensor(np.array(forces))
         self._everyone = torch.ones(n, dtype=torch.bool, device=self.device)
@@ -223,26 +225,6 @@ class BatchTask(abc.ABC):
     # what they share
 
     @property
-    def qpos(self) -> torch.Tensor:
-        """(num_envs, nq) of the model, a view."""
-        return self._qpos
-
-    @property
-    def qvel(self) -> torch.Tensor:
-        """(num_envs, nv) of the model, a view."""
-        return self._qvel
-
-    @property
-    def sensordata(self) -> torch.Tensor:
-        """(num_envs, nsensordata) of the model, a view."""
-        return self._sensed
-
-    @property
-    def mocap_pos(self) -> torch.Tensor:
-        """(num_envs, nmocap, 3) of the model [m], a view."""
-        return wp.to_torch(self._d.mocap_pos)
-
-    @property
     def rest_counts(self) -> torch.Tensor:
         """(num_envs, nfinger, k) of electrodes, PDC and PAC when nothing was touched; 0 before."""
         return self._touch.tare
@@ -250,7 +232,7 @@ class BatchTask(abc.ABC):
     @property
     def force(self) -> torch.Tensor:
         """(num_envs, nfinger) contact force of each finger [N]; not observed."""
-        return self._sensed[:, self._forces].norm(dim=2)
+        return self.sensordata[:, self._forces].norm(dim=2)
 
     def _moves(self, actions):
         """Changes of the goals by actions (num_envs, num_actions)."""
@@ -367,7 +349,7 @@ class BatchTask(abc.ABC):
             self._advance(still)
         force = self.force
         good = self.held & (force.min(1).values > _FELT) & (force.max(1).values <= self.cfg.gentle)
-        good &= torch.isfinite(self._qpos).all(1) & torch.isfinite(self._qvel).all(1)
+        good &= torch.isfinite(self.qpos).all(1) & torch.isfinite(self.qvel).all(1)
         self.good = good.nonzero()[:, 0]
         if not len(self.good):
             raise RuntimeError(
@@ -441,7 +423,7 @@ class BatchTask(abc.ABC):
         for one in self.batches.values():
             one.reset(mask)
         mjw.reset_data(self._m, self._d, mask)
-        self._qpos[:] = torch.where(some, self._start, self._qpos)
+        self.qpos[:] = torch.where(some, self._start, self.qpos)
         self._place(some)
         self._draw_goals(which)
         self._moved[:] = torch.where(some, 0.0, self._moved)
