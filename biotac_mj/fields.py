@@ -76,15 +76,17 @@ def as_numbers(what: str, value: object) -> np.ndarray:
         raise ValueError(f"{what} is {short_repr(value)}: pass a number, or an array of them") from None
 
 
-def as_real(what: str, value: object, least: float = -math.inf) -> float:
-    """Converts to a finite number; raises ValueError for anything else, or below `least`."""
+def as_real(what: str, value: object, least: float = -math.inf, above: bool = False, unit: str = "") -> float:
+    """Converts to a finite number; raises ValueError for anything else, or below `least`; above: also for
+    `least` itself. unit: for the message."""
     try:
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:
         good = False
-    if not good or value < least:
-        more = "" if least == -math.inf else f" >= {least:g}"
-        raise ValueError(f"{what} is {short_repr(value)}: give a finite number{more}")
+    if not good or value < least or (above and value == least):
+        more = "" if least == -math.inf else f" {'>' if above else '>='} {least:g}"
+        unit = f" [{unit}]" if unit else ""
+        raise ValueError(f"{what} is {short_repr(value)}: give a finite number{more}{unit}")
     return float(value)
 
 

@@ -159,9 +159,9 @@ def calls_of_hands():
     yield row("hand is {1: Mount(", hand={1: one["f"]})
     yield row("path of a file of mounts is array(shape=(3,), dtype=float32): give", mount=others())
     for hand in (one, "shadow_hand"):
-        yield row("unknown variant 'autentic': choose replace", hand=hand, variant="autentic")
-        yield row("unknown variant nan: choose replace", hand=hand, variant=np.nan)
-        yield row("unknown variant array([0., 0., 0.]): choose replace", hand=hand, variant=ARRAY)
+        yield row("unknown variant 'autentic': choose one of replace", hand=hand, variant="autentic")
+        yield row("unknown variant nan: choose one of replace", hand=hand, variant=np.nan)
+        yield row("unknown variant array([0., 0., 0.]): choose one of replace", hand=hand, variant=ARRAY)
     for wrong in (3, "", None):
         said = f"body of a Mount is {wrong!r}: give the name of a link"
         yield f"mount {said}", lambda wrong=wrong: Mount(wrong, (0, 0, 0)), ValueError, said
@@ -299,7 +299,7 @@ def calls_of_recordings():
     yield row("paths is [1]: give names of files", lambda: load_one([1]))
     yield row("force is [5]: give names of files", lambda: load("a", force=5))
     for wrong in (-1, np.nan, "a", [1]):
-        yield row(f"rate is {wrong!r}: give a positive", lambda wrong=wrong: load("a", rate=wrong))
+        yield row(f"rate is {wrong!r}: give a finite number > 0", lambda wrong=wrong: load("a", rate=wrong))
     yield row("the path of a recording is [1]: give a file that", lambda: read([1]))
     yield row("recordings are [5]: give a list of Recordings", lambda: write("a.h5", [5]))
     for wrong in (5, 1.5, "a", None, [1.5], [[1, 2]], [True], {}, slice("a"), ARRAY, [[1], [1, 2]]):
@@ -340,7 +340,7 @@ def calls_of_sensors():
         )
     yield row("noise of the readings is 5: pass true or false", lambda: PhysicsReadings(skin, noise=5))
     yield row("temperature of the readings is 'a': pass", lambda: PhysicsReadings(skin, temperature="a"))
-    yield row("seed is 'a': pass an integer", lambda: PhysicsReadings(skin, seed="a"))
+    yield row("seed is 'a': give a whole number from 0", lambda: PhysicsReadings(skin, seed="a"))
     yield row("geometry is int and film NoneType: pass", lambda: PhysicsReadings(5))
 
 

@@ -454,7 +454,7 @@ def files_of_csv():
     yield Row(
         "lab calibrate --synthetic --fit nu:0.2:0.9", "bounds of 'nu:0.2:0.9': Poisson's ratio 0.9 is outside"
     )
-    yield Row("lab calibrate --synthetic --fit mu:-1:1", "bounds of 'mu:-1:1': friction -1")
+    yield Row("lab calibrate --synthetic --fit mu:-1:1", "bounds of 'mu:-1:1': material friction is -1")
     yield Row(f"{CSV} --fit jelly", "cannot fit 'jelly'")
     yield Row(f"{CSV} --fit E:1", "bounds of 'E:1' are not two numbers")
     yield Row(f"{CSV} --fit E:nan:1", "are no interval")
@@ -503,7 +503,7 @@ def files_of_sensors():
     )
     yield change("material: default", "material: jelly", "unknown material 'jelly'")
     yield change("material: default", "material: {frction: 1}", "did you mean 'friction'?")
-    yield change("material: default", "material: {friction: -1}", "friction -1 is negative")
+    yield change("material: default", "material: {friction: -1}", "material friction is -1: give a finite")
     yield change("material: default", "material: 7", "material of sensor.yaml is 7")
     yield change("sensor: '1'", "options: {skn: {}}", "did you mean 'skin'?")
     yield change("sensor: '1'", "options: [1]", "options of sensor.yaml is [1]")
@@ -548,8 +548,8 @@ def settings():
         ('{"frction":1}', "material has 'frction': did you mean 'friction'?"),
         ('{"friction":"a"}', "friction is 'a': pass a number"),
         ('{"friction":NaN}', "friction is nan: pass a finite number"),
-        ('{"friction":Infinity}', "friction is inf: pass a finite number"),
-        ('{"friction":-1}', "friction -1 is negative"),
+        ('{"friction":Infinity}', "friction is inf: give a finite number >= 0"),
+        ('{"friction":-1}', "material friction is -1: give a finite number >= 0"),
         ('{"youngs_modulus":0}', "must be from 100 to"),
         ('{"youngs_modulus":1e-300}', "must be from 100 to"),
         ('{"poissons_ratio":0.5}', "Poisson's ratio 0.5 is outside"),
@@ -594,7 +594,7 @@ def settings():
             '--sensor {"rest":[1]}',
             "rest of a sensor has 1 electrodes, and the skin is of BioTac (19 electrodes)",
         ),
-        ('--sensor {"colour":1}', "a sensor has no 'colour': choose from like, rest"),
+        ('--sensor {"colour":1}', "sensor has 'colour': did you mean 'pac_colour'? choose from like, rest"),
         ("--sensor {rest", "is no JSON"),
         ("--randomise gremlins", "cannot randomise 'gremlins': choose from gain, dead"),
         ("--thermal mithril", "no material is known by 'mithril'"),
@@ -614,7 +614,7 @@ def settings():
         ('{"skin":3}', "options['skin'] is int: pass a dict"),
         ('{"skin":{"contact_law":3}}', "contact_law is 3"),
         ('{"skin":{"contact_law":{"adhesn":3}}}', "contact_law has 'adhesn': did you mean 'adhesion'?"),
-        ('{"skin":{"tolerance":-1}}', "tolerance is -1: pass a positive"),
+        ('{"skin":{"tolerance":-1}}', "tolerance is -1: give a finite number > 0"),
         ('{"skin":{"dynamics":"odd"}}', "unknown dynamics 'odd'"),
         ('{"skin":{"fill_volume":Infinity}}', "fill_volume is inf"),
         ('{"modulus":"nowhere.npy"}', "no modulus at nowhere.npy"),
@@ -664,7 +664,7 @@ def configs():
     yield Row(TRAIN, "did you mean 'steps'?", "config.json", text('{"stps": 3}'))
     yield Row(TRAIN, "config.json is no config", "config.json", text("no"))
     yield Row(TRAIN, "it holds list", "config.json", text("[]"))
-    yield Row(TRAIN, "choose from latent, decoded", "config.json", text('{"projection_loss": "odd"}'))
+    yield Row(TRAIN, "choose one of latent, decoded", "config.json", text('{"projection_loss": "odd"}'))
     yield Row(TRAIN.replace("config.json", "nowhere"), "no config at nowhere")
 
 

@@ -782,7 +782,7 @@ def test_errors_say_what_to_do():
         attach(mjm, 3, material=["default"] * 2)
     with pytest.raises(ValueError, match=r"friction is \[0.1, 0.2\] of shape \(2,\)"):
         attach(mjm, 3, friction=[0.1, 0.2])
-    with pytest.raises(ValueError, match="worlds cannot differ in 'adhesive': choose from"):
+    with pytest.raises(ValueError, match=r"worlds has 'adhesive': did you mean 'adhesion'\? choose from"):
         attach(mjm, 3, worlds={"adhesive": 0.1})
     with pytest.raises(ValueError, match=r"modulus has shape \(2, 5\)"):
         attach(mjm, 3, worlds={"modulus": np.ones((2, 5))})

@@ -104,8 +104,8 @@ def test_the_default_film_is_its_own():
         (3, r"options\['film'\] is 3: a dict is needed"),
         ({"radius": 1e-3}, r"options\['film'\] has 'radius'"),
         ({"electrode_radius": "1"}, r"electrode_radius of options\['film'\] is '1': pass a number"),
-        ({"electrode_radius": 0.0}, "electrode_radius is 0.0: pass a positive number"),
-        ({"residual_film": float("inf")}, "residual_film is inf: pass a positive number"),
+        ({"electrode_radius": 0.0}, "electrode_radius is 0.0: give a finite number > 0"),
+        ({"residual_film": float("inf")}, "residual_film is inf: give a finite number > 0"),
         ({"excitation": [[0, 1]]}, r"excitation is \[\[0, 1\]\]: pass \(4, 2\) finite numbers"),
     ],
 )

@@ -403,9 +403,9 @@ def test_example(repo, tmp_path):
         (dict(count=0), "count is 0"),
         (dict(measured_batch=0), "measured_batch is 0"),
         (dict(labelled=9), "labelled is 9: give a whole number from 0 to 3"),
-        (dict(rate=0.0), "rate is 0.0 Hz"),
+        (dict(rate=0.0), "rate is 0.0: give a finite number > 0"),
         (dict(seed=-1), "seed is -1"),
-        (dict(tier="fast"), "unknown tier 'fast': choose full or condensed"),
+        (dict(tier="fast"), "unknown tier 'fast': choose one of full, condensed"),
         (dict(objects=("spoon",)), "unknown object 'spoon': choose from sphere_3-5mm"),
         (dict(objects=()), "list: it is empty"),
         (dict(objects=("table_edge",)), "labelled interactions are made with the eight indenters"),
@@ -417,7 +417,7 @@ def test_bad_options_are_named(changes, text):
 
 
 def test_bad_plans_are_named(skin):
-    with pytest.raises(ValueError, match="unknown kind of interaction 'poke': choose from press"):
+    with pytest.raises(ValueError, match="unknown kind of interaction 'poke': choose one of press"):
         plan_motions(skin, "sphere_7mm", [[0]], 12, kinds=("poke",))
     with pytest.raises(ValueError, match="5 steps are too few"):
         plan_motions(skin, "sphere_7mm", [[0]], 5)

@@ -102,7 +102,7 @@ def test_what_cannot_be_simulated_is_said():
     ):
         with pytest.raises(ValueError, match=said):
             Design("mine", "my pad", **changes)
-    with pytest.raises(ValueError, match="a design has no 'colour'"):
+    with pytest.raises(ValueError, match="design has 'colour'"):
         read_design(json.dumps({"name": "a", "title": "b", "colour": "red"}))
     with pytest.raises(FileNotFoundError, match="pass one of biotac, biotac_sp,.* or a folder"):
         read_design("nowhere")

@@ -414,7 +414,7 @@ def test_an_ellipsoid_is_refused():
 def test_what_a_press_cannot_take_is_refused():
     skin = ball(liquid=False)
     pos, quat = path(3)
-    with pytest.raises(ValueError, match="cannot press with .*hardness.*choose from"):
+    with pytest.raises(ValueError, match="press has .hardness.*choose from"):
         press(skin, pos, quat, hardness=1.0)
     with pytest.raises(ValueError, match="no liquid: leave fill_volume out"):
         press(skin, pos, quat, fill_volume=1e-9)

@@ -99,11 +99,11 @@ def test_what_a_body_is_of_has_a_slope():
     [
         ({"area": np.zeros((3, 1))}, r"pass \(nstep, nbody\) of both"),
         ({"begin": np.zeros(4)}, r"begin has shape \(4,\): 2 bodies make it"),
-        ({"dt": 0.0}, "dt is 0.0: give a positive time"),
+        ({"dt": 0.0}, r"dt is 0.0: give a finite number > 0 \[s\]"),
         ({"area": np.full((3, 2), -1e-6)}, "area is negative or no number somewhere: give square metres"),
         ({"force": np.full((3, 2), np.nan)}, "force is negative or no number somewhere: give newtons"),
         ({"area": np.full((3, 2), 1e-6j)}, "area is of complex128: give real numbers"),
-        ({"constants": {"power": 1.0}}, "no constants power: choose from ambient"),
+        ({"constants": {"power": 1.0}}, "constants has .power.: choose from ambient"),
         ({"constants": {"air": -1.0}}, "air cannot be"),
     ],
 )

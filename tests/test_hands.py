@@ -236,7 +236,7 @@ def test_another_hand_than_the_one_named_is_recognised():
             dict(hand="allegro_hand", variant="authentic"),
             r"only the shadow_hand comes with authentic BioTac fingers, not 'allegro_hand'",
         ),
-        (dict(variant="new"), r"unknown variant 'new': choose replace or authentic"),
+        (dict(variant="new"), r"unknown variant 'new': choose one of replace, authentic"),
         (dict(fingers=("ff", "pinky")), r"the hand has no finger 'pinky': choose from ff, mf, rf, lf, th"),
         (
             dict(fingers=("ff",)),

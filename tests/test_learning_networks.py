@@ -205,7 +205,7 @@ def test_pointnet_reads_only_its_nodes(skin):
 
 
 def test_config_names_what_is_wrong():
-    with pytest.raises(ValueError, match="projection_loss is 'pixels': choose from latent, decoded"):
+    with pytest.raises(ValueError, match="unknown projection_loss 'pixels': choose one of latent, decoded"):
         LearningConfig(projection_loss="pixels")
     with pytest.raises(ValueError, match="must not be negative"):
         LearningConfig(steps=-1)

@@ -272,7 +272,7 @@ def test_bad_input(tube_film):
         tube_film.impedance(broken)
     with pytest.raises(ValueError, match="no liquid film over E1, E2"):
         tube_film.impedance(vert + [0.2, 0, 0])
-    with pytest.raises(ValueError, match="conductivity is -1: pass a positive number"):
+    with pytest.raises(ValueError, match="conductivity is -1: give a finite number > 0"):
         FilmConduction(tube_film.geometry, conductivity=-1)
     with pytest.raises(ValueError, match="sensor is '9': pass one of '1', '2', '3'"):
         FilmConduction(tube_film.geometry, sensor="9")
@@ -305,7 +305,7 @@ def test_another_residual_film_is_that_of_a_film_made_with_it(sensor):
     np.testing.assert_array_equal(other.impedance(pressed), made.impedance(pressed))
     np.testing.assert_array_equal(other.rest, made.rest)
     assert own.residual_film == 50e-6 and not np.allclose(own.impedance(pressed), made.impedance(pressed))
-    with pytest.raises(ValueError, match="residual_film is 0.0: pass a positive number"):
+    with pytest.raises(ValueError, match="residual_film is 0.0: give a finite number > 0"):
         own.with_residual_film(0.0)
 
 

@@ -83,7 +83,7 @@ def test_random_sensors_differ_as_the_measured_do():
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="sensor is 'f9': pass one of '1', .*'epfl_f1'"):
         read_sensor("f9")
-    with pytest.raises(ValueError, match="a sensor has no 'colour': choose from like, rest"):
+    with pytest.raises(ValueError, match=r"sensor has 'colour': did you mean 'pac_colour'\? choose from"):
         read_sensor({"colour": 1})
     with pytest.raises(ValueError, match="rest of a sensor has 2 electrodes, and the skin is of BioTac"):
         read_sensor({"rest": [1, 2]})

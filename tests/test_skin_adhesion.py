@@ -249,12 +249,12 @@ def test_default_range_is_what_the_mesh_resolves():
 @pytest.mark.parametrize(
     "law, text",
     [
-        (dict(adhesion=-0.1), "adhesion is -0.1: pass a work >= 0"),
+        (dict(adhesion=-0.1), "adhesion is -0.1: give a finite number >= 0 .J/m.2."),
         (dict(adhesion=np.nan), "adhesion is nan: pass a finite number"),
-        (dict(adhesion_hysteresis=0.5), "pass >= 1"),
-        (dict(adhesion_range=0.0), "pass a positive length in m, or None"),
+        (dict(adhesion_hysteresis=0.5), "give a finite number >= 1"),
+        (dict(adhesion_range=0.0), "adhesion_range is 0.0: give a finite number > 0 .m."),
         (dict(friction_exponent=5.0), "from -1 to 2; 0 is Coulomb's law"),
-        (dict(friction_pressure=0.0), "pass a positive number of Pa"),
+        (dict(friction_pressure=0.0), "friction_pressure is 0.0: give a finite number > 0 .Pa."),
         (dict(adhesive=1.0), "did you mean 'adhesion'"),
         (0.05, "contact_law is 0.05: pass a ContactLaw, or a dict"),
     ],

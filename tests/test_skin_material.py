@@ -220,7 +220,7 @@ def test_bulk_and_shear_modulus():
     (dict(youngs_modulus=0.0), "must be from 100"),
     (dict(youngs_modulus=0.65), r"0.65 Pa must be from 100 to 1e.15 .give it in Pa: 0.65 MPa is 650000"),
     (dict(density=-1.0), "must be from 100"),
-    (dict(friction=-0.1), "friction -0.1 is negative: pass a Coulomb coefficient"),
+    (dict(friction=-0.1), "material friction is -0.1: give a finite number >= 0"),
 ])  # fmt: skip
 def test_bad_constants(values, text):
     with pytest.raises(ValueError, match=text):

@@ -25,7 +25,7 @@ LAYERS = {
     "triangles": "",
     "units": "short_repr",
     "versions": "biotac_mj",
-    "geometry": "cache short_repr files reading quiet triangles",
+    "geometry": "cache short_repr fields files reading quiet triangles",
     "skin": "cache short_repr lazy geometry fields files reading threads quiet launches",
     "quiet": "",
     "sensor": "cache short_repr lazy fields files geometry threads quiet launches",
@@ -37,8 +37,8 @@ LAYERS = {
     "neighbours": "lazy batch coupling geometry recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading short_repr triangles units "
     "versions view.offscreen",
-    "differentiable": "cache short_repr coupling plugin geometry skin sensor threads calibration recordings "
-    "files press.indenter data.generation.clearance",
+    "differentiable": "cache short_repr fields coupling plugin geometry skin sensor threads calibration "
+    "recordings files press.indenter data.generation.clearance",
     "calibration": "cache geometry skin sensor.channels fields files reading press.indenter press.path",
     "quality": "sensor.channels",
     "recordings": "short_repr lazy arguments quality sensor geometry fields files reading",
@@ -46,12 +46,12 @@ LAYERS = {
     "press.approach press.indenter press.path learning.serve",
     "tasks": "cache short_repr lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles versions data.objects view.offscreen",
-    "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks press",
+    "view": "lazy coupling plugin skin sensor geometry fields files reading triangles tasks press",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "
     "reading press.approach",
     "matching": "cache skin sensor geometry recordings",
-    "resimulation": "lazy arguments matching data recordings skin sensor geometry files shards",
+    "resimulation": "lazy arguments matching data recordings skin sensor geometry fields files shards",
     "samples": "coupling plugin press.indenter data resimulation quality recordings effects sensor geometry "
     "files",
     "biotac_mj": "lazy plugin",

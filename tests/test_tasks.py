@@ -496,7 +496,7 @@ def test_an_entity_takes_settings_by_stage():
         ),
         (
             lambda: load("finger", "explore", task_kwargs={"objects": ["peg"]}),
-            "no object 'peg': choose from sphere_3-5mm",
+            "no object 'peg': choose one of sphere_3-5mm",
         ),
         (lambda: BioTac(site="tip"), "BioTac got site='tip': an Entity is placed with robot.attach"),
         (lambda: BioTac(tier="fast"), "unknown tier 'fast': choose one of full, condensed"),

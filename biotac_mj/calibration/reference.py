@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ..fields import as_real
 from ..skin.settings import read_settings
 from .forward import simulate
 from .indentation import Indentation
@@ -37,8 +38,7 @@ def stand_in(
     Raises:
       ValueError: negative noise, or a path that the skin cannot follow.
     """
-    if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"noise is {noise}: pass a standard deviation in newtons, 0 or more")
+    as_real("noise", noise, 0.0, unit="N")
     rubber, options, _ = read_settings(
         material, None, liquid=liquid, element=element, tolerance=1e-4, max_newton=100
     )

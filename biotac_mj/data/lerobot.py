@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import tqdm
 
+from ..fields import check_choice
 from ..files import refuse_existing, replacing
 from ..geometry.design import SINGLES
 from .schema import SPLITS
@@ -81,8 +82,7 @@ def interactions_to_export(
             f"{data.path} is unfinished ({data.unfinished}): run its `biotac data generate` again, which "
             "goes on"
         )
-    if counts not in ("counts", "measured_counts"):
-        raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
+    check_choice("unknown counts", counts, ("counts", "measured_counts"))
     for name in (counts, *needed):
         data[name]  # raises if it is missing
     chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))

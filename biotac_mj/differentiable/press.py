@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..fields import refuse_unknown
 from ..geometry.edge_nodes import EDGES
 from ..geometry.rigid import matrix_entries
 from ..short_repr import short_repr
@@ -159,11 +160,7 @@ def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -
       ValueError: an unknown parameter, one of the liquid for a dry skin, or an invalid value.
     """
     model, options = skin.model, skin.model.options
-    unknown = set(parameters) - set(PARAMETERS)
-    if unknown:
-        raise ValueError(
-            f"cannot press with {', '.join(sorted(unknown))}: choose from {', '.join(PARAMETERS)}"
-        )
+    refuse_unknown(parameters, PARAMETERS, "press")
     wet = {"fill_volume", "bulk_modulus"} & set(parameters)
     if wet and not model.has_liquid:
         raise ValueError(f"the skin has no liquid: leave {' and '.join(sorted(wet))} out")

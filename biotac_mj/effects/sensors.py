@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..fields import as_real
 from ..geometry.design import BIOTAC, Design
 from ..sensor.presets import Sensor, generator, read_sensor
 from ..short_repr import short_repr
@@ -52,11 +53,7 @@ def read_randomise(value: object) -> dict[str, float]:
     for name, size in value.items():
         if name not in RANDOM:
             raise ValueError(f"cannot randomise {short_repr(name)}: choose from {', '.join(RANDOM)}")
-        if isinstance(size, bool) or not isinstance(size, (int, float)) or not 0 <= size < np.inf:
-            raise ValueError(
-                f"randomise {short_repr(name)} by {short_repr(size)}: give a number >= 0, 1 is a real "
-                "sensor's"
-            )
+        as_real(f"size of {short_repr(name)} in randomise", size, 0.0)
     return dict(value)
 
 

@@ -10,6 +10,7 @@ import re
 
 import numpy as np
 
+from ..fields import refuse_unknown
 from ..reading import read_json
 from ..short_repr import short_repr
 from .assets import asset_path
@@ -167,11 +168,8 @@ class Design:
 
 @functools.cache
 def _parsed(text):
-    known = [field.name for field in dataclasses.fields(Design)]
     fields = json.loads(text)
-    unknown = [name for name in fields if name not in known]
-    if unknown:
-        raise ValueError(f"a design has no {unknown[0]!r}: choose from {', '.join(known)}")
+    refuse_unknown(fields, [field.name for field in dataclasses.fields(Design)], "design")
     missing = [name for name in ("name", "title") if name not in fields]
     if missing:
         raise ValueError(f"a design needs {missing[0]!r}: give a text")

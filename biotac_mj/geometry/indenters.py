@@ -8,6 +8,7 @@ import dataclasses
 
 import numpy as np
 
+from ..fields import check_choice
 from .assets import asset_path
 from .making.importing import read_obj
 
@@ -72,7 +73,5 @@ def indenter(name: str) -> Indenter:
     Raises:
       ValueError: unknown name; the text lists the names.
     """
-    for shape in _ALL:
-        if shape.name == name:
-            return shape
-    raise ValueError(f"unknown indenter {name!r}: choose one of {', '.join(INDENTERS)}")
+    check_choice("unknown indenter", name, INDENTERS)
+    return _ALL[INDENTERS.index(name)]

@@ -7,8 +7,8 @@ import typing
 from collections.abc import Callable, Sequence
 
 import h5py
-import numpy as np
 
+from ..fields import as_real
 from ..reading import reading
 from ..short_repr import short_repr
 from .formats.arrays import is_numpy, read_numpy
@@ -69,8 +69,8 @@ def load(
         if not known:
             raise ValueError(f"{what} is {short_repr(given)}: give names of files")
     for what, number in (("rate", rate), ("scale", scale)):
-        if number is not None and not (np.isreal(number) and np.ndim(number) == 0 and 0 < number < np.inf):
-            raise ValueError(f"{what} is {short_repr(number)}: give a positive number")
+        if number is not None:
+            as_real(what, number, 0.0, above=True)
     paths = [pathlib.Path(one) for one in paths]
     if len(set(paths)) < len(paths):
         raise ValueError("a file is given twice: give each once")

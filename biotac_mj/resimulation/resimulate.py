@@ -17,6 +17,7 @@ from ..data.objects import OBJECTS, make_object
 from ..data.schema import Interaction
 from ..data.splits import assign
 from ..data.store import TactileSet, shard_path, write_shard
+from ..fields import as_real, as_whole, check_choice
 from ..files import write_json
 from ..geometry import load_skin
 from ..geometry.design import BIOTAC, SINGLES, check_nelectrode
@@ -71,14 +72,12 @@ class ResimulateOptions:
         object.__setattr__(self, "material", plain(self.material))
         if self.options is not None:
             object.__setattr__(self, "options", plain(read_dict(self.options, "options")))
-        if self.poses not in POSES:
-            raise ValueError(f"unknown poses {self.poses!r}: choose one of {', '.join(POSES)}")
+        check_choice("unknown poses", self.poses, POSES)
         if self.poses == "fitted" and self.object not in (None, PLATE):
             raise ValueError(f"fitted poses are a plate's: leave --object {self.object} out")
-        if self.batch < 1 or not (self.rate > 0 and self.block > 0):
-            raise ValueError(
-                f"rate {self.rate}, block {self.block} and batch {self.batch} must all be above 0"
-            )
+        as_whole("batch", self.batch, 1)
+        for name in ("rate", "block"):
+            as_real(name, getattr(self, name), 0.0, above=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,6 @@ memory, and noise is a function of (seed, slot), so a replay from a saved state 
 their device. Both launch the kernels of `acquisition_kernels`."""
 
 import math
-import numbers
 import threading
 
 import numpy as np
@@ -26,9 +25,9 @@ from biotac_mj.sensor import channels
 from biotac_mj.sensor.acquisition_kernels import place_of, real
 from biotac_mj.sensor.presets import SENSORS, Sensor
 
+from ..fields import as_whole
 from ..geometry.design import BIOTAC, Design
 from ..launches import recorded
-from ..short_repr import short_repr
 
 
 class Acquisition:
@@ -66,9 +65,8 @@ class Acquisition:
         heat: bool = False,
         design: Design = BIOTAC,
     ):
-        if not isinstance(seed, numbers.Real) or seed % 1 or not 0 <= seed < 2**64:
-            raise ValueError(f"seed is {short_repr(seed)}: pass an integer from 0 to 2**64 - 1")
-        self.seed, self.noise, self.film_every_step = int(seed), bool(noise), bool(film_every_step)
+        self.seed = as_whole("seed", seed, 0, 2**64 - 1)
+        self.noise, self.film_every_step = bool(noise), bool(film_every_step)
         self.sensor, self.design, self.place = sensor, design, place_of(design)
         self.nstate = self.place.nstate
         self._film_rest, self._heat = film_rest, heat

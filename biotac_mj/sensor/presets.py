@@ -28,6 +28,7 @@ from biotac_mj.sensor.channels import (
     temperature_from_counts,
 )
 
+from ..fields import refuse_unknown
 from ..geometry.design import BIOTAC, Design, check_nelectrode, designs
 from ..short_repr import short_repr
 
@@ -284,10 +285,7 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
     if isinstance(value, Mapping):
         fields = dict(value)
         like = read_sensor(fields.pop("like", None), seed, design)
-        known = [field.name for field in dataclasses.fields(Sensor)]
-        unknown = [name for name in fields if name not in known]
-        if unknown:
-            raise ValueError(f"a sensor has no {unknown[0]!r}: choose from like, {', '.join(known)}")
+        refuse_unknown(fields, ["like", *(field.name for field in dataclasses.fields(Sensor))], "sensor")
         for name, value in fields.items():
             if name in _OF_ELECTRODES and np.ndim(value) and len(value):  # empty: as the design has it
                 check_nelectrode(design, len(value), f"{name} of a sensor")

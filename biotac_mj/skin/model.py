@@ -10,7 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..fields import check_choice, check_types
+from ..fields import as_real, check_choice, check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.surface import face_areas
@@ -104,8 +104,7 @@ class SkinOptions:
     def __post_init__(self):
         object.__setattr__(self, "contact_law", contact_law(self.contact_law))
         check_types(self)
-        if self.dynamics not in ("quasistatic", "implicit"):
-            raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
+        check_choice("unknown dynamics", self.dynamics, ("quasistatic", "implicit"))
         if self.element is not None:
             check_choice("unknown element", self.element, ELEMENTS, ", or None for the material's choice")
         if not self.bulk_modulus > 0:
@@ -120,19 +119,11 @@ class SkinOptions:
                 "them, a finite number"
             )
         for name in ("stick_ratio", "tolerance"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}: pass a positive finite number")
+            as_real(name, getattr(self, name), 0.0, above=True)
         for name in ("core_clearance", "max_core_depth", "mass_damping", "stiffness_damping"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} is {value}: pass a finite number >= 0")
-        if self.contact_stiffness is not None and not (
-            math.isfinite(self.contact_stiffness) and self.contact_stiffness > 0
-        ):
-            raise ValueError(
-                f"contact_stiffness is {self.contact_stiffness}: pass a positive number of Pa/m, or None"
-            )
+            as_real(name, getattr(self, name), 0.0)
+        if self.contact_stiffness is not None:
+            as_real("contact_stiffness", self.contact_stiffness, 0.0, above=True, unit="Pa/m")
         if (self.mass_damping or self.stiffness_damping) and self.dynamics != "implicit":
             raise ValueError(
                 "mass_damping and stiffness_damping act on a skin in motion: "

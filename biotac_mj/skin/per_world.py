@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..fields import as_numbers
+from ..fields import as_numbers, refuse_unknown
 from .contact.law import ContactLaw
 from .data import SkinData
 from .fill import rest_worlds
@@ -30,11 +30,7 @@ def make_room(
     Raises:
       ValueError: unknown names.
     """
-    unknown = set(values) - set(NAMES)
-    if unknown:
-        raise ValueError(
-            f"worlds cannot differ in {', '.join(map(repr, sorted(unknown)))}: choose from {', '.join(NAMES)}"
-        )
+    refuse_unknown(values, NAMES, "worlds")
     if options.contact_law is None and any(name in values for name in _LAW):
         options = dataclasses.replace(options, contact_law=ContactLaw())
     return options, np.ones(nelem) if modulus is None and "modulus" in values else modulus

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..coupling.config import OWN, SOLID, TO_COME, collides
 from ..coupling.settings import SettingKeywords, Settings
-from ..fields import as_whole
+from ..fields import as_whole, check_choice
 from ..geometry.assets import asset_path
 from ..short_repr import short_repr
 from .mounts import Mount, read_mounts
@@ -234,8 +234,7 @@ def _listed(fingers, mounts):
 
 
 def _mounts(hand, variant):
-    if not isinstance(variant, str) or variant not in ("replace", "authentic"):
-        raise ValueError(f"unknown variant {short_repr(variant)}: choose replace or authentic")
+    check_choice("unknown variant", variant, ("replace", "authentic"))
     if not isinstance(hand, str):
         named = isinstance(hand, dict) and hand and all(isinstance(finger, str) for finger in hand)
         if not named or not all(isinstance(mount, Mount) for mount in hand.values()):

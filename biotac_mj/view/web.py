@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from ..coupling.show import CORE, OBJECT, SKIN
+from ..fields import as_whole
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.colors import FULL_CHANGE, electrode_colors
 from .offscreen import directions
@@ -130,8 +131,7 @@ class Page:
             import viser
         except ImportError as error:
             raise ValueError("the page in the browser needs viser: pip install 'biotac-mj[web]'") from error
-        if not 0 < port < 65536:
-            raise ValueError(f"port {port} is none: choose one from 1 to 65535")
+        as_whole("port", port, 1, 65535)
         self.fingers = fingers
         # browsers open connections in advance and close them unused, which is not an error
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)

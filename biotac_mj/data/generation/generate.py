@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from ...effects.sensors import take_sensor
-from ...fields import as_whole, check_types, either
+from ...fields import as_real, as_whole, check_choice, check_types, either
 from ...files import write_json
 from ...geometry import load_skin
 from ...geometry.indenters import INDENTERS
@@ -132,10 +132,8 @@ class GenerateOptions:
                 f"device is {self.device!r}: "
                 "choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1"
             )
-        if not (np.isfinite(self.rate) and self.rate > 0):
-            raise ValueError(f"rate is {self.rate} Hz: it must be a positive number")
-        if self.tier not in ("full", "condensed"):
-            raise ValueError(f"unknown tier {self.tier!r}: choose full or condensed")
+        as_real("rate", self.rate, 0.0, above=True, unit="Hz")
+        check_choice("unknown tier", self.tier, ("full", "condensed"))
         if not self.objects:
             raise ValueError(f"unknown object list: it is empty: choose from {', '.join(OBJECTS)}")
         for name in self.objects:

@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...fields import check_choice
 from ...geometry.core_surface import CoreSurface
 from ...geometry.rigid import matrix, quaternion_from_y, rotation
 from ...geometry.skin_geometry import SkinGeometry
@@ -80,8 +81,7 @@ def plan_motions(
       ValueError: unknown kind, too few steps, or no admissible motion.
     """
     for kind in kinds:
-        if kind not in KINDS:
-            raise ValueError(f"unknown kind of interaction {kind!r}: choose from {', '.join(KINDS)}")
+        check_choice("unknown kind of interaction", kind, KINDS)
     if steps < 8:
         raise ValueError(f"{steps} steps are too few for an interaction: take at least 8")
     planner = _Planner(geometry, name, steps, kinds, device)

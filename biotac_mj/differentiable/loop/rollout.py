@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ...coupling.handle import handles
+from ...fields import as_real, as_whole
 from ...plugin.engine import world_of
 from ..readings.counts import electrode_counts, pdc_counts
 from ..readings.film import impedance
@@ -131,10 +132,9 @@ def rollout(
         raise ValueError("gradients through RK4 are not there: take implicitfast, implicit or Euler")
     if len(data.qpos) != model.nq or len(data.plugin_state) != model.npluginstate:
         raise ValueError("data is of another model: make it with MjData(model)")
-    if nstep is not None and (isinstance(nstep, bool) or not isinstance(nstep, int) or nstep < 1):
-        raise ValueError(f"nstep is {nstep!r}: pass a whole number, 1 or more")
-    if not (isinstance(agree, (int, float)) and 0 < agree < np.inf):
-        raise ValueError(f"agree is {agree!r}: pass a length above 0 [m]")
+    if nstep is not None:
+        nstep = as_whole("nstep", nstep, 1)
+    as_real("agree", agree, 0.0, above=True, unit="m")
     for name in (*_STATE, *_DRIVEN, "xfrc_applied"):
         if not np.isfinite(getattr(data, name)).all():
             raise ValueError(f"data.{name} is not finite: the simulation has diverged, or it was set so")

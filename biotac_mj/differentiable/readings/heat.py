@@ -7,12 +7,12 @@ one-sided."""
 import dataclasses
 import functools
 import math
-import numbers
 import types
 from collections.abc import Iterable
 
 import torch
 
+from ...fields import as_real, refuse_unknown
 from ...sensor import heat as own
 from ...sensor.formulas import with_globals
 from ...sensor.heat import HeatParameters
@@ -56,11 +56,8 @@ def temperatures(
     for name, value, least in (("area", area, 0.0), ("force", force, 0.0), ("begin", begin, -math.inf)):
         if not (torch.isfinite(value) & (value >= least)).all():
             raise ValueError(f"{name} is negative or no number somewhere: give {_UNITS[name]}")
-    if not (isinstance(dt, numbers.Real) and math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt is {dt}: give a positive time of a step [s]")
-    unknown = set(constants) - set(_CONSTANTS)
-    if unknown:
-        raise ValueError(f"no constants {', '.join(sorted(unknown))}: choose from {', '.join(_CONSTANTS)}")
+    as_real("dt", dt, 0.0, above=True, unit="s")
+    refuse_unknown(constants, _CONSTANTS, "constants")
     values = {name: float(torch.as_tensor(value).detach()) for name, value in constants.items()}
     q = dataclasses.asdict(HeatParameters(**values)) | constants  # raises for invalid values
     q = {name: torch.as_tensor(value, dtype=torch.float64, device="cpu") for name, value in q.items()}

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from ...fields import check_types
+from ...fields import check_choice, check_types
 
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
@@ -90,8 +90,7 @@ class LearningConfig:
         for name in ("mesh_scale", "learning_rate", "scale", "decay"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is 0: it must be positive")
-        if self.projection_loss not in ("latent", "decoded"):
-            raise ValueError(f"projection_loss is {self.projection_loss!r}: choose from latent, decoded")
+        check_choice("unknown projection_loss", self.projection_loss, ("latent", "decoded"))
         if len(self.mesh_channels) != len(self.mesh_factors):
             raise ValueError(
                 f"mesh_channels {self.mesh_channels} and mesh_factors {self.mesh_factors} must be equally "

@@ -33,7 +33,7 @@ from scipy.spatial.distance import pdist
 from scipy.special import j1
 
 from biotac_mj.cache import cached
-from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
+from biotac_mj.fields import as_numbers, as_real, check_entries, refuse_unknown
 from biotac_mj.geometry.core_surface import CoreSurface
 from biotac_mj.geometry.design import BIOTAC, Design, electrode_positions
 from biotac_mj.geometry.rigid import across
@@ -315,8 +315,7 @@ def read_film(
 
 def _check_numbers(given, geometry):
     for name, value in given.items():
-        if not 0 < value < np.inf:
-            raise ValueError(f"{name} is {value}: pass a positive number in SI units")
+        as_real(name, value, 0.0, above=True, unit="SI")
     places = electrode_positions(BIOTAC if geometry is None else geometry.design)
     half_distance = 1e-3 * pdist(places).min(initial=np.inf) / 2
     if given.get("electrode_radius", 0.0) >= half_distance:

@@ -14,14 +14,13 @@ Both act at the samples of a face, each on its part of the face's area:
 """
 
 import dataclasses
-import math
 import typing
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ...fields import as_numbers, check_types, refuse_unknown
+from ...fields import as_numbers, as_real, check_types, refuse_unknown
 from ...geometry.surface import node_areas
 from ...short_repr import short_repr
 from ..types import real
@@ -71,19 +70,11 @@ class ContactLaw:
                 f"friction_exponent is {self.friction_exponent}: pass a number from -1 to 2; 0 is Coulomb's "
                 "law"
             )
-        if not (math.isfinite(self.friction_pressure) and self.friction_pressure > 0):
-            raise ValueError(f"friction_pressure is {self.friction_pressure}: pass a positive number of Pa")
-        if not (math.isfinite(self.adhesion) and self.adhesion >= 0):
-            raise ValueError(f"adhesion is {self.adhesion}: pass a work >= 0 in J/m^2")
-        if not (math.isfinite(self.adhesion_hysteresis) and self.adhesion_hysteresis >= 1):
-            raise ValueError(
-                f"adhesion_hysteresis is {self.adhesion_hysteresis}: separation takes at least the work of "
-                "adhesion, pass >= 1"
-            )
-        if self.adhesion_range is not None and not (
-            math.isfinite(self.adhesion_range) and self.adhesion_range > 0
-        ):
-            raise ValueError(f"adhesion_range is {self.adhesion_range}: pass a positive length in m, or None")
+        as_real("friction_pressure", self.friction_pressure, 0.0, above=True, unit="Pa")
+        as_real("adhesion", self.adhesion, 0.0, unit="J/m^2")
+        as_real("adhesion_hysteresis", self.adhesion_hysteresis, 1.0)  # separation takes the work of adhesion
+        if self.adhesion_range is not None:
+            as_real("adhesion_range", self.adhesion_range, 0.0, above=True, unit="m")
 
 
 def contact_law(choice: ContactLaw | dict | None) -> ContactLaw | None:

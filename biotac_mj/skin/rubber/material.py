@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from ...fields import check_choice, check_types
+from ...fields import as_real, check_choice, check_types
 from .law import LAWS
 
 ELEMENTS = ("linear", "quadratic")
@@ -60,10 +60,9 @@ class Material:
         check_choice("unknown material law", self.law, LAWS)
         if self.element is not None:
             check_choice("unknown element", self.element, ELEMENTS, ", or None for the geometry's")
-        numbers = "youngs_modulus", "poissons_ratio", "friction", "density", "stiffening", "rest_pressure"
-        for name in numbers:
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
+        for name in ("youngs_modulus", "poissons_ratio", "density", "stiffening", "rest_pressure"):
+            as_real(f"material {name}", getattr(self, name))
+        as_real("material friction", self.friction, 0.0)
         if not (_SOFTEST <= self.youngs_modulus <= _HARDEST and self.density > 0):
             raise ValueError(
                 f"Young's modulus {self.youngs_modulus:g} Pa must be from {_SOFTEST:g} to {_HARDEST:g} (give "
@@ -80,8 +79,6 @@ class Material:
                 f"Poisson's ratio is 0.5 less {0.5 - self.poissons_ratio:.1g}, too little for double "
                 f"precision: pass at most 0.5 - {_LEAST_DIFFERENCE:g}"
             )
-        if self.friction < 0:
-            raise ValueError(f"friction {self.friction} is negative: pass a Coulomb coefficient >= 0")
 
     def _check_memory(self):
         try:  # lists, as YAML and JSON give them, become tuples: a material is a key

@@ -9,6 +9,7 @@ from dm_control import mjcf
 from dm_env import specs
 
 from ...data.objects import OBJECTS, make_object
+from ...fields import check_choice
 from ...short_repr import short_repr
 from ..base import AWAY, TouchTask
 from ..robots import Gantry
@@ -33,8 +34,7 @@ class Explore(TouchTask):
         if not isinstance(objects, (list, tuple)) or not objects:
             raise ValueError(f"objects is {short_repr(objects)}: give a list of some of {', '.join(OBJECTS)}")
         for name in objects:
-            if not isinstance(name, str) or name not in OBJECTS:
-                raise ValueError(f"no object {short_repr(name)}: choose from {', '.join(OBJECTS)}")
+            check_choice("no object", name, OBJECTS)
         self.choices = [OBJECTS.index(name) for name in objects]
         shapes = [make_object(name) for name in OBJECTS]
         gantry, rounding = Gantry(), {shape.name: shape.rounding for shape in shapes if shape.rounding}
