@@ -5,6 +5,7 @@ measured on the paper's meshes, without handles and mounts, which never touch th
 cube and ring have a radius of 1 mm."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -42,8 +43,13 @@ class Indenter:
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """The shape with its rounded edges as a closed mesh: vert (n, 3) [m], indenter frame, face (m, 3),
         normals outwards."""
-        ((vert, face),) = read_obj(asset_path(f"indenters/{self.name}.obj"))
-        return vert, face
+        return tuple(array.copy() for array in _mesh(self.name))
+
+
+@functools.cache
+def _mesh(name):
+    ((vert, face),) = read_obj(asset_path(f"indenters/{name}.obj"))
+    return vert, face
 
 
 def _sphere(name, diameter):
