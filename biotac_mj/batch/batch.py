@@ -168,10 +168,15 @@ class Batch(Skins):
         """Writes whether the skin acts into the correction of all skins. Launches only."""
         self._acts.fill_(int(self.active))
 
-    def evaluate(self, qacc: wp.array) -> None:
-        """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""
-        self._qacc = qacc
-        self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, self._of_step))
+    def evaluate(self, m: "mjw.Model", d: "mjw.Data", qacc: wp.array) -> None:
+        """Finds where the bodies go with accelerations (nworld, nv), where the skins are solved, and the work
+        of mujoco_warp's contacts with core, nail and clamp."""
+        self._qacc, r, c, efc = qacc, self._of_step, d.contact, d.efc
+        self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, r))
+        r.lifted.zero_()
+        known = [self._core, self._body, self.dt, m.geom_bodyid, d.nacon, c.geom, c.worldid, c.efc_address]
+        known += [efc.force, efc.J, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind, d.qvel, qacc]
+        self._launch(solid.find_lift, c.worldid.shape, known, [r.lifted])
 
     def _put_bodies(self, m):
         """Lets bodies that were placed begin without contact; finds which were placed in the skin."""

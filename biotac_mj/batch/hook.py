@@ -280,7 +280,7 @@ class Hook:
             wp.launch(integrator.begin_correction, d.nworld, [going, correction], device=device)
             compare()
             wp.capture_while(self._amiss, go_on)
-        self._fork.run(*(functools.partial(batch.evaluate, self._integrator.qacc) for batch in moving))
+        self._fork.run(*(functools.partial(batch.evaluate, m, d, self._integrator.qacc) for batch in moving))
 
     def _find_accelerations(self, m, d, moving, going, first=False):
         """Computes the constraint solver's accelerations in the worlds that continue."""

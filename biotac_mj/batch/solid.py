@@ -48,6 +48,58 @@ def sum_contacts(
 
 
 @wp.kernel
+def find_lift(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    step: real,
+    geom_bodyid: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    geom: wp.array(dtype=wp.vec2i),
+    world: wp.array(dtype=int),
+    row: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=float),
+    J: wp.array3d(dtype=float),
+    sparse: int,
+    J_rownnz: wp.array2d(dtype=int),
+    J_rowadr: wp.array2d(dtype=int),
+    J_colind: wp.array3d(dtype=int),
+    qvel: wp.array2d(dtype=float),
+    qacc: wp.array2d(dtype=float),
+    # In and out:
+    lifted: wp.array2d(dtype=real),
+):
+    """Adds up the work that contacts with body `core` do on the touching bodies in the step [J]."""
+    i = wp.tid()
+    if i >= count[0] or row[i, 0] < 0 or wp.min(geom[i][0], geom[i][1]) < 0:  # -1: a flex
+        return
+    first, second = geom_bodyid[geom[i][0]], geom_bodyid[geom[i][1]]
+    if first != core and second != core:
+        return
+    w = world[i]
+    work = real(0.0)
+    for k in range(row.shape[1]):
+        r = row[i, k]
+        if r >= 0 and force[w, r] != 0.0:
+            speed = real(0.0)
+            entries = wp.where(sparse == 1, J_rownnz[w, r], qvel.shape[1])
+            for n in range(entries):
+                line = int(r)
+                at = int(n)
+                column = int(n)
+                if sparse == 1:
+                    line = 0
+                    at = J_rowadr[w, r] + n
+                    column = J_colind[w, 0, at]
+                mean = real(qvel[w, column]) + real(0.5) * step * real(qacc[w, column])
+                speed += real(J[w, line, at]) * mean
+            work += step * real(force[w, r]) * speed
+    for g in range(body.shape[0]):
+        if body[g] == wp.where(first == core, second, first):
+            wp.atomic_add(lifted, g, w, work)
+
+
+@wp.kernel
 def add_push(
     # In:
     core: int,

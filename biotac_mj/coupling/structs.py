@@ -39,6 +39,7 @@ LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
 LIBRARY.mj_mulJacTVec.argtypes = (ctypes.c_void_p,) * 4
+LIBRARY.mj_mulJacVec.argtypes = (ctypes.c_void_p,) * 4
 LIBRARY.mj_integratePos.argtypes = (*(ctypes.c_void_p,) * 3, ctypes.c_double)
 
 _SCALARS = {
@@ -317,6 +318,12 @@ class DataView(_View):
         """(k, nv) accelerations by generalised forces (k, nv), without any constraint."""
         out, force = np.empty(force.shape), np.ascontiguousarray(force)
         LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
+        return out
+
+    def rows_moved_by(self, motion: np.ndarray) -> np.ndarray:
+        """(nefc,) motions of the constraint rows by those of the degrees of freedom (nv,)."""
+        out, motion = np.empty(len(self.rows().efc_type)), np.ascontiguousarray(motion)
+        LIBRARY.mj_mulJacVec(self.model.address, self.address, out.ctypes.data, motion.ctypes.data)
         return out
 
     def pushed_by(self, force: np.ndarray) -> np.ndarray:

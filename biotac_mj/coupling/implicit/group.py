@@ -3,11 +3,13 @@ energy that the skins can give. The bodies of one skin follow those of another i
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 
 from ...geometry.rigid_warp import LEVER
 from ..instance import Instance
 from ..setup import ENERGY, FREQUENCY, STARTED, models_of
+from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .kinematics import Kinematics
@@ -15,6 +17,7 @@ from .metric import Metric
 from .springs import Springs
 from .step_arrays import StepArrays
 
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # the first type of a contact's row
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
 
@@ -33,7 +36,9 @@ class SkinGroup:
     """
 
     def __init__(self, model: ModelView, data: DataView, instances: Sequence[Instance], metric: Metric):
-        self._model, self._instances, self._metric = model, instances, metric
+        self._model, self._data, self._instances, self._metric = model, data, instances, metric
+        meets = ((t.touching.core, body) for t in instances for body in t.touching.body)
+        self._meets = np.array(list(meets), int).reshape(-1, 2)
         self._kinematics = Kinematics(model, data, [t.touching for t in instances])
         self.springs = Springs(model, data, [len(t.slots) for t in instances])
         setups = [t.setup for t in instances]
@@ -104,10 +109,24 @@ class SkinGroup:
         self.arrays.qacc[:] = acceleration
         np.add(self.amiss, self.excess, out=self.arrays.amiss)
         self.arrays.evaluate()
+        self.arrays.lifted[:] = self._find_lift()
         if self.withdrawn:
             self.arrays.acting[:] = 0.0
         for skin in self.skins:
             skin.look()
+
+    def _find_lift(self):
+        """(n,) [J] work that MuJoCo's contacts with core, nail and clamp do on the bodies in the step."""
+        geom = contacts_of(self._data)["geom"]
+        pairs = np.where(geom >= 0, self._model.geom_bodyid[geom], -1)  # -1: a flex
+        meet = (pairs[None, :, :, None] == self._meets[:, None, None]).any(axis=2).all(axis=2)
+        if not meet.any():
+            return 0.0
+        rows, step = self._data.rows(), self._model.opt.timestep
+        mean = self._data.qvel + 0.5 * step * self.arrays.qacc
+        work = step * rows.efc_force * self._data.rows_moved_by(mean)
+        of_contacts = rows.efc_type >= _CONTACT
+        return meet @ np.bincount(rows.efc_id[of_contacts], work[of_contacts], len(geom))
 
     def use_models(self) -> None:
         """Takes the models of the last solves into use."""

@@ -61,6 +61,7 @@ class Rounds:
     # what passive forces and rows lack of the skin's model or have more than it: it acts on the bodies too
     amiss: wp.array2d(dtype=vec6)
     acting: wp.array2d(dtype=vec6)  # what acts on the bodies, linear in the accelerations
+    lifted: wp.array2d(dtype=real)  # [J] work of MuJoCo's contacts with core, nail and clamp on the bodies
     asked_pos: wp.array2d(dtype=vec3)
     asked_mat: wp.array2d(dtype=mat33)
     free_pos: wp.array2d(dtype=vec3)
