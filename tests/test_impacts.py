@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
+import trimesh
 from grids import covering, first
 
 import biotac_mj
@@ -386,6 +387,35 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
         np.testing.assert_allclose(force, lost, rtol=0, atol=1e-8 * (1 + np.abs(lost).max()))
         assert kinetic(model, data) <= start * (1 + 1e-12)
     assert touched > 1
+
+
+@pytest.mark.parametrize("seed", [7, 48, 56])
+def test_a_ring_that_comes_into_the_core_gains_nothing(seed):
+    """Its contact with the core lifts it against a skin that holds it from the other side: both together give
+    no more than was put in."""
+    ring = trimesh.creation.torus(6e-3, 2e-3, major_sections=28, minor_sections=14)
+    corners, faces = (" ".join(str(x) for x in a.ravel()) for a in (ring.vertices.round(7), ring.faces))
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".004" gravity="0 0 0"/>'
+        f'<asset><mesh name="ring" inertia="exact" vertex="{corners}" face="{faces}"/></asset>'
+        '<worldbody><site name="tip" quat="1 -1 0 0"/><body name="ring" pos="0 0 .021"><freejoint/>'
+        '<geom type="mesh" mesh="ring" mass=".0068" friction="0"/></body></worldbody></mujoco>'
+    )
+    biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", friction=0.0, readings=False)
+    model = spec.compile()
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    data.qpos[:2] = [-0.012, 0] + rng.uniform(-3e-3, 3e-3, 2)
+    quat = rng.normal(size=4)
+    data.qpos[3:] = quat / np.linalg.norm(quat)
+    data.qvel[:3] = *rng.uniform(-0.15, 0.15, 2), -rng.uniform(0.5, 1.2)
+    data.qvel[3:] = 8 * rng.normal(size=3)
+    mujoco.mj_forward(model, data)
+    start, into_core = kinetic(model, data), 0
+    for _ in range(14):
+        mujoco.mj_step(model, data)
+        into_core += data.ncon
+        assert kinetic(model, data) < 1.02 * start
+    assert into_core
 
 
 def test_a_tool_that_jumps_into_the_condensed_skin_is_followed():
