@@ -415,7 +415,7 @@ _GRADIENTS = [
     ("fits: slopes by these gradients, else by differences, said in the output",
      "`biotac lab calibrate`, `biotac lab compare`", "yes; not the refits of `diagnose`"),
     ("place and force of a contact from electrodes, with intervals", "`biotac lab estimate`, `Estimator`",
-     "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
+     "one geom that comes along the normal, tilted to first order; its drag in presses of the simulator; "
      "labelled touches of the sensor by `--known`"),
     ("kinks and jumps: first touch, stick and slip, rubber's memory, sharp edges, no equilibrium",
      "`Pressed.changes`, `Pressed.counts`", "counted in every step"),

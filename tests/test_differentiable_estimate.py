@@ -70,11 +70,11 @@ def press(estimator, along, around, share, gain=1.0):
     record, nodes = trajectory.steps[-1], len(estimator.geometry.vert)
     film = FilmConduction(estimator.geometry)
     pressed, rest = (of.x[:nodes, 0].numpy() for of in (record, trajectory.rest))
+    solved = table.solved(record, trajectory.rest)
     ratio = film.impedance(pressed) / film.impedance(rest)
     counts = counts_from_impedance(impedance_from_counts(REST) * ratio**gain)
     pdc = float(counts_from_pressure(float(record.pressure - trajectory.rest.pressure)))
-    wrench, middle = record.wrench[0, 0], torch.from_numpy(table.middle(record.touches))
-    truth = outcome_of(wrench, middle).numpy()
+    truth = table.outcome_of_step(solved)
     force, pressure = float(np.exp(truth[0])), pressure_change(pdc, PDC)
     return counts, pdc, Touch(change_of(counts, REST), pressure, force, truth[1:4])
 
@@ -85,15 +85,18 @@ def pressed(estimator):
     return press(estimator, -0.0098, 0.17, 0.6)
 
 
-def test_a_table_without_derivatives_has_the_same_presses(estimator):
+def test_starts_are_the_presses_of_the_full_skin_roughly(estimator):
+    """By the condensed tier: force, place and readings."""
     one = copy.copy(estimator.presses)
     along, around = one._capsule.along[:1], one._capsule.around[:1]
     one._capsule = dataclasses.replace(one._capsule, along=along, around=around)
     whole, one._slopes = one._make(), False
     alone = one._make()
     assert alone.keys() == {"signal", "outcome"} and len(whole) == 5
-    for name, values in alone.items():
-        np.testing.assert_array_equal(values, whole[name])
+    off = alone["outcome"] - whole["outcome"]
+    assert np.abs(off[..., 0]).max() < 0.15 and np.abs(off[..., 1:4]).max() < 0.5e-3
+    change = whole["signal"][..., :19]
+    assert np.linalg.norm(alone["signal"][..., :19] - change) < 0.2 * np.linalg.norm(change)
 
 
 def test_a_press_is_found_again(estimator, pressed):
@@ -109,11 +112,11 @@ def test_a_press_is_found_again(estimator, pressed):
 
 
 def test_a_fit_explains_more_than_the_nearest_press(estimator, pressed, monkeypatch):
-    """Of the table; by three moves of it."""
+    """Of the table."""
     counts, pdc, _ = pressed
     monkeypatch.setattr(fitting, "_STARTS", 1)
     found = []
-    for moves in (0, 3):
+    for moves in (0, 12):
         monkeypatch.setattr(fitting, "_ITERATIONS", moves)
         found.append(estimator.fit(counts.round(), REST, (pdc, PDC)))
     near, better = found
@@ -135,14 +138,14 @@ def test_a_press_of_the_simulated_sensor_is_fitted(estimator, pressed):
 def test_secants_correct_gradients_that_hide_a_small_one():
     """Errors of a few percent in large gradients make the least known direction look far better known."""
     draw = np.random.default_rng(0)
-    left, _, right = np.linalg.svd(draw.normal(size=(20, 5)), full_matrices=False)
-    true = left * [600, 500, 400, 300, 10] @ right
+    left, _, right = np.linalg.svd(draw.normal(size=(20, 7)), full_matrices=False)
+    true = left * [600, 550, 500, 450, 400, 300, 10] @ right
     wrong = true + 10 * draw.normal(size=true.shape)
-    by = draw.normal(size=(7, 5))
+    by = draw.normal(size=(7, 7))
 
     def simulate(at):
         missed = true @ at
-        return fitting._Press(at, None, None, by @ at, missed, missed @ missed)
+        return fitting._Press(at, by @ at, missed, missed @ missed)
 
     def spread(press, gradient):
         press = dataclasses.replace(press, outcome_by=by, missed_by=gradient)
@@ -150,7 +153,7 @@ def test_secants_correct_gradients_that_hide_a_small_one():
 
     search = object.__new__(fitting._Search)
     search._simulate = simulate
-    here = dataclasses.replace(simulate(np.zeros(5)), outcome_by=by, missed_by=wrong)
+    here = dataclasses.replace(simulate(np.zeros(7)), outcome_by=by, missed_by=wrong)
     found = search._with_secants(here)
     assert (spread(here, wrong) < 0.5 * spread(here, true)).all()
     np.testing.assert_allclose(spread(here, found.missed_by), spread(here, true), rtol=0.1)
@@ -185,7 +188,7 @@ def test_a_tilts_slope_is_that_of_tilted_presses(estimator):
     table, skin = estimator.presses, estimator.skin
     around = np.radians(-25.0)
     straight, steps = table.simulate(-0.0085, around)
-    middle = torch.from_numpy(table.middle(straight.steps[-1].touches))
+    middle = torch.from_numpy(table.middle(straight.steps[-1].touches.numpy()))
     tilt, size = table._tangents(steps, around).pose[0, 0], 0.02
     ends = []
     for h in (size, -size):

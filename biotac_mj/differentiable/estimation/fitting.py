@@ -1,32 +1,42 @@
 """Contact of a known sensor: fits a press such that the simulator has the measured readings.
 
-A Gauss-Newton method moves and tilts the press. The simulator supplies its gradients, the table of presses
-its start. Several combinations of place, depth and tilt may have nearly the same readings. Gradients at one
-press cannot tell how far these lie apart: samples begin and cease to touch, and errors of a few percent in
-large gradients hide small ones. Therefore presses at both ends of the interval correct the gradients there.
+A Gauss-Newton method moves, tilts and slides the press. The condensed tier supplies the start and, by
+differences, the gradients: it is a hundred times faster than the full skin, whose readings are fitted.
+Several combinations of place, depth, tilt and slide may have nearly the same readings. Gradients at one press
+cannot tell how far these lie apart: samples begin and cease to touch, and errors of a few percent in large
+gradients hide small ones. Therefore presses at both ends of the interval correct the gradients there.
 """
 
 import dataclasses
-import functools
+from collections.abc import Callable
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from ...sensor.channels import electrode_noise, log_impedance, pressure_from_counts
 from ...sensor.film import FilmConduction, NoFilmError
-from ..record import Trajectory, follow
-from ..sweep import Inputs, push_forward
+from ..record import follow
 from .belief import TILT
-from .presses import Presses, frame_of, outcome_of, slopes_of_film
+from .presses import Presses, Solved, frame_of
 
 _STARTS, _SPACING = 3, 2e-3  # starting positions from the table at most, and their least distance [m]
-_ITERATIONS, _LONGEST = 20, 1.0  # per start; longest move of an iteration [mm]
-_CONVERGED = 0.1  # least gain of ln of the likelihood per iteration: well inside the interval
+_ITERATIONS, _LONGEST = 30, 1.0  # per start and tier; longest move of an iteration [mm]
+_STEP, _ROUGH = 2.5e-4, 5e-4  # [m] longest step of a path, of one by the condensed tier
+_SLIDE = 1.0  # [mm] standard deviation of a slide that follows a press, in each of two directions
+_APART = np.array([0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05])  # of coordinates in differences [mm], [rad]
+# least gain of -2 ln of the likelihood to go on for: well inside the interval; by the condensed tier
+_CONVERGED, _ROUGHLY = 0.1, 2.0
 _EXPLAINED = 2.0  # mean square residual, in variances of the noise, of a press that explains a reading
 _SECANTS = 8  # pairs of presses at most that correct the gradients
 _AGREES = 0.2  # relative error of a gradient that needs no correction
+
+
+class _NoPressError(ValueError):
+    """The geom does not touch the skin."""
+
+
+_IMPOSSIBLE = NoFilmError, _NoPressError  # a press deeper than the film allows, or beside the skin
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,12 +55,10 @@ class Fit:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Press:
-    """A simulated press at five coordinates: its steps, outcome, residuals in standard deviations (k,), -2 ln
-    of its likelihood, and derivatives of outcome and residuals by the coordinates, None if not computed."""
+    """A simulated press at seven coordinates: its outcome, residuals in standard deviations (k,), -2 ln of
+    its likelihood, and derivatives of outcome and residuals by the coordinates, None if not computed."""
 
     at: np.ndarray
-    trajectory: Trajectory
-    pos: np.ndarray
     outcome: np.ndarray
     missed: np.ndarray
     cost: float
@@ -64,7 +72,7 @@ class _Press:
 
     @property
     def spread(self) -> np.ndarray:
-        """(5, 5) covariance of the coordinates, with the noise scaled to the residuals."""
+        """(7, 7) covariance of the coordinates, with the noise scaled to the residuals."""
         scale = max(1.0, self.missed @ self.missed / (len(self.missed) - len(_PRIOR)))
         return np.linalg.inv(self.missed_by.T @ self.missed_by / scale + np.diag(_PRIOR))
 
@@ -109,7 +117,8 @@ def fit(
     return Fit(mean, covariance, fraction)
 
 
-_PRIOR = np.array([0, 0, 0, 1, 1]) / TILT**2  # precisions of three moves [mm], which are free, and two tilts
+# precisions of three moves [mm], which are free, of two tilts and of the slide
+_PRIOR = np.array([0, 0, 0, TILT**-2, TILT**-2, _SLIDE**-2, _SLIDE**-2])
 
 
 def _starts(presses, signal, noise):
@@ -131,36 +140,52 @@ class _Search:
 
     def __init__(self, presses, film, signal, noise, start, bar):
         self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
-        self._steps = presses.path(*presses.at[start])
-        self._axes, self._bar = frame_of(self._steps, presses.at[start, 1]), bar
+        self._steps, self._bar = presses.path(*presses.at[start]), bar
+        self._axes = frame_of(self._steps, presses.at[start, 1])
+        self._rest = np.log(film.impedance(presses.skin.model.rest.vert[: presses.geometry.nvert]))
 
     def run(self) -> _Press | None:
-        """Levenberg-Marquardt iterations. The scale of the noise is estimated with the press, so the prior
-        limits the tilts while the residual is large."""
-        damping = 1e-2
+        """The press of the condensed tier, and from it that of the full skin; None: none can be simulated."""
         try:
-            here = self._differentiated(self._simulate(np.zeros(5)))
-        except NoFilmError:
+            start = self._differentiated(self._approximated(np.zeros(len(_PRIOR))))
+            start = self._differentiated(self._fitted(start, self._approximated, _ROUGHLY))
+            by = {"missed_by": start.missed_by, "outcome_by": start.outcome_by}
+            press = dataclasses.replace(self._simulate(start.at), **by)
+            return self._with_secants(self._fitted(press, self._simulate, _CONVERGED))
+        except _IMPOSSIBLE:
             return None
+
+    def _fitted(self, here: _Press, simulate: Callable, least: float) -> _Press:
+        """Levenberg-Marquardt iterations, whose derivatives every press corrects (Broyden) and which takes
+        new ones where these lead no further. The scale of the noise is estimated with the press, so the prior
+        limits tilts and slide while the residual is large."""
+        damping, fresh = 1e-2, True
         for _ in range(_ITERATIONS):
             scale = max(1.0, here.missed @ here.missed / len(here.missed))
             normal = here.missed_by.T @ here.missed_by / scale + np.diag(_PRIOR)
             pull = -here.missed_by.T @ here.missed / scale - _PRIOR * here.at
+            if pull @ np.linalg.solve(normal, pull) < least or damping > 1e2:
+                break
             move = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), pull)
             move *= min(1.0, _LONGEST / np.linalg.norm(move[:3]))
             try:
-                there = self._simulate(here.at + move)
-            except NoFilmError:  # deeper than the film allows
-                there = None
-            if there is None or there.cost >= here.cost:
-                damping = max(1e-2, 10 * damping)
-                if damping > 1e2:
-                    break
+                there = simulate(here.at + move)
+            except _IMPOSSIBLE:
+                damping *= 10
                 continue
-            gain, here, damping = here.cost - there.cost, self._differentiated(there), damping / 5
-            if gain < _CONVERGED:
+            slope = move / _APART**2
+            by, _ = _corrected(here, here, there, move, slope / (slope @ move))
+            gain = here.cost - there.cost
+            here = dataclasses.replace(there if gain > 0 else here, **by)
+            if gain > least:
+                damping, fresh = damping / 5, False
+            elif not fresh:
+                here, fresh = self._differentiated(here), True
+            elif gain > 0:
                 break
-        return self._with_secants(here)
+            else:
+                damping *= 10
+        return here
 
     def _with_secants(self, press):
         """The press with derivatives corrected by secants over one standard deviation to both sides: in turn
@@ -174,62 +199,74 @@ class _Search:
             move = spread @ slope
             try:
                 ends = [self._simulate(press.at + sign * move) for sign in (-1, 1)]
-            except NoFilmError:
+            except _IMPOSSIBLE:
                 break
-            missed, outcome = (
-                0.5 * (getattr(ends[1], of) - getattr(ends[0], of)) for of in ("missed", "outcome")
-            )
-            wrong = missed - press.missed_by @ move
-            by = {
-                "missed_by": press.missed_by + np.outer(wrong, slope),
-                "outcome_by": press.outcome_by + np.outer(outcome - press.outcome_by @ move, slope),
-            }
-            best = min([press, *ends], key=lambda one: one.cost)
-            press = dataclasses.replace(best, **by)
-            agrees = agrees + 1 if np.linalg.norm(wrong) < _AGREES * np.linalg.norm(missed) else 0
+            by, error = _corrected(press, *ends, 2 * move, slope / 2)
+            press = dataclasses.replace(min([press, *ends], key=lambda one: one.cost), **by)
+            agrees = agrees + 1 if error < _AGREES else 0
             if agrees == 2:
                 break
         return press
 
+    def _path(self, at, step=_STEP):
+        """Poses (nstep, 1, 3) [m], (nstep, 1, 3, 3) of a press: moved by the first three coordinates [mm],
+        tilted by two [rad], and then slid by two [mm]."""
+        turn = Rotation.from_rotvec(at[3:5] @ self._axes).as_matrix()
+        down, slide = turn @ (self._steps.pos[-1] - self._steps.pos[0])[0], 1e-3 * at[5:] @ self._axes
+        first, then = (np.linspace(0, 1, _count(leg, step))[:, None] * leg for leg in (down, slide))
+        pos = self._steps.pos[0] + 1e-3 * at[:3] + np.concatenate([first, down + then[1:]])
+        return pos[:, None], np.repeat((turn @ self._steps.mat[0])[None], len(pos), axis=0)
+
     def _simulate(self, at):
-        """Simulates a press moved by the first three coordinates [mm] and tilted by the others [rad]."""
+        """Simulates a press of the full skin."""
         self._bar.update()
-        skin, presses, start = self._presses.skin, self._presses, self._steps.pos[0]
-        turn = Rotation.from_rotvec(at[3:] @ self._axes).as_matrix()
-        pos = start + (self._steps.pos - start) @ turn.T + 1e-3 * at[:3]
+        skin, (pos, mat) = self._presses.skin, self._path(at)
         with skin.lock:
-            trajectory = follow(skin, pos[None], (turn @ self._steps.mat)[None], skin.friction, skin.own)
-        record, rest, n = trajectory.steps[-1], trajectory.rest, presses.geometry.nvert
-        lies = rest.x[:n, 0].numpy() if rest else presses.geometry.vert
-        pressure = float(record.pressure - (rest.pressure if rest else 0.0))
-        after, before = (np.log(self._film.impedance(x)) for x in (record.x[:n, 0].numpy(), lies))
-        used = slice(len(self._signal))
-        missed = (np.append(after - before, 1e-3 * pressure)[used] - self._signal) / self._noise[used]
+            trajectory = follow(skin, pos[None], mat[None], skin.friction, skin.own)
+        return self._read(at, self._presses.solved(trajectory.steps[-1], trajectory.rest))
+
+    def _approximated(self, at):
+        """Simulates a press of the condensed tier."""
+        *_, last = self._presses.approximate(*self._path(at, _ROUGH))
+        return self._read(at, last)
+
+    def _read(self, at, step: Solved):
+        if not len(step.touches):
+            raise _NoPressError
+        change = np.log(self._film.impedance(step.x)) - self._rest
+        signal = np.append(change, 1e-3 * step.pressure)[: len(self._signal)]
+        missed = (signal - self._signal) / self._noise[: len(signal)]
         scale = max(1.0, missed @ missed / len(missed))
         cost = missed @ missed / scale + len(missed) * np.log(scale) + at**2 @ _PRIOR
-        outcome = outcome_of(record.wrench[0, 0], self._middle(record)).numpy()
-        return _Press(at, trajectory, pos, outcome, missed, cost)
-
-    def _middle(self, record):
-        return torch.from_numpy(self._presses.middle(record.touches))
+        return _Press(at, self._presses.outcome_of_step(step), missed, cost)
 
     def _differentiated(self, press):
-        """A press with its derivatives by the coordinates."""
-        skin, pos, record = self._presses.skin, press.pos, press.trajectory.steps[-1]
-        pose = np.zeros((5, 1, len(pos), 1, 6))
-        pose[:3, 0, :, 0, :3] = 1e-3 * np.eye(3)[:, None]
-        for k, axis in enumerate(self._axes):
-            pose[3 + k, 0, :, 0] = np.column_stack(
-                [np.cross(axis, pos[:, 0] - pos[0, 0]), np.tile(axis, (len(pos), 1))]
-            )
-        still = {name: np.zeros((5, 1)) for name in skin.own}
-        with skin.lock:
-            tangents = push_forward(skin, press.trajectory, Inputs(pose, np.zeros((5, 1, 1)), still))
-        x, n = record.x[:, 0].numpy(), self._presses.geometry.nvert
-        read_by = slopes_of_film(self._film, x[:n], tangents.nodes[:, 0, -1, :n])[1]
-        used = slice(len(self._signal))
-        read_by = np.column_stack([read_by, 1e-3 * tangents.pressure[:, 0, -1]])[:, used] / self._noise[used]
-        outcome = functools.partial(outcome_of, middle=self._middle(record))
-        by_wrench = torch.autograd.functional.jacobian(outcome, record.wrench[0, 0]).numpy()
-        by = by_wrench @ tangents.wrench[:, 0, -1, 0].T
-        return dataclasses.replace(press, outcome_by=by, missed_by=read_by.T)
+        """A press with its derivatives by the coordinates, differences of the condensed tier."""
+        here, columns = self._approximated(press.at), []
+        for move in np.diag(_APART):
+            try:
+                there = self._approximated(press.at + move)
+            except _IMPOSSIBLE:  # the other way
+                move = -move
+                there = self._approximated(press.at + move)
+            by = ((getattr(there, of) - getattr(here, of)) / move.sum() for of in ("missed", "outcome"))
+            columns.append(tuple(by))
+        missed_by, outcome_by = (np.array(rows).T for rows in zip(*columns))
+        return dataclasses.replace(press, missed_by=missed_by, outcome_by=outcome_by)
+
+
+def _corrected(press, begin, end, move, slope):
+    """Derivatives of a press corrected along a move, by the presses at its ends, and their relative error
+    there; slope @ move is 1."""
+    by, errors = {}, []
+    for of in ("missed", "outcome"):
+        change, known = getattr(end, of) - getattr(begin, of), getattr(press, f"{of}_by")
+        wrong = change - known @ move
+        by[f"{of}_by"] = known + np.outer(wrong, slope)
+        errors.append(np.linalg.norm(wrong) / np.linalg.norm(change))
+    return by, errors[0]
+
+
+def _count(leg, step):
+    """Points of a straight part of a path, two or more."""
+    return 1 + max(1, int(np.ceil(np.linalg.norm(leg) / step)))

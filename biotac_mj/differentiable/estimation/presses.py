@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import itertools
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -25,7 +26,9 @@ from ...geometry.rigid import matrix
 from ...geometry.skin_geometry import SkinGeometry
 from ...press.indenter import make_indenter
 from ...sensor.film import FilmConduction, NoFilmError
-from ..record import Trajectory, follow
+from ...skin import GeomSet, SkinModel
+from ...skin.condensed import CondensedSkin, Memory
+from ..record import Record, Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward
 
@@ -36,6 +39,7 @@ _DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] largest depth, least distance from the 
 _FINER = 2  # interpolated points per point of the table
 _LIGHTEST = 1 / 32  # fraction of the depth of the lightest press
 _FILL = 1e-9  # [m^3] unit of the fill in derivatives
+_TOLERANCE = 1e-4  # of the condensed tier: differences of presses are taken
 _NUDGE = 1e-8  # [m] largest move of a node in differences: far under a film's thickness, far over rounding
 _FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, shifts of the electrodes
 
@@ -82,6 +86,17 @@ def coarser(capsule: Capsule) -> Capsule:
     """A third of the places: every second along, five around."""
     around = np.linspace(capsule.around[0], capsule.around[-1], 5)
     return dataclasses.replace(capsule, along=capsule.along[::2], around=around)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solved:
+    """A solved step: nodes (nvert, 3) [m], pressure of the liquid above rest [Pa], wrench (6,) of the skin on
+    the geom [N, N m], samples in contact (k,)."""
+
+    x: np.ndarray
+    pressure: float
+    wrench: np.ndarray
+    touches: np.ndarray
 
 
 def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
@@ -143,8 +158,8 @@ class Presses:
     Args:
       skin: with one geom. geometry: of it. indenter: the geom, as in `biotac press --indenter`.
       progress: whether to show a bar while the table is made.
-      slopes: whether derivatives are computed too, which takes as long as the presses; without them the table
-        is for starts of a search, and has a third of the places.
+      slopes: whether derivatives are computed too, of the full skin; without them the table is for starts
+        of a search, by the condensed tier, with a third of the places.
 
     Attributes:
       at: (n, 3) along [m] and around [rad] the capsule, fraction of the deepest press there.
@@ -185,19 +200,43 @@ class Presses:
         steps, skin = self.path(along, around, fraction), self.skin
         return follow(skin, steps.pos[None], steps.mat[None], skin.friction, skin.own), steps
 
+    @functools.cached_property
+    def _condensed(self):
+        given, geoms = self.skin.model, GeomSet(**self.skin.made_with)
+        geoms.set_friction(self.skin.friction)
+        options = dataclasses.replace(given.options, tolerance=_TOLERANCE)
+        return CondensedSkin(SkinModel(self.geometry, given.material, options), geoms)
+
+    def approximate(self, pos: np.ndarray, mat: np.ndarray) -> Iterator[Solved]:
+        """Steps of the condensed tier along a path (nstep, 1, 3) [m], (nstep, 1, 3, 3)."""
+        memory, n = Memory.rest(1), len(self.geometry.vert)
+        for one_pos, one_mat in zip(pos, mat):
+            out = self._condensed.solve(memory, one_pos, one_mat)
+            memory = out.memory
+            touches = memory.contacts[:, 0].astype(int)
+            yield Solved(out.vert_xpos[:n], float(memory.pressure), out.wrench[0], touches)
+
+    def solved(self, record: Record, rest: Record | None) -> Solved:
+        """A record of the full skin, and of the skin at rest."""
+        pressure = float(record.pressure - (rest.pressure if rest else 0.0))
+        x, wrench = record.x[: len(self.geometry.vert), 0].numpy(), record.wrench[0, 0].numpy()
+        return Solved(x, pressure, wrench, record.touches.numpy())
+
+    def outcome_of_step(self, step: Solved) -> np.ndarray:
+        """(7,) of `outcome_of`."""
+        middle = torch.from_numpy(self.middle(step.touches))
+        return outcome_of(torch.from_numpy(step.wrench), middle).numpy()
+
     def path(self, along: float, around: float, fraction: float = 1.0) -> Steps:
         """The steps of a press at a position [m], [rad]."""
-        point = self._capsule.at(along, around)
+        point, samples = self._capsule.at(along, around), len(_FRACTIONS) - 1
+        plan = plan_indentation(self._indenter, point, _DEEPEST, 0.0, samples=samples, skin=self.geometry)
+        part = fraction * deepest(plan, self._core_samples) / _DEEPEST
+        return steps_of(dataclasses.replace(plan, tip=plan.tip[0] + part * (plan.tip - plan.tip[0])))[0]
 
-        def plan(depth):
-            samples = len(_FRACTIONS) - 1
-            return plan_indentation(self._indenter, point, depth, 0.0, samples=samples, skin=self.geometry)
-
-        return steps_of(plan(fraction * deepest(plan(_DEEPEST), self._core_samples)))[0]
-
-    def middle(self, touches: torch.Tensor) -> np.ndarray:
+    def middle(self, touches: np.ndarray) -> np.ndarray:
         """(3,) mean of samples given by number, on the skin at rest [m]."""
-        skin, touches = self.skin, touches.numpy()
+        skin = self.skin
         face, weight = touches // len(skin.weights), skin.weights[touches % len(skin.weights)]
         corner = self.geometry.vert[skin.data.outer.surface.face_np[face]]
         return np.einsum("ma,mak->mk", weight, corner).mean(0)
@@ -212,39 +251,39 @@ class Presses:
             widths |= {"by_press": (3, width), "by_sensor": (3, width), "outcome_by": (3, 7)}
         of_films = [name for name in ("signal", "by_press", "by_sensor") if name in widths]
         table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
-        films, n = None, len(self.geometry.vert)
+        n = len(self.geometry.vert)
+        films = _Films(self.geometry, self.skin.model.rest.vert[:n], self._slopes)
         places = list(itertools.product(enumerate(capsule.along), enumerate(capsule.around)))
-        shown = self._progress
+        shown = self._progress and self._slopes
         if shown:
-            each = 2.5 if self._slopes else 1
-            text = f"note: simulating {len(places)} presses all over the skin once, {each} s each on one core"
+            text = f"note: simulating {len(places)} presses all over the skin once, 2.5 s each on one core"
             print(text, file=sys.stderr, flush=True)  # a bar is hidden where stderr is a file
         for (i, along), (j, around) in tqdm(places, "table, once", unit="press", disable=not shown or None):
             with self.skin.lock:
-                trajectory, steps = self.simulate(along, around)
                 if self._slopes:
+                    trajectory, steps = self.simulate(along, around)
                     tangents = push_forward(self.skin, trajectory, self._tangents(steps, around))
-            rest = trajectory.rest
-            lies = rest.x[:n, 0].numpy() if rest else self.geometry.vert
-            films = films or _Films(self.geometry, lies, self._slopes)
-            begin = float(rest.pressure) if rest else 0.0
+                    solved = [self.solved(record, trajectory.rest) for record in trajectory.steps]
+                else:
+                    steps = self.path(along, around)
+                    solved = list(self.approximate(steps.pos, steps.mat))
             for k, end in enumerate(steps.ends[1:], start=1):
-                record, here = trajectory.steps[end], (i, j, k)
+                step, here = solved[end], (i, j, k)
                 directions = tangents.nodes[:, 0, end, :n] if self._slopes else None
                 try:
-                    read = films.read(record.x[:n, 0].numpy(), directions)
+                    read = films.read(step.x, directions)
                 except NoFilmError:  # deeper than the film allows: use the deepest valid one
                     read = [table[name][i, j, k - 1, ..., :-1] for name in of_films]
                 for name, value in zip(of_films, read):
                     table[name][here][..., :-1] = value
-                table["signal"][here][-1] = 1e-3 * (float(record.pressure) - begin)
-                wrench, middle = record.wrench[0, 0], torch.from_numpy(self.middle(record.touches))
-                table["outcome"][here] = outcome_of(wrench, middle).numpy()
+                table["signal"][here][-1] = 1e-3 * step.pressure
+                table["outcome"][here] = self.outcome_of_step(step)
                 table["outcome"][here][0] -= np.log(_FRACTIONS[k])
                 if self._slopes:
                     table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
+                    middle = torch.from_numpy(self.middle(step.touches))
                     slopes = torch.autograd.functional.jacobian(
-                        functools.partial(outcome_of, middle=middle), wrench
+                        functools.partial(outcome_of, middle=middle), torch.from_numpy(step.wrench)
                     )
                     table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
         for name in {"outcome", "outcome_by"} & table.keys():

@@ -46,8 +46,8 @@ def estimate_verb(args: argparse.Namespace) -> None:
         except ValueError as error:
             raise ValueError(f"row {row} of {recording.name}: {error}") from None
     pressed = settings_of(args.file, recording)
-    simulated = pressed is not None and _is_the_simulated_one(args, pressed)
     skin, indenter, settings, film = _inverted(args, pressed, designed(counts))
+    simulated = pressed is not None and _is_the_simulated_one(args, pressed, settings.material)
     estimator = Estimator(load_skin(skin), indenter, settings.material, settings.options, not args.quiet)
     belief = estimator.learn(_touches(args)) if args.known else None
     pdc = _pdc(recording)
@@ -60,7 +60,7 @@ def estimate_verb(args: argparse.Namespace) -> None:
         return estimator(counts[row], rest, pressure, belief)
 
     if simulated and not args.quiet:
-        print(f"note: fitting a press to each of {len(rows)} rows, half a minute each", file=sys.stderr)
+        print(f"note: fitting a press to each of {len(rows)} rows, seconds to a minute each", file=sys.stderr)
     found = [
         estimate(row)
         for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False)
@@ -87,13 +87,14 @@ def estimate_verb(args: argparse.Namespace) -> None:
         print("  the force is known to a factor only: touches of the same sensor (--known) narrow it")
 
 
-def _is_the_simulated_one(args, pressed):
+def _is_the_simulated_one(args, pressed, material):
     """Whether a press is of the simulated sensor itself: its own skin under its own geom, whether these are
-    given or not, with readings by physics and without effects."""
+    given or not, elastic, with readings by physics and without effects."""
     given = {name: getattr(args, name) for name in ("skin", "indenter", "material", "options", "known")}
     asked = [name for name, value in given.items() if value not in (None, pressed.get(name))]
     added = [name for name in _ADDED if pressed.get(name) is not None]
     added += [f"options['{name}']" for name in ("readings", "modulus") if name in pressed["options"]]
+    added += material.extensions
     if pressed["tier"] != "full":
         added.append(f"tier {pressed['tier']!r}")
     why = [f"--{name} was given" for name in asked] + [f"it was made with {name}" for name in added]
