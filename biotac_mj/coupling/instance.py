@@ -401,7 +401,8 @@ class Instance:
         force = solid - self.acting_wrench().sum(axis=0)
         for other, group in self.skins_met:
             push = other.acting_wrench()[[group]]
-            force += _carried(push, other.frame(), self.frame())[0]
+            if push.any():
+                force += _carried(push, other.frame(), self.frame())[0]
         return force, self._result.converged and self.outcome.settled and solved
 
     def acting_wrench(self) -> np.ndarray:

@@ -26,7 +26,7 @@ class SkinGroup:
 
     Attributes:
       skins: `Coupled` that take part in this step: not those that rest with nothing in reach.
-      arrays: `StepArrays`, where the step stands. springs: `Springs`.
+      arrays: `StepArrays`, where the step stands. springs: `Springs`. metric: `Metric`.
       jacobian: (n, 6, nv) of the bodies relative to their BioTacs.
       correction: (n, 6) of what the integrator's accelerations differ in from the constraint solver's.
       amiss: (n, 6) what that still lacks: it acts on the bodies too.
@@ -35,15 +35,15 @@ class SkinGroup:
       forced: wrenches (n, 6) that act in place of models and rows, or None. withdrawn: nothing acts.
     """
 
-    def __init__(self, model: ModelView, data: DataView, instances: Sequence[Instance], metric: Metric):
-        self._model, self._data, self._instances, self._metric = model, data, instances, metric
+    def __init__(self, model: ModelView, data: DataView, instances: Sequence[Instance]):
+        self._model, self._data, self._instances = model, data, instances
         meets = ((t.touching.core, body) for t in instances for body in t.touching.body)
         self._meets = np.array(list(meets), int).reshape(-1, 2)
-        self._kinematics = Kinematics(model, data, [t.touching for t in instances])
-        self.springs = Springs(model, data, [len(t.slots) for t in instances])
-        setups = [t.setup for t in instances]
-        self.arrays = arrays = StepArrays(self._kinematics, setups, self.springs)
-        metric.record(*arrays.stiffness)
+        touchings, slots = [t.touching for t in instances], [t.slots for t in instances]
+        self._kinematics = Kinematics(model, data, touchings)
+        self.springs = Springs(model, data, list(map(len, slots)))
+        self.arrays = arrays = StepArrays(self._kinematics, [t.setup for t in instances], self.springs)
+        self.metric = Metric(model, touchings, slots, arrays.stiffness)
         both = zip(instances, self._kinematics.parts)
         self._all = [Coupled(t, data, arrays, k, bodies) for k, (t, bodies) in enumerate(both)]
         for k, t in enumerate(instances):
@@ -153,10 +153,10 @@ class SkinGroup:
     def apply(self) -> np.ndarray:
         """Puts the models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
         if self.forced is not None:
-            self._metric.release()
+            self.metric.release()
             return self.forced.ravel() @ self._rows
         if not self.written:
-            self._metric.write(self.touching)
+            self.metric.write(self.touching)
             self.written = True
         self.arrays.find_wrenches()
         return (self.correction + self.arrays.wrench).ravel() @ self._rows
@@ -182,7 +182,7 @@ class SkinGroup:
         if self.forced is not None:
             return self.forced
         moved = self.arrays.square[:, None] * (self.jacobian @ acceleration)
-        rows = self._metric.excess(acceleration)
+        rows = self.metric.excess(acceleration)
         rows -= (self.arrays.tangent0 @ moved[:, :, None])[:, :, 0]
         return self.correction + self.arrays.wrench + rows
 

@@ -67,12 +67,20 @@ class Metric:
 
     Args:
       touchings: of the BioTacs. slots: of each, see `assign_slots`.
+      stiffness: by how much accelerations move the bodies in the step [body, world] [m per m/s^2], their
+        Jacobians, and the skins' stiffnesses against them.
 
     Attributes:
       first: number of the first row of each slot; numbers: of all rows.
     """
 
-    def __init__(self, model: ModelView, touchings: Sequence[Touching], slots: Sequence[dict[int, int]]):
+    def __init__(
+        self,
+        model: ModelView,
+        touchings: Sequence[Touching],
+        slots: Sequence[dict[int, int]],
+        stiffness: tuple[wp.array, wp.array, wp.array],
+    ):
         self._model, self._slot_of = model, []
         self._slots = np.array([slot for one in slots for slot in one.values()], dtype=np.int64)
         count = 0
@@ -82,6 +90,17 @@ class Metric:
             count += len(one)
         self._layout, self._filled, self._held = None, False, None
         self.first, self.numbers = np.zeros(0, int), np.zeros(0, int)
+        n = 6 * count
+        with wp.ScopedDevice("cpu"):
+            J, D = wp.zeros((1, n, model.nv), dtype=real), wp.zeros((1, n), dtype=real)
+            basis, unused = wp.zeros((n, 1), dtype=vec6), wp.zeros((1, n), dtype=real)
+            first = wp.array(np.arange(0, n, 6, dtype=np.int32)[:, None], dtype=int)
+            square, jacobian, tangent = stiffness
+            known = [square, wp.array(np.array(self._slot_of, np.int32), dtype=int), first, jacobian, tangent]
+            none = [wp.zeros((1,) * ndim, dtype=int) for ndim in (2, 2, 3)]
+        written = [J, D, unused, unused, basis]
+        self._find_stiffness = row((write_rows, (count, 1, 1), [*known, 1, 0, *none, *written]))
+        self._J, self._D, self._basis = J.numpy()[0], D.numpy()[0], basis.numpy().reshape(-1, 6, 6)
 
     def switch_on(self, data: DataView) -> bool:
         """Activates the constraint slots. Returns whether one was inactive, so that MuJoCo has to build its
@@ -102,22 +121,6 @@ class Metric:
             return False
         data.eq_active[self._slots] = 1  # switched off with all others, or new to this mjData
         return True
-
-    def record(self, square: wp.array, jacobian: wp.array, tangent: wp.array) -> None:
-        """Makes the launch that finds rows of stiffnesses [body, world] against bodies with these Jacobians,
-        which accelerations move by `square` in the step [m per m/s^2]."""
-        count, nv = len(self._slots), jacobian.shape[2]
-        n = 6 * count
-        with wp.ScopedDevice("cpu"):
-            J, D = wp.zeros((1, n, nv), dtype=real), wp.zeros((1, n), dtype=real)
-            basis, unused = wp.zeros((n, 1), dtype=vec6), wp.zeros((1, n), dtype=real)
-            first = wp.array(np.arange(0, n, 6, dtype=np.int32)[:, None], dtype=int)
-            known = [square, wp.array(np.array(self._slot_of, np.int32), dtype=int), first, jacobian, tangent]
-            none = [wp.zeros((1,) * ndim, dtype=int) for ndim in (2, 2, 3)]
-        self._find_stiffness = row(
-            (write_rows, (count, 1, 1), [*known, 1, 0, *none, J, D, unused, unused, basis])
-        )
-        self._J, self._D, self._basis = J.numpy()[0], D.numpy()[0], basis.numpy().reshape(-1, 6, 6)
 
     def find_rows(self, data: DataView) -> None:
         """Finds this step's rows, which MuJoCo has made, and takes their own meaning from them, and their

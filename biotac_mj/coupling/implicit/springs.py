@@ -11,7 +11,7 @@ from ...skin.types import real, vec6
 from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
 from .compliance import factor
-from .kinematics import row
+from .kinematics import row, rows_of
 
 _NEWTON = int(mujoco.mjtSolver.mjSOL_NEWTON)
 _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
@@ -39,8 +39,7 @@ class Springs:
             self._inertia, self._rows = wp.zeros((1, data.M.size), dtype=real), wp.zeros(1, dtype=int)
             self._own, self._one = wp.full((ends[-1], 1), -1, dtype=int), wp.ones(1, dtype=int)
             self.L, self.stiffness = (wp.zeros((1, model.nv, model.nv), dtype=real) for _ in range(2))
-            none = wp.zeros((0, 1), dtype=int)
-        self._parts = [self._own[a:b] if a < b else none for a, b in zip(ends, ends[1:])]
+        self._parts = [rows_of(self._own, slice(a, b)) for a, b in zip(ends, ends[1:])]
         self.own = self._own.numpy()[:, 0]
         self._here = {"inertia": self._inertia.numpy(), "rows": self._rows.numpy()}
         self.held = self.stiffness.numpy()

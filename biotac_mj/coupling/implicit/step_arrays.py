@@ -14,7 +14,7 @@ from ..setup import Setup
 from . import energy, rounds
 from .compliance import Response, add_stiffness
 from .kinematics import Kinematics, row, rows_of
-from .marks import MarkedWorlds, Marks
+from .marks import MarkedWorlds
 from .rounds import Model, Rounds, Solid
 from .rows import keep_held
 from .rules import LOSS_FREQUENCY
@@ -62,9 +62,9 @@ class StepArrays:
             model, last = (rounds.make_model(*shape) for _ in range(2))
             tangent, wrench = wp.zeros(shape, dtype=mat66), wp.zeros(shape, dtype=vec6)
             left_out, self._qacc = wp.zeros(shape, dtype=real), wp.zeros_like(kinematics.d.qvel)
-            n, self._marks, off = len(setups), Marks(len(setups)), wp.zeros((len(setups), 2), dtype=real)
-            names = "awake", "began", "inside", "reason", "greedy"
-            flags = {name: wp.zeros(n, dtype=int) for name in names}
+            off, self._any = wp.zeros((len(setups), 2), dtype=real), wp.zeros(1, dtype=int)
+            names = "awake", "began", "inside", "reason", "greedy", "marked"
+            flags = {name: wp.zeros(len(setups), dtype=int) for name in names}
             self._skins = [types.SimpleNamespace() for _ in setups]
             for k, (skin, setup, part) in enumerate(zip(self._skins, setups, kinematics.parts)):
                 skin.jacobian, skin.tangent = rows_of(kinematics.jacobian, part), rows_of(tangent, part)
@@ -75,7 +75,7 @@ class StepArrays:
                 skin.rounds.began, skin.rounds.inside = skin.flags["began"], skin.flags["inside"]
                 skin.rounds.surface = wp.array([setup.surface_energy], dtype=real)
                 skin.marks = MarkedWorlds()
-                skin.marks.world, skin.marks.any = self._marks.world[k : k + 1], self._marks.any
+                skin.marks.world, skin.marks.any = skin.flags["marked"], self._any
                 skin.compliance = wp.zeros((setup.ngroup, setup.ngroup, 1), dtype=wp.spatial_matrixd)
                 skin.by_mocap = wp.array(setup.touching.by_mocap, dtype=bool)
                 skin.bodies, skin.loss, skin.solid = kinematics.bodies[k], setup.config.loss, Solid()
@@ -85,7 +85,7 @@ class StepArrays:
         self._keep_held = [row((keep_held, skin.tangent.shape, [skin.tangent])) for skin in self._skins]
         self.wrench, self.left_out, self.qacc = _seen(wrench), _seen(left_out), self._qacc.numpy()[0]
         self.compliance, self.off = [skin.compliance.numpy()[:, :, 0] for skin in self._skins], off.numpy()
-        self.awake, self.began, self.inside, self._reason, _ = (a.numpy() for a in flags.values())
+        self.awake, self.began, self.inside, self._reason, *_ = (a.numpy() for a in flags.values())
         for kind, struct in ((Rounds, whole), (Model, model)):
             for name in kind.vars:
                 if _is_of_bodies(array := getattr(struct, name)):
@@ -164,7 +164,7 @@ class StepArrays:
     def _marking(self, kernel, known):
         """A function that runs a kernel and returns whether it has marked a skin."""
         run = self._row(lambda s: [(kernel, 1, [s.flags["awake"], *known(s), s.marks])])
-        marked = self._marks.any.numpy()
+        marked = self._any.numpy()
 
         def find():
             marked[0] = 0

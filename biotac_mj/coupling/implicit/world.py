@@ -26,7 +26,6 @@ from ..solid_contacts import SolidContacts, contacts_of
 from ..structs import MINVAL, DataView, ModelView
 from .group import SkinGroup
 from .integrator import Integrator
-from .metric import Metric
 from .rules import MAX_CORRECTIONS, TOLERANCE, poorly_corrected
 
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
@@ -60,7 +59,6 @@ class World:
                 if other.touching.body[k] == t.touching.core
             ]
         self.first = self.coupled[0].index if self.coupled else -1
-        self.metric = Metric(model, [t.touching for t in self.coupled], [t.slots for t in self.coupled])
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting, self._now = False, None  # whether bodies are under way, and from where
         self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
@@ -75,7 +73,7 @@ class World:
 
     @functools.cached_property
     def _group(self):
-        return SkinGroup(self.model, self.data, self.coupled, self.metric)
+        return SkinGroup(self.model, self.data, self.coupled)
 
     def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
@@ -135,7 +133,7 @@ class World:
         if not self.coupled:
             return
         if self._loads is None:
-            self._loads = Loads(self.model, self.data, self.coupled, self.metric)
+            self._loads = Loads(self.model, self.data, self.coupled, self._group.metric)
         acting = {t: t.acting_wrench() for t in self.coupled}
         if self._acting:
             found = self._group.acting_with(self.data.qacc)
@@ -182,9 +180,10 @@ class World:
             other.failed()
 
     def _take_rows(self):
-        if self.metric.switch_on(self.data):
+        metric = self._group.metric
+        if metric.switch_on(self.data):
             self.data.make_constraints()
-        self.metric.find_rows(self.data)
+        metric.find_rows(self.data)
 
     def _step(self):
         self._acting, self._weights = False, None
@@ -198,15 +197,15 @@ class World:
             self._pushes = self.data.qfrc_passive - outside
         except BaseException:
             self.data.qfrc_passive[:] = outside
-            self.metric.release()
+            self._group.metric.release()
             raise
 
     def _newton(self, group, outside):
         self._damped, skins = None, group.skins
         if not skins:
-            self.metric.release()
+            self._group.metric.release()
             return
-        group.springs.own[:] = self.metric.first
+        group.springs.own[:] = self._group.metric.first
         if self.model.opt.timestep > 0 and self.model.nv > 0:
             rounds = self._find_balance(outside)
             rounds += self._damp(outside)
@@ -246,7 +245,7 @@ class World:
         """(nv,) generalised forces of equality constraints, as the last solve left them."""
         force = self.data.rows().efc_force.copy()
         force[self.data.ne :] = 0.0
-        force[self.metric.numbers] = 0.0
+        force[self._group.metric.numbers] = 0.0
         return self.data.pushed_by(force)
 
     def _go_on(self):
@@ -256,7 +255,7 @@ class World:
         constraints turn with what they hold, and answer to the others."""
         data = self.data
         self._take_rows()
-        self.metric.release()
+        self._group.metric.release()
         self._now = data.qpos.copy()
         if self._acting:
             if self._stage == 2:
@@ -340,7 +339,7 @@ class World:
         The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
         (a - a') corrects it."""
         self._found, moved = self._corrected(outside)
-        self._group.excess[:] = self.metric.excess(self._found)
+        self._group.excess[:] = self._group.metric.excess(self._found)
         self._group.evaluate(moved)
 
     def _damp(self, outside):
