@@ -19,19 +19,19 @@ def principal_components(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
     """For each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
-    |std(x) w|^2; x (n, k), y (n, m). The Gram matrix of x, most of the work, is shared. For infinite
-    strength, w is 0 and b the mean."""
-    from sklearn.linear_model import ridge_regression
+    |std(x) w|^2; x (n, k), y (n, m). For infinite strength, w is 0 and b the mean.
+
+    scikit-learn's `ridge_regression` factors once for every target and strength, here once for a strength."""
     from sklearn.preprocessing import StandardScaler
 
     scaler, mean = StandardScaler().fit(x), y.mean(0)
-    scaled, finite = np.zeros((len(strengths), y.shape[1], x.shape[1])), np.isfinite(strengths)
-    if finite.any():
-        alpha = len(x) * np.repeat(np.asarray(strengths)[finite], y.shape[1])
-        targets = np.tile(y - mean, finite.sum())
-        found = ridge_regression(scaler.transform(x), targets, alpha, solver="cholesky")
-        scaled[finite] = found.reshape(-1, y.shape[1], x.shape[1])
-    weights = [w.T / scaler.scale_[:, None] for w in scaled]
+    scaled = scaler.transform(x)
+    gram, moment, weights = scaled.T @ scaled, scaled.T @ (y - mean), []
+    for strength in strengths:
+        w = np.zeros_like(moment)
+        if np.isfinite(strength):
+            w = np.linalg.solve(gram + len(x) * strength * np.eye(len(gram)), moment)
+        weights.append(w / scaler.scale_[:, None])
     return [(w, mean - scaler.mean_ @ w) for w in weights]
 
 
