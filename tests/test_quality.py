@@ -313,6 +313,17 @@ def test_rows_where_all_electrodes_jump_are_common_spikes():
         assert named(counts) == [("spikes", ALL)], row
 
 
+def test_common_spikes_are_chance_by_the_fourth_power_of_time():
+    """Four of them, in a log four times as long: Poisson's law."""
+    chance = []
+    for seconds in (10, 40):
+        counts = noisy(*unloaded(5, seconds=seconds))
+        counts[[150, 420, 421, 700]] = 0
+        (found,) = faults(counts)
+        chance.append(found.p)
+    assert chance[1] == pytest.approx(4**4 * chance[0], rel=0.05, abs=0)
+
+
 @pytest.mark.parametrize("every, size", [(7, -90), (10, 60), (50, 60)])
 def test_rows_that_are_off_again_and_again_are_one_fault(every, size):
     """They come as evenly as a hum does, and what lies between them looks held."""
