@@ -434,7 +434,7 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
         off = np.abs(displacement(*target, a.pos0, a.mat0) * ([1.0] * 3 + [LEVER] * 3))
         for skin in self.skins:
             assert skin.off == pytest.approx(off[skin.bodies].max(), abs=1e-15)
-            seen.append(np.abs(skin.of("wrench")).max())
+            seen.append(np.abs(skin.part("wrench")).max())
         conclude(self, *how)
 
     spec = mujoco.MjSpec.from_string(
@@ -484,7 +484,7 @@ def test_bodies_give_way_as_all_else_lets_them(jacobian, monkeypatch):
             others[: data.ne] = ~own
             J = self.jacobian[skin.bodies].reshape(-1, model.nv)
             springs = rows[others].T @ (data.efc_D[others, None] * rows[others])
-            wanted = skin.of("square")[0] * J @ np.linalg.solve(H + springs, J.T)
+            wanted = skin.part("square")[0] * J @ np.linalg.solve(H + springs, J.T)
             found = self.arrays.compliance[skin.number][0, 0]
             np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15)
             seen.append(np.abs(springs).max())

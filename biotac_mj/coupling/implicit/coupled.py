@@ -34,17 +34,17 @@ class Coupled:
         self.result, self._still, self.settled = None, False, True
         self.off, self.may_act, self._cost = np.inf, True, 0.0
 
-    def of(self, name: str) -> np.ndarray:
+    def part(self, name: str) -> np.ndarray:
         """The bodies' part of one of the arrays of the group."""
         return getattr(self._arrays, name)[self.bodies]
 
-    def look(self) -> None:
+    def find_off(self) -> None:
         """Finds how far its bodies go from where it was solved. If that was in the last step, the skin may
         stay as it is."""
         off, of_all = self._arrays.off[self.number].tolist()
         if self.result is None:
             still = self.bodies.start < self.bodies.stop and off < STILL and of_all < TOLERANCE
-            self._still = still and not self.of("placed").any()
+            self._still = still and not self.part("placed").any()
             self.result = self.instance.stay() if self._still else None
         self.off = np.inf if self.result is None else off
 
@@ -53,26 +53,26 @@ class Coupled:
         if not self.instance.setup.skin.stepper.gives_way:  # it takes poses only
             self.finish()
             return
-        spin = self.of("drift")[:, 3:] + self.of("moved")[:, 3:]
-        wrench = self.of("acting") / self.instance.touching.fraction[:, None]
-        compliance, here = self._arrays.compliance[self.number].copy(), self.of("here_pos").copy()
-        self._solve(BodyMotion(compliance, wrench, self.of("pos").copy(), here, spin))
+        spin = self.part("drift")[:, 3:] + self.part("moved")[:, 3:]
+        wrench = self.part("acting") / self.instance.touching.fraction[:, None]
+        compliance, here = self._arrays.compliance[self.number].copy(), self.part("here_pos").copy()
+        self._solve(BodyMotion(compliance, wrench, self.part("pos").copy(), here, spin))
 
     def finish(self) -> None:
         """Solves the skin where its bodies are sure to come."""
         self._solve(None)
 
     def _solve(self, bodies):
-        pose = self.of("pos").copy(), self.of("mat").copy()
+        pose = self.part("pos").copy(), self.part("mat").copy()
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
         if self._still and self.result is None and result.converged:
-            wrong, wrench = np.abs(result.wrench - self.of("acting")), np.abs(result.wrench)
+            wrong, wrench = np.abs(result.wrench - self.part("acting")), np.abs(result.wrench)
             self.instance.stays = bool(wrong.max() < FORETOLD * wrench.max())
         self.result, self.may_act = result, result.converged and self._cost < _MOST
         names = "wrench0", "tangent0", "pos0", "mat0", "slack"
         for name, value in zip(names, (result.wrench, result.tangent, *result.pose, result.slack)):
-            self.of(name)[:] = value
+            self.part(name)[:] = value
 
     def _core_motion(self):
         if not self.instance.inertial:
@@ -83,8 +83,8 @@ class Coupled:
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
-        acting = self.instance.seen(self.of("acting"))
-        withheld = 1.0 - self.of("push").min(initial=1.0)
-        of_bodies = (self.of(name).copy() for name in ("gamma", "frequency"))
-        energy = self.of("left_out").copy()
+        acting = self.instance.seen(self.part("acting"))
+        withheld = 1.0 - self.part("push").min(initial=1.0)
+        of_bodies = (self.part(name).copy() for name in ("gamma", "frequency"))
+        energy = self.part("left_out").copy()
         self.instance.outcome = Outcome(rounds, self.settled, withheld, energy, acting, *of_bodies)

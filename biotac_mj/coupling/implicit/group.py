@@ -77,7 +77,7 @@ class SkinGroup:
             before[:] = now[:] = part
         for skin in self._all:
             if skin not in self.skins:
-                skin.of("wrench0")[:] = 0.0
+                skin.part("wrench0")[:] = 0.0
         arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)
         arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
         arrays.began[:] = [head[STARTED] != 0.0 for head in heads]
@@ -85,7 +85,7 @@ class SkinGroup:
         self._kinematics.check(arrays.start_pos, arrays.start_mat)
         if arrays.placed.any():
             for skin in self.skins:
-                if skin.of("placed").any() and skin.instance.take_placed(skin.of("placed")):
+                if skin.part("placed").any() and skin.instance.take_placed(skin.part("placed")):
                     arrays.inside[skin.number] = 0
         for skin in self.skins:
             skin.instance.begun = skin.instance.frame()
@@ -113,7 +113,7 @@ class SkinGroup:
         if self.withdrawn:
             self.arrays.acting[:] = 0.0
         for skin in self.skins:
-            skin.look()
+            skin.find_off()
 
     def _find_lift(self):
         """(n,) [J] work that MuJoCo's contacts with core, nail and clamp do on the bodies in the step."""
@@ -205,7 +205,7 @@ class SkinGroup:
         self._find_left()
         for skin in self.skins:
             outcome = skin.instance.outcome
-            outcome.energy = skin.of("left_out").copy()
+            outcome.energy = skin.part("left_out").copy()
             if skin.instance.by_stages:  # whose status is written when the step ends
                 outcome.settled &= bool(error[skin.bodies].max(initial=0.0) < near)
 

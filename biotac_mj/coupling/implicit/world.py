@@ -298,7 +298,7 @@ class World:
         """Whether a skin's rows push what its model says, and MuJoCo's constraint solver found what holds its
         bodies."""
         rows = np.abs(_SCALE * self._group.excess[skin.bodies]).max(initial=0.0)
-        if rows > SOLVED * np.abs(_SCALE * skin.of("acting")).max(initial=0.0):
+        if rows > SOLVED * np.abs(_SCALE * skin.part("acting")).max(initial=0.0):
             return False
         return self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
 
