@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
-from .beside import last_measured
+from .adjacent import last_measured
 from .evidence import BLOCKS, evidence
 from .fault import Fault
 from .log import Log

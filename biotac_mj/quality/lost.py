@@ -8,7 +8,7 @@ from scipy.ndimage import percentile_filter
 from scipy.signal import find_peaks
 
 from ..sensor.channels import FULL_SCALE
-from .beside import last_measured, line_ends
+from .adjacent import last_measured, line_ends
 from .codes import mostly_coarse
 from .evidence import BLOCKS, NAN, evidence, runs
 from .fault import Fault

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from ..sensor.channels import electrode_noise
-from .beside import last_measured
+from .adjacent import last_measured
 from .evidence import BLOCKS, evidence, runs
 from .fault import Fault
 from .log import Log

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.stats import norm, poisson
 
-from .beside import last_measured
+from .adjacent import last_measured
 from .evidence import BLOCKS, NAN, evidence
 from .fault import Fault
 from .log import Log

@@ -205,11 +205,11 @@ def _scratch(model, linear, data, ngeom, room, groups):
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
     s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)
     s.load = wp.zeros((nworld, n), dtype=float)
-    alone = 0 if model.device.is_cuda else n  # by one thread; memory of rows that are never used is not taken
-    s.sum = wp.zeros((nworld, 3 * max(alone, len(model.free))), dtype=float)
-    s.between = wp.empty((nworld, alone * alone), dtype=float)
-    s.columns = wp.empty((nworld, alone * min(alone, 3 * touched)), dtype=float)
-    s.ready, s.last = wp.zeros((nworld, alone), dtype=int), wp.zeros((nworld, alone + 1), dtype=int)
+    cached = 0 if model.device.is_cuda else n  # by one thread; memory of rows that are never used is not taken
+    s.sum = wp.zeros((nworld, 3 * max(cached, len(model.free))), dtype=float)
+    s.between = wp.empty((nworld, cached * cached), dtype=float)
+    s.columns = wp.empty((nworld, cached * min(cached, 3 * touched)), dtype=float)
+    s.ready, s.last = wp.zeros((nworld, cached), dtype=int), wp.zeros((nworld, cached + 1), dtype=int)
     s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
     s.stiff = wp.zeros((nworld, ninner), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))

@@ -7,7 +7,7 @@ import typing
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from ....quality.beside import last_measured, line_ends
+from ....quality.adjacent import last_measured, line_ends
 from ....quality.noise import noise_level
 from ..candidates import Candidate
 from ..conditional import Conditional
