@@ -1,6 +1,7 @@
 """Topics beside and between the sensors of a bag: whose force it is, which sensor, and what is no pose."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -56,6 +57,16 @@ def test_a_sensor_keeps_its_number_whatever_the_order():
     rows = np.r_[0:20, 30:60]
     assert (first.electrodes == ONE.electrodes[rows]).all()
     assert (second.electrodes == TWO.electrodes).all()
+
+
+def test_fingers_without_a_sensor_are_left_out_and_named():
+    """Their electrodes are zero. Where all fingers have sensors nothing is said."""
+    none = types.SimpleNamespace(electrodes=0 * TWO.electrodes)
+    (only,) = join(hand("hand", {"A": ONE, "B": none}))
+    assert (only.electrodes == ONE.electrodes).all()
+    assert [note for note in only.notes if "no sensor there" in note]
+    for one in join(hand("hand", {"A": ONE, "B": TWO})):
+        assert not [note for note in one.notes if "no sensor there" in note]
 
 
 def test_each_finger_has_the_force_that_is_named_after_it():

@@ -205,7 +205,7 @@ def _scratch(model, linear, data, ngeom, room, groups):
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
     s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)
     s.load = wp.zeros((nworld, n), dtype=float)
-    cached = 0 if model.device.is_cuda else n  # by one thread; memory of rows that are never used is not taken
+    cached = 0 if model.device.is_cuda else n  # by one thread; rows that are never used take no memory
     s.sum = wp.zeros((nworld, 3 * max(cached, len(model.free))), dtype=float)
     s.between = wp.empty((nworld, cached * cached), dtype=float)
     s.columns = wp.empty((nworld, cached * min(cached, 3 * touched)), dtype=float)
