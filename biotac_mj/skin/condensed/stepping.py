@@ -372,8 +372,8 @@ def _commit(
     _remember(w, t, threads, found, geoms, c, s, r, geoms.pos_last, geoms.mat_last)
     if s.previous.pos.shape[0] > 0:
         _remember(w, t, threads, found, geoms, c, s, s.previous.balance, s.previous.pos, s.previous.mat)
-    for f in range(t, c.face.shape[0], threads):
-        commit_face(f, w, s.touch)
+    for k in range(t, found.nface, threads):  # those that had anchors are candidates
+        commit_face(s.face[w, k], w, s.touch)
     for i in range(t, s.x.shape[0], threads):
         s.touch.x_last[i, w] = s.x[i, w]
     if t == 0:
