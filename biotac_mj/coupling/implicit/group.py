@@ -117,6 +117,8 @@ class SkinGroup:
 
     def _find_lift(self):
         """(n,) [J] work that MuJoCo's contacts with core, nail and clamp do on the bodies in the step."""
+        if not self._data.ncon:
+            return 0.0
         geom = contacts_of(self._data)["geom"]
         pairs = np.where(geom >= 0, self._model.geom_bodyid[geom], -1)  # -1: a flex
         meet = (pairs[None, :, :, None] == self._meets[:, None, None]).any(axis=2).all(axis=2)
