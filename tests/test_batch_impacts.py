@@ -13,6 +13,7 @@ from blocks import four_nodes
 
 import biotac_mj
 from biotac_mj import batch as batches
+from biotac_mj.batch import solid
 from biotac_mj.skin import SkinOptions
 
 # four nodes an element: a quarter of the work of the shipped skin's ten, which those tests take ("coarse")
@@ -572,3 +573,32 @@ def test_the_integrator_is_corrected_for_where_bodies_spin_fast(integrator, monk
     in_batch(xml, qpos, np.c_[np.tile([0, 0, -0.3], (len(spin), 1)), spin], 2, TIP)
     amiss, acting = seen[-2]  # on CUDA attach goes through a step before, to compile its kernels
     assert acting.min() > 0.05 and (amiss < 3e-4 * acting).all(), amiss / acting
+
+
+@pytest.mark.parametrize("sparse", [0, 1])
+def test_contacts_with_the_core_do_the_work_of_their_rows(sparse):
+    """Two contacts with body 2, of the touching body 1 and of another, and one between these."""
+    rng, step = np.random.default_rng(0), 0.004
+    J, force, qvel, qacc = (rng.normal(size=shape).astype(np.float32) for shape in ((4, 3), 4, 3, 3))
+    kinds = {"i": int, "f": float, "pair": wp.vec2i}
+    arrays = [
+        wp.array(a, dtype=kinds[kind], ndim=ndim)
+        for a, kind, ndim in (
+            ([0, 1, 3, 2], "i", 1),  # bodies of the geoms
+            ([3], "i", 1),
+            ([[1, 3], [2, 3], [1, 2]], "pair", 1),
+            ([0, 0, 0], "i", 1),
+            ([[0, 1], [2, -1], [3, -1]], "i", 2),
+            (force[None], "f", 2),
+            (J.reshape(1, 1, -1) if sparse else J[None], "f", 3),
+        )
+    ]
+    layout = [[[3] * 4], [[0, 3, 6, 9]], [[list(range(3)) * 4]]]
+    layout = [wp.array(a, dtype=int, ndim=n) for a, n in zip(layout, (2, 2, 3))]
+    moved = [wp.array(a[None], dtype=float, ndim=2) for a in (qvel, qacc)]
+    lifted = wp.zeros((1, 1), dtype=wp.float64)
+    body = wp.array([1], dtype=int)
+    given = [2, body, step, *arrays, sparse, *layout, *moved]
+    wp.launch(solid.find_lift, 3, given, [lifted])
+    work = step * (force * (J @ (qvel + 0.5 * step * qacc)))
+    np.testing.assert_allclose(lifted.numpy()[0, 0], work[:2].sum(), rtol=1e-6)
