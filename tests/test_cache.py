@@ -17,6 +17,8 @@ from imports import modules
 
 from biotac_mj import cache
 from biotac_mj.cache import Entry, cache_folder, cached, digest
+from biotac_mj.calibration.forward import simulate
+from biotac_mj.calibration.indentation import Indentation
 from biotac_mj.discrepancy import Trajectory
 from biotac_mj.discrepancy.plates import tables
 from biotac_mj.discrepancy.trajectories.model import simulator
@@ -122,6 +124,25 @@ def recording(geometry):
     script._recording("recordings", ["a BioTac", geometry, "press", 0], None)
 
 
+def path(time, tip):
+    return Indentation("a", "sphere_7mm", time, tip, np.array([1.0, 0, 0, 0]), np.eye(4, 3))
+
+
+def indentation(geometry, time, tip, modulus):
+    simulate(geometry, SkinOptions(), [Material()], path(time, tip), modulus=modulus)
+
+
+def slopes(geometry, time, tip, modulus):
+    pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
+    from biotac_mj.differentiable.fit import Forces
+
+    body = types.SimpleNamespace(geometry=geometry, options=SkinOptions(), modulus=modulus)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Forces, "prepare", lambda *_: (None, None))
+        Forces()(body, Material(), [], np.zeros(0), path(time, tip))
+
+
+MOVES = {"time": np.arange(4.0), "tip": np.full((4, 3), 0.01), "modulus": np.ones(GEOMETRY.nelem)}
 NODES = {"outer": np.array([3, 8]), "inner": np.array([700])}
 # what computes each kind, and the arrays that it takes beside a skin
 KINDS = {
@@ -144,6 +165,8 @@ KINDS = {
             "depth": np.ones(1),
         },
     ),
+    "indentation": (indentation, MOVES),
+    "slopes": (slopes, MOVES),
     "presses": (presses, {"poisson": np.array([0.4])}),
     "recording": (recording, {}),
     "field": (field, {"pos": np.full((8, 3), 0.01), "mat": np.tile(np.eye(3), (8, 1, 1))}),
