@@ -5,9 +5,12 @@ import itertools
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 import biotac_mj
 from biotac_mj.geometry import load_skin
+from biotac_mj.skin.contact.meshes import bake_distance_grid
+from biotac_mj.skin.geoms import GeomSet
 
 HALF = np.array([4e-3, 6e-3, 4e-3])  # of the box [m]
 DEPTH, WAY = 1.3e-3, 3e-3  # [m] pressed, dragged
@@ -133,6 +136,18 @@ def test_a_cycle_on_the_default_skin_gives_back_its_work(name, tier):
     assert unsettled <= (2 if tier == "full" else 0)
     assert abs(apparent_friction(force)) < 0.01
     assert np.median(errors) < 0.02
+
+
+@pytest.mark.parametrize("sides, begins", [(16, 2.0 / 1.1705), (100, 10.0)])
+def test_edges_of_narrow_facets_are_no_edges(sides, begins):
+    """Facets of 1.17 mm, and of 0.19 mm as those of the indenters, where samples are 0.2 mm apart."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    circle = 3e-3 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    prism = trimesh.convex.convex_hull(np.concatenate([circle, circle + [0, 0, 5e-3]]))
+    geoms = GeomSet(["mesh"], [[]], grids=[bake_distance_grid(prism.vertices, prism.faces, cells=16)])
+    geoms.resolve(2e-4, 3)
+    angles = np.degrees(np.arccos(geoms.struct.turn.numpy()[0]))
+    assert angles == pytest.approx([begins, 2.5 * begins], rel=1e-3)
 
 
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])

@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .contact.meshes import DistanceGrid, pack_grids
-from .contact.posed import WINDOW, Geoms
+from .contact.posed import TURN, WINDOW, Geoms
 from .contact.shapes import GEOM_TYPES
 from .contact.touch import CORE, MESHES, SKINS, SOLIDS
 from .state import allocate
@@ -103,6 +103,7 @@ class GeomSet:
             struct.size = wp.array(size.reshape(-1, 3), dtype=vec3)
             struct.rounding = wp.array(rounding, dtype=real)
             struct.window = wp.zeros(count, dtype=real)
+            struct.turn = wp.zeros(count, dtype=wp.vec2d)
             struct.grid = wp.array(np.maximum(number, 0).astype(np.int32), dtype=int)
             struct.group = wp.array(groups.astype(np.int32), dtype=int)
             struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
@@ -128,12 +129,18 @@ class GeomSet:
 
     def resolve(self, spacing: float, samples: int) -> None:
         """Sets the windows around edges whose radius is below the spacing [m] of a skin's samples^2 contact
-        samples in a face, see `contact.posed.meet`."""
+        samples in a face, and the angles from which on they count, see `contact.posed.meet`. The wider the
+        facets beside an edge, the further it stands out of a smooth surface: facets as wide as the skin's
+        faces would lock with them if samples alone touched, and narrow ones are as good as smooth."""
         size = self.struct.size.numpy().reshape(-1, 3)
         curved = np.isin(self.types, "ellipsoid")  # a thin one has an edge
         radius = np.where(curved, size.min(1) ** 2 / np.maximum(size.max(1), 1e-12), self._rounding)
         edged = curved | np.isin(self.types, ("box", "cylinder", "mesh"))
         self.struct.window.assign(np.where(edged & (radius < spacing), WINDOW / samples, 0.0))
+        widths = iter([grid.facet_width for grid in self._grids])
+        width = np.array([next(widths) if kind in ("mesh", "skin") else 0.0 for kind in self.types])
+        turn = np.outer(np.minimum(spacing / np.maximum(width, 1e-12), 1.0), TURN)
+        self.struct.turn.assign(np.cos(np.radians(turn)))
 
     def advance(self) -> None:
         """Stores the present poses as those of the last step."""

@@ -5,8 +5,6 @@ where the signed distances d1, d2 from both undeformed shapes are equal, the zer
 skins meet there by symmetry (`docs/design.md`, "Skin on skin").
 """
 
-import math
-
 import warp as wp
 
 from ..types import mat33, real, vec3
@@ -23,9 +21,9 @@ from .shapes import (
 wp.set_module_options({"enable_backward": False})
 
 WINDOW = 1.25  # radius around edges, over the distance of a face's corners from its samples, see `meet`
-# cosines of the angle between two normals: below the first it is a side of a solid, above the second an edge.
-# Shallow edges of facets as large as the skin's faces lock with its edges if samples alone touch them
-_SMOOTH, _SHARP = (wp.constant(real(math.cos(math.radians(angle)))) for angle in (2, 6))
+# angles between two normals [degrees] at edges of facets as narrow as the spacing of samples: up to the first
+# it is a side of a solid, from the second on an edge
+TURN = 10.0, 25.0
 _FIRM = wp.constant(real(4.0))  # stiffness at an edge, where few samples take part, over that of a side
 _BEYOND = wp.constant(real(0.3))  # barycentric distance outside a face at which an edge leaves it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
@@ -42,6 +40,8 @@ class Geoms:
     rounding: wp.array(dtype=real)
     window: wp.array(dtype=real)  # radius around edges over that of a face, see `meet`; 0: no sharp edges
     grid: wp.array(dtype=int)
+    # cosines of the angle between two normals up to which it is a side, and from which on an edge
+    turn: wp.array(dtype=wp.vec2d)
     group: wp.array(dtype=int)
     friction: wp.array2d(dtype=real)
     pos: wp.array2d(dtype=vec3)
@@ -228,7 +228,8 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     if gap > dn[3]:  # in a hollow
         return met
     # every sample touches a side of the solid; only samples of the face above an edge touch that, at the edge
-    edge = wp.clamp((_SMOOTH - wp.dot(normal, met.normal)) / (_SMOOTH - _SHARP), real(0.0), real(1.0))
+    turn = geoms.turn[g]
+    edge = wp.clamp((turn[0] - wp.dot(normal, met.normal)) / (turn[0] - turn[1]), real(0.0), real(1.0))
     near = wp.length_sq(off - gap * normal) / (window * window)
     at = _moved(b, along, across, -off)
     beyond = wp.max(-wp.min(at), real(0.0)) / _BEYOND
