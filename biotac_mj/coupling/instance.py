@@ -397,13 +397,23 @@ class Instance:
     def _acting(self):
         """Wrench (6,) on the BioTac in its frame as it acts now, and whether skin, bodies and MuJoCo's
         constraint solver settled."""
-        solid, solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
-        force = solid - self.acting_wrench().sum(axis=0)
+        none = np.zeros(self.model.ntree, bool)
+        (solid, _), solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs, none)
+        return solid + self._pushed(), self._settled and solved
+
+    @property
+    def _settled(self):
+        """Whether skin and bodies did."""
+        return self._result.converged and self.outcome.settled
+
+    def _pushed(self):
+        """Wrench (6,) on the BioTac in its frame by what meets its skin, and by skins that it meets."""
+        force = -self.acting_wrench().sum(axis=0)
         for other, group in self.skins_met:
             push = other.acting_wrench()[[group]]
             if push.any():
                 force += _carried(push, other.frame(), self.frame())[0]
-        return force, self._result.converged and self.outcome.settled and solved
+        return force
 
     def acting_wrench(self) -> np.ndarray:
         """(ngroup, 6) that the touching bodies get from the skin in this step, in the BioTac frame; zeros
@@ -434,21 +444,17 @@ class Instance:
             found.kept[face], found.geom[face], found.force[face] = 1, geom, -push[:, None] * normal
         return found.find()
 
-    def end_stage(self, first: bool, held: bool) -> None:
-        """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
-        and bodies get all four. held: what acted in the first acts in this one, besides contacts that have
-        begun since."""
-        if self._error:
+    def end_stage(self, first: bool, held: np.ndarray) -> None:
+        """After the forces of all skins in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first
+        alone, and bodies get all four. The skin's push in the first acts in all, and so do contacts on the
+        kinematic trees `held` (ntree,), whose own forces in later stages are none."""
+        if self._error or self._result is None:
             return
+        (of_stage, kept), solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs, held)
         if first:
-            self._stages, self._first = [], self.frame()
-        if held:
-            wrench, good = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
-            before, settled = self._stages[0]
-        else:
-            (wrench, good), before, settled = self._acting(), 0.0, True
-        wrench = before + _carried(wrench[None], self.frame(), self._first)[0]
-        self._stages.append((wrench, good and settled))
+            self._stages, self._first, self._stays = [], self.frame(), self._pushed() + kept
+        wrench = self._stays + _carried(of_stage[None], self.frame(), self._first)[0]
+        self._stages.append((wrench, self._settled and solved))
 
     def _sum_up(self, settled):
         """Writes what acted over the stages of a step, in the frame of its start; whether all settled, and
@@ -489,7 +495,7 @@ class Instance:
             return
         readings, _ = self._counts()
         head, models, skin, readings_state = self.parts
-        good = self._sum_up(result.converged and self.outcome.settled)
+        good = self._sum_up(self._settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach = OUT_OF_REACH if self.outcome.acting is None else REACHED
         if good and self.stays:

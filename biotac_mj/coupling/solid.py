@@ -12,14 +12,17 @@ LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_i
 SOLVED = 1e-3  # of the forces at hand, which MuJoCo's constraint solver may leave open
 
 
-def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) -> tuple[np.ndarray, bool]:
-    """(6,) force [N] and torque [N m] of contacts on the geoms of body `core`, about the origin of its frame
-    and in that frame; and whether MuJoCo's solver finds them, on these dofs, to `SOLVED`.
+def solid_wrench(
+    model: ModelView, data: DataView, core: int, dofs: np.ndarray, trees: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """(2, 6) forces [N] and torques [N m] of contacts on the geoms of body `core`, about the origin of its
+    frame and in that frame: of those that act on none of `trees` (ntree,) and of the others; and whether
+    MuJoCo's solver finds them, on these dofs, to `SOLVED`.
 
     For when all passive forces are known and accelerations are not: where anything touches, MuJoCo's
     constraint solver runs in advance.
     """
-    out = np.zeros(6)
+    out = np.zeros((2, 6))
     if not data.ncon:
         return out, True
     contacts = contacts_of(data)
@@ -29,13 +32,12 @@ def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) 
     if not len(touching):
         return out, True
     solved = data.unsolved(data.acceleration(), dofs) < SOLVED
-    found = np.empty(6)
-    for i in touching:
+    which = data.trees_of_rows()[contacts["efc_address"][touching]][:, trees].any(axis=1)
+    found, frame = np.empty(6), data.xmat[core].reshape(3, 3)
+    for i, k in zip(touching, which.astype(int)):
         LIBRARY.mj_contactForce(model.address, data.address, int(i), found.ctypes.data)
-        frame = contacts["frame"][i].reshape(3, 3)
         sign = float(mine[i, 1]) - float(mine[i, 0])  # it acts on the second
-        force, torque = sign * found[:3] @ frame, sign * found[3:] @ frame
-        out[:3] += force
-        out[3:] += torque + cross((contacts["pos"][i] - data.xpos[core])[None], force[None])[0]
-    frame = data.xmat[core].reshape(3, 3)
-    return np.concatenate([out[:3] @ frame, out[3:] @ frame]), solved
+        force, torque = sign * found.reshape(2, 3) @ contacts["frame"][i].reshape(3, 3)
+        torque += cross((contacts["pos"][i] - data.xpos[core])[None], force[None])[0]
+        out[k] += np.concatenate([force @ frame, torque @ frame])
+    return out, solved

@@ -134,14 +134,9 @@ def _compute(model, data, index, capability):
     world = _world(model, data, index)
     if index == world.begins:
         watch_interrupts()
-    last = index == world.last
     if capability == _PASSIVE:
-        try:
-            world.passive(index)
-        finally:
-            if last:
-                world.sense()
-    elif capability == _SENSOR and last:
+        world.passive(index)
+    elif capability == _SENSOR and index == world.last:
         world.sense_forces()
 
 

@@ -62,6 +62,7 @@ class World:
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting, self._now = False, None  # whether bodies are under way, and from where
         self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
+        self._held_trees = np.zeros(model.ntree, bool)  # see `_go_on`
         self._loads = None
         self._solids = [SolidContacts(model, one.touching) for one in self.instances.values()]
         self._damped = (
@@ -77,8 +78,16 @@ class World:
 
     def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
-        asked."""
-        instance = self.instances[index]
+        asked. What acts on each is found when all are solved."""
+        try:
+            self._pass(self.instances[index])
+        finally:
+            if index == self.last:
+                self._end_stage()
+                self.sense()
+
+    def _pass(self, instance):
+        index = instance.index
         if index == self.begins:
             self._amend_contacts()
             self._stage = self._next_stage() if instance.by_stages else 1
@@ -91,8 +100,15 @@ class World:
                 raise
         elif index == self.first:
             self._go_on()
-        if instance.by_stages:
-            instance.end_stage(self._stage == 1, self._stage > 1 and self._acting)
+
+    def _end_stage(self):
+        for instance in self.instances.values():
+            if instance.by_stages:
+                try:
+                    instance.end_stage(self._stage == 1, self._held_trees & self._acting)
+                except Exception:
+                    self.failed(instance.index)
+                    raise
 
     def _amend_contacts(self):
         amended = [one.amend(self.data) for one in self._solids] if self.data.ncon else []
