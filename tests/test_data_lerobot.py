@@ -44,6 +44,7 @@ def folder(tmp_path_factory):
                 contact_depth=rng.random(n),
                 indenter_pos=rng.normal(size=(n, 3)),
                 indenter_quat=rng.normal(size=(n, 4)),
+                converged=np.arange(n) != 4,
                 **label,
             )
             what, kind = ["ring_7mm", "sphere_7mm"][k % 2], ["press", "tap"][k // 3]
@@ -92,7 +93,7 @@ def test_frames_are_the_steps(exported, folder):
         kind = str(table.schema.field(name).type)
         width = feature["shape"][0]
         assert kind == (
-            {"float32": "float", "int64": "int64"}[feature["dtype"]]
+            {"float32": "float", "int64": "int64", "bool": "bool"}[feature["dtype"]]
             if width == 1
             else f"fixed_size_list<element: float>[{width}]"
         )
@@ -108,6 +109,7 @@ def test_frames_are_the_steps(exported, folder):
         np.testing.assert_array_equal(rows["observation.contact.pos"], touched)
         np.testing.assert_array_equal(rows["observation.contact.depth"], data["contact_depth"][order])
         assert "observation.contact.area" not in rows and (touched == 0).all(1).any()
+        np.testing.assert_array_equal(rows["converged"], data["converged"][order])
         length = (data.stop - data.start)[ORDER]
         np.testing.assert_array_equal(rows["episode_index"], np.repeat(np.arange(5), length))
         np.testing.assert_allclose(rows["timestamp"], data["time"][order], atol=1e-6)
@@ -158,7 +160,8 @@ def test_measured_counts_of_labelled_interactions(folder, tmp_path, capsys):
     assert (
         cli.main(["data", "export", str(folder), "--measured", "--quiet", "--out", str(tmp_path / "m")]) == 0
     )
-    assert "LeRobotDataset v3.0" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "LeRobotDataset v3.0" in said and "note: 2 of 19 time steps of the set did not converge" in said
     assert json.loads((tmp_path / "m/source.json").read_text())["interaction"] == ["003", "004"]
     rows = parquet.read_table(tmp_path / "m/data/chunk-000/file-000.parquet").to_pydict()
     with TactileSet(folder) as data:

@@ -28,6 +28,7 @@ def made():
             pac=rng.integers(0, 4096, (n, 22)),
             contact_pos=np.where(np.arange(n)[:, None] >= k, rng.normal(size=(n, 3)), np.nan),
             contact_depth=rng.random(n),
+            converged=np.arange(n) != 3 * k,
             indenter_pos=np.cumsum(1e-3 * rng.normal(size=(n, 3)), axis=0),
             indenter_quat=Rotation.from_rotvec(0.3 * rng.normal(size=(n, 3))).as_quat(scalar_first=True),
         )
@@ -80,12 +81,15 @@ def test_sensor_data_have_the_models_names(made, exported):
             np.testing.assert_allclose(data.sensor("contact_pos").data, one.contact_pos[k], rtol=1e-6)
             np.testing.assert_allclose(data.sensor("contact_depth").data, one.contact_depth[k], rtol=1e-6)
             assert np.isnan(data.sensor("contact_area").data).all()  # not in the set
+        kept = np.load(exported / "out" / f"{one.id}.npz")["converged"]
+        np.testing.assert_array_equal(kept, one.converged)
 
 
 def test_measured_counts_are_exported(made, exported, capsys):
     words = ["data", "export", str(exported / "set"), "--form", "mujoco", "--quiet", "--out"]
     assert cli.main([*words, str(exported / "measured"), "--measured"]) == 0
     assert sorted(p.name for p in (exported / "measured").glob("*.npz")) == ["001.npz"]
+    assert "note: 1 of 6 time steps of the set did not converge" in capsys.readouterr().out
     model = mujoco.MjModel.from_xml_path(str(exported / "measured" / "cube_14mm.xml"))
     data = mujoco.MjData(model)
     data.sensordata[:] = np.load(exported / "measured" / "001.npz")["sensordata"][2]

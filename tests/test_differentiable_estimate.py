@@ -282,6 +282,7 @@ def test_the_verb(estimator, pressed, tmp_path, capsys):
     assert cli.main([*given, str(tmp_path / "found.csv")]) == 0
     said = capsys.readouterr().out
     assert "row 1: centre" in said and "unexplained" in said and "any sensor" in said
+    assert "nearest to the middle of the contact on the undeformed skin" in said
     with open(tmp_path / "found.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["low"]) < truth.force < float(row["high"])

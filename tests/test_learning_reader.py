@@ -184,7 +184,7 @@ def test_a_model_comes_back_from_its_file(reader, tmp_path):
     for name in ours.value:
         np.testing.assert_allclose(theirs.value[name], ours.value[name], rtol=1e-3, atol=2e-2)
     np.testing.assert_allclose(theirs.novelty, ours.novelty, rtol=1e-2)
-    with pytest.raises(ValueError, match="give rows at rest with --tare"):
+    with pytest.raises(ValueError, match="--tare ROWS says how many rows are at rest"):
         back.predict(data.counts)
     with pytest.raises(ValueError, match="holds no model that reads electrodes"):
         Reader.load(shipped("forward"))
@@ -282,7 +282,7 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys):
     write(tmp_path / "rec.h5", [one])
     rec, model = str(tmp_path / "rec.h5"), str(tmp_path / "m.safetensors")
     assert cli.main(["learn", "train", rec, "--out", model]) == 0
-    assert "held out" in capsys.readouterr().out
+    assert "held out calibrate the intervals and give the errors" in capsys.readouterr().out
     assert cli.main(["learn", "predict", model, rec, "--out", str(tmp_path / "p.csv")]) == 0
     table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
     assert len(table) == len(one) and {"time", "fz", "fz_half", "e19", "novelty"} <= set(table.dtype.names)

@@ -3,6 +3,7 @@ wrong with the input."""
 
 import dataclasses
 import json
+import re
 import shutil
 import sys
 
@@ -494,4 +495,8 @@ def test_a_forward_model_is_kept_with_intervals(trained, folder, tmp_path, capsy
     assert biotac_mj.attach(spec, site="tip", skin="coarse", signal=model).config.readings == "learned"
     capsys.readouterr()
     assert cli.main(["learn", "train", str(folder), "--out", str(tmp_path / "r.safetensors")]) == 0
-    assert "place" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    with TactileSet(folder) as data:  # each labelled interaction has its part
+        assert "place" in said and data.labelled.sum() == sum(
+            map(int, re.findall(r"(\d+) (?:traj|held|more)", said))
+        )

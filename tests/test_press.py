@@ -428,3 +428,9 @@ def test_a_filled_skin_is_met_where_its_filling_holds_it(skin):
     assert record.depth[0] < 0 and force[0] == 0  # 5 um before first touch
     touched = record.depth > 5e-5
     assert touched.sum() > 2 and (force[touched] > 0.01).all() and (np.diff(force[touched]) >= 0).all()
+
+
+@pytest.mark.parametrize("name, tip", [("cube_14mm", 0.0), ("geom:box:2mm,3mm,4mm", 4e-3)])
+def test_frames_are_at_tips_and_centres_of_geoms(name, tip):
+    """As docs/howto/file_formats.md says of `indenter_pos`."""
+    assert make_indenter(name).vert[:, 1].max() == pytest.approx(tip, abs=1e-12)

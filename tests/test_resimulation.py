@@ -150,6 +150,8 @@ def test_what_cannot_be_resimulated_is_named(truth, tmp_path):
             resimulate(one, tmp_path / "o", ResimulateOptions(skin="coarse", **options), progress=False)
 
     refused("never meets the skin", far, mount=MOUNT)
+    few = r"2 have fewer than 8 rows at 4 Hz, \d at most: take a higher --at-most, or log more [a-z ]+$"
+    refused(few, recording, mount=MOUNT, rate=4.0)
     refused("give --object, one of", dataclasses.replace(recording, object="cork"), mount=MOUNT)
     refused("a match needs the force", recording, poses="fitted")
     refused("is no pose", recording, mount=(1.0, 2.0))

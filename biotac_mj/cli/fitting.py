@@ -150,8 +150,8 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "estimate",
         "differentiable.estimation.verbs.estimate_verb",
-        "Find the contact, its place and force with intervals, that makes the simulated electrodes read what "
-        "a recording says.",
+        "Find the contact, its place on the undeformed skin and its force with intervals, that makes the "
+        "simulated electrodes read what a recording says.",
     )
     verb.add_argument(
         "file", metavar="FILE", help="a recording as `biotac recording show` reads it, or a row of counts"
@@ -172,8 +172,8 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--known",
         metavar="FILE",
-        help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, --rest rows "
-        "first: its touches calibrate this sensor",
+        help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, on the "
+        "undeformed skin, --rest rows first: its touches calibrate this sensor",
     )
     verb.add_argument("--touches", type=whole(1, 1000), default=10, help="number of these touches")
     verb.add_argument(

@@ -37,8 +37,10 @@ def export_lerobot(
 
     Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (those of the
       design), .pdc, .tdc, .tac (1 each), .pac (of a frame, or the latest if the set has no more) [counts],
-      observation.force (6, of the skin on the object), observation.contact.pos, .normal (3), .depth and .area
-      (1; all 0 without contact) and action (7), the pose at the next time step.
+      observation.force (6, of the skin on the object, in the BioTac frame, the torque about its origin; of a
+      recording in the file's frame) [N, N m], observation.contact.pos, .normal (3), .depth and .area (1; all
+      0 without contact: LeRobot normalises every row), action (7), the pose at the next time step, and
+      converged, if the set has it: false where the skin kept its last good state.
     The task names action and object: "press with ring_7mm". `source.json` maps each episode to its
     interaction, so that (episode_index, frame_index) leads to the nodes in the HDF5 shards.
 
@@ -118,12 +120,10 @@ class _Export:
             **({"observation.tactile.pac": _feature(pac)} if self.pac else {}),
             "action": _feature(_POSE),
         }
-        index = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDEX[1:]}
-        self.all_features = {
-            **self.features,
-            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-            **index,
-        }
+        if "converged" in data.columns:  # no `observation.`, which LeRobot would give to networks
+            self.features["converged"] = _single("bool")
+        index = {name: _single("int64") for name in _INDEX[1:]}
+        self.all_features = {**self.features, "timestamp": _single("float32"), **index}
         tasks = [f"{kind} with {name}" for kind, name in zip(data.kind[chosen], data.object[chosen])]
         self.tasks = sorted(set(tasks))
         self.task = [self.tasks.index(task) for task in tasks]
@@ -215,6 +215,7 @@ class _Export:
             **{f"observation.tactile.{name}": counts[:, k - len(SINGLES)] for k, name in enumerate(SINGLES)},
             **({"observation.tactile.pac": data[self.pac][rows].astype(np.float32)} if self.pac else {}),
             "action": pose[np.minimum(np.arange(1, n + 1), n - 1)],
+            "converged": data["converged"][rows] if "converged" in self.features else None,
             "timestamp": (np.arange(n) / self.fps).astype(np.float32),
             "frame_index": np.arange(n),
             "episode_index": np.full(n, number),
@@ -325,6 +326,10 @@ def _chunk(number):
 
 def _feature(names):
     return {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+
+
+def _single(kind):
+    return {"dtype": kind, "shape": [1], "names": None}
 
 
 def _statistics(value):

@@ -38,9 +38,11 @@ def export_mujoco(
 
     A model has the BioTac at the world's origin, and the object on a free joint "object". An .npz has `state`
     (n, nstate) of mjSTATE_FULLPHYSICS (time, qpos, qvel) and `sensordata` (n, nsensordata) with the model's
-    sensors: electrodes (19), pdc, pac (22), tac, tdc [counts], contact_force (6, on the BioTac, about its
-    origin) [N, N m], contact_pos (3) [m], contact_normal (3), contact_depth [m], contact_area [m^2]. NaN:
-    missing, or no contact. Velocities are differences of the poses.
+    sensors: electrodes (19), pdc, pac (22), tac, tdc [counts], contact_force (6, of the object on the BioTac,
+    in its frame, the torque about its origin: minus the set's `wrench`) [N, N m], contact_pos (3) [m],
+    contact_normal (3), contact_depth [m], contact_area [m^2]. NaN: missing, or no contact. Velocities are
+    differences of the poses. If the set has it, `converged` (n,) is False where the skin kept its last good
+    state.
 
     Args:
       data: TactileSet with poses.
@@ -71,6 +73,7 @@ def export_mujoco(
                 models[thing] = file, _write_model(thing, _timestep(data, rows), building / file)
             file, model = models[thing]
             arrays = {"state": _states(model, data, rows), "sensordata": _sensors(model, data, rows, counts)}
+            arrays |= {name: data[name][rows] for name in ("converged",) if name in data.columns}
             np.savez_compressed(building / f"{data.id[i]}.npz", **arrays)
             about = {"id": str(data.id[i]), "model": file, "object": thing, "kind": str(data.kind[i])}
             index.append(about | {"split": str(data.split[i]), "rows": len(rows)})

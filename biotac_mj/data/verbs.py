@@ -63,12 +63,20 @@ def export_verb(args: argparse.Namespace) -> None:
             from .trajectories import export_mujoco
 
             out = export_mujoco(data, args.out, counts, not args.quiet)
-            print(f"wrote {out}: models of MuJoCo, and states and sensor data of {len(data)} interactions")
-            return
-        from .lerobot import VERSION, export_lerobot
+            print(f"wrote {out}: models, and states and sensor data of MuJoCo")
+        else:
+            from .lerobot import VERSION, export_lerobot
 
-        try:
-            out = export_lerobot(data, args.out, counts, not args.quiet, args.rate)
-        except ImportError as error:
-            raise ValueError(str(error)) from error
-    print(f"wrote {out} in the layout of LeRobotDataset {VERSION}")
+            try:
+                out = export_lerobot(data, args.out, counts, not args.quiet, args.rate)
+            except ImportError as error:
+                raise ValueError(str(error)) from error
+            print(f"wrote {out} in the layout of LeRobotDataset {VERSION}")
+        if "converged" in data.columns:
+            chosen = data.labelled if counts == "measured_counts" else slice(None)
+            good = data["converged"][data.steps(chosen)]
+            if not good.all():
+                print(
+                    f"note: {(~good).sum()} of {len(good)} time steps of the set did not converge and are "
+                    "exported, too: `converged` is false there, leave them out of training"
+                )

@@ -269,7 +269,11 @@ def _save_reader(args, reader, scores):
     from .instants.reader import TARGETS
 
     reader.save(args.out)
-    print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} held out")
+    tested = f", {scores['test']} more give the errors" if "test" in scores else " and give the errors"
+    print(
+        f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} held out "
+        f"calibrate the intervals{tested}"
+    )
     for name, row in scores["targets"].items():
         covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
         error = ""

@@ -1,6 +1,7 @@
 """Indenters: the paper's eight by name, any MuJoCo geom, any closed mesh.
 
-The frame of an indenter has its origin at the tip and presses along +y, as in the paper's files.
+The frame of an indenter has its origin at the tip and presses along +y, as in the paper's files. Of `geom:`
+it is at the geom's centre, with the geom's z along +y; of `mesh:` it is the file's.
 """
 
 import dataclasses

@@ -105,7 +105,10 @@ def fitted_touches(
             )
             out[-1].motion.parameters["misfit_counts"] = float(np.median(misfit[piece]))
     if not out:
-        raise ValueError(f"{recording.name} has no touch of {_FEWEST} rows: take a higher --rate")
+        raise ValueError(
+            f"{recording.name} has no touch of {_FEWEST} rows, and {len(taken)} under load at {rate:g} Hz: "
+            "take a higher --at-most, a longer --block or a longer recording"
+        )
     notes = [
         *found.notes,
         f"the plate's poses were fitted from force and electrodes (median misfit {np.median(misfit):.0f} "

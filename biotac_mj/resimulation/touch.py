@@ -140,7 +140,8 @@ def touches_of(
             f"{name} never meets the skin in {recording.name}: it comes no nearer than "
             f"{1e3 * skin.min():.1f} mm (2 mm is as far as is looked); check --object, --mount and units"
         )
-    rest, out, rejected = None, [], {"begin with no row before the touch": 0, "reach into the core": 0}
+    rest, out, short = None, [], []
+    rejected = {"begin with no row before the touch": 0, "reach into the core": 0}
     for piece in pieces:
         begins = piece[0] > 0 and time[piece[0]] - time[piece[0] - 1] < _GAP
         if not begins:
@@ -152,20 +153,23 @@ def touches_of(
             rejected["reach into the core"] += 1
             rows = rows[: deep[0]]
         if len(rows) < _FEWEST:
+            short.append(len(rows))
             continue
         before = _before(recording.time, known, taken, contact, rows[0])
         if len(before) < 2 and rest is None:
             rest = _rest(recording, found)
         tare = found.counts[before].mean(0) if len(before) > 1 else rest
         out.append(_touch(recording, found, taken[rows], pos[rows], mat[rows], tare))
+    if short:
+        rejected[f"have fewer than {_FEWEST} rows at {rate:g} Hz, {max(short)} at most"] = len(short)
     notes += [f"{count} touches {why}: they were cut or left out" for why, count in rejected.items() if count]
     if not out:
+        misplaced = len(short) < len(pieces) or rejected["reach into the core"]
         raise ValueError(
             f"none of the {len(pieces)} touches of {recording.name} can be simulated: "
-            + "; ".join(
-                [f"{c} {why}" for why, c in rejected.items() if c] or [f"fewer than {_FEWEST} rows each"]
-            )
-            + "; check --mount and --object, or take a higher --at-most"
+            + "; ".join(f"{count} {why}" for why, count in rejected.items() if count)
+            + ": take a higher --at-most, or log more rows of a touch"
+            + "; check --mount and --object" * bool(misplaced)
         )
     return out, notes
 

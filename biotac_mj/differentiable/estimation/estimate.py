@@ -38,7 +38,8 @@ class Estimate:
     """One contact; errors are half widths of 95 % intervals.
 
     Attributes:
-      centre, centre_error: (3,) of the contact on the skin at rest, on the line of force [m].
+      centre, centre_error: (3,) of the contact, in the BioTac frame [m]: the point of the line of force that
+        is nearest to the middle of the samples in contact, where these lie on the skin at rest.
       force: (3,) of the geom on the skin [N]. size: its norm, most likely; low, high: its interval.
       unexplained: fraction of the electrodes' change that the most likely press does not explain. deepest:
         whether that is the deepest simulated press there, so that the true one may be deeper.

@@ -83,6 +83,7 @@ def estimate_verb(args: argparse.Namespace) -> None:
     elif args.known:
         whose = f"a sensor known by {args.touches} touches at most"
     print(f"written: {args.out}; +- and (to) are 95 % for {whose}")
+    print("  centre: on the line of force, nearest to the middle of the contact on the undeformed skin")
     if not (simulated or args.known):
         print("  the force is known to a factor only: touches of the same sensor (--known) narrow it")
 

@@ -84,7 +84,7 @@ class Reader:
                 "same fingertip"
             )
         if self.meta["tared"] and tare is None:
-            raise ValueError("this model reads changes from rest: give rows at rest with --tare")
+            raise ValueError("this model reads changes from rest: --tare ROWS says how many rows are at rest")
         rest = log_impedance(tare) if self.meta["tared"] else np.zeros(n)
         x = log_impedance(counts) - rest
         strange = self._novelty(x, pdc)
@@ -288,7 +288,8 @@ def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
         )
     subset = assign(len(names), seed)
     train, kept, test = (names[subset == name] for name in SPLITS)
-    return _scored(fit_reader(data, train, kept, seed=seed), data, test, train)
+    reader, scores = _scored(fit_reader(data, train, kept, seed=seed), data, test, train)
+    return reader, scores | {"test": len(test)}
 
 
 def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple[Reader, dict]:
