@@ -120,3 +120,20 @@ def test_a_body_that_comes_slowly_is_felt_in_time(monkeypatch):
         CondensedStepper, "solve_skin", lambda *a, **k: dataclasses.replace(own(*a, **k), slack=0.0)
     )
     assert np.abs(ways - creep()).max() < 1e-8
+
+
+def test_a_body_that_the_nail_carries_leaves_the_skin_settled():
+    """MuJoCo's contact lifts it, as it comes to rest; the skin does nothing, and owes nothing."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 0.002
+    spec.worldbody.add_site(name="tip", quat=[1, 1, 0, 0])
+    body = spec.worldbody.add_body(name="ball", pos=[-10e-3, 0, 9.5e-3])
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    body.add_geom(size=[5e-3, 0, 0], mass=0.02)
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(50):
+        mujoco.mj_step(model, data)
+        assert handle.read(data, "status")[0] == 1.0
+    assert handle.read(data, "contact_force")[1] == pytest.approx(-0.02 * 9.81, rel=1e-3)
