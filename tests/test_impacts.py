@@ -389,7 +389,15 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
     assert touched > 1
 
 
-@pytest.mark.parametrize("seed", [7, 48, 56])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        48,
+        54,
+        56,
+        pytest.param(50, marks=pytest.mark.xfail(strict=True, reason="MuJoCo's contact throws it by itself")),
+    ],
+)
 def test_a_ring_that_comes_into_the_core_gains_nothing(seed):
     """Its contact with the core lifts it against a skin that holds it from the other side: both together give
     no more than was put in."""
