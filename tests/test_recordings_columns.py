@@ -66,8 +66,8 @@ def test_one_column(tmp_path):
         ),
         ("1,5,2,5,3,5\n", "line 1: 6 columns"),
         (
-            "fx fy fz\nlb lb lb\n1 2 3\n",
-            "line 2: no number in it .lb, lb, lb.: remove all lines but one of the header",
+            "fx fy fz\nsn sn sn\n1 2 3\n",
+            "line 2: no number in it .sn, sn, sn.: remove all lines but one of the header",
         ),
         ("fx fy fz\n1 2 3\nfx fy fz\n1 2 3\n", "line 3: no number in it"),
         ("Logged by\nhand, today\nfx,fy,fz\n1,2,3\n", "line 2: no number in it"),
