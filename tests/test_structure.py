@@ -26,7 +26,7 @@ LAYERS = {
     "units": "short_repr",
     "versions": "biotac_mj",
     "geometry": "cache short_repr fields files reading quiet triangles",
-    "skin": "cache short_repr lazy geometry fields files reading threads quiet launches",
+    "skin": "cache short_repr lazy geometry fields files reading threads quiet launches triangles",
     "quiet": "",
     "sensor": "cache short_repr lazy fields files geometry threads quiet launches",
     "effects": "short_repr lazy skin sensor geometry fields files reading",

@@ -78,21 +78,15 @@ class DistanceGrid:
     def facet_width(self) -> float:
         """Median width of the two facets at edges of 1 to 25 degrees, across the edge [m]; 0 without such
         edges."""
-        corner = self.vert[self.face]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        twice = np.linalg.norm(normal, axis=1)
-        normal /= np.maximum(twice, 1e-30)[:, None]
-        ends = np.sort(self.face[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        order = np.lexsort(ends.T)
-        first, second = order[:-1], order[1:]
-        same = (ends[first] == ends[second]).all(axis=1)
-        one, other = first[same] // 3, second[same] // 3
-        cosine = (normal[one] * normal[other]).sum(axis=1)
-        shallow = (cosine < np.cos(np.radians(1))) & (cosine > np.cos(np.radians(25)))
+        from ...triangles import trimesh
+
+        mesh = trimesh.Trimesh(self.vert, self.face, process=False)
+        turn = mesh.face_adjacency_angles
+        shallow = (turn > np.radians(1)) & (turn < np.radians(25))
         if not shallow.any():
             return 0.0
-        a, b = self.vert[ends[first[same][shallow]].T]
-        across = 0.5 * (twice[one] + twice[other])[shallow] / np.linalg.norm(b - a, axis=1)
+        a, b = self.vert[mesh.face_adjacency_edges[shallow].T]
+        across = mesh.area_faces[mesh.face_adjacency[shallow]].sum(axis=1) / np.linalg.norm(b - a, axis=1)
         return float(np.median(across))
 
 
