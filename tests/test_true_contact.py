@@ -409,7 +409,7 @@ def test_a_margin_moves_no_load(tier):
     np.testing.assert_allclose(wide, plain, atol=0.02 * np.abs(plain).max())
 
 
-def batch_of(xml, steps, margin=0.0):
+def batch_of(xml, steps, margin=0.0, **settings):
     """The Data after some steps of two worlds, and their contact_force (2, 3)."""
     mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
     from biotac_mj import batch
@@ -422,7 +422,7 @@ def batch_of(xml, steps, margin=0.0):
     with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
         m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=2)
         mjw.reset_data(m, d)
-        batch.attach(mjm, m, d, tier="condensed", skin="coarse", readings=False)
+        batch.attach(mjm, m, d, tier="condensed", skin="coarse", readings=False, **settings)
         for _ in range(steps):
             mjw.step(m, d)
     return d, d.sensordata.numpy()[:, mjm.sensor("biotac_contact_force").adr[0] :][:, :3]
@@ -446,6 +446,31 @@ def test_in_a_batch_a_margin_moves_no_load():
     assert np.linalg.norm(plain[1], axis=1).min() > 0.5
     np.testing.assert_allclose(wide[1], plain[1], atol=1e-4)
     np.testing.assert_allclose(wide[0].qpos.numpy(), plain[0].qpos.numpy(), atol=1e-7)
+
+
+SLICK = on_a_static_link(1, 0.025).replace('mass=".1"', 'mass=".1" friction="0"')
+
+
+def test_contact_without_friction_is_as_soft_as_condim_1():
+    """Edges of a pyramid of MuJoCo's least friction are harder by billions."""
+    ends = []
+    for dim in (3, 1):
+        spec = mujoco.MjSpec.from_string(SLICK)
+        biotac_mj.attach(spec, site="mount", tier="condensed", skin="coarse", friction=0.0, readings=False)
+        model = spec.compile()
+        model.geom_condim[:] = dim
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, 200)
+        assert 0 < data.ncon == data.nefc - data.ne
+        ends.append(data.qpos[0])
+    assert ends[0] == ends[1]
+
+
+def test_in_a_batch_contact_without_friction_has_one_row():
+    d, force = batch_of(SLICK, 200, friction=0.0)
+    count = int(d.nacon.numpy()[0])
+    assert count >= 2 and (d.contact.dim.numpy()[:count] == 1).all()
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), WEIGHT, rtol=0.01)
 
 
 APEX = """<mujoco><option timestep=".002"/><asset>{asset}</asset><worldbody>

@@ -1,9 +1,9 @@
 """mujoco_warp's contacts of core, nail and clamp with what a skin meets, made those of the shapes that it
 meets: `coupling/solid_contacts.py` for all worlds at once."""
 
-import functools
 import typing
 
+import mujoco
 import numpy as np
 import warp as wp
 
@@ -17,6 +17,8 @@ if typing.TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 _CONSTRAINT = wp.constant(1)  # bit of mujoco_warp's ContactType
+_MINMU = wp.constant(wp.float32(mujoco.mjMINMU))
+vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
 @wp.kernel
@@ -29,16 +31,19 @@ def amend_contacts(
     count: wp.array(dtype=int),
     geom: wp.array(dtype=wp.vec2i),
     world: wp.array(dtype=int),
+    friction: wp.array(dtype=vec5),
     # In and out:
     includemargin: wp.array(dtype=float),
+    dim: wp.array(dtype=int),
     kind: wp.array(dtype=int),
     # Out:
     wanted_out: wp.array2d(dtype=int),
     source_out: wp.array2d(dtype=int),
     any_out: wp.array(dtype=int),
 ):
-    """Removes the margins of a BioTac's rigid parts, and contacts with convex hulls of non-convex shapes. The
-    last removed contact of each pair [pair, world] is the template of those that replace it."""
+    """Removes the margins of a BioTac's rigid parts, friction of none, and contacts with convex hulls of
+    non-convex shapes. The last removed contact of each pair [pair, world] is the template of those that
+    replace it."""
     i = wp.tid()
     if i >= count[0]:
         return
@@ -50,6 +55,8 @@ def amend_contacts(
         other = g[1 - k]
         if part >= 0 and met[other] == 1:
             includemargin[i] = 0.0
+            if friction[i][0] <= _MINMU:
+                dim[i] = 1
             shape = shape_of[other]
             if shape >= 0 and (kind[i] & _CONSTRAINT) != 0:
                 kind[i] = kind[i] - _CONSTRAINT
@@ -79,73 +86,67 @@ def place_shapes(
     mat_out[nparts + s, w] = turn * widen(geom_xmat[w, shape[s]])
 
 
-@functools.cache
-def _appending():
-    from mujoco_warp._src.types import vec5
-
-    @wp.kernel
-    def append_contacts(
-        # In:
-        core: int,
-        part_of: wp.array(dtype=int),
-        xpos: wp.array2d(dtype=wp.vec3),
-        xmat: wp.array2d(dtype=wp.mat33),
-        source: wp.array2d(dtype=int),
-        found_pos: wp.array3d(dtype=vec3),
-        found_normal: wp.array3d(dtype=vec3),
-        found_depth: wp.array3d(dtype=real),
-        # In and out:
-        count: wp.array(dtype=int),
-        dist: wp.array(dtype=float),
-        pos: wp.array(dtype=wp.vec3),
-        frame: wp.array(dtype=wp.mat33),
-        includemargin: wp.array(dtype=float),
-        friction: wp.array(dtype=vec5),
-        solref: wp.array(dtype=wp.vec2),
-        solreffriction: wp.array(dtype=wp.vec2),
-        solimp: wp.array(dtype=vec5),
-        dim: wp.array(dtype=int),
-        geom: wp.array(dtype=wp.vec2i),
-        efc_address: wp.array2d(dtype=int),
-        world: wp.array(dtype=int),
-        kind: wp.array(dtype=int),
-        adhesion: wp.array(dtype=float),
-    ):
-        """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; `count` goes on beyond
-        it, which shows the overflow."""
-        pair, s, w = wp.tid()
-        if found_depth[pair, s, w] <= real(0.0):
-            return
-        t = source[pair, w]
-        i = wp.atomic_add(count, 0, 1)
-        if i >= dist.shape[0]:
-            return
-        turn = widen(xmat[w, core])
-        n = wp.vec3(turn * found_normal[pair, s, w])
-        if part_of[geom[t][0]] < 0:  # from the first geom to the second
-            n = -n
-        across = wp.vec3(1.0, 0.0, 0.0)
-        if wp.abs(n[0]) > 0.6:
-            across = wp.vec3(0.0, 1.0, 0.0)
-        a = wp.normalize(wp.cross(n, across))
-        b = wp.cross(n, a)
-        dist[i] = -float(found_depth[pair, s, w])
-        pos[i] = wp.vec3(turn * found_pos[pair, s, w] + double(xpos[w, core]))
-        frame[i] = wp.mat33(n[0], n[1], n[2], a[0], a[1], a[2], b[0], b[1], b[2])
-        includemargin[i] = 0.0
-        friction[i] = friction[t]
-        solref[i] = solref[t]
-        solreffriction[i] = solreffriction[t]
-        solimp[i] = solimp[t]
-        dim[i] = dim[t]
-        geom[i] = geom[t]
-        world[i] = w
-        kind[i] = _CONSTRAINT
-        adhesion[i] = adhesion[t]
-        for k in range(efc_address.shape[1]):
-            efc_address[i, k] = -1
-
-    return append_contacts
+@wp.kernel
+def append_contacts(
+    # In:
+    core: int,
+    part_of: wp.array(dtype=int),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    source: wp.array2d(dtype=int),
+    found_pos: wp.array3d(dtype=vec3),
+    found_normal: wp.array3d(dtype=vec3),
+    found_depth: wp.array3d(dtype=real),
+    # In and out:
+    count: wp.array(dtype=int),
+    dist: wp.array(dtype=float),
+    pos: wp.array(dtype=wp.vec3),
+    frame: wp.array(dtype=wp.mat33),
+    includemargin: wp.array(dtype=float),
+    friction: wp.array(dtype=vec5),
+    solref: wp.array(dtype=wp.vec2),
+    solreffriction: wp.array(dtype=wp.vec2),
+    solimp: wp.array(dtype=vec5),
+    dim: wp.array(dtype=int),
+    geom: wp.array(dtype=wp.vec2i),
+    efc_address: wp.array2d(dtype=int),
+    world: wp.array(dtype=int),
+    kind: wp.array(dtype=int),
+    adhesion: wp.array(dtype=float),
+):
+    """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; `count` goes on beyond
+    it, which shows the overflow."""
+    pair, s, w = wp.tid()
+    if found_depth[pair, s, w] <= real(0.0):
+        return
+    t = source[pair, w]
+    i = wp.atomic_add(count, 0, 1)
+    if i >= dist.shape[0]:
+        return
+    turn = widen(xmat[w, core])
+    n = wp.vec3(turn * found_normal[pair, s, w])
+    if part_of[geom[t][0]] < 0:  # from the first geom to the second
+        n = -n
+    across = wp.vec3(1.0, 0.0, 0.0)
+    if wp.abs(n[0]) > 0.6:
+        across = wp.vec3(0.0, 1.0, 0.0)
+    a = wp.normalize(wp.cross(n, across))
+    b = wp.cross(n, a)
+    dist[i] = -float(found_depth[pair, s, w])
+    pos[i] = wp.vec3(turn * found_pos[pair, s, w] + double(xpos[w, core]))
+    frame[i] = wp.mat33(n[0], n[1], n[2], a[0], a[1], a[2], b[0], b[1], b[2])
+    includemargin[i] = 0.0
+    friction[i] = friction[t]
+    solref[i] = solref[t]
+    solreffriction[i] = solreffriction[t]
+    solimp[i] = solimp[t]
+    dim[i] = dim[t]
+    geom[i] = geom[t]
+    world[i] = w
+    kind[i] = _CONSTRAINT
+    adhesion[i] = adhesion[t]
+    for k in range(efc_address.shape[1]):
+        efc_address[i, k] = -1
 
 
 class SolidContacts:
@@ -164,15 +165,14 @@ class SolidContacts:
                 self._wanted = self._overlaps.wanted
             self._source = wp.zeros((npair, nworld), dtype=int)
             self._any = wp.zeros(1, dtype=int)
-        self._append = _appending() if self._overlaps else None
 
     def amend(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Makes the contacts what they should be, before constraints are made of them. Launches only."""
         c = d.contact
         for array in (self._wanted, self._source, self._any):
             array.zero_()
-        found = [len(self._shape), *self._of_geoms, d.nacon, c.geom, c.worldid]
-        outputs = [c.includemargin, c.type, self._wanted, self._source, self._any]
+        found = [len(self._shape), *self._of_geoms, d.nacon, c.geom, c.worldid, c.friction]
+        outputs = [c.includemargin, c.dim, c.type, self._wanted, self._source, self._any]
         self._launch(amend_contacts, len(c.dist), found, outputs)
         if self._overlaps:
             wp.capture_if(self._any, lambda: self._replace(d))
@@ -187,7 +187,7 @@ class SolidContacts:
         contacts = [d.nacon, c.dist, c.pos, c.frame, c.includemargin, c.friction, c.solref, c.solreffriction]
         contacts += [c.solimp, c.dim, c.geom, c.efc_address, c.worldid, c.type, c.adhesion]
         known = [self._core, self._of_geoms[0], d.xpos, d.xmat, *new]
-        self._launch(self._append, (found.npair, MOST, self._nworld), known, contacts)
+        self._launch(append_contacts, (found.npair, MOST, self._nworld), known, contacts)
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

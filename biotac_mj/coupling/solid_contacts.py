@@ -3,7 +3,11 @@
 A skin meets closed meshes with their hollows, and no geom before it touches. MuJoCo's contacts of the solid
 parts are with convex hulls, and begin at a geom's margin: a finger in a cup would be thrown out, and the core
 would carry a body through skin that is hardly touched. So each step takes margins away, and replaces contacts
-with hulls of meshes that have hollows by those with the meshes themselves."""
+with hulls of meshes that have hollows by those with the meshes themselves.
+
+MuJoCo keeps friction of zero as mjMINMU, and regularises the edges of a pyramid by its square: such a contact
+is 1e10 times as hard as its solimp says, and those of a body that is deep in the core contradict each other.
+They have one row, as with condim 1."""
 
 import ctypes
 import functools
@@ -117,10 +121,12 @@ class SolidContacts(SolidPairs):
         contacts["includemargin"][wide] = 0.0
         contacts["exclude"][wide] = contacts["dist"][wide] >= 0.0
         contacts["efc_address"][wide] = -1
+        slick = rows[(contacts["friction"][rows, 0] <= mujoco.mjMINMU) & (contacts["dim"][rows] > 1)]
+        contacts["dim"][slick] = 1
         hulls = shape >= 0
         if hulls.any():
             self._replace(data, contacts, rows[hulls], first[hulls], part[hulls], shape[hulls])
-        return bool(len(wide) or hulls.any())
+        return bool(len(wide) or len(slick) or hulls.any())
 
     def _replace(self, data, contacts, rows, first, part, shape):
         templates = {}
