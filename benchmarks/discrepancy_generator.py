@@ -101,6 +101,7 @@ class Generator:
             "cpu" if tier == "condensed" else device,
         )
         self.modulus, self.footprint, self.tier = modulus, footprint, tier
+        self._solved = {}  # by the condensed tier
 
     def skin(self, plans, poses, radii, friction=1.0) -> list:
         """Per plan force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]; poses: lists of (n, 3);
@@ -137,6 +138,13 @@ class Generator:
         return [(b[0] - a[0], b[1] - a[1], np.log(b[2] / a[2])) for a, b in zip(plain, stiff)]
 
     def _condensed(self, one, pos, r, friction):
+        """Kept: what effects do after the skin is measured with and without them."""
+        key = r, friction, one["tool"], one["heading"].tobytes(), pos.tobytes()
+        if key not in self._solved:
+            self._solved[key] = self._walked(one, pos, r, friction)
+        return tuple(part.copy() for part in self._solved[key])
+
+    def _walked(self, one, pos, r, friction):
         from biotac_mj.skin.condensed import CondensedSkin, Memory
         from biotac_mj.skin.geoms import GeomSet
 

@@ -20,7 +20,7 @@ import numpy as np
 from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator
 from records import write_json
 
-__all__ = ["carried_out", "draw", "opened", "read_plan", "seal"]
+__all__ = ["carried_out", "clean", "draw", "opened", "read_plan", "seal"]
 
 # of 30 laboratories; wrong-base: a rubber that is half as stiff, or twice
 _OF_30 = {"single": 15, "pair": 5, "none": 4, "outside": 4, "wrong-base": 2}
@@ -110,14 +110,16 @@ def generator_of(sensor: dict, skin: str, tier: str) -> Generator:
     return lab
 
 
-def carried_out(
-    lab: Generator, sensor: dict, contacts: list[dict], turn: int = 0, clean: bool = False
-) -> list[tuple]:
+def carried_out(lab: Generator, sensor: dict, contacts: list[dict], turn: int = 0) -> list[tuple]:
     """Per contact counts (n, 19), pdc (n,) and force (n, 3); turn: number of the round, whose noise and pose
-    errors are its own. clean: without effects, noise and rounding, by the same poses."""
-    if clean:
-        return lab.clean(contacts, [], sensor["seed"] + turn, _POSE)
+    errors are its own."""
     return lab.measure(contacts, [tuple(e) for e in sensor["effects"]], sensor["seed"] + turn, _POSE)
+
+
+def clean(lab: Generator, sensor: dict, contacts: list[dict], turn: int, effects: bool) -> list[tuple]:
+    """The same by the same poses without noise and rounding, with and without the hidden effects."""
+    hidden = [tuple(e) for e in sensor["effects"]] if effects else []
+    return lab.clean(contacts, hidden, sensor["seed"] + turn, _POSE)
 
 
 def _write(path, contacts, readings):

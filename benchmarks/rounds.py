@@ -19,7 +19,7 @@ import pathlib
 import time
 
 import numpy as np
-from hidden_lab import carried_out, generator_of, opened, read_plan
+from hidden_lab import carried_out, clean, generator_of, opened, read_plan
 from poses_blind import MEANT, gap
 from records import read_json, write_json
 
@@ -83,6 +83,36 @@ def _record(report, seconds):
     }
 
 
+def in_place(report, data):
+    """What stands in place of the effects that a report names, on other trajectories: per trajectory
+    (n, width) what constants alone, fitted again, do more than those beside the effects, and the same with a
+    Gaussian process of what they leave of the fitted trajectories."""
+    from biotac_mj.discrepancy.trajectories.likelihood import kernel
+
+    c, null, fields = report.comparison, report.null, report.comparison.sim.fields(data, progress=False)
+    alone, beside = (
+        c.predict(c.sim.run(data, fields, False, nuisance=fit.nuisance)) for fit in (null, report.fit)
+    )
+    constants = [a - b for a, b in zip(alone, beside)]
+    known, left = ([of[i] for i in report.selection] for of in (c.trajectories, null.posed(c)))
+    left = np.concatenate([one * c.sigmas[i] for one, i in zip(left, report.selection)])
+    every = kernel(known + data, [np.arange(len(t.time)) for t in known + data])
+    own, across = every[: len(left), : len(left)], every[len(left) :, : len(left)]
+    noise = (c.noises / (null.amplitude * null.size)) ** 2
+    values, vectors = np.linalg.eigh(own)
+    process = across @ vectors @ ((vectors.T @ left) / (np.maximum(values, 0.0)[:, None] + noise))
+    parts = np.split(process, np.cumsum([len(t.time) for t in data])[:-1])
+    return constants, [a + b for a, b in zip(constants, parts)]
+
+
+def _share(hidden, said, noise):
+    """Share of what is hidden (n, width) per trajectory that is said, by their noise (width,)."""
+    left, before = (
+        sum((((h - by * s) / noise) ** 2).sum() for h, s in zip(hidden, said)) for by in (1.0, 0.0)
+    )
+    return float(1 - np.sqrt(left / before))
+
+
 def _contacts(args):
     """The simulator, bounds, and contacts of round 1, of the pool, and of the tool and place that no round
     touches."""
@@ -113,28 +143,43 @@ def run(task, args):
     sensor = opened(path.read_bytes())
     lab = generator_of(sensor, "coarse", "condensed")
     sim, bounds, begin, pool, unseen = _contacts(args)
-    number, clean = int(path.stem.split("_")[1]), {}
+    number, free = int(path.stem.split("_")[1]), {}  # of noise, with and without what is hidden
 
     def measured(plan, turn, kind=arm):
         file = args.cache / f"{path.stem}_{kind}_{turn}.csv"
         write_poses(plan, file)
         contacts = read_plan(file)
         name = f"{kind}{turn}"
-        free = _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), name)
-        clean.update((t.id, t) for t in free)
+        both = (
+            _trajectories(contacts, clean(lab, sensor, contacts, turn, effects), name)
+            for effects in (True, False)
+        )
+        free.update((a.id, (a, b)) for a, b in zip(*both))
         return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), name)
+
+    def hidden(t):
+        """(n, width) what is hidden in a trajectory."""
+        shown, bare = (np.column_stack([one.electrodes, one.pdc, one.force]) for one in free[t.id])
+        return shown - bare
+
+    def closed(report, data, ids):
+        """Share of what is hidden in some trajectories (ids) of data that the amended sensor repeats."""
+        shown, bare = zip(*(free[t.id] for t in data))
+        # the base is the sensor's own
+        return gap(shown, bare, report.apply(sim), ids, noise=report.comparison.noise)
 
     def judged(data, turn):
         began = time.process_time()
         report = diagnose(sim, data, progress=False)
         record = _record(report, time.process_time() - began)
         if report.effects and sensor["effects"]:  # of nothing hidden there is no share
-            aside = {data[i].id for i in report.locked}
-            # the base is the sensor's own
-            amended = report.apply(sim)
-            record["true"] = gap(data, [clean[t.id] for t in data], amended, aside)
+            record["true"] = closed(report, data, {data[i].id for i in report.locked})
             other = measured(_plan(unseen, _end(data)), turn, "unseen")
-            record["unseen"] = gap(other, [clean[t.id] for t in other], amended, {t.id for t in other})
+            record["unseen"] = closed(report, other, {t.id for t in other})
+            rest = np.mean([hidden(t)[0] for t in data], axis=0)  # about which all is compared
+            about = [hidden(t) - rest for t in other]
+            some = in_place(report, other)
+            record["in_place"] = [_share(about, said, report.comparison.noises) for said in some]
         return report, record
 
     row = {"lab": path.stem, "arm": arm, "truth": sensor}

@@ -361,6 +361,12 @@ def test_spots_are_where_trajectories_touch_again():
     assert list(effect.params) == names and by_id("spots").given([]).applicable(data)
 
 
+def test_an_amended_sensor_has_its_spots_wherever_it_touches():
+    name = "at_-9.0_-6.5_0.0"
+    sim = Springs(effects=[(by_id("spots").given([name]), {name: 0.5})])
+    assert name not in spots(plans(1)) and name in sim.fields(plans(1), progress=False).slopes
+
+
 class Elsewhere(Springs):
     """Springs of other electrodes, which rest some 150 counts apart (synthetic)."""
 

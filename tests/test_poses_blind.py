@@ -7,6 +7,7 @@ import sys
 import types
 
 import numpy as np
+import pytest
 from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import Trajectory
@@ -85,10 +86,14 @@ def test_the_known_gap_closes_as_far_as_the_amendment_repeats():
     clean = Trajectory(
         "a", "sphere_7mm", 0.0, np.arange(n) / 50, pos, np.tile(np.eye(3), (n, 1, 1)), REST + change
     )
-    noisy = dataclasses.replace(clean, electrodes=REST + 1.3 * change + rng.normal(0, 2, (n, 19)))
+    shown = dataclasses.replace(clean, electrodes=REST + 1.3 * change)
+    noisy = dataclasses.replace(clean, electrodes=shown.electrodes + rng.normal(0, 2, (n, 19)))
+    known = {"electrodes": np.full(19, 2.0), "pdc": None, "force": None}
     for said, share in ((0.3, 1.0), (0.15, 0.5), (0.0, 0.0)):
         sim = Amended([(by_id("gain"), {"by": said})])
         assert abs(poses_blind.gap([noisy], [clean], sim, {"a"}) - share) < 0.06
+        exact = poses_blind.gap([shown], [clean], sim, {"a"}, noise=known)  # without noise of its own
+        assert exact == pytest.approx(share, abs=1e-6)
     assert poses_blind.gap([clean], [clean], Amended([]), {"a"}) is None
     stiffer = Amended([], modulus=1.3)
     assert poses_blind.gap([noisy], [clean], stiffer, {"a"}, modulus=True) > 0.94

@@ -44,6 +44,7 @@ class Solver(typing.Protocol):
     material: typing.Any
     options: dict
     cache: typing.Any
+    effects: list
 
     def solve(self, trajectories: list[Trajectory], **changes: object) -> list:
         """Force, pressure and ln Z along trajectories, dicts of arrays."""
@@ -94,9 +95,11 @@ def solved_fields(
 
     Args:
       places: at which the rubber may be another (see `spots`), of contacts that are not made yet: nothing is
-        fitted to these, so curves are straight lines about their middle. None finds them in the data."""
+        fitted to these, so curves are straight lines about their middle. None finds them in the data. Those
+        of the simulator's own effects are always among them."""
     fitted = places is None
-    places = spots(trajectories) if fitted else places
+    own = [name for _, theta in sim.effects for name in theta if name.startswith(SPOT)]
+    places = dict.fromkeys([*own, *(spots(trajectories) if fitted else places)])
     deeper, thick = (_DEEPER, _FILM) if fitted else (_DEEPER[2:7:2], _FILM[4:13:4])
     # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
