@@ -693,7 +693,8 @@ def test_each_tool_has_a_radius_of_its_own(tmp_path):
     )
     assert list(radius.params) == ["sphere_14mm", "sphere_7mm"]
     theta = {"sphere_14mm": 0.2, "sphere_7mm": 0.0}
-    for tool, grown in (("sphere_14mm", 0.2), ("sphere_7mm", 0.0), ("ring_7mm", 0.0)):
+    tools = {"sphere_14mm": 0.2, "sphere_7mm": 0.0, "geom:sphere:0.005": 0.1, "ring_7mm": 0.0}
+    for tool, grown in tools.items():
         run = run_of()
         run.tool = tool
         radius.apply(run, theta)

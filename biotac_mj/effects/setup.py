@@ -8,7 +8,8 @@ from .effect import Effect, Param, Run
 
 
 class Radius(Effect):
-    """One parameter for each spherical tool among the trajectories, else one for all."""
+    """One parameter for each spherical tool among the trajectories, else one for all; another sphere is off
+    by their mean."""
 
     id, name, stage = "radius", "radius of the tool", "S"
     physics = "the sphere is larger or smaller than stated"
@@ -29,7 +30,7 @@ class Radius(Effect):
 
     def apply(self, run: Run, theta: dict) -> None:
         if "sphere" in run.tool:
-            run.log_radius = run.log_radius + theta.get("log_radius", theta.get(run.tool, 0.0))
+            run.log_radius = run.log_radius + theta.get(run.tool, np.mean([*theta.values()]))
 
 
 class Misalignment(Effect):
