@@ -185,7 +185,7 @@ class Hook:
         self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
 
     def _choose(self, moving, choose):
-        """Selects the worlds that continue: those that any batch chooses."""
+        """Selects the worlds that continue: those that choose(batch, found) finds in any batch."""
         self._next.clear()
         self._fork.run(*(functools.partial(choose, batch, self._next) for batch in moving))
         self._going.copy(self._next)

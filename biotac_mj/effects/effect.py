@@ -292,7 +292,7 @@ class Effect(abc.ABC):
         return None
 
     def undoes(self, theta: dict, log_modulus: float) -> bool:
-        """Whether it compensates a modulus factor exp(log_modulus) of the base model."""
+        """Whether the effect cancels a factor exp(log_modulus) of the base model's modulus."""
         return False
 
     def rejection_reason(self, theta: dict) -> str | None:

@@ -169,7 +169,8 @@ def load_one(path: pathlib.Path | str, recording: str | None = None, **options: 
 
     Args:
       path: as for `load`, which returns all its recordings.
-      recording: its name, or the end of it; None: the first. options: of `load`.
+      recording: its name, or the end of it; None: the first.
+      options: keywords of `load`.
 
     Raises:
       FileNotFoundError, ValueError: see `load`; or no recording of that name.

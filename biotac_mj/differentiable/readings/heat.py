@@ -1,8 +1,8 @@
-"""The sensor's temperatures as a differentiable PyTorch function: the text of the kernel
-`sensor.heat.step_heat`, run on tensors, for one sensor.
+"""The sensor's temperatures as a differentiable PyTorch function, for one sensor: the
+source of the kernel `sensor.heat.step_heat`, run on tensors.
 
-Temperatures are smooth except in areas: where one stops growing, and where the pad is full, derivatives are
-one-sided."""
+Temperatures depend smoothly on the contact areas, except where an area stops growing or covers the whole pad:
+there the derivatives are one-sided."""
 
 import dataclasses
 import functools

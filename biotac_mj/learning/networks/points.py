@@ -61,7 +61,7 @@ class SkinPoints:
         return cls(skin.vert[whole.keep], levels, whole.up, reference)
 
     def reading(self, geometry: SkinGeometry) -> csr_matrix:
-        """(n, nvert) CSR: interpolation from the nodes of a skin to the points.
+        """Sparse matrix (n, nvert) that interpolates a field on the nodes of a skin at the points.
 
         Raises:
           ValueError: the points are not in that skin.

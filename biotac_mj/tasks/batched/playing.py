@@ -42,7 +42,8 @@ def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
     """The environment in which a policy learned.
 
     Args:
-      card: of the policy, or {"task": name}. changes: of the keywords of `make`.
+      card: the policy's card, or {"task": name}.
+      changes: keywords of `make` that replace those of the card.
     """
     full_card = {"biotac": {"sensor": "random"}} | card
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in full_card.get("settings", {}).items()}

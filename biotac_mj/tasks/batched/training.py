@@ -40,7 +40,10 @@ class Run:
     """One policy that learns in its fraction of the worlds.
 
     Args:
-      env: the environment. worlds: slice of its worlds. observe: of OBSERVE. seed: of networks.
+      env: the environment.
+      worlds: the worlds in which this policy acts.
+      observe: what it sees, one of OBSERVE.
+      seed: for its networks' first weights.
     """
 
     def __init__(self, env: BatchTask, worlds: slice, observe: str, seed: int, numbers: Numbers):

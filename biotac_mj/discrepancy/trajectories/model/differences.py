@@ -163,8 +163,8 @@ def _shifts(sim, trajectories, base, deeper, tick):
 
 
 def _films(sim, trajectories, base, logs, tick):
-    """Changes by another minimum thickness of the film, about the baseline. It does not act on the skin,
-    which is solved once for all of them."""
+    """Changes of the readings from the baseline for other minimum thicknesses of the film, which differ by
+    the factors exp(logs). The skin does not depend on the thickness, so it is solved once."""
     from ....effects.in_film import SeveralFilms
 
     model, own = sim.skin_and_film(0.0, 0.0)
