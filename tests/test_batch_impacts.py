@@ -602,3 +602,17 @@ def test_contacts_with_the_core_do_the_work_of_their_rows(sparse):
     wp.launch(solid.find_lift, 3, given, [lifted])
     work = step * (force * (J @ (qvel + 0.5 * step * qacc)))
     np.testing.assert_allclose(lifted.numpy()[0, 0], work[:2].sum(), rtol=1e-6)
+
+
+def test_a_skin_that_only_reads_feels_the_nail_stop_a_body():
+    """In each world by itself: a third one has no contact."""
+    ball = '<body pos="-.009 0 .01"><joint type="slide" axis="0 0 1"/><geom size=".005" mass=".02"/></body>'
+    xml = scene(ball, 0.002).replace("1 -1 0 0", "1 1 0 0")
+    read = []
+    for coupling in ("two-way", "one-way"):
+        where = {"site": "tip", "coupling": coupling}
+        thrown = [[0.0], [0.45e-3], [0.1]], [[-0.45]] * 3, 5, where
+        seen, _ = in_batch(xml, *thrown, tier="condensed", coupling=coupling)
+        read.append([world.force for world in seen])
+    assert np.abs(read[0][:2]).max() > 4 and not np.any(read[0][2])
+    np.testing.assert_allclose(read[1], read[0], rtol=1e-4, atol=1e-4)

@@ -137,3 +137,26 @@ def test_a_body_that_the_nail_carries_leaves_the_skin_settled():
         mujoco.mj_step(model, data)
         assert handle.read(data, "status")[0] == 1.0
     assert handle.read(data, "contact_force")[1] == pytest.approx(-0.02 * 9.81, rel=1e-3)
+
+
+@pytest.mark.parametrize("height", [10.15e-3, 9.95e-3])
+def test_what_only_reads_feels_the_nail_stop_a_body(height):
+    """Through it, at the body's speed, the skin below would be pressed by kilonewtons."""
+    seen = {}
+    for coupling in ("two-way", "one-way"):
+        spec = mujoco.MjSpec()
+        spec.option.timestep = 0.002
+        spec.worldbody.add_site(name="tip", quat=[1, 1, 0, 0])
+        body = spec.worldbody.add_body(name="ball", pos=[-9e-3, 0, height])
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+        body.add_geom(size=[5e-3, 0, 0], mass=0.02)
+        handle = biotac_mj.attach(spec, site="tip", skin="coarse", readings=False, coupling=coupling)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qvel[0] = -0.45
+        steps = seen[coupling] = []
+        for _ in range(8):
+            mujoco.mj_step(model, data)
+            steps.append(handle.read(data, "contact_force"))
+    assert np.abs(seen["two-way"]).max() > 4
+    np.testing.assert_allclose(seen["one-way"], seen["two-way"], rtol=1e-9, atol=1e-9)

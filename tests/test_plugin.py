@@ -425,7 +425,7 @@ def test_disabled_equalities_are_refused_two_way(model):
 
 @pytest.mark.parametrize("coupling, limit", [("one-way", 120), ("two-way", 320)])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
-    """Calls of Python functions in a step whose skin costs nothing, 105 and 287 (docs/lab/coupling.md), on
+    """Calls of Python functions in a step whose skin costs nothing, 108 and 311 (docs/lab/coupling.md), on
     whatever machine."""
     ball = (
         '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" '

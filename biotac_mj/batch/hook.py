@@ -43,6 +43,7 @@ class Hook:
         self._contactfilter = m.callback.contactfilter
         self._contact_force = None
         self._corrected = []  # whose forces are corrected together
+        self._began_with = self._aside = None  # velocities of one-way skins' bodies, memory of the search
         self._fork = Fork(m.qpos0.device)
         self._taking_part = self._going = self._next = None  # `Marks` of worlds: in the step, in a round
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
@@ -87,7 +88,7 @@ class Hook:
             return kernels_of_step(mjm, m, own)
         finally:
             self._passive, self._sensor, self._contactfilter = before
-            self._corrected = []  # the memory was for another Data
+            self._corrected, self._began_with = [], None  # the memory was for another Data
 
     def contactfilter(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._contactfilter:
@@ -104,11 +105,12 @@ class Hook:
             self._take_memory(m, d)
         batches = [b for b in self.batches if b.active]
         self._taking_part.clear()
-        self._fork.run(*(functools.partial(batch.predict, m, d, self._taking_part) for batch in batches))
         moving = [b for b in batches if b.moving]
         for batch in batches:
             if batch not in moving:
+                self._predict_one_way(m, d, batch)
                 batch.solve_one_way(m, d)
+        self._fork.run(*(functools.partial(batch.predict, m, d, self._taking_part) for batch in moving))
         if moving:
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
@@ -119,6 +121,33 @@ class Hook:
             self._fork.run(*(functools.partial(batch.pass_by, self._taking_part) for batch in moving))
             self._act(m, d, moving)
         self._fork.run(*(batch.end_step for batch in batches))
+
+    def _predict_one_way(self, m, d, batch):
+        """Predicts where bodies go at their velocities; where core, nail or clamp stops one, at those of the
+        step's end."""
+        import mujoco_warp as mjw
+
+        stopped, first = batch.solid_contacts.stopped, self._began_with is None
+        if first:
+            self._began_with, self._aside = wp.empty_like(d.qvel), Scratch(d.qvel.device)
+        wp.copy(self._began_with, d.qvel)
+
+        def speed_up():
+            _begin_dynamics(m, d)
+            mjw.fwd_acceleration(m, d, factorize=True)
+            mjw.solve(m, d)
+            known = [stopped.world, batch.dt, d.qacc]
+            wp.launch(integrator.speed_up, d.qvel.shape, known, [d.qvel], device=d.qvel.device)
+            mjw.com_vel(m, d)
+
+        with self._aside:
+            if first:  # it takes the memory that a capture must find
+                speed_up()
+            else:
+                wp.capture_if(stopped.any, speed_up)
+        batch.predict(m, d, self._taking_part)
+        wp.copy(d.qvel, self._began_with)
+        wp.capture_if(stopped.any, lambda: mjw.com_vel(m, d))
 
     def _take_memory(self, m, d):
         """Allocates the arrays shared by the skins that move bodies, at the first step with them."""

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
 from ..coupling.solid_contacts import SolidPairs
 from ..skin.contact.overlap import MOST
 from ..skin.types import double, mat33, real, vec3, widen
@@ -40,6 +41,7 @@ def amend_contacts(
     wanted_out: wp.array2d(dtype=int),
     source_out: wp.array2d(dtype=int),
     any_out: wp.array(dtype=int),
+    stopped: MarkedWorlds,
 ):
     """Removes the margins of a BioTac's rigid parts, friction of none, and contacts with convex hulls of
     non-convex shapes. The last removed contact of each pair [pair, world] is the template of those that
@@ -54,6 +56,7 @@ def amend_contacts(
         part = part_of[g[k]]
         other = g[1 - k]
         if part >= 0 and met[other] == 1:
+            mark(stopped, world[i])
             includemargin[i] = 0.0
             if friction[i][0] <= _MINMU:
                 dim[i] = 1
@@ -150,7 +153,11 @@ def append_contacts(
 
 
 class SolidContacts:
-    """Contacts of the rigid parts of one BioTac in every world."""
+    """Contacts of the rigid parts of one BioTac in every world.
+
+    Attributes:
+      stopped: `Marks` of worlds that had some when they were last amended.
+    """
 
     def __init__(self, pairs: SolidPairs, nworld: int, device: wp.DeviceLike):
         self._core, self._nworld, self._device = pairs.core, nworld, wp.get_device(device)
@@ -164,15 +171,16 @@ class SolidContacts:
             if self._overlaps:
                 self._wanted = self._overlaps.wanted
             self._source = wp.zeros((npair, nworld), dtype=int)
-            self._any = wp.zeros(1, dtype=int)
+            self._any, self.stopped = wp.zeros(1, dtype=int), Marks(nworld)
 
     def amend(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Makes the contacts what they should be, before constraints are made of them. Launches only."""
         c = d.contact
         for array in (self._wanted, self._source, self._any):
             array.zero_()
+        self.stopped.clear()
         found = [len(self._shape), *self._of_geoms, d.nacon, c.geom, c.worldid, c.friction]
-        outputs = [c.includemargin, c.dim, c.type, self._wanted, self._source, self._any]
+        outputs = [c.includemargin, c.dim, c.type, self._wanted, self._source, self._any, self.stopped.struct]
         self._launch(amend_contacts, len(c.dist), found, outputs)
         if self._overlaps:
             wp.capture_if(self._any, lambda: self._replace(d))

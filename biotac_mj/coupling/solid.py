@@ -28,7 +28,7 @@ def solid_wrench(
     contacts = contacts_of(data)
     geom = contacts["geom"]
     mine = (geom >= 0) & (model.geom_bodyid[geom] == core)  # -1: a flex, or none
-    touching = np.flatnonzero(mine.any(axis=1) & (contacts["efc_address"] >= 0))
+    touching = (mine.any(axis=1) & (contacts["efc_address"] >= 0)).nonzero()[0]
     if not len(touching):
         return out, True
     solved = data.unsolved(data.acceleration(), dofs) < SOLVED

@@ -89,7 +89,13 @@ def _fills_hull(vert, face):
 
 class SolidContacts(SolidPairs):
     """The same in one mjData. A shape that has moved by less than its distance, as that was last measured, is
-    not measured again."""
+    not measured again.
+
+    Attributes:
+      met_any: whether MuJoCo had contacts of these pairs when they were last amended.
+    """
+
+    met_any = False
 
     @functools.cached_property
     def _known(self):
@@ -112,9 +118,10 @@ class SolidContacts(SolidPairs):
         first = (self.part_of[geom[:, 0]] >= 0) & self.met[geom[:, 1]]
         mine = first | (self.part_of[geom[:, 1]] >= 0) & self.met[geom[:, 0]]
         mine &= (geom >= 0).all(axis=1)  # -1: a flex
-        if not mine.any():
+        self.met_any = bool(mine.any())
+        if not self.met_any:
             return False
-        rows, first = np.flatnonzero(mine), first[mine]
+        rows, first = mine.nonzero()[0], first[mine]
         part = self.part_of[np.where(first, geom[rows, 0], geom[rows, 1])]
         shape = self.shape_of[np.where(first, geom[rows, 1], geom[rows, 0])]
         wide = rows[contacts["includemargin"][rows] > 0.0]

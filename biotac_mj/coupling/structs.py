@@ -357,6 +357,11 @@ class DataView(_View):
             self.qpos[:] = before
             self._find_motion()
 
+    def set_velocity(self, velocity: np.ndarray) -> None:
+        """Makes the velocities of the degrees of freedom (nv,), and those of the bodies with them."""
+        self.qvel[:] = velocity
+        LIBRARY.mj_comVel(self.model.address, self.address)
+
     def _find_motion(self):
         for stage in (LIBRARY.mj_kinematics, LIBRARY.mj_comPos, LIBRARY.mj_comVel):
             stage(self.model.address, self.address)

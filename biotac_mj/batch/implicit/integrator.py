@@ -190,6 +190,16 @@ def respond(
 
 
 @wp.kernel
+def speed_up(
+    stopped: wp.array(dtype=int), step: float, qacc: wp.array2d(dtype=float), qvel: wp.array2d(dtype=float)
+):
+    """Velocities at the end of the step, in worlds where a solid part of a BioTac stops a body."""
+    w, i = wp.tid()
+    if stopped[w] == 1:
+        qvel[w, i] = qvel[w, i] + step * qacc[w, i]
+
+
+@wp.kernel
 def write_slope(c: Correction):
     """Writes the slope; a skin that does not act is not corrected."""
     w, k, column = wp.tid()

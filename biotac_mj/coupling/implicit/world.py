@@ -64,7 +64,7 @@ class World:
         self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
         self._held_trees = np.zeros(model.ntree, bool)  # see `_go_on`
         self._loads = None
-        self._solids = [SolidContacts(model, one.touching) for one in self.instances.values()]
+        self._solids = {i: SolidContacts(model, one.touching) for i, one in self.instances.items()}
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -111,7 +111,7 @@ class World:
                     raise
 
     def _amend_contacts(self):
-        amended = [one.amend(self.data) for one in self._solids] if self.data.ncon else []
+        amended = [one.amend(self.data) for one in self._solids.values()] if self.data.ncon else []
         if any(amended):
             self.data.make_constraints()
 
@@ -181,13 +181,25 @@ class World:
             self._refuse_reset()
         if not instance.two_way:
             instance.forget_last_solve()
-            bodies, step = instance.kinematics, self.model.opt.timestep
-            core = bodies.core_motion(step, 0.0, np.zeros(self.model.nv)) if instance.inertial else ()
-            instance.solve_for_pose(*bodies.predict(step), core)
+            self._solve_one_way(instance)
         elif instance.index == self.first:
             for other in self.coupled:
                 other.forget_last_solve()
             self._step()
+
+    def _solve_one_way(self, instance):
+        """Solves a skin that pushes nothing where MuJoCo takes the bodies: at their velocities, or where its
+        core, nail or clamp stops one, at those of the step's end."""
+        bodies, step, data = instance.kinematics, self.model.opt.timestep, self.data
+        before = None
+        if data.ncon and self._solids[instance.index].met_any:
+            before = data.qvel.copy()
+            data.set_velocity(before + step * data.acceleration())
+        core = bodies.core_motion(step, 0.0, np.zeros(self.model.nv)) if instance.inertial else ()
+        pose = bodies.predict(step)
+        if before is not None:
+            data.set_velocity(before)
+        instance.solve_for_pose(*pose, core)
 
     def failed(self, index: int) -> None:
         """After an exception: no skin that was being solved is known, and none acts."""
