@@ -22,6 +22,15 @@ def pytest_collection():
     gc.disable()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Marks the tests of slow.txt, before pytest leaves out what is marked."""
+    slow = set((REPO / "tests" / "slow.txt").read_text().splitlines())
+    for item in items:
+        if not slow.isdisjoint((item.nodeid, item.nodeid.partition("[")[0])):
+            item.add_marker("slow")
+
+
 def pytest_collection_finish():
     """What a process has imported by now stays: without it a collection, of which there are hundreds, takes
     0.6 s."""
