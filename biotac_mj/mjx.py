@@ -172,11 +172,10 @@ def make_data(model: Model, seed: "jax.typing.ArrayLike" = 0) -> Data:
 
     fields = {name: jnp.asarray(value[0]) for name, value in model.rest.items()}
     row, seed = fields["skins"], jnp.asarray(seed, jnp.uint32)
-    for number, (seeds, pool) in enumerate(model.draws):
-        own = seed + jnp.uint32(number * _NEXT)
+    for at_seed, pool in model.draws:
         for at, words in pool:
-            row = row.at[at : at + words.shape[1]].set(jnp.asarray(words)[own % len(words)])
-        row = row.at[seeds].set(own)
+            row = row.at[at : at + words.shape[1]].set(jnp.asarray(words)[seed % len(words)])
+        row = row.at[at_seed].set(seed)  # the lower word: the upper one is of the BioTac's name
     return Data(**{**fields, "skins": row})
 
 
@@ -213,8 +212,6 @@ def readings(model: Model, data: Data, prefix: str = "biotac_") -> dict[str, "ja
 
 
 # --- JAX's side ---
-
-_NEXT = 0x9E3779B9  # difference between the seeds of a world's BioTacs
 
 
 @functools.cache

@@ -12,6 +12,7 @@ import test_batch
 from test_batch import RADIUS, make, read, shell
 
 import biotac_mj
+from biotac_mj import batch as batches
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
@@ -163,6 +164,42 @@ def test_worlds_begin_as_singles_of_their_seeds():
         made = heat[w, BODIES + MADE : BODIES + MADE + 3]
         state = data.plugin_state
         assert any((state[i : i + 3] == made).all() for i in np.flatnonzero(state == made[0]))
+
+
+def test_noise_is_of_the_seed_and_the_name():
+    """Two sensors of one seed have their own, in worlds as in singles; the default name's is the seed's."""
+    names = {"a_": 0.0, "b_": 0.1}
+
+    def spec():
+        made = mujoco.MjSpec.from_string('<mujoco><option timestep="0.008"/></mujoco>')
+        return made, dict(body="world", skin=shell())
+
+    def single(names, seed):
+        made, how = spec()
+        fingers = [
+            biotac_mj.attach(made, prefix=p, pos=(0, 0, z), seed=seed, **how) for p, z in names.items()
+        ]
+        data = mujoco.MjData(model := made.compile())
+        for _ in range(4):
+            mujoco.mj_step(model, data)
+        return [finger.read(data, "pac") for finger in fingers]
+
+    made, how = spec()
+    for prefix, z in names.items():
+        batches.add(made, prefix=prefix, pos=(0, 0, z), **how)
+    mjm = made.compile()
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, mujoco.MjData(mjm), nworld=2)
+    kept = [batches.attach(mjm, m, d, prefix=prefix, skin=how["skin"], seed=7) for prefix in names]
+    for _ in range(4):
+        mjw.step(m, d)
+    for prefix, mine in zip(names, single(names, 8)):
+        at = mjm.sensor(f"{prefix}pac")
+        np.testing.assert_array_equal(d.sensordata.numpy()[1, at.adr[0] : at.adr[0] + at.dim[0]], mine)
+    (a, b), (same,), (default,) = single(names, 8), single({"b_": 0.0}, 8), single({"biotac_": 0.0}, 8)
+    np.testing.assert_array_equal(b, same)
+    assert (a != b).any() and (a != default).any() and len(kept) == 2
+    assert Config(name="biotac_", seed=8).noise_seed() == 8
+    assert 0 <= Config(name="a_").noise_seed(2**64 - 1) < 2**64
 
 
 def test_lists_give_every_world_its_own_and_stay():

@@ -425,4 +425,6 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
         if skin.data.rests is not None:  # fillings that differ: each rests at its own
             film.calibrate(skin.data.rest_vert)
     settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
-    return Senses(skin, film, touching.group, rows, redraw, seed, float(mjm.opt.timestep), **settings)
+    seeds = [int(seed) + w for w in range(nworld)] if np.ndim(seed) == 0 else [int(s) for s in seed]
+    seeds = [config.noise_seed(s) for s in seeds]
+    return Senses(skin, film, touching.group, rows, redraw, seeds, float(mjm.opt.timestep), **settings)

@@ -46,8 +46,8 @@ def attach(
       site, body: where the BioTac is fixed: the name of a site or of a body, one of them. body="world" is the
         world.
       pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame at that site or body.
-      prefix: of every name that is added. Give each BioTac of a model its own, and its own `seed`: those of
-        one seed have the same noise.
+      prefix: of every name that is added. Give each BioTac of a model its own, by which its noise and what is
+        drawn are its own too.
       slots: how many bodies may touch two-way. None: as many as are in `spec`, and 64 more.
       settings: what the BioTac is made with, for code that gives the same to several functions: Settings, a
         dict of its fields, or a .json file of them.

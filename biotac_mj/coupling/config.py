@@ -153,6 +153,12 @@ class Config:
         """Seed of this sensor's random draws: `seed`, or the configured one, and its name."""
         return [self.seed if seed is None else int(seed), zlib.crc32(self.name.encode())]
 
+    def noise_seed(self, seed: int | None = None) -> int:
+        """Seed of this sensor's noise, below 2^64: `seed`, or the configured one, below a word of its name,
+        so that sensors of one seed have noise of their own. The default name's word is zero."""
+        word = zlib.crc32(self.name.encode()) ^ zlib.crc32(b"biotac_")
+        return (self.own_seed(seed)[0] + (word << 32)) % 2**64
+
     def _set(self, name, value):
         object.__setattr__(self, name, value)
 

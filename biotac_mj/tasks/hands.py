@@ -1,7 +1,6 @@
 """BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, Aero, the gripper
 2F-85, any other by body name."""
 
-import dataclasses
 import functools
 import itertools
 import operator
@@ -14,7 +13,7 @@ import numpy as np
 
 from ..coupling.config import OWN, SOLID, TO_COME, collides
 from ..coupling.settings import SettingKeywords, Settings
-from ..fields import as_whole, check_choice
+from ..fields import check_choice
 from ..geometry.assets import asset_path
 from ..short_repr import short_repr
 from .mounts import Mount, read_mounts
@@ -96,7 +95,7 @@ def attach_to_hand(
       prefix: each finger's names begin with link_prefix + prefix + finger + "_".
       slots: number of bodies that may touch each BioTac with two-way coupling; None: number of those outside
         the hand, and 64 more.
-      settings, keywords: as for `biotac_mj.attach`, for every finger (each has its own noise seed).
+      settings, keywords: as for `biotac_mj.attach`, for every finger.
 
     Returns:
       {finger: Handle}, in the order of `fingers`; of a batch {finger: prefix}, for `biotac_mj.batch.attach`.
@@ -169,8 +168,8 @@ def attach_to_hand(
             if collides(g, every) and g.parent.name not in names
         }
         slots = len(outside) + (len(names) if self_touch else 0) + TO_COME
-    handles, seed = {}, as_whole("seed", chosen.seed, 0)
-    for i, (finger, link) in enumerate(links.items()):
+    handles = {}
+    for finger, link in links.items():
         handles[finger] = attach(
             spec,
             body=link.name,
@@ -178,7 +177,7 @@ def attach_to_hand(
             quat=mounts[finger].quat,
             prefix=f"{prefix}{finger}_",
             slots=slots,
-            settings=dataclasses.replace(chosen, seed=seed + i),
+            settings=chosen,
         )
     _give_masks(spec, {handle.body: masks[finger] for finger, handle in handles.items()})
     if not self_touch:

@@ -40,7 +40,7 @@ class SensorReadings:
     _more = {"cold": bool}
 
     def __init__(self, config: Config, geometry: SkinGeometry):
-        self._config, self._geometry, self._seed = config, geometry, config.seed
+        self._config, self._geometry, self._seed = config, geometry, config.noise_seed()
         settings = check_settings(config.options.get("readings", {}), self._more, design=geometry.design)
         self._film = film_of(config, geometry)
         self.sensor, self._options, _ = take_sensor(settings, config.own_seed(), geometry.design)

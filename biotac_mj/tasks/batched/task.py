@@ -135,8 +135,7 @@ class BatchTask(abc.ABC):
             friction = self._uniform(*s.friction, n).cpu().numpy()
             own = {"friction": friction} | touching | biotac
             self.batches = {
-                finger: batch.attach(mjm, m, d, prefix=p, seed=1000 * i + seed, **own)
-                for i, (finger, p) in enumerate(prefixes.items())
+                finger: batch.attach(mjm, m, d, prefix=p, seed=seed, **own) for finger, p in prefixes.items()
             }
         tensor = functools.partial(torch.as_tensor, device=self.device)
         self.qpos, self.qvel, self._ctrl = (wp.to_torch(a) for a in (d.qpos, d.qvel, d.ctrl))

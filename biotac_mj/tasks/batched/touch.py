@@ -114,8 +114,8 @@ class Touch:
     def reseed(self, worlds: torch.Tensor, seed: torch.Tensor) -> None:
         """Gives worlds (k,) other seeds, of seed (nworld,): of their noise, and of the sensor that the next
         reset draws. States that were kept have one."""
-        for i, (seeds, drawn) in enumerate(zip(self._seeds, self._drawn, strict=True)):
-            seeds[worlds] = seed[worlds] + i
+        for seeds, drawn in zip(self._seeds, self._drawn, strict=True):
+            seeds[worlds] = (seeds[worlds] >> 32 << 32) + seed[worlds]  # the upper word is of the name
             drawn[worlds] = 1
 
 
