@@ -12,6 +12,8 @@ import hashlib
 import io
 import os
 import pathlib
+import sys
+import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -26,6 +28,18 @@ _FORMAT = "2"  # of keys and files
 _SKIN = ("geometry", "skin")  # folders whose code makes most arrays
 _LARGEST = 4  # default limit of the folder, see BIOTAC_CACHE_GB [GB]
 _PACKAGE = pathlib.Path(__file__).parent
+_PATIENCE = 5.0  # [s] before a note says what takes so long
+_LONG = {
+    "grid": "computing the distances around a mesh",
+    "spline": "interpolating the distances around a mesh",
+    "core": "finding where the skin may meet the core",
+    "rest": "filling the skin",
+    "rests": "filling the skins",
+    "modes": "computing the skin's modes",
+    "film": "laying out the film of liquid",
+    "stiffness": "computing the stiffness of the condensed skin",
+    "vector": "computing forces of the condensed skin",
+}
 
 
 def cache_folder() -> pathlib.Path:
@@ -145,9 +159,24 @@ def cached(
     entry = Entry(kind, inputs, code)
     found = entry.load()
     if found is None:
-        found = make()
+        with _announced(kind):
+            found = make()
         entry.save(found)
     return found
+
+
+@contextlib.contextmanager
+def _announced(kind):
+    """Says on standard error what is made, if it takes long."""
+    text = f"biotac_mj: {_LONG.get(kind)} once on this machine: it is read from disk afterwards"
+    timer = threading.Timer(_PATIENCE, print, [text], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    if kind in _LONG:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def touch(path: pathlib.Path) -> None:

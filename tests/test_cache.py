@@ -8,6 +8,7 @@ import os
 import pathlib
 import re
 import sys
+import time
 import types
 
 import numpy as np
@@ -307,6 +308,15 @@ def test_a_bad_file_of_a_skin_does_not_reach_who_comes_next(content):
     pathlib.Path(path).write_bytes(content)
     assert skin_reference(GEOMETRY)[0] == path
     assert np.array_equal(load_skin(path).electrode_pos, GEOMETRY.electrode_pos)
+
+
+def test_what_takes_long_is_said(monkeypatch, tmp_path, capsys):
+    """Only then, and not where it is read from disk."""
+    monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path))
+    monkeypatch.setattr(cache, "_PATIENCE", 0.05)
+    for seconds, says in ((0.5, True), (0.5, False), (0.0, False)):
+        cache.cached("grid", [seconds], lambda seconds=seconds: time.sleep(seconds) or {"a": np.zeros(1)}, ())
+        assert ("biotac_mj: computing the distances around a mesh once" in capsys.readouterr().err) == says
 
 
 def test_a_skin_is_stored_where_the_cache_cannot_be(monkeypatch, tmp_path):
