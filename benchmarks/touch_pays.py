@@ -3,7 +3,7 @@ skin and another sensor.
 
     python benchmarks/touch_pays.py --json out/touch_pays.json --device cuda:0 [--tasks insert_peg ...]
         [--observe electrodes none ...] [--seeds 0 1 2 3 4] [--worlds 512] [--minutes 10] [--policies DIR]
-        [--hand DIR/shadow_hand/right_hand.xml] [--transfer 64]
+        [--hand DIR/shadow_hand/right_hand.xml] [--transfer 64 [--to tier]]
     python benchmarks/touch_pays.py --score out/policies --transfer 16 --json OUT     # of policies that are
     python benchmarks/touch_pays.py --table OUT [OUT ...] [--draw FILE.png]
 
@@ -12,7 +12,8 @@ learned electrodes in a batch of their own. Success is that of one more episode 
 that no policy has seen, without exploration; its interval is Wilson's, of 95 %.
 
 --transfer N: the same policies, side by side in N worlds each, with the default skin in the full tier, on
-other random sensors with another gain of PDC and three effects that learning did not have (UNSEEN)."""
+other random sensors with another gain of PDC and three effects that learning did not have (UNSEEN). --to tier
+changes the tier alone, --to skin the tier and the skin."""
 
 import argparse
 import functools
@@ -25,18 +26,24 @@ import time
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-__all__ = ["UNSEEN", "draw", "main", "table", "transfer"]
+__all__ = ["CHANGES", "UNSEEN", "draw", "main", "table", "transfer"]
 
 UNSEEN = ("dead", "crosstalk", "relax")
-OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": (*UNSEEN, "pdc_gain")}
+_TIER = {"tier": "full"}
+_SKIN = {"skin": "default", **_TIER}
+CHANGES = {
+    "tier": _TIER,
+    "skin": _SKIN,
+    "sensor": {"sensor": "random", "randomise": (*UNSEEN, "pdc_gain"), **_SKIN},
+}  # of the environment in which a policy learned
 
 
-def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict]:
-    """Scores of policies of one task in OTHER worlds, in which they play side by side; those that feel
+def transfer(paths: list[pathlib.Path], worlds: int, to: str = "sensor", **own: object) -> list[dict]:
+    """Scores of policies of one task in other worlds, in which they play side by side; those that feel
     learned electrodes in worlds of their own.
 
     Args:
-      paths: of the policies. worlds: of each. own: further keywords of `make`.
+      paths: of the policies. worlds: of each. to: of CHANGES. own: further keywords of `make`.
     """
     from biotac_mj.tasks.batched.playing import HELD_OUT, acting, env_of, play
     from biotac_mj.tasks.batched.policy import read_card
@@ -47,7 +54,7 @@ def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict
         if not some:
             continue
         signal = "learned" if learned else "electrodes"
-        more = {"seed": HELD_OUT, **OTHER, **own}
+        more = {"seed": HELD_OUT, **CHANGES[to], **own}
         env = env_of(cards[some[0]], worlds * len(some), observe=signal, **more)
         acts = []
         for i, path in enumerate(some):
@@ -206,6 +213,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--resume", action="store_true", help="go on from what is in --policies")
     parser.add_argument("--hand", type=pathlib.Path, help="shadow_hand/right_hand.xml of MuJoCo Menagerie")
     parser.add_argument("--transfer", type=int, default=0, help="worlds of another skin and sensor")
+    parser.add_argument("--to", choices=CHANGES, default="sensor", help="the last change of --transfer")
     options = parser.parse_args(arguments)
     if options.table:
         found = _joined([json.loads(path.read_text(encoding="utf-8")) for path in options.table])
@@ -238,7 +246,7 @@ def main(arguments=None) -> int:
         for task in options.tasks:
             paths = sorted(folder.glob(f"{task}-*.safetensors"))
             more = {"device": options.device, **own.get(task, {})}
-            found["transfer"] += transfer(paths, options.transfer, **more) if paths else []
+            found["transfer"] += transfer(paths, options.transfer, options.to, **more) if paths else []
             written(found["policies"])
     print(table(found))
     return 0

@@ -599,6 +599,26 @@ def test_files_of_touch_are_read_and_drawn_as_one(tmp_path, accuracy, capsys):
         assert min(image.size) > 200
 
 
+@pytest.mark.parametrize("to, changed", [("tier", 1), ("skin", 2), ("sensor", 4)])
+def test_policies_play_where_one_thing_more_differs(to, changed, tmp_path, accuracy, monkeypatch):
+    """The rest stays as the card has it."""
+    import touch_pays
+
+    from biotac_mj.tasks.batched import playing, policy
+
+    card = {"task": "follow_edge", "observe": "electrodes", "seed": 0}
+    card["biotac"] = {"tier": "condensed", "skin": "coarse", "sensor": "epfl_f1", "randomise": ["gain"]}
+    policy.save_policy(tmp_path / "follow_edge-electrodes-0.safetensors", policy.Policy(33, 4), card)
+    made = {}
+    monkeypatch.setattr(
+        playing, "make", lambda task, n, **k: made.update(k, n=n) or SimpleNamespace(device="cpu")
+    )
+    monkeypatch.setattr(playing, "play", lambda env, acts: [{"success": 0.5} for _ in acts])
+    (score,) = touch_pays.transfer([*tmp_path.glob("*.safetensors")], 3, to)
+    assert score == {"task": "follow_edge", "observe": "electrodes", "seed": 0, "success": 0.5}
+    assert made["n"] == 3 and sum(made[name] != value for name, value in card["biotac"].items()) == changed
+
+
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
 
 
