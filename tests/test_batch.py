@@ -482,8 +482,8 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
 
 
 def test_a_step_without_a_balance_pulls_no_ball():
-    """Of 100 g, in `mj_step` and in a batch, with less work than `mj_step` has by default. Which solves are cut
-    off as a ball leaves skin that lay on the core is a matter of rounding: some of these speeds have one."""
+    """Of 100 g, in `mj_step` and in a batch, with less work than by default. Which solves are cut off as a
+    ball leaves skin that lay on the core is a matter of rounding: some of these speeds have one."""
     unsettled, little = np.zeros(2), {"skin": {"max_work": 80}}
     for speed in (0.5, 0.52, 0.6, 0.65):
         spec = mujoco.MjSpec()

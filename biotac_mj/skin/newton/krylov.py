@@ -95,8 +95,8 @@ def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_ac
 
 @wp.kernel
 def choose_beta(tolerance: real, partial: wp.array3d(dtype=real), st: Worlds):
-    """Ends the linear solve of world w if it has reduced r . z, the square of the error, to a hundredth, or to
-    half of Newton's tolerance. partial: r . z."""
+    """Ends the linear solve of world w if it has reduced r . z, the square of the error, to a hundredth, or
+    the error to half of Newton's tolerance. partial: r . z."""
     w, t = wp.tid()
     if st.running[w] == 0:
         return
