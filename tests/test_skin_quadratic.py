@@ -287,7 +287,8 @@ def test_cuda_equals_cpu(law):
         results.append((elements.force(x), elements.product(rng.standard_normal(x.shape))))
         folded = x.copy()
         folded[model.geometry.elem[5, 0], 1] += 0.1
-        assert elements.upright(x).all() and elements.upright(folded).tolist() == [True, False, True]
+        assert elements.upright(x).all()
+        assert elements.upright(folded).tolist() == [True, law == "linear", True]  # small strain has no flaw
     for cpu, cuda, close in zip(*results, (1e-11, 1e-5), strict=True):
         assert abs(cpu - cuda).max() < close * abs(cpu).max()
 

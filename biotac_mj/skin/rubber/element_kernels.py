@@ -106,23 +106,22 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
     corners, averaged, is_single = kind.corners, kind.averaged, kind.is_single
     corotational, precision, gradients = kind.corotational, kind.precision, kind.gradients(kind.precision)
     scalar, vec, thin = precision.scalar, precision.vec, precision.narrow
-    directions, deformation = wp.types.matrix(shape=(3, corners), dtype=scalar), deformation_of(corners)
+    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
     f = material_functions(kind)
 
     @wp.func
     def point_state(
-        e: int,
-        q: int,
+        i: int,
         w: int,
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
+        X: directions,
+        slopes: gradients,
+        B: precision.mat,
         F: wp.array2d(dtype=mat33),
         R: wp.array2d(dtype=mat33),
     ):
-        """Deformation gradient and rotation of point q."""
-        i = wp.static(kind.npoint) * e + q
+        """Deformation gradient and rotation of point i; slopes: of the shape functions there."""
         if wp.static(is_single):
-            here = thin(deformation(mesh, e, q, x, w))
+            here = X * slopes * B
             return here, f.rotation_thin(here)
         elif wp.static(corotational):
             return F[i, w], R[i, w]
@@ -149,12 +148,17 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         if on[w] == 0:
             return
         D = directions()
+        X = directions()  # positions from the first node: their differences have the digits that are needed
         first = mesh.elem[0, e]
         for a in range(1, wp.static(corners)):
             n = mesh.elem[a, e]
             d = p[n, w] - p[first, w]
             for c in range(3):
                 D[c, a] = d[c]
+            if wp.static(is_single):
+                v = x[n, w] - x[first, w]
+                for c in range(3):
+                    X[c, a] = scalar(v[c])
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = f.local_lame(mu, lam, cap)
@@ -169,7 +173,8 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
                 mean = scalar(0.0)
                 for q in range(npoint):
                     B = thin(mesh.inverse[e, q])
-                    F, R = point_state(e, q, w, mesh, x, deformation_in, rotation_in)
+                    i = wp.static(kind.npoint) * e + q
+                    F, R = point_state(i, w, X, shape[q], B, deformation_in, rotation_in)
                     dF = D * shape[q] * B
                     mean += scalar(mesh.weight[e, q]) * wp.ddot(f.direction_of(rubber.law, F, R), dF)
                 stiff = scalar((lam - local) / mesh.volume[e]) * mean
@@ -177,7 +182,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         for q in range(npoint):
             i = npoint * e + q
             B = thin(mesh.inverse[e, q])
-            F, R = point_state(e, q, w, mesh, x, deformation_in, rotation_in)
+            F, R = point_state(i, w, X, shape[q], B, deformation_in, rotation_in)
             dF = D * shape[q] * B
             dP = f.change_of(rubber, e, i, w, mu, local, mean_pressure, F, R, dF)
             if wp.static(averaged):
