@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,7 @@ from biotac_mj import cli
 from biotac_mj.calibration import plan_indentation
 from biotac_mj.data.generation.clearance import surface_samples
 from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
-from biotac_mj.differentiable.estimation import fitting, presses
+from biotac_mj.differentiable.estimation import fitting, presses, verbs
 from biotac_mj.differentiable.estimation.belief import believe
 from biotac_mj.differentiable.estimation.estimate import touch_of
 from biotac_mj.differentiable.estimation.presses import capsule_of, deepest, outcome_of
@@ -88,8 +89,8 @@ def pressed(estimator):
 def test_starts_are_the_presses_of_the_full_skin_roughly(estimator):
     """By the condensed tier: force, place and readings."""
     one = copy.copy(estimator.presses)
-    along, around = one._capsule.along[:1], one._capsule.around[:1]
-    one._capsule = dataclasses.replace(one._capsule, along=along, around=around)
+    along, around = one.capsule.along[:1], one.capsule.around[:1]
+    one.capsule = dataclasses.replace(one.capsule, along=along, around=around)
     whole, one._slopes = one._make(), False
     alone = one._make()
     assert alone.keys() == {"signal", "outcome"} and len(whole) == 5
@@ -171,16 +172,35 @@ def test_a_presss_own_settings_are_taken_from_its_file(tmp_path):
     assert settings_of(tmp_path / "readings.csv", one) is None
 
 
-def press_into(folder, depth=5e-4):
+def press_into(folder, depth=5e-4, **more):
     """A folder of a light press, of four steps."""
     folder.mkdir()
-    settings = {"skin": "coarse", "tier": "condensed", "indenter": "sphere_7mm"}
-    record = pressed_record(
-        PressOptions(depth=depth, speed=depth / 16e-3, hold=0.0, **settings), progress=False
-    )
+    settings = {"skin": "coarse", "tier": "condensed", "indenter": "sphere_7mm", "hold": 0.0}
+    settings = {"speed": depth / 16e-3, **settings, **more}
+    record = pressed_record(PressOptions(depth=depth, **settings), progress=False)
     write_readings(record.record, folder / "readings.csv")
     write_skin(record.record, folder / "skin.h5")
     return folder
+
+
+def test_rows_in_motion_are_read_at_their_time(tmp_path):
+    """The multiplexer's are up to a frame and a step old: many times the noise at 20 mm/s."""
+    folder = press_into(tmp_path / "a", depth=2e-3, slide=1e-3, speed=20e-3, hold=0.03)
+    recording, _ = load_one(folder / "readings.csv")
+    with h5py.File(folder / "skin.h5") as file:
+        nodes = file["vert_xpos"][:].astype(float)
+    film = FilmConduction(load_skin("coarse"))
+    change = np.log([film.impedance(x[: film.geometry.nvert]) for x in nodes])
+    counts, _ = recording.counts()
+    read, noise = verbs._instants(recording, counts, recording.pdc, True), fitting.noise_of(counts[0], 1)
+    raw, told = [], []
+    for row in range(10, len(counts) - 5):
+        found, _, moved = read(row)
+        spread = np.hypot(noise, moved * fitting.slopes_at(found))[:19]
+        told.append((change_of(found, counts[0]) - change[row] + change[0]) / spread)
+        raw.append((change_of(counts[row], counts[0]) - change[row] + change[0]) / noise[:19])
+    raw, told = (np.square(off).mean(1) for off in (raw, told))
+    assert raw.max() > 10 and told.max() < 4 and np.median(told) < 1.5, (raw.round(1), told.round(1))
 
 
 def test_a_tilts_slope_is_that_of_tilted_presses(estimator):

@@ -20,7 +20,7 @@ from ...sensor.film import FilmConduction
 from ...skin import Material, SkinOptions
 from ..skin import Skin
 from .belief import FORCE, PLACE, Belief, Posterior, Touch, believe, learn
-from .fitting import fit, noise_of
+from .fitting import fit, noise_of, slopes_at
 from .presses import Presses
 
 # Ratio of half widths of 95 % intervals to standard deviations, of ln of the force and of the centre: FITTED
@@ -73,6 +73,31 @@ def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
                 "at its end tells no impedance; choose another row"
             )
     return log_impedance(counts) - log_impedance(rest)
+
+
+def at_instant(
+    time: np.ndarray, values: np.ndarray, row: int, period: float, late: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n, k) of channels at the time of a row, and how far off they may be by motion, (k,) each.
+
+    A multiplexer holds a value for a frame: in a row it is half a frame old in the mean. So a mean over the
+    frame that follows is of the row's time. While a geom slides, what is a frame old may be off by ten times
+    the noise.
+
+    Args:
+      time: (n,) [s]. period: of a frame [s]. late: (k,) mean age of the values beyond half a frame [s].
+    """
+    begin = time[row] + late + np.zeros(values.shape[1])
+    inside = (time[:, None] > begin - 1e-6) & (time[:, None] < begin + period + 1e-6)
+    inside[-1] |= ~inside.any(0)
+    value = np.where(inside, values, 0).sum(0) / inside.sum(0)
+    first = max(np.searchsorted(time, time[row] - period + 1e-6, "right") - 1, 0)
+    last = len(time) - 1 - inside[::-1].argmax(0)
+    rate = np.abs(values[last, np.arange(values.shape[1])] - values[first]) / np.maximum(
+        time[last] - time[first], 1e-6
+    )
+    unsure = period if len(time) < 2 else min(period, float(np.median(np.diff(time))))
+    return value, rate * unsure / np.sqrt(12)
 
 
 def touch_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -144,6 +169,7 @@ class Estimator:
         pdc: tuple[float, float] | None = None,
         rows: int = 1,
         film: dict | None = None,
+        moved: np.ndarray | None = None,
     ) -> Estimate:
         """The contact for which the simulated sensor itself reads counts (nelectrode,), and `rest` without
         contact.
@@ -151,6 +177,7 @@ class Estimator:
         Args:
           pdc: its counts, with and without contact; None: unknown. rows: number of rows averaged for `rest`.
           film: settings of `sensor.film.FilmConduction`, if changed.
+          moved: (nelectrode,), with pdc and its own, standard deviations by motion, see `at_instant`.
 
         Raises:
           ValueError: shapes, counts that hardly differ from rest, or a press that cannot be simulated.
@@ -159,6 +186,8 @@ class Estimator:
         signal = change if pdc is None else np.append(change, pressure_change(*pdc))
         film = FilmConduction(self.geometry, **(film or {}))
         noise = noise_of(np.asarray(rest, float), rows)[: len(signal)]
+        if moved is not None:
+            noise = np.hypot(noise, moved * slopes_at(np.asarray(counts, float))[: len(signal)])
         found = fit(self._starts, film, signal, noise, self.progress)
         spread = np.sqrt(np.diag(found.covariance))
         wide_force, wide = OWN_WIDE

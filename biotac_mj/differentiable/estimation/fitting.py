@@ -22,7 +22,7 @@ from .presses import Presses, Solved, frame_of
 
 _STARTS, _SPACING = 3, 2e-3  # starting positions from the table at most, and their least distance [m]
 _ITERATIONS, _LONGEST = 30, 1.0  # per start and tier; longest move of an iteration [mm]
-_STEP, _ROUGH = 2.5e-4, 5e-4  # [m] longest step of a path, of one by the condensed tier
+_STEP = 5e-4  # [m] longest step of a path: forces are those of steps of a quarter to 0.5 %
 _SLIDE = 1.0  # [mm] standard deviation of a slide that follows a press, in each of two directions
 _APART = np.array([0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05])  # of coordinates in differences [mm], [rad]
 # least gain of -2 ln of the likelihood to go on for: well inside the interval; by the condensed tier
@@ -80,9 +80,14 @@ class _Press:
 def noise_of(rest: np.ndarray, rows: int) -> np.ndarray:
     """(nelectrode + 1,) standard deviations of one row's change of ln Z and pressure [kPa] from the mean of
     `rows` rows of rest (nelectrode,) [counts]."""
-    slope = 0.5 * np.abs(log_impedance(rest + 1) - log_impedance(rest - 1))
-    count = 1e-3 * (pressure_from_counts(1.0) - pressure_from_counts(0.0))
-    return np.append(electrode_noise(rest) * slope, count) * np.sqrt(1 + 1 / rows)
+    return np.append(electrode_noise(rest), 1.0) * slopes_at(rest) * np.sqrt(1 + 1 / rows)
+
+
+def slopes_at(counts: np.ndarray) -> np.ndarray:
+    """(nelectrode + 1,) sizes of the slopes of ln Z at counts (nelectrode,), and of pressure [kPa], by the
+    counts."""
+    slope = 0.5 * np.abs(log_impedance(counts + 1) - log_impedance(counts - 1))
+    return np.append(slope, 1e-3 * (pressure_from_counts(1.0) - pressure_from_counts(0.0)))
 
 
 def fit(
@@ -95,8 +100,12 @@ def fit(
     """
     found = []
     with tqdm(desc="estimate: fit", unit="press", disable=not progress or None, leave=False) as bar:
-        for start in _starts(presses, signal, noise):
-            press = _Search(presses, film, signal, noise, start, bar).run()
+        searches = [
+            _Search(presses, film, signal, noise, start, bar) for start in _starts(presses, signal, noise)
+        ]
+        rough = [(press, search) for search in searches if (press := search.rough()) is not None]
+        for start, search in sorted(rough, key=lambda one: one[0].cost):
+            press = search.fine(start)
             found += [press] if press is not None else []
             if found and found[-1].explains:
                 break
@@ -140,15 +149,22 @@ class _Search:
 
     def __init__(self, presses, film, signal, noise, start, bar):
         self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
-        self._steps, self._bar = presses.path(*presses.at[start]), bar
+        self._steps, self._place, self._bar = presses.path(*presses.at[start]), presses.at[start, :2], bar
         self._axes = frame_of(self._steps, presses.at[start, 1])
         self._rest = np.log(film.impedance(presses.skin.model.rest.vert[: presses.geometry.nvert]))
 
-    def run(self) -> _Press | None:
-        """The press of the condensed tier, and from it that of the full skin; None: none can be simulated."""
+    def rough(self) -> _Press | None:
+        """The press of the condensed tier; None: none can be simulated."""
         try:
             start = self._differentiated(self._approximated(np.zeros(len(_PRIOR))))
-            start = self._differentiated(self._fitted(start, self._approximated, _ROUGHLY))
+            return self._fitted(start, self._approximated, _ROUGHLY)
+        except _IMPOSSIBLE:
+            return None
+
+    def fine(self, start: _Press) -> _Press | None:
+        """The press of the full skin from that of the condensed tier; None: it cannot be simulated."""
+        try:
+            start = self._differentiated(start)
             by = {"missed_by": start.missed_by, "outcome_by": start.outcome_by}
             press = dataclasses.replace(self._simulate(start.at), **by)
             return self._with_secants(self._fitted(press, self._simulate, _CONVERGED))
@@ -208,14 +224,22 @@ class _Search:
                 break
         return press
 
-    def _path(self, at, step=_STEP):
-        """Poses (nstep, 1, 3) [m], (nstep, 1, 3, 3) of a press: moved by the first three coordinates [mm],
-        tilted by two [rad], and then slid by two [mm]."""
+    def _path(self, at):
+        """Poses (nstep, 1, 3) [m], (nstep, 1, 3, 3) of a press at seven coordinates: moved along and around
+        the finger, deeper [mm], tilted by two [rad], and then slid by two [mm]. The skin's curvature is in
+        the moves, so that a place is changed at a depth."""
+        capsule, (along, around) = self._presses.capsule, self._place
+        around_by = 1e-3 / (capsule.radius * max(np.cos(capsule.turn(along)), 0.3))
+        there = along + 1e-3 * at[0], around + around_by * at[1]
+        moved = capsule.frame(*there).T @ capsule.frame(*self._place)
         turn = Rotation.from_rotvec(at[3:5] @ self._axes).as_matrix()
-        down, slide = turn @ (self._steps.pos[-1] - self._steps.pos[0])[0], 1e-3 * at[5:] @ self._axes
-        first, then = (np.linspace(0, 1, _count(leg, step))[:, None] * leg for leg in (down, slide))
-        pos = self._steps.pos[0] + 1e-3 * at[:3] + np.concatenate([first, down + then[1:]])
-        return pos[:, None], np.repeat((turn @ self._steps.mat[0])[None], len(pos), axis=0)
+        start, down = self._steps.pos[0, 0], (self._steps.pos[-1] - self._steps.pos[0])[0]
+        down = turn @ down * (1 + 1e-3 * at[2] / np.linalg.norm(down))
+        slide = 1e-3 * at[5:] @ self._axes
+        first, then = (np.linspace(0, 1, _count(leg))[:, None] * leg for leg in (down, slide))
+        pos = start - capsule.at(*self._place) + np.concatenate([first, down + then[1:]])
+        pos = pos @ moved.T + capsule.at(*there)
+        return pos[:, None], np.repeat((moved @ turn @ self._steps.mat[0])[None], len(pos), axis=0)
 
     def _simulate(self, at):
         """Simulates a press of the full skin."""
@@ -227,7 +251,7 @@ class _Search:
 
     def _approximated(self, at):
         """Simulates a press of the condensed tier."""
-        *_, last = self._presses.approximate(*self._path(at, _ROUGH))
+        *_, last = self._presses.approximate(*self._path(at))
         return self._read(at, last)
 
     def _read(self, at, step: Solved):
@@ -267,6 +291,6 @@ def _corrected(press, begin, end, move, slope):
     return by, errors[0]
 
 
-def _count(leg, step):
+def _count(leg):
     """Points of a straight part of a path, two or more."""
-    return 1 + max(1, int(np.ceil(np.linalg.norm(leg) / step)))
+    return 1 + max(1, int(np.ceil(np.linalg.norm(leg) / _STEP)))

@@ -63,11 +63,16 @@ class Capsule:
         """Angle [rad] of the normal towards the tip; negative: to the base."""
         return (np.maximum(0, self.tip - along) - np.maximum(0, along - self.base)) / self.radius
 
-    def at(self, along: float, around: float) -> np.ndarray:
-        """(3,) point [m]."""
+    def frame(self, along: float, around: float) -> np.ndarray:
+        """(3, 3), its rows the outward normal, the direction around the finger, and the one along it."""
         turn = self.turn(along)
         out = np.array([-np.sin(turn), -np.cos(turn) * np.cos(around), np.cos(turn) * np.sin(around)])
-        return self.radius * out + [min(max(along, self.tip), self.base), 0, 0]
+        side = np.array([0, np.sin(around), np.cos(around)])
+        return np.array([out, side, np.cross(out, side)])
+
+    def at(self, along: float, around: float) -> np.ndarray:
+        """(3,) point [m]."""
+        return self.radius * self.frame(along, around)[0] + [min(max(along, self.tip), self.base), 0, 0]
 
 
 def capsule_of(geometry: SkinGeometry) -> Capsule:
@@ -170,6 +175,7 @@ class Presses:
       outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) derivatives by tilts and fill.
       weight: (n,) ln of the fraction of the skin's area. deepest: (n,) whether it is the deepest at its
         position.
+      capsule: that of the places.
     """
 
     def __init__(
@@ -178,7 +184,7 @@ class Presses:
         self.skin, self.geometry, self._indenter, self._progress = skin, geometry, indenter, progress
         self._slopes = slopes
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
-        self._capsule = capsule = capsule_of(geometry) if slopes else coarser(capsule_of(geometry))
+        self.capsule = capsule = capsule_of(geometry) if slopes else coarser(capsule_of(geometry))
         axes = capsule.along, capsule.around, _FRACTIONS
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
@@ -229,7 +235,7 @@ class Presses:
 
     def path(self, along: float, around: float, fraction: float = 1.0) -> Steps:
         """The steps of a press at a position [m], [rad]."""
-        point, samples = self._capsule.at(along, around), len(_FRACTIONS) - 1
+        point, samples = self.capsule.at(along, around), len(_FRACTIONS) - 1
         plan = plan_indentation(self._indenter, point, _DEEPEST, 0.0, samples=samples, skin=self.geometry)
         part = fraction * deepest(plan, self._core_samples) / _DEEPEST
         return steps_of(dataclasses.replace(plan, tip=plan.tip[0] + part * (plan.tip - plan.tip[0])))[0]
@@ -244,7 +250,7 @@ class Presses:
     def _make(self):
         """The table: (along, around, fraction, ...) of each attribute, with the outcome's force divided by
         the fraction."""
-        capsule, width = self._capsule, self.geometry.design.nelectrode + 1
+        capsule, width = self.capsule, self.geometry.design.nelectrode + 1
         shape = len(capsule.along), len(capsule.around), len(_FRACTIONS)
         widths = {"signal": (width,), "outcome": (7,)}
         if self._slopes:

@@ -16,10 +16,11 @@ from ...geometry.skins import shipped_skin
 from ...recordings import Recording, load_one
 from ...recordings.formats.pressed import settings_of
 from ...recordings.recording import designed
+from ...sensor.acquisition_kernels import SLOT_RATE
 from ...sensor.presets import read_sensor
 from ...skin.settings import read_dict, read_settings
 from .belief import Touch
-from .estimate import Estimate, Estimator, change_of, pressure_change, touch_of
+from .estimate import Estimate, Estimator, at_instant, change_of, pressure_change, touch_of
 
 _VECTORS = "centre", "centre_error", "force"
 _ADDED = "sensor", "randomise", "effects", "signal", "friction", "thermal"  # keywords of a press
@@ -40,24 +41,26 @@ def estimate_verb(args: argparse.Namespace) -> None:
             f"the first {args.rest} are (--rest): leave it out"
         )
     rest, rows = _rest(args, counts), _rows(args, recording, counts)
+    pressed = settings_of(args.file, recording)
+    pdc = _pdc(recording)
+    read = _instants(recording, counts, pdc, pressed is not None)
     for row in rows:  # check before the work
         try:
-            touch_of(counts[row], rest)
+            touch_of(read(row)[0], rest)
         except ValueError as error:
             raise ValueError(f"row {row} of {recording.name}: {error}") from None
-    pressed = settings_of(args.file, recording)
     skin, indenter, settings, film = _inverted(args, pressed, designed(counts))
     simulated = pressed is not None and _is_the_simulated_one(args, pressed, settings.material)
     estimator = Estimator(load_skin(skin), indenter, settings.material, settings.options, not args.quiet)
     belief = estimator.learn(_touches(args)) if args.known else None
-    pdc = _pdc(recording)
     pdc_rest = None if pdc is None or len(counts) <= args.rest else pdc[: args.rest].mean()
 
     def estimate(row):
-        pressure = None if pdc_rest is None else (pdc[row], pdc_rest)
+        then, pressure, moved = read(row)
+        pressure = None if pdc_rest is None else (pressure, pdc_rest)
         if simulated:
-            return estimator.fit(counts[row], rest, pressure, args.rest, film)
-        return estimator(counts[row], rest, pressure, belief)
+            return estimator.fit(then, rest, pressure, args.rest, film, moved)
+        return estimator(then, rest, pressure, belief)
 
     if simulated and not args.quiet:
         print(f"note: fitting a press to each of {len(rows)} rows, seconds to a minute each", file=sys.stderr)
@@ -86,6 +89,22 @@ def estimate_verb(args: argparse.Namespace) -> None:
     print("  centre: on the line of force, nearest to the middle of the contact on the undeformed skin")
     if not (simulated or args.known):
         print("  the force is known to a factor only: touches of the same sensor (--known) narrow it")
+
+
+def _instants(recording, counts, pdc, simulated):
+    """A function of a row: electrodes (nelectrode,) and PDC at its time, and their deviations by motion."""
+    design = designed(counts)
+    values = counts if pdc is None else np.column_stack([counts, pdc])
+    late = np.zeros(values.shape[1])
+    if simulated:  # all electrodes are of the first step of a frame, see `Acquisition.needs_impedance`
+        slots = 2 * np.arange(design.nelectrode) + 1
+        late[: len(slots)] = slots / SLOT_RATE - 0.5 * np.median(np.diff(recording.time))
+
+    def read(row):
+        found, moved = at_instant(recording.time, values, row, design.slots / SLOT_RATE, late)
+        return found[: counts.shape[1]], found[-1], moved
+
+    return read
 
 
 def _is_the_simulated_one(args, pressed, material):
