@@ -97,25 +97,12 @@ def found(
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         if not able:
             break
-        best = able[0] = _other_shapes(comparison, able[0], out.fit, chosen)
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
+        best = able[0]
         best.ties = [c.effect.id for c in able[1:] if _tied(best, c)]
         out.found.append(best)
         out.fit = best.fit
     return out
-
-
-def _other_shapes(comparison, one, current, chosen) -> Candidate:
-    """A Candidate at the likeliest of its shapes: a fit ends at the one that lies nearest to its start."""
-    effect, theta = one.fit.effects[-1]
-    best = one.fit
-    for shape in effect.grid if len(effect.grid) > 1 else ():
-        begin = [*current.effects, (effect, theta | shape)]
-        fit = fit_effects(comparison, begin, chosen, current)
-        if fit.score > best.score and not effect.rejection_reason(fit.effects[-1][1]):
-            best = fit
-    gain = float(best.score - current.score)
-    return dataclasses.replace(one, fit=_beside(best, current, gain), gain=gain)
 
 
 def _beside(fit, current, gain) -> Fit:
