@@ -9,7 +9,7 @@ from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.discrepancy.trajectories import beliefs, proof
+from biotac_mj.discrepancy.trajectories import beliefs, proof, search, workflow
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
 from biotac_mj.discrepancy.trajectories.proof import _closed, borne_out, proved
@@ -124,6 +124,24 @@ def test_what_the_amended_sensor_leaves_out_has_no_name(monkeypatch):
     assert report.verdict.startswith("unknown (") and report.significant
     assert {(e.id, e.confirmed, e.confidence) for e in report.not_named} == {("latency", False, None)}
     assert not report.beliefs.told_apart and [e.ids for e in report.beliefs.explanations] == [[]]
+
+
+def test_of_effects_that_tie_the_confirmed_one_has_the_name(monkeypatch):
+    """As if held-out trajectories contradicted a low-pass, which explains the fitted ones best."""
+    data = measured([(by_id("lowpass"), {"tau": 0.08})], n=12)
+    upheld = workflow.borne_out
+    monkeypatch.setattr(search, "_tied", lambda best, other: other.effect.id == "latency")
+    monkeypatch.setattr(
+        workflow,
+        "borne_out",
+        lambda comparison, smaller, larger, aside: (
+            "lowpass" not in {e.id for e, _ in larger.effects} and upheld(comparison, smaller, larger, aside)
+        ),
+    )
+    report = diagnose(Springs(), data, effects=[LATE[0], by_id("lowpass")], progress=False)
+    assert [(e.id, e.ties, e.confirmed) for e in report.effects] == [("latency", {}, True)], report.verdict
+    assert report.tried[0]["id"] == "lowpass" and not report.not_named
+    assert not any("lowpass" in e.ids for e in report.beliefs.explanations)
 
 
 def test_what_is_less_likely_than_not_is_suspected(monkeypatch):

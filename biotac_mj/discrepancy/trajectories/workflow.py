@@ -40,10 +40,10 @@ class TrajectoryDiagnosis(Verdict):
     """A verdict on data with poses; `effects` are those of single electrodes, too, with their channels.
 
     Attributes:
-      given: the simulator that was compared. fit: Fit, with the effects that are named and added; null:
-        without effects.
-      proof: on held-out trajectories, before any fit has seen them, the skin solved again. comparison, selection, locked: what it was
-        made of. beliefs: how likely which explanation is.
+      given: the simulator that was compared. fit: Fit, with the effects that are named and added, to all
+        trajectories; null: without effects, to those that are not held out.
+      proof: on held-out trajectories, which no fit of it has seen, the skin solved again. comparison,
+        selection, locked: what it was made of. beliefs: how likely which explanation is.
       trace: numbers that thresholds are set on, as a file can hold them.
     """
 
@@ -202,26 +202,39 @@ def _in_words(comparison, current, effects, named, chosen, refuted):
     return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder
 
 
-def _with(comparison, null, current, some, search, chosen):
-    """Fit of these Candidates of a Fit with all of them."""
-    pairs = [pair for pair in current.effects if pair[0].id in {one.effect.id for one in some}]
-    if len(pairs) == len(current.effects):
-        return current
+def _with(comparison, null, some, search, chosen):
+    """Fit of these Candidates' effects together."""
+    pairs = [one.fit.effects[-1] for one in some]
     fit = search.fits.get(frozenset(e.id for e, _ in pairs))
     return fit_effects(comparison, pairs, chosen, null) if fit is None else fit
 
 
-def _upheld(comparison, null, current, found, search, chosen, aside):
+def _upheld(comparison, null, found, search, chosen, aside):
     """Fit and Candidates of the effects that held-out trajectories confirm, one effect after another, and the
-    other Candidates: an effect that explains the fitted ones alone has no name."""
-    best, upheld = null, []
-    for k in range(1, len(found) + 1):
-        some = found[:k]
-        fit = _with(comparison, null, current, some, search, chosen)
+    other Candidates: an effect that explains the fitted ones alone has no name. Where they confirm another
+    one that ties with it, that one has."""
+    best, upheld, before = null, [], []
+    for one in found:
         starts = [null] if best is null else [best, null]
-        if all(borne_out(comparison, start, fit, aside) for start in starts):
-            best, upheld = fit, some
-    return best, upheld, [one for one in found if one not in upheld]
+        for other in (one, *_tied(one, search)):
+            some = [*before, other]
+            fit = _with(comparison, null, some, search, chosen)
+            if all(borne_out(comparison, start, fit, aside) for start in starts):
+                best, upheld = fit, some
+                break
+        before = upheld if len(upheld) > len(before) else [*before, one]
+    return best, upheld, found[len(upheld) :]
+
+
+def _tied(one, search):
+    """Candidates that tie with one, the likeliest first, each with the ties after it."""
+    step = next(step for step in search.rounds if any(c.fit is one.fit for c in step))
+    tied = [c for c in step if c.effect.id in one.ties and not c.refused]
+    out, left = [], one.ties
+    for c in tied:
+        left = [name for name in left if name != c.effect.id]
+        out.append(dataclasses.replace(c, ties=left))
+    return out
 
 
 def _unnamed(refuted, suspected):
@@ -237,23 +250,21 @@ def _unnamed(refuted, suspected):
 
 def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     """Diagnosis by a Search: named effects, errors of the base model, the proof."""
-    current, found = search.fit, search.found
     names = {e.id: e.name for e in usable}
-    _tie_aliases(current, found, names)
-    fitted = current
-    current, found, refuted = _upheld(comparison, null, current, found, search, chosen, aside)
-    if refuted:  # by held-out trajectories: no experiment has to distinguish it from others
-        gone = {one.effect.id for one in refuted}
+    _tie_aliases(search.fit, search.found, names)
+    current, found, refuted = _upheld(comparison, null, search.found, search, chosen, aside)
+    gone = {one.effect.id for one in search.found} - {one.effect.id for one in found}
+    search.found = found + refuted
+    if gone:  # by held-out trajectories: no experiment has to distinguish it from others
         some = {ids: fit for ids, fit in search.fits.items() if not ids & gone}
         search.fits = {k: fit for k, fit in some.items() if not k or borne_out(comparison, null, fit, aside)}
     beliefs = believed(comparison, search, len(chosen))
     sure = {one.effect.id: _sure(beliefs, one) for one in found}
     likely = [one for one in found if sure[one.effect.id] >= 0.5]  # what has a name is there rather than not
     doubtful = [one for one in found if one not in likely]
-    suspected = [_described(one, fitted, sure[one.effect.id], names, True) for one in doubtful]
+    suspected = [_described(one, one.fit, sure[one.effect.id], names, True) for one in doubtful]
     if doubtful:
-        alone = _with(comparison, null, current, likely, search, chosen)
-        current, found, more = _upheld(comparison, null, alone, likely, search, chosen, aside)
+        current, found, more = _upheld(comparison, null, likely, search, chosen, aside)
         refuted += more
     without_name = _unnamed(refuted, suspected)
     named = not _wrong(comparison, current)
@@ -309,7 +320,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         verdict=verdict,
         significant=bool(seen or stray),
         effects=effects,
-        not_named=[_described(item, fitted, None, names, False) for item in refuted] + suspected,
+        not_named=[_described(item, item.fit, None, names, False) for item in refuted] + suspected,
         gap=gaps,
         aside=f"{len(aside)} trajectories that took no part in the search, errors of their poses taken out",
         closed=proof.closed,
