@@ -53,6 +53,19 @@ def touched(seed=0, seconds=40, rate=BUS):
     return np.clip(counts, 0, 4095), force, rng
 
 
+def tapped(rows, seed=0, seconds=40):
+    """Counts (n, 19), force (n, 3) and a generator: touches at changing places that last some rows, and come
+    and go within one."""
+    rng = np.random.default_rng(seed)
+    state = np.zeros((int(seconds * RATE), 5))
+    for begin in range(150, len(state) - 85, 70):
+        some = slice(begin + (k := rng.integers(25)), begin + k + rows)
+        state[some] = np.r_[rng.uniform(-1, 1, 4), rng.uniform(0.3, 1)]
+    clean = rng.uniform(2100, 3200, 19) + 120 * state @ rng.standard_normal((5, 19))
+    force = state[:, [0, 1, 4]] * [0.3, 0.3, -3.0] + 0.01 * rng.standard_normal((len(state), 3))
+    return np.rint(clean + electrode_noise(clean) * rng.standard_normal(clean.shape)), force, rng
+
+
 def through_a_bus(counts):
     """As a logger of LOGGER writes what a bus brings a hundred times a second."""
     rows = int(len(counts) * LOGGER / BUS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from logs import RATE, noisy, unloaded
+from logs import RATE, noisy, tapped, unloaded
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search
@@ -47,3 +47,33 @@ def test_what_the_part_kept_aside_contradicts_is_unknown(monkeypatch):
     d = diagnose_recording(coarse)
     assert not d.findings and d.verdict.startswith("unknown: coarse quantisation")
     assert "the held-out ones contradict it" in d.verdict
+
+
+@pytest.mark.parametrize("rows", (1, 2, 5, 12, 30))
+def test_what_a_touch_does_sharply_is_no_fault(rows):
+    """The force tells that it was one; spikes of an electrode are found beside touches."""
+    counts, force, _ = tapped(rows)
+    assert (
+        diagnose_recording(PlainRecording(counts, force, rate=RATE)).verdict == "no significant disagreement"
+    )
+    free = np.flatnonzero(np.abs(force[:, 2]) < 0.05)[50::150]
+    counts[free, 4] -= 300
+    (found,) = diagnose_recording(PlainRecording(counts, force, rate=RATE)).findings
+    assert (found.id, found.channels) == ("spikes", (4,))
+
+
+@pytest.mark.parametrize("rows", (5, 12))
+def test_sharp_touches_without_force_are_no_fault(rows):
+    assert not diagnose_recording(PlainRecording(tapped(rows)[0], rate=RATE)).significant
+
+
+def test_what_one_electrode_does_in_company_is_of_touch():
+    """A tap that one electrode feels most, for a row or two, and others a little."""
+    counts, rng = unloaded(3, 40)
+    for row in range(200, 3800, 90):
+        some = slice(row, row + rng.integers(1, 3))
+        counts[some] -= 40
+        counts[some, 2] -= 200
+    assert not [
+        f for f in diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE)).findings if not f.of_all
+    ]

@@ -24,6 +24,20 @@ def test_a_warm_up_lies_within_its_interval(sample):
         assert low < value < high
 
 
+@pytest.mark.parametrize("change", (250.0, -250.0))
+@pytest.mark.parametrize("with_force", (False, True))
+def test_a_slow_common_change_is_of_the_session(sample, change, with_force):
+    """In counts, of a sensor that is warm by then: not told from what goes on in ln Z, and no step."""
+    counts, force = (part[2600:] for part in sample)
+    drifted = np.rint(counts + change * np.linspace(0, 1, len(counts))[:, None])
+    diagnosis = diagnose_recording(PlainRecording(drifted, force if with_force else None, rate=100.0))
+    (found,) = diagnosis.findings
+    assert found.kind.drifts and found.verified and found.written
+    assert {found.id, *found.ties} >= {"warmup", "count_offset"}
+    for gap in diagnosis.gap.values():
+        assert gap.after < 1.01 * gap.before
+
+
 def test_what_makes_held_out_rows_worse_is_not_written(sample):
     """A warm-up that is taken back as soon as the rows fitted end."""
     counts, _ = sample

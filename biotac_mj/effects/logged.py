@@ -297,8 +297,9 @@ class WarmUpInLog(WarmUp, SharedLevel):
     confusable = WarmUp.confusable | _LEVELS
 
     def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """a, tau of the a (1 - exp(-t / tau)) closest to the trend. A straight line has no end: of all that
-        are nearly as close it is the one with the least a; the interval has those that are less close."""
+        """a, tau of the a (1 - exp(-t / tau)) closest to the trend, with an a that a sensor can have. A
+        straight line has no end: of all that are nearly as close it is the one with the least a; the interval
+        has those that are less close."""
         time, bounds = np.linspace(trend.knots[0], trend.knots[-1], 200), self.params["tau"]
         y = trend(time) - trend(time[:1])
         fits = []
@@ -306,6 +307,7 @@ class WarmUpInLog(WarmUp, SharedLevel):
             basis = np.column_stack([1 - np.exp(-time / tau), np.ones(len(time))])
             w, *_ = np.linalg.lstsq(basis, y, rcond=None)
             fits.append((float(((y - basis @ w) ** 2).sum()), tau, w[0]))
+        fits = [f for f in fits if self.params["a"].low <= f[2] <= self.params["a"].high] or fits
         off = 0.5 * min(fits)[0] + 1e-4 * (y**2).sum()
         near, nearly = ([f for f in fits if f[0] < min(fits)[0] + part * off] for part in (1.0, 0.5))
         least = min(nearly, key=lambda f: abs(f[2]))

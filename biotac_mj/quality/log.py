@@ -4,10 +4,15 @@ import dataclasses
 import functools
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from ..sensor.channels import NELECTRODE
+from .adjacent import sharp
 from .clock import BUS_RATE
 from .repeats import repeated_rows
+
+_LATER = 3  # rows by which one device follows another at most
+_TREMBLES = 0.05  # of its standard deviation: what another device changes by when nothing happens
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,6 +70,16 @@ class Log:
     def whole(self) -> bool:
         """Whether all counts are whole numbers."""
         return bool((self.counts == np.rint(self.counts)).all())
+
+    @functools.cached_property
+    def touched(self) -> np.ndarray:
+        """(n,) bool, rows about which the other device changes sharply as well: a touch, no fault of this
+        log."""
+        if self.other_device is None:
+            return np.zeros(len(self), bool)
+        force = self.other_device
+        changes = sharp(force, _TREMBLES * force.std(0)).any(1)
+        return maximum_filter1d(np.pad(changes, (1, 0)), 2 * _LATER + 1)
 
     def some(self, of_biotac: int) -> int:
         """Number of channels that corresponds to `of_biotac` of a BioTac's 19 electrodes."""

@@ -24,6 +24,7 @@ _LEAST = 200  # rows
 # places to check; ratio of the other device's change there to its usual change: at least 5 where a logger
 # lost rows, at most 0.9 where only electrodes jump
 _PLAINEST, _LEAPS = 3, 2.5
+_AT_REST = 0.1  # of the force beside it
 _END, _MEETS = 4, 2.0  # rows at either end, and their largest distance in noise units if they join
 _LINE = 4  # rows of the line fitted on either side
 # least score of a jump, least ratio to its neighbourhood, and least distance between jumps in rows
@@ -134,7 +135,19 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
         "times": float(np.clip(np.max(score[chosen] / around[chosen]), 12, 30)),
         "score": float(np.log(score[chosen].max())),
     }
+    if _from_rest(log, at[:_PLAINEST]):
+        return []
     return [_alternative(log, found, rows, chosen + _LINE, noise, x)]
+
+
+def _from_rest(log, at):
+    """Whether the other device says that something touched or let go at rows at (k,): it is at rest on one
+    side of most of them, where one that lost rows goes on."""
+    if log.other_device is None:
+        return False
+    size = np.linalg.norm(log.other_device, axis=1)
+    sides = [sorted((size[max(i - _END, 0) : i].mean(), size[i : i + _END].mean())) for i in at]
+    return np.median([low / max(high, 1e-12) for low, high in sides]) < _AT_REST
 
 
 def _isolated(score, around):

@@ -16,6 +16,7 @@ _TIMES = 4  # samples of a channel, more than chance explains
 _ROWS = 7  # times the noise, distance of all of these from the signal
 _FAR = 20.0  # times the noise plus one count, distance of a sample of a loose contact from the signal
 _RARE = 1e-5  # fraction of such rows by chance
+_MOVED = 5.0  # times the noise, by which a channel that is touched leaves its running median
 _CABLE = 3  # channels that one cable may affect: if more have as many spikes, the cause is a common one
 _ADJACENT, _REPEATED = 0.1, 0.3  # fraction of outliers side by side, without and with repeated rows
 _GONE = 100  # [counts] by which most channels leave for a row: no load does that
@@ -30,11 +31,14 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     for f in faults:
         if f.step:
             coarse[list(f.channels)] = f.step
-    bad = _outliers(x, coarse) & ~log.masked
+    bad = _outliers(x, coarse) & ~log.masked & ~log.touched[:, None]
     bad &= bad.sum(1, keepdims=True) <= max(1, log.some(_FEW))  # an event of all has another cause
+    off, noise = np.abs(x - running_median(x, _SPAN, "mirror")), noise_level(x, least=ROUNDING)
+    # a touch moves others as well: so what a channel does mostly in their company is none of its own
+    alone = bad & ((off > _MOVED * noise).sum(1, keepdims=True) <= _CABLE)
+    bad = np.where(alone.sum(0) > 0.5 * bad.sum(0), bad, False)
     number = bad.sum(0)
-    off = np.abs(x - running_median(x, _SPAN, "mirror"))
-    far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
+    far = bad & (off > _FAR * (noise + 1))
     found = []
     for k in np.argsort(-number, kind="stable")[: np.count_nonzero(number >= _TIMES)]:
         if _consecutive(log, bad[:, k]):
@@ -96,6 +100,7 @@ def _consecutive(log, bad):
 def off_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Finds rows that most channels leave at once and return to, at any rate."""
     whole = _outliers(log.counts, np.zeros(log.channels), often=True).sum(1) >= max(2, log.some(_MOST))
+    whole &= ~log.touched
     if not whole.any():
         return []
     mask = np.repeat(whole[:, None], log.channels, axis=1)

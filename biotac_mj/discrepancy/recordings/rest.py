@@ -4,10 +4,11 @@ others and from its own earlier blocks."""
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
+from ...quality.adjacent import sharp
 from ...quality.clock import CLOCK_FAULT
 from ...quality.noise import noise_level, running_median
+from .candidates import as_log
 from .confidence import NAMED, USUAL, farthest
 from .session import Session
 
@@ -17,7 +18,9 @@ _LIVELY = 1.0
 # of a load that is too short to be separated from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
 _COMPARED = 400  # rows of the shortest recording in USUAL
+_BY_HAND = 10.0  # [Hz] below which a load moves
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
+_OWN = 4  # electrodes of 19 that change from one row to the next by themselves: a touch moves more
 _FEW = 3  # samples that are sharp in a recording of any length
 
 
@@ -111,22 +114,26 @@ def _of_rows(session):
     f = np.fft.rfftfreq(size, 1 / rate)
     band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
     over = over[band]
-    if r.force is not None:  # a touch that comes again is none of the sensor's
+    # a touch that comes again is none of the sensor's
+    if r.force is not None:
         over = over - np.maximum(_spectrum(r.force[rows], series, size, 1e-12)[1][band].max(1), 0)[:, None]
+    elif session.loaded:
+        over[f[band] < _BY_HAND] = 0.0
     beats = 2 * np.sqrt(power[band]) / np.hanning(size).sum()  # [counts]
     most_over = int(over.mean(1).argmax())
     swing = float(np.sort(beats[most_over])[-3])
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
-    # from one row to the next, more than noise and than the rows around
-    step = np.abs(np.diff(x, axis=0))
-    step[[one[0] - 1 for one in series[1:]]] = 0
-    usual = uniform_filter1d(step, 21, axis=0)
-    sharp = (step > 6 * noise_level(x) + 2) & (step > 5 * usual)
+    # from one row to the next, more than noise and than the rows around, where no touch is felt elsewhere
+    least = 6 * noise_level(x) + 2
+    log, many = as_log(r), (np.abs(np.diff(x, axis=0)) > least).sum(1)
+    felt = log.touched[rows][1:] | (many > log.some(_OWN))
+    jumps = sharp(x, least) & ~felt[:, None]
+    jumps[[one[0] - 1 for one in series[1:]]] = False
     # noise never comes again in all electrodes
     same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
     live = np.median(noise_level(x)) > 1.0
-    number = int(sharp.sum())
-    most = np.argsort(-sharp.sum(0))[:2]
+    number = int(jumps.sum())
+    most = np.argsort(-jumps.sum(0))[:2]
     rhythm = f"a rhythm of {f[band][most_over]:.1f} Hz and up to {beats[most_over].max():.0f} counts"
     said = {"rhythm": rhythm} | dict.fromkeys(
         ("sharp", "sharp1"),
@@ -137,8 +144,8 @@ def _of_rows(session):
     said["again"] = "rows come again, in all electrodes"
     return {
         "rhythm": float(over.mean(1).max()) if swing >= _RESOLVED else 0.0,
-        "sharp": float(np.log(sharp.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
-        "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
+        "sharp": float(np.log(jumps.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
+        "sharp1": float(np.log(np.sort(jumps.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
         "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
         "low": float(np.median(low)),
         "low1": float(low.max()),

@@ -302,7 +302,8 @@ def _name_shared(session, finding, trend, change):
     common, at = m.levels(m.shared(np.ones(len(m.used))))
     sudden = trend.kind == "step" and sharp(common, at, trend.onset) > SHARP
     order = [e for e in sorted(SHARED, key=lambda e: e.drifts == sudden) if change > 0 or not e.rises]
-    alike = [e for e in order if misfit[e.id] < 2 * min(misfit.values()) + 12]
+    # what comes slowly is the session's whatever its pattern: electrodes have shares of their own of it
+    alike = [e for e in order if e.drifts and not sudden or misfit[e.id] < 2 * min(misfit.values()) + 12]
     found = {e.id: e.of_trend(trend, change, m.slope, middle) for e in alike}
     best, *ties = [e for e in alike if e.possible(found[e.id])] or alike
     finding.id, finding.parameters, ties = best.id, found[best.id], [e.id for e in ties]
