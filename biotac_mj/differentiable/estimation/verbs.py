@@ -92,13 +92,16 @@ def estimate_verb(args: argparse.Namespace) -> None:
 
 
 def _instants(recording, counts, pdc, simulated):
-    """A function of a row: electrodes (nelectrode,) and PDC at its time, and their deviations by motion."""
+    """A function of a row: electrodes (nelectrode,) and PDC, of a press of the simulator at the row's time,
+    and their deviations by motion."""
     design = designed(counts)
     values = counts if pdc is None else np.column_stack([counts, pdc])
+    if not simulated:
+        return lambda row: (counts[row], values[row, -1], np.zeros(values.shape[1]))
     late = np.zeros(values.shape[1])
-    if simulated:  # all electrodes are of the first step of a frame, see `Acquisition.needs_impedance`
-        slots = 2 * np.arange(design.nelectrode) + 1
-        late[: len(slots)] = slots / SLOT_RATE - 0.5 * np.median(np.diff(recording.time))
+    # all electrodes are of the first step of a frame, see `Acquisition.needs_impedance`
+    slots = 2 * np.arange(design.nelectrode) + 1
+    late[: len(slots)] = slots / SLOT_RATE - 0.5 * np.median(np.diff(recording.time))
 
     def read(row):
         found, moved = at_instant(recording.time, values, row, design.slots / SLOT_RATE, late)
