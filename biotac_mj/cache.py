@@ -168,7 +168,7 @@ def cached(
 @contextlib.contextmanager
 def _announced(kind):
     """Says on standard error what is made, if it takes long."""
-    text = f"biotac_mj: {_LONG.get(kind)} once on this machine: it is read from disk afterwards"
+    text = f"biotac_mj: {_LONG.get(kind)}, once on this machine: it is read from disk afterwards"
     timer = threading.Timer(_PATIENCE, print, [text], {"file": sys.stderr, "flush": True})
     timer.daemon = True
     if kind in _LONG:

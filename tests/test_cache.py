@@ -316,7 +316,7 @@ def test_what_takes_long_is_said(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(cache, "_PATIENCE", 0.05)
     for seconds, says in ((0.5, True), (0.5, False), (0.0, False)):
         cache.cached("grid", [seconds], lambda seconds=seconds: time.sleep(seconds) or {"a": np.zeros(1)}, ())
-        assert ("biotac_mj: computing the distances around a mesh once" in capsys.readouterr().err) == says
+        assert ("biotac_mj: computing the distances around a mesh, once" in capsys.readouterr().err) == says
 
 
 def test_a_skin_is_stored_where_the_cache_cannot_be(monkeypatch, tmp_path):
