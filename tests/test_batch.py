@@ -482,16 +482,16 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
 
 
 def test_a_step_without_a_balance_pulls_no_ball():
-    """Of 100 g, in `mj_step` and in a batch, with less work than by default. Which solves are cut off as a
-    ball leaves skin that lay on the core is a matter of rounding: some of these speeds have one."""
-    unsettled, little = np.zeros(2), {"skin": {"max_work": 80}}
+    """Of 100 g, in `mj_step` and in a batch. Which solves are cut off as a ball leaves skin that lay on the
+    core is a matter of rounding: some of these speeds have one."""
+    unsettled = np.zeros(2)
     for speed in (0.5, 0.52, 0.6, 0.65):
         spec = mujoco.MjSpec()
         spec.option.timestep, spec.option.gravity = 2e-3, [0, 0, 0]
         ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.011, 0.001])
         ball.add_freejoint()
         ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.1)
-        biotac = biotac_mj.attach(spec, body="world", skin=shell(), readings="none", options=little)
+        biotac = biotac_mj.attach(spec, body="world", skin=shell(), readings="none")
         model = spec.compile()
         data, push, settled = mujoco.MjData(model), [], []
         data.qvel[1] = speed
@@ -499,8 +499,8 @@ def test_a_step_without_a_balance_pulls_no_ball():
             mujoco.mj_step(model, data)
             push.append(biotac.read(data, "contact_force")[1])
             settled.append(biotac.read(data, "status")[0])
-        batch_push, batch_settled = [], []
-        for _, mjm, d, _ in thrown([speed], 0.0, 0.1, 2e-3, 14, options=little):  # noqa: B007
+        batch_push, batch_settled = [], []  # with even less work than mj_step has
+        for _, mjm, d, _ in thrown([speed], 0.0, 0.1, 2e-3, 14, options={"skin": {"max_work": 80}}):  # noqa: B007
             batch_push.append(read(mjm, d, "contact_force")[0, 1])
             batch_settled.append(read(mjm, d, "status")[0, 0])
         unsettled += np.sum(np.equal(settled, 0)), np.sum(np.equal(batch_settled[1:], 0))

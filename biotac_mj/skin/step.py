@@ -468,7 +468,7 @@ class SkinStep:
         self._launch(
             self._nodes_kernels.residuals, (k.nchunk, d.nworld),
             [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st],
-            [k.r, k.norms, self._newton_on, self._solve_on],
+            [k.r, k.norms, self._newton_on],
         )  # fmt: skip
         if self._compliant:
             self._compliant.begin_iteration(self._launcher)
@@ -483,29 +483,22 @@ class SkinStep:
     def _continue_solve(self):
         k, st = self.k, self.st
         self.M.apply(self._launcher, st, k.partial, k.r, self._forces.gradient, k.z, k.partial)
-        self._decide(krylov.choose_beta, [self.m.options.tolerance, k.partial, st])
+        self._decide(krylov.choose_beta, [k.partial, st])
         self._launch(self._krylov_kernels.next_direction, self.d.x.shape, [k.z, st, k.p])
         self._advance_solve(0)
 
     def _advance_solve(self, first):
-        """One iteration of conjugate gradients along p, without a product in quasi-Newton steps."""
-        k, st, chunks = self.k, self.st, (self.k.nchunk, self.d.nworld)
-        if first:
-            self._launcher.branch(self._solve_on, self._find_length)
-        else:
-            self._find_length()
-        inputs = [k.chunk, first, k.p, k.q, self._forces.gradient, self.m.wet_node, st, k.dx, k.r]
-        self._launch(self._krylov_kernels.update_solution, chunks, inputs, [k.partial])
-
-    def _find_length(self):
-        """The length of the step along p."""
-        m, k, st, chunks = self.m, self.k, self.st, (self.k.nchunk, self.d.nworld)
+        """One iteration of conjugate gradients along p."""
+        m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._krylov_kernels
         self._forces.multiply(self._launcher)
         if self._compliant:
             self._compliant.soften_product(self._launcher)
-        inputs = [k.chunk, k.p, k.q, k.viscous_work, self._forces.gradient, m.wet_node, st.running]
-        self._launch(self._krylov_kernels.measure_product, chunks, inputs, [k.partial, self._solve_on])
+        chunks, gradient = (k.nchunk, d.nworld), self._forces.gradient
+        inputs = [k.chunk, k.p, k.q, k.viscous_work, gradient, m.wet_node, st.running]
+        self._launch(kernels.measure_product, chunks, inputs, [k.partial, self._solve_on])
         self._decide(krylov.choose_alpha, [m.options.max_cg, k.partial, st], [self._solve_on])
+        inputs = [k.chunk, first, k.p, k.q, gradient, m.wet_node, st, k.dx, k.r]
+        self._launch(kernels.update_solution, chunks, inputs, [k.partial])
 
     def _search(self):
         self._take_full_step()

@@ -92,8 +92,6 @@ def find_pending(partial: wp.array3d(dtype=real), st: Worlds):
     if t == 0:
         st.rz[w] = rz
         st.start_rz[w] = rz
-        st.quasi_newton[w] = 0
-        st.error[w] = real(1.0)
 
 
 @wp.kernel

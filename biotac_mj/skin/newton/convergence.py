@@ -20,9 +20,6 @@ _LAGGED_TOLERANCE = wp.constant(wp.float64(0.05))  # of the error at which a rou
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 # error below which a bad iteration may be rounding: no viscosity starts
 _SMALL_ERROR = wp.constant(wp.float64(0.01))
-# error that a step along the preconditioned residual may leave for the next one to be of this kind, too: a
-# product with the tangent costs as much as the evaluation of forces after a step
-_QUASI_NEWTON = wp.constant(wp.float64(0.2))
 # the viscosity is divided by the first after a good full step, and multiplied by the second after a bad one
 _DECREASE, _INCREASE = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # a lower viscosity is set to zero; a higher one makes the skin stiffer than contact, and the try fails
@@ -164,10 +161,6 @@ def check_convergence(
         st.iterations[w] = iterations + 1
         st.rz[w] = rz
         st.start_rz[w] = rz
-        st.pressure_response[w] = kappa * gz
-        first = iterations == start_iterations
-        accurate = first or st.error[w] < _QUASI_NEWTON * error
-        st.quasi_newton[w] = wp.where(accurate and viscosity == real(0.0) and rz > real(0.0), 1, 0)
         any_active[0] = 1
 
 

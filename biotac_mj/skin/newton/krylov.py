@@ -28,22 +28,16 @@ class Inertia:
 
 
 @wp.kernel
-def begin_solve(st: Worlds, any_running: wp.array(dtype=int)):
-    """Starts the linear solve of world w, unless it has converged. A quasi-Newton step has no more to solve
-    for."""
+def begin_solve(st: Worlds, any_active: wp.array(dtype=int)):
+    """Starts the linear solve of world w, unless it has converged."""
     w = wp.tid()
+    if w == 0:
+        any_active[0] = 0
     st.running[w] = st.active[w]
     st.moving[w] = st.active[w]
     st.iterations_cg[w] = 0
     st.start_pressure[w] = st.pressure[w]
     st.predicted_pressure[w] = st.pressure[w]
-    st.viscous_work[w] = real(0.0)
-    if st.active[w] == 1:
-        if st.quasi_newton[w] == 1:
-            st.running[w] = 0
-            st.predicted_pressure[w] = st.pressure[w] - st.pressure_response[w]
-        else:
-            any_running[0] = 1
 
 
 @wp.kernel
@@ -70,6 +64,8 @@ def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_ac
     st.pressure_response[w] = kappa * gp
     curvature = pq + kappa * gp * gp
     first = iterations == 0
+    if first:
+        before = real(0.0)
     st.iterations_cg[w] = iterations + 1
     st.work[w] = done + 1
     if not (curvature > real(0.0)):
@@ -94,21 +90,17 @@ def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_ac
 
 
 @wp.kernel
-def choose_beta(tolerance: real, partial: wp.array3d(dtype=real), st: Worlds):
-    """Ends the linear solve of world w if it has reduced r . z, the square of the error, to a hundredth, or
-    the error to half of Newton's tolerance. partial: r . z."""
+def choose_beta(partial: wp.array3d(dtype=real), st: Worlds):
+    """Ends the linear solve of world w if it has reduced r . z to a hundredth. partial: r . z."""
     w, t = wp.tid()
     if st.running[w] == 0:
         return
     first = st.start_rz[w]
     before = st.rz[w]
-    goal = real(0.0)
-    if st.error[w] > tolerance:  # not where only the pressure has to converge
-        goal = real(0.5) * tolerance / st.error[w]
     rz = total_of(partial, 0, w, t)
     if t > 0:
         return
-    if not (rz > wp.max(real(0.01), goal * goal) * wp.abs(first)):
+    if not (rz > real(0.01) * wp.abs(first)):
         st.running[w] = 0
         return
     st.beta[w] = rz / before
@@ -261,8 +253,6 @@ def _update_kernels(precision):
         if st.active[w] == 0:
             return
         alpha = scalar(st.alpha[w])
-        if first == 1 and st.quasi_newton[w] == 1:
-            alpha = scalar(1.0)
         pressure_response = scalar(st.alpha[w] * st.pressure_response[w])
         rr = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, p.shape[0])):

@@ -313,14 +313,12 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         r_out: wp.array2d(dtype=vec),
         norms_out: wp.array3d(dtype=real),
         any_active: wp.array(dtype=int),
-        any_running: wp.array(dtype=int),
     ):
         """Residual r of a chunk of nodes; norms [quantity, chunk, world]: square of r, work of the loads,
         square of the volume's gradient, work of inertia."""
         c, w = wp.tid()
         if c == 0 and w == 0:
             any_active[0] = 0
-            any_running[0] = 0
         if st.active[w] == 0:
             return
         if c == 0:

@@ -90,7 +90,6 @@ class Worlds:
     alpha: wp.array(dtype=real)  # step length
     alpha_change: wp.array(dtype=real)  # step length minus the one before it in this search
     beta: wp.array(dtype=real)  # of conjugate gradients
-    quasi_newton: wp.array(dtype=int)  # the step is the preconditioned residual: no product is taken
     pressure_response: wp.array(dtype=real)  # kappa times the change of volume along a direction [Pa]
     pressure_correction: wp.array(dtype=real)  # factor on the volume's gradient that corrects the pressure
     start_rz: wp.array(dtype=real)  # `rz` at the start of the linear solve
