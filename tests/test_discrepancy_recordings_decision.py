@@ -71,9 +71,9 @@ def test_what_one_electrode_does_in_company_is_of_touch():
     """A tap that one electrode feels most, for a row or two, and others a little."""
     counts, rng = unloaded(3, 40)
     for row in range(200, 3800, 90):
-        some = slice(row, row + rng.integers(1, 3))
-        counts[some] -= 40
+        begin = row + rng.integers(60)
+        some = slice(begin, begin + rng.integers(1, 3))
+        counts[some] -= 26
         counts[some, 2] -= 200
-    assert not [
-        f for f in diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE)).findings if not f.of_all
-    ]
+    found = diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE))
+    assert not found.findings and "e3" not in found.verdict
