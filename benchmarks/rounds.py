@@ -173,8 +173,7 @@ def run(task, args):
         report = diagnose(sim, data, progress=False)
         record = _record(report, time.process_time() - began)
         if report.effects and sensor["effects"]:  # of nothing hidden there is no share
-            unseeing = dataclasses.replace(report, fit=report.proof.fit)  # held-out ones are in no fit of it
-            record["true"] = closed(unseeing, data, {data[i].id for i in report.locked})
+            record["true"] = closed(report, data, {data[i].id for i in report.locked})
             other = measured(_plan(unseen, _end(data)), turn, "unseen")
             record["unseen"] = closed(report, other, {t.id for t in other})
             rest = np.mean([hidden(t)[0] for t in data], axis=0)  # about which all is compared

@@ -674,8 +674,6 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, effects,
     parameter, found = next(iter(report.effects[0].parameters.items()))
     assert abs(found.value / size[parameter] - 1) < 0.3
     assert np.mean(report.proof.after["mean_square"]) < np.mean(report.proof.before["mean_square"])
-    every = [fit.offsets[report.locked].any() for fit in (report.proof.fit, report.fit)]
-    assert every == [False, True]  # held-out trajectories prove it, and then measure it as well
     assert report.tried[0]["id"] == name
     # what a sideways shift does changes its sign from place to place: no cell has a mean
     assert name == "misalign" or any(

@@ -220,19 +220,6 @@ def _solved(comparison, fit, effect, current, chosen, times=_SOLVED, about=False
     return fit
 
 
-def refitted(comparison: "Comparison", fit: Fit) -> Fit:
-    """The effects of a Fit, and the base model's constants beside them, by all trajectories: what held-out
-    ones have confirmed they may measure as well. The skin is solved again where that moves the object."""
-    every = np.arange(len(comparison.trajectories))
-    out = fit_effects(comparison, fit.effects, every, fit)
-    moved = any(effect.before_skin for effect, _ in fit.effects)
-    for _ in range(_SOLVED if moved else 0):
-        if not comparison.sim.bend(comparison.fields, out.effects, out.nuisance, every):
-            break
-        out = fit_effects(comparison, out.effects, every, out)
-    return out
-
-
 def _moving(out):
     """Indices of the likeliest Candidates that move the object: where their fits end they may lead."""
     least = max(_WORTH, _SOME * max((c.gain for c in out), default=0.0))

@@ -21,7 +21,7 @@ from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import Proof, borne_out, proved
 from .remarks import few_off, next_experiment, of_base, of_data, of_search, strays
-from .search import found, refitted
+from .search import found
 from .settings import SETTINGS
 from .trajectory import FEWEST, measurement_noise
 from .where import left_over, where
@@ -40,10 +40,10 @@ class TrajectoryDiagnosis(Verdict):
     """A verdict on data with poses; `effects` are those of single electrodes, too, with their channels.
 
     Attributes:
-      given: the simulator that was compared. fit: Fit, with the effects that are named and added, to all
-        trajectories; null: without effects, to those that are not held out.
-      proof: on held-out trajectories, which no fit of it has seen, the skin solved again. comparison,
-        selection, locked: what it was made of. beliefs: how likely which explanation is.
+      given: the simulator that was compared. fit: Fit, with the effects that are named and added; null:
+        without effects.
+      proof: on held-out trajectories, the skin solved again. comparison, selection, locked: what it was
+        made of. beliefs: how likely which explanation is.
       trace: numbers that thresholds are set on, as a file can hold them.
     """
 
@@ -275,8 +275,6 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     # what has no name is not written, and what is not written has no name
     proof = proved(comparison, null, current if found or modulus else null, aside)
     modulus = modulus if proof.fit is current else None
-    sound = (found or modulus) and proof.fit is current
-    written = refitted(comparison, current) if sound else proof.fit
     seen = found or modulus or _wrong(comparison, null)
     alike = [names[name] for one in found for name in one.ties if name in names]
     doubts = [f"{', '.join(alike)} may be as good"] if alike else []
@@ -286,7 +284,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         doubts.append(_unnamed(refuted, []))
     beliefs = dataclasses.replace(beliefs, doubts=doubts)
     gaps = _gaps(comparison, proof)
-    effects = [_described(one, written if sound else current, sure[one.effect.id], names) for one in found]
+    effects = [_described(item, current, sure[item.effect.id], names) for item in found]
     effects = [_proved(one, proof, gaps) for one in effects]
     effects += [dataclasses.replace(modulus, confidence=_SURE)] if modulus else []
     stray = ""
@@ -357,7 +355,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
             "explanations": [{"effects": one.ids, "probability": one.weight} for one in beliefs.explanations],
         },
         given=given,
-        fit=written,
+        fit=proof.fit,
         null=null,
         proof=proof,
         comparison=comparison,
