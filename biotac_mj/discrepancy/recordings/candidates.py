@@ -72,19 +72,17 @@ def as_log(
     recording: PlainRecording,
     counts: np.ndarray | None = None,
     masked: np.ndarray | None = None,
-    rows: np.ndarray | slice = slice(None),
 ) -> Log:
-    """Rows of a recording as a log; counts (n, nelectrode) and samples masked (n, nelectrode) of the whole
+    """A recording as a log; counts (n, nelectrode) and samples masked (n, nelectrode) of the whole
     recording: others than its own."""
-    counts = recording.electrodes if counts is None else counts
     return Log(
-        counts[rows],
+        recording.electrodes if counts is None else counts,
         recording.rate,
         recording.rate_source == CLOCKED,
-        masked=None if masked is None else masked[rows],
-        repeated=recording.repeated[rows],
-        missing=None if recording.missing is None else recording.missing[rows],
-        other_device=None if recording.force is None else recording.force[rows],
+        masked=masked,
+        repeated=recording.repeated,
+        missing=recording.missing,
+        other_device=recording.force,
         converter=recording.absolute,
         signed=recording.signed,
     )
