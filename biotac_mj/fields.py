@@ -40,16 +40,15 @@ def check_choice(what: str, value: object, known: Collection[str], more: str = "
         raise ValueError(f"{what} {short_repr(value)}: choose one of {', '.join(known)}{more}")
 
 
-def check_types(settings: object, names: Iterable[str] | None = None, nan: bool = False) -> None:
+def check_types(settings: object, names: Iterable[str] | None = None) -> None:
     """Raises ValueError for values of a dataclass that do not have the types of its fields.
 
     Args:
-      names: of the fields; None: all. nan: whether NaN is allowed.
+      names: of the fields; None: all.
     """
     for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if (names is None or field.name in names) and not (nan and isinstance(value, float)):
-            _check(field.name, value, field.type)
+        if names is None or field.name in names:
+            _check(field.name, getattr(settings, field.name), field.type)
 
 
 def either(name: str, value: object, given: object, where: str) -> object:

@@ -156,17 +156,17 @@ _STEADY = float(_TAC_SCALE / _thermistor_log(_MIDDLE))  # the manual's formula w
 _LEAST, _MOST_FORCE = 8, 100.0  # a resting electrode has thousands of counts; a BioTac bears 50 N
 
 
-def check_counts(counts: np.ndarray, where: str, first: int = 0) -> None:
+def check_counts(counts: np.ndarray, where: str) -> None:
     """Raises ValueError for values that are not raw counts of electrodes.
 
     Args:
-      counts: (n, nelectrode). where: name of their source, first: number of the first row, for the text.
+      counts: (n, nelectrode). where: name of their source, for the text.
     """
     bad = ~((counts >= 0) & (counts <= FULL_SCALE))
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise ValueError(
-            f"{where}: e{column + 1} of row {first + row} is {counts[row, column]:g}: raw counts 0..4095 are "
+            f"{where}: e{column + 1} of row {row} is {counts[row, column]:g}: raw counts 0..4095 are "
             "needed, not tared, scaled or in ohm; import counts of 16 bits with --scale 0.0625"
         )
     if counts.size and counts.max() <= _LEAST:
