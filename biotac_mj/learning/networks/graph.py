@@ -1,8 +1,8 @@
 """Chebyshev graph convolutions and changes of level with torch's sparse matrices."""
 
+import functools
 import math
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -55,17 +55,11 @@ class SparseMatrix(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(n, ...) = matrix @ x (m, ...)."""
-        return sparse_product(self._matrices(), x)
+        return _Product.apply(x.reshape(x.shape[0], -1), *self._matrices()).reshape(-1, *x.shape[1:])
 
     def fields(self, u: torch.Tensor) -> torch.Tensor:
         """(k, n, 3) of fields u (k, m, 3), each times the matrix."""
         return self(u.float().transpose(0, 1).contiguous()).transpose(0, 1)
-
-
-def sparse_product(pair: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """matrix @ x for pair = (matrix, its transpose), x (m, ...); the first axis is that of the graph."""
-    flat = x.reshape(x.shape[0], -1)
-    return _Product.apply(flat, *pair).reshape(-1, *x.shape[1:])
 
 
 # torch_geometric's ChebConv takes the edges of a graph at each call and gathers along them; the mesh is
@@ -112,7 +106,10 @@ class ChebConv(nn.Module):
         else:
             x = x if self.up is None else self.up(x)
             narrower = self.weight.shape[2] < self.weight.shape[1]
-            y = self._at_kept(self._clenshaw(x)) if narrower else self._forward_recurrence(x)
+            if narrower:
+                y = self._at_kept(self._clenshaw(x))
+            else:
+                y = functools.reduce(torch.add, map(torch.matmul, self._polynomials(x), self.weight))
         return y if self.bias is None else y + self.bias
 
     def dense(self, x: torch.Tensor) -> torch.Tensor:
@@ -131,25 +128,20 @@ class ChebConv(nn.Module):
         if self._dense is None or self._dense.device != x.device:
             eye = torch.eye(self.laplacian.shape[0], device=x.device)
             now = eye if self.up is None else self.up(torch.eye(self.up.shape[1], device=x.device))
-            before, blocks = None, [self._at_kept(now)]
-            for _ in range(1, len(self.weight)):
-                new = self.laplacian(now) if before is None else 2 * self.laplacian(now) - before
-                before, now = now, new
-                blocks.append(self._at_kept(now))
-            self._dense = torch.cat(blocks, 0 if self.up is None else 1)
+            self._dense = torch.cat(list(self._polynomials(now)), 0 if self.up is None else 1)
         return self._dense
 
     def _at_kept(self, v):
         return v if self.keep is None else v.index_select(0, self.keep)
 
-    def _forward_recurrence(self, x):
+    def _polynomials(self, x):
+        """T_k(L) x at the kept nodes, one k after another."""
         before, now = None, x
-        y = self._at_kept(x) @ self.weight[0]
-        for k in range(1, len(self.weight)):
-            new = self.laplacian(now) if before is None else 2 * self.laplacian(now) - before
-            before, now = now, new
-            y = y + self._at_kept(now) @ self.weight[k]
-        return y
+        for k in range(len(self.weight)):
+            if k:
+                new = self.laplacian(now) if before is None else 2 * self.laplacian(now) - before
+                before, now = now, new
+            yield self._at_kept(now)
 
     def _clenshaw(self, x):
         after, now = None, None
