@@ -103,16 +103,14 @@ class CompliantBodies:
         self._forces.compute_wrench(program, self._touched_by, self._wrench)
 
     def begin_iteration(self, program: Launcher) -> None:
-        """Computes residual and compliance of the bodies in the active worlds."""
+        """Computes residual and compliance of the bodies in the active worlds, and adds the effect of that
+        residual on the skin to r and its square."""
         d, f = self._data, self._forces
         inputs = [f.wrench_chunk, f.geoms.struct, d.x, f.contact, d.worlds.active]
         stiffness = [self._touched, self._stiffness]
         self._launch(program, bodies.measure_stiffness, self._faces, inputs, [d.body_contact, *stiffness])
         f.decide(program, bodies.begin_iteration, [*stiffness, d.worlds.active, *self._structs, d.worlds])
-
-    def add_residual(self, program: Launcher) -> None:
-        """Adds the effect of the bodies' residual on the skin to r and its square."""
-        self._add_body_forces(program, 1.0, self._data.worlds.active, self._k.r, self._k.norms)
+        self._add_body_forces(program, 1.0, d.worlds.active, self._k.r, self._k.norms)
 
     def soften_product(self, program: Launcher) -> None:
         """Subtracts from the product q the softening of the contact stiffness by the bodies' compliance."""

@@ -472,7 +472,6 @@ class SkinStep:
         )  # fmt: skip
         if self._compliant:
             self._compliant.begin_iteration(self._launcher)
-            self._compliant.add_residual(self._launcher)
         residual = Residual(k.norms, k.r, self._forces.gradient)
         self.M.update(self._launcher, st, residual, k.p, k.partial, self._forces.in_parallel)
 
