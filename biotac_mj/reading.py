@@ -49,13 +49,11 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
     except Unfit:
         raise
     except Exception as error:  # libraries raise any type for broken files
-        lines = _unquoted(str(error).strip()).splitlines() or [type(error).__name__]
+        text = str(error).strip()
+        if len(text) > 1 and text[0] == text[-1] in "'\"":  # as of a KeyError
+            text = text[1:-1]
+        lines = text.splitlines() or [type(error).__name__]
         raise ValueError(f"{path} is no {what} ({lines[0][:200]}): {remedy}") from error
-
-
-def _unquoted(text):
-    """The text of an error, without the quotes of a KeyError."""
-    return text[1:-1] if len(text) > 1 and text[0] == text[-1] in "'\"" else text
 
 
 def check_arrays(

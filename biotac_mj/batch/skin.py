@@ -303,9 +303,5 @@ def _refuse_differences(data, materials, worlds):
 def _world_bytes(nworld, *roots):
     """Bytes of the arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that
     objects hold."""
-    sizes = {a.ptr: _bytes(a) for a in arrays_of(roots) if {nworld, 2 * nworld, 4 * nworld} & set(a.shape)}
-    return sum(sizes.values())
-
-
-def _bytes(array):
-    return array.size * wp.types.type_size_in_bytes(array.dtype)
+    found = {a.ptr: a for a in arrays_of(roots) if {nworld, 2 * nworld, 4 * nworld} & set(a.shape)}
+    return sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in found.values())

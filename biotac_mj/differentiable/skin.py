@@ -263,12 +263,10 @@ class SkinWorlds:
         mu, lam = (wp.to_torch(getattr(self.data.rubber, name)).clone() for name in ("mu", "lam"))
         with self.another_lam() as other:
             there = self._push_virgin()
-        here = self._found(self._collect) if self._is_at_hand() else self._push_virgin()
+        at_hand = self._stepped is not self._elements and not self.data.memory
+        here = self._found(self._collect) if at_hand else self._push_virgin()
         by_lam = (there - here) / (other - lam)[:, None]
         return (here - lam[:, None] * by_lam) / mu[:, None], by_lam
-
-    def _is_at_hand(self):
-        return self._stepped is not self._elements and not self.data.memory
 
     def _push_virgin(self):
         """Forces of rubber without past stress and softening [N]."""

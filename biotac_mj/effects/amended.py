@@ -11,7 +11,7 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import design_of, skin_reference
 from ..geometry.tet_mesh import enclosed_volume
-from ..sensor.presets import Sensor, read_sensor
+from ..sensor.presets import read_sensor
 from ..short_repr import short_repr
 from ..skin.model import SkinOptions
 from ..skin.settings import plain, read_dict, read_material, read_modulus
@@ -116,7 +116,7 @@ def amend(model: Model, effects: Effects) -> Model:
     if inside.model:
         given = read_modulus(options.get("modulus"))
         options["modulus"] = plain(moduli(given, inside.model["modulus"], skin_reference(skin)[1]))
-    return Model(skin, material, options, _plain_sensor(with_effects(sensor, of_sensor)), friction)
+    return Model(skin, material, options, plain(vars(with_effects(sensor, of_sensor))), friction)
 
 
 def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
@@ -149,7 +149,3 @@ def _liquid(geometry):
     solids = (geometry.vert, geometry.inner_face), (geometry.core_vert, geometry.core_face)
     cavity, core = (abs(enclosed_volume(*solid)) for solid in solids)
     return cavity - core
-
-
-def _plain_sensor(sensor: Sensor) -> dict:
-    return plain({f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)})

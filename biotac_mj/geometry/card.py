@@ -23,6 +23,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         -enclosed_volume(vert, skin.inner_face),
         enclosed_volume(skin.core_vert * 1e3, skin.core_face),
     )
+    linked = skin.tets[np.isin(skin.tets, skin.outer_face).any(axis=1)]  # to an outer node
     rays = zip(skin.electrode_pos * 1e3, skin.electrode_normal)
     gaps = np.array([ray_distances(vert[skin.inner_face], *ray).min() for ray in rays])
     lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
@@ -36,7 +37,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "minimum dihedral angle": lowest.min(),
         "minimum dihedral angle, 1st percentile over tetrahedra": np.percentile(lowest, 1),
         "fraction of inner nodes two or more edges from the outside": 1
-        - np.mean(np.isin(*_inner_and_linked(skin))),
+        - np.mean(np.isin(np.unique(skin.inner_face), linked)),
         "skin volume": mesh.volumes.sum() * 1e9,
         "cavity volume": cavity,
         "core volume": core,
@@ -47,8 +48,3 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "box": [vert.min(axis=0), vert.max(axis=0)],
         "gaps": np.where(np.isfinite(gaps), gaps, np.nan),
     }
-
-
-def _inner_and_linked(skin):
-    """Inner nodes, and all nodes that share a tetrahedron with an outer node."""
-    return np.unique(skin.inner_face), np.unique(skin.tets[np.isin(skin.tets, skin.outer_face).any(axis=1)])

@@ -122,7 +122,9 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
         stiffness_damping=0.0,
         tolerance=_INTERMEDIATE,
     )
-    bare.material, *relaxed = (_relaxed(m) for m in (model.material, *materials))
+    bare.material, *relaxed = (
+        dataclasses.replace(m, prony=(), mullins=None, hysteresis=()) for m in (model.material, *materials)
+    )
     bare.rest = Rest(vert, 0.0, volume, volume)
     data = SkinData(bare, len(relaxed), relaxed, modulus)
     nothing, liquid = GeomSet([], [], nworld=len(relaxed), device=model.device), data.liquid
@@ -149,11 +151,6 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
             bare, data, nothing, f"fill_volume {np.max(extra):g}", lambda s: liquid.fill(natural + s * extra)
         )
     return Rests(data.vert_xpos.copy(), liquid.gauge_pressure, data.volume, natural)
-
-
-def _relaxed(material):
-    """The virgin, fully relaxed material."""
-    return dataclasses.replace(material, prony=(), mullins=None, hysteresis=())
 
 
 def _inflate(bare, data, nothing, what, fill, size=0.25):

@@ -72,7 +72,10 @@ def take_state(env: composer.Environment) -> dict | None:
         "counters": {name: getattr(env, name) for name in _COUNTERS},
         "steps": env._hooks._episode_step_count,
         "hooks": {name: list(getattr(env._hooks, name).extra_hooks) for name in _HOOKS},
-        "notes": [copy.deepcopy(_notes(owner)) for owner in _owners(env.task)],
+        "notes": [
+            copy.deepcopy({name: value for name, value in vars(owner).items() if _is_plain(value)})
+            for owner in _owners(env.task)
+        ],
         "observables": {name: _settings(one) for name, one in env.task.observables.items()},
         "observed": _observed(env._observation_updater),
     }
@@ -119,10 +122,6 @@ def give_state(env: composer.Environment, state: dict | None) -> None:
 def _owners(task):
     """Objects whose attributes may change in an episode."""
     return [task, *task.root_entity.iter_entities()]
-
-
-def _notes(owner):
-    return {name: value for name, value in vars(owner).items() if _is_plain(value)}
 
 
 def _is_plain(value):

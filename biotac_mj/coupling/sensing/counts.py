@@ -157,14 +157,11 @@ def textures_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Te
 def _by_body(geoms, wanted, read, else_, rng):
     bodies = [read(else_)] * (1 + max((g.group for g in geoms), default=-1))
     chosen = {k: v[rng.integers(len(v))] if isinstance(v, (list, tuple)) else v for k, v in wanted.items()}
-    named = [(g, value) for g in geoms for key, value in chosen.items() if _is(g.name, key)]
+    # after a further attach a name ends so
+    named = [(g, value) for g in geoms for key, value in chosen.items() if g.name.endswith(key)]
     for geom, value in reversed(named):
         bodies[geom.group] = read(value)
     return bodies
-
-
-def _is(name, key):
-    return name == key or name.endswith(key)  # after a further attach
 
 
 class _Skin:

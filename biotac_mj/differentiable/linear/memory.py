@@ -133,7 +133,9 @@ class LinearMemory:
             strain = 0.5 * F.mT @ F
             if self._isochoric:
                 strain = _volume_ratio(F)[:, None, None] ** (-2 / 3) * strain
-        return _deviator(strain - slip)
+        strain = strain - slip
+        mean = strain.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3
+        return strain - mean * torch.eye(3, dtype=strain.dtype)
 
     def _sticking(self, trial, branch):
         """Trial strains after the return mapping."""
@@ -199,8 +201,9 @@ class LinearMemory:
             + (self._push_forward(F, friction) if len(branch) else 0.0)
         )
 
-    def _of_nodes(self, stress):
-        """(nvert, 3) sum over points (n, 3, 3) at their nodes."""
+    def pull_nodes(self, stress: np.ndarray) -> np.ndarray:
+        """(nvert, 3) sum at the nodes over points (n, 3, 3): forces of stresses, or cotangents of the nodes
+        from those of deformation gradients."""
         out = np.zeros((self._skin.model.nvert, 3))
         parts = np.einsum("eqij,eqaj->eai", stress.reshape(*self._shape, 3, 3), self._gradient)
         np.add.at(out, self._elem, parts)
@@ -222,14 +225,10 @@ class LinearMemory:
         """(n, 3, 3) cotangents of the deformation gradients from those of the new memory."""
         return self._pull(0, after.tensors(), [0])[0].numpy()
 
-    def pull_nodes(self, deformation: np.ndarray) -> np.ndarray:
-        """(nvert, 3) cotangents of the nodes from those of deformation gradients (n, 3, 3)."""
-        return self._of_nodes(deformation)
-
     def pull_rest(self, deformation: np.ndarray) -> np.ndarray:
         """(nvert, 3) cotangents of rest positions from those of deformation gradients (n, 3, 3), see
         `rest`."""
-        return self._of_nodes(-np.swapaxes(self._inputs[0].numpy(), 1, 2) @ deformation)
+        return self.pull_nodes(-np.swapaxes(self._inputs[0].numpy(), 1, 2) @ deformation)
 
     def pull(self, after: Memory, balance: np.ndarray) -> tuple[Memory, np.ndarray, dict]:
         """Cotangents of the old memory, of the memory's constants (c,), and, by name, of mu and lam (those
@@ -257,7 +256,7 @@ class LinearMemory:
     def push_force(self, before: Memory, constants: np.ndarray, moduli: dict) -> np.ndarray:
         """(nvert, 3) change of the rubber's forces at fixed nodes, without the terms of `LinearStep`."""
         (change,) = self._push(self._stress, self._tangents(None, before, constants, moduli))
-        return self._of_nodes(-self._volume[:, None, None] * change)
+        return self.pull_nodes(-self._volume[:, None, None] * change)
 
     def push(
         self,
@@ -317,7 +316,3 @@ def _volume_ratio(F):
 
 def _symmetric(A):
     return 0.5 * (A + A.mT)
-
-
-def _deviator(A):
-    return A - A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3 * torch.eye(3, dtype=A.dtype)

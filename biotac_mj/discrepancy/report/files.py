@@ -22,12 +22,9 @@ def page(verdict: Verdict, pictures: Sequence[Picture] = ()) -> str:
     source = importlib.resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     kept = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = kept.from_string(source)
-    more = {"stages": STAGES, "columns": columns, "cell": cell, "percent": _percent}
+    more = {"stages": STAGES, "columns": columns, "cell": cell}
+    more["percent"] = lambda share: f"{share:.0%}" if math.isfinite(share) else ""
     return template.render(v=verdict, pictures=pictures, **more)
-
-
-def _percent(share):
-    return f"{share:.0%}" if math.isfinite(share) else ""
 
 
 def write_report(verdict: Verdict, folder: pathlib.Path | str) -> list[pathlib.Path]:
