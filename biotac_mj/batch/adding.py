@@ -49,9 +49,7 @@ def add(
     own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
     geometry = skin_reference(skin_of_design(design, skin))[1]
-    core = add_parts(
-        spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
-    )
+    core = add_parts(spec, geometry, site, body, pos, quat, prefix, config)
     _couple(spec, core, prefix, bodies)
     if coupling == "two-way" and geoms is None:
         _couple_earlier(spec, core)

@@ -83,9 +83,7 @@ def attach(
     else:
         there = {g.parent.name or id(g.parent) for g in spec.geoms if collides(g)}
         slots = len(there) + TO_COME
-    core = add_parts(
-        spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
-    )
+    core = add_parts(spec, geometry, site, body, pos, quat, prefix, config)
     _activate(spec, core, prefix + "skin", config)
     if config.coupling == "two-way":
         add_slots(spec, core, prefix, slots)

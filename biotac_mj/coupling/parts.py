@@ -12,7 +12,7 @@ from ..fields import as_real
 from ..geometry.rigid import unit
 from ..geometry.skin_geometry import SkinGeometry
 from ..short_repr import short_repr
-from .config import collides
+from .config import Config, collides
 from .touching import deformable
 
 
@@ -81,12 +81,10 @@ def add_parts(
     pos: ArrayLike,
     quat: ArrayLike,
     prefix: str,
-    friction: float,
-    priority: int,
-    geoms: Iterable[str] | None,
+    config: Config,
 ) -> mujoco.MjsBody:
-    """Fixes the model of a skin to a site or body; its core, nail and clamp collide with `geoms`, or with all
-    that collides. The core's body, whose frame is the BioTac frame."""
+    """Fixes the model of a skin to a site or body; its core, nail and clamp collide with config's geoms, or
+    with all that collides. The core's body, whose frame is the BioTac frame."""
     child = _model(geometry)
     child.body("core").pos, child.body("core").quat = pos, unit(quat)  # MuJoCo squares it
     if site is not None:
@@ -94,7 +92,7 @@ def add_parts(
     else:
         spec.attach(child, frame=spec.body(body).add_frame(), prefix=prefix)
     core = spec.body(prefix + "core")
-    _collide(spec, core, friction, priority, geoms)
+    _collide(spec, core, config.friction, config.priority, config.geoms)
     return core
 
 
