@@ -334,7 +334,7 @@ class SkinModel:
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the only geom that the inner surface can touch, without friction."""
         if nworld not in self._cores:
-            grid = _core_grid(_Key(self.geometry.core_vert, self.geometry.core_face))
+            grid = _core_grid(self.geometry.core_vert.tobytes(), self.geometry.core_face.tobytes())
             self._cores[nworld] = GeomSet(
                 ["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device
             )
@@ -443,19 +443,6 @@ def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
 
 
 @functools.lru_cache(maxsize=8)
-def _core_grid(key):
-    return bake_distance_grid(*key.arrays, spacing=_GRID_SPACING, margin=_GRID_MARGIN, smooth=True)
-
-
-class _Key:
-    """Arrays that are hashable by content, so that models of one geometry share the core's distance grid."""
-
-    def __init__(self, *arrays):
-        self.arrays = arrays
-        self.digest = hash(tuple(a.tobytes() for a in arrays))
-
-    def __hash__(self):
-        return self.digest
-
-    def __eq__(self, other):
-        return all(np.array_equal(a, b) for a, b in zip(self.arrays, other.arrays, strict=True))
+def _core_grid(vert, face):
+    vert, face = np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3)
+    return bake_distance_grid(vert, face, spacing=_GRID_SPACING, margin=_GRID_MARGIN, smooth=True)
