@@ -136,8 +136,8 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     at = geoms.struct.pos.numpy().copy()
     at[0, 0, 0] = np.nan
     geoms.struct.pos.assign(at)
-    stiff = data.mu.numpy().copy()
-    data.mu.assign(np.where(np.arange(5) == 4, np.nan, stiff))
+    stiff = data.rubber.mu.numpy().copy()
+    data.rubber.mu.assign(np.where(np.arange(5) == 4, np.nan, stiff))
     launch_step(model, data, geoms)
     step(model, sound, others)
     assert data.worlds.reason.numpy().tolist() == [NOT_FINITE, CONVERGED, INSIDE_CORE, CONVERGED, NOT_FINITE]
@@ -160,7 +160,7 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     assert np.linalg.norm(data.wrench[2, 0, :3]) > 3 * np.linalg.norm(good[1][2, 0, :3])
     # what was wrong is mended: the worlds go on to where the sound ones are, but for friction where one was
     # pressed deep
-    data.mu.assign(stiff)
+    data.rubber.mu.assign(stiff)
     geoms.set_pose(poses(worlds, DEPTHS[2]))
     step(model, data, geoms)
     assert data.converged.all() and data.nonconverged.tolist() == [1, 0, 1, 0, 1]

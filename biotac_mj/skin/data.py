@@ -204,16 +204,6 @@ class SkinData:
     # --- parts of a step, made at the first access ---
 
     @property
-    def mu(self) -> wp.array:
-        """(nworld,) shear moduli [Pa]."""
-        return self.rubber.mu
-
-    @property
-    def lam(self) -> wp.array:
-        """(nworld,) second constants of the law [Pa]."""
-        return self.rubber.lam
-
-    @property
     def chunk(self) -> int:
         """Nodes that one thread sums: few with few worlds, many with many worlds."""
         if not self.model.device.is_cuda:
