@@ -105,11 +105,9 @@ def train_latent_projection(
     def mesh_validate():
         return sum(float((vae(field(r))[0] - field(r)).square().sum()) for r in mesh_check.split(64))
 
-    def mesh_loss(rows):
-        return vae.loss(field(rows), config.mesh_kl)
-
     options = TrainingOptions(config.mesh_batch, config.mesh_steps, config.learning_rate, decay=config.decay,
                               seed=seed, graph=False)  # fmt: skip
+    mesh_loss = lambda rows: vae.loss(field(rows), config.mesh_kl)  # noqa: E731
     fitting.train(vae, mesh_loss, mesh_rows, options, mesh_validate, checkpoints, curves["mesh"])
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
@@ -119,9 +117,7 @@ def train_latent_projection(
     options = TrainingOptions(config.batch, config.paper_steps, config.learning_rate, decay=config.decay,
                               seed=seed)  # fmt: skip
 
-    def electrode_loss(r):
-        return electrode.loss(y[r], config.electrode_kl)
-
+    electrode_loss = lambda r: electrode.loss(y[r], config.electrode_kl)  # noqa: E731
     error = lambda: (electrode(y[check])[0] - y[check]).square().mean()  # noqa: E731
     fitting.train(electrode, electrode_loss, rows, options, error, checkpoints, curves["electrode"])
 
