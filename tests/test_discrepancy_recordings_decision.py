@@ -62,6 +62,15 @@ def test_what_a_touch_does_sharply_is_no_fault(rows):
     assert (found.id, found.channels) == ("spikes", (4,))
 
 
+def test_what_jumps_together_without_a_force_is_unknown():
+    """Eight at once: the force says that nothing touches there."""
+    counts, force, _ = tapped(12)
+    free = np.flatnonzero(np.abs(force[:, 2]) < 0.05)[50::150]
+    counts[free, :8] -= 300
+    verdict = diagnose_recording(PlainRecording(counts, force, rate=RATE)).verdict
+    assert verdict.startswith("unknown") and "change from one row to the next" in verdict
+
+
 @pytest.mark.parametrize("rows", (5, 12))
 def test_sharp_touches_without_force_are_no_fault(rows):
     assert not diagnose_recording(PlainRecording(tapped(rows)[0], rate=RATE)).significant

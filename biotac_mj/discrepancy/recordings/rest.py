@@ -123,11 +123,11 @@ def _of_rows(session):
     most_over = int(over.mean(1).argmax())
     swing = float(np.sort(beats[most_over])[-3])
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
-    # from one row to the next, more than noise and than the rows around, where no touch is felt elsewhere
-    least = 6 * noise_level(x) + 2
-    log, many = as_log(r), (np.abs(np.diff(x, axis=0)) > least).sum(1)
-    felt = log.touched[rows][1:] | (many > log.some(_OWN))
-    jumps = sharp(x, least) & ~felt[:, None]
+    # from one row to the next, more than noise and than the rows around, where nothing touches: so says the
+    # force, or without one the other electrodes
+    least, log = 6 * noise_level(x) + 2, as_log(r)
+    many = (np.abs(np.diff(x, axis=0)) > least).sum(1) > log.some(_OWN)
+    jumps = sharp(x, least) & ~(many if r.force is None else log.touched[rows][1:])[:, None]
     jumps[[one[0] - 1 for one in series[1:]]] = False
     # noise never comes again in all electrodes
     same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
