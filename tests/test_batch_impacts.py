@@ -617,3 +617,15 @@ def test_a_skin_that_only_reads_feels_the_nail_stop_a_body():
         read.append([world.force for world in seen])
     assert np.abs(read[0][:2]).max() > 4 and not np.any(read[0][2])
     np.testing.assert_allclose(read[1], read[0], rtol=1e-4, atol=1e-4)
+
+
+def test_a_ball_that_comes_onto_the_nails_rim_gains_nothing():
+    """Where the skin's nodes are fixed: 2 mm deep in a step, at several places about it."""
+    ball = '<body name="ball" pos="-.0097 .0008 -.013"><freejoint/><geom size=".004" mass=".02"/></body>'
+    places = [[-0.0097 + dx, 0.0008, -0.013, 1, 0, 0, 0] for dx in (-0.002, 0.0, 0.002)]
+    option = 'gravity="0 0 0" integrator="implicitfast"'
+    thrown = places, [[0, 0, 1, 0, 0, 0]] * 3, 12, {"site": "tip"}
+    seen, _ = in_batch(scene(ball, 0.002, option), *thrown, tier="condensed")
+    for world in seen:
+        assert world.touched and world.growth < 1e-3
+        assert world.speed[-1, 2] < 0.3  # it was stopped

@@ -245,7 +245,8 @@ class Batch(Skins):
 
     def compare(self, going: Marks) -> None:
         """After it; marks worlds whose bodies may go elsewhere under its new model."""
-        self._launch(rounds.look, self.nworld, [self.rest.awake, self.model], [self._of_step, going.struct])
+        known = [self.rest.awake, self.skin.fraction, self.skin.bodies, self.model]
+        self._launch(rounds.look, self.nworld, known, [self._of_step, going.struct])
 
     def judge(self, going: Marks, still_going: Marks) -> None:
         """After `evaluate`: marks those of the worlds that are going whose skin is to be solved again."""

@@ -301,16 +301,23 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 
 
 @wp.func
+def _beyond_slack(model: Model, g: int, w: int, moved: vec6, free: real):
+    """Size of a motion from the pose of the skin's model [m]; zero within `free` times `slack`, where the
+    body cannot touch."""
+    way = wp.length(vec3(moved[0], moved[1], moved[2])) + real(LEVER) * wp.length(_turns(moved))
+    if way > free * model.slack[g, w]:
+        return size_of(moved)
+    return real(0.0)
+
+
+@wp.func
 def distance_off(model: Model, r: Rounds, w: int, free: real):
-    """Largest distance of the bodies from the poses of the skin's model [m], except of those that are within
-    `free` times `slack` of them, and so cannot touch."""
+    """Largest distance of the bodies from the poses of the skin's model [m], see `_beyond_slack`."""
     off = real(0.0)
     for g in range(r.pos.shape[0]):
         if is_finite(r.pos[g, w], r.mat[g, w]):  # what is lost takes no part
             moved = motion(r.pos[g, w], r.mat[g, w], model.pos0[g, w], model.mat0[g, w])
-            way = wp.length(vec3(moved[0], moved[1], moved[2])) + real(LEVER) * wp.length(_turns(moved))
-            if way > free * model.slack[g, w]:
-                off = wp.max(off, size_of(moved))
+            off = wp.max(off, _beyond_slack(model, g, w, moved, free))
     return off
 
 
@@ -318,19 +325,30 @@ def distance_off(model: Model, r: Rounds, w: int, free: real):
 def look(
     # In:
     awake: wp.array(dtype=int),
+    fraction: wp.array(dtype=real),
+    bodies: Bodies,
     model: Model,
     # In and out:
     r: Rounds,
     going: MarkedWorlds,
 ):
     """After the first solve: counts it, and marks worlds that need another one, since their bodies do not
-    move as predicted. Other constraints on the bodies make the change smaller than their inertia alone."""
+    move as predicted: neither to where the skin was solved, nor by its wrenches, which on nodes that are
+    fixed do not move bodies in a solve of the condensed tier. Other constraints on the bodies make the change
+    smaller than their inertia alone."""
     w = wp.tid()
     if awake[w] == 0:
         return
     r.rounds[w] = 1
     r.settled[w] = 0
-    if distance_off(model, r, w, real(1.0)) < _TOLERANCE:
+    off = distance_off(model, r, w, real(1.0))
+    for g in range(r.pos.shape[0]):
+        moves = vec6()
+        for h in range(r.pos.shape[0]):
+            moves += bodies.compliance[g, h, w] * (model.wrench0[h, w] - fraction[h] * bodies.predicted[h, w])
+        if is_finite(r.pos[g, w], r.mat[g, w]):
+            off = wp.max(off, _beyond_slack(model, g, w, moves, real(1.0)))
+    if off < _TOLERANCE:
         r.settled[w] = 1
     else:
         mark(going, w)
