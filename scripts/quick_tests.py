@@ -5,9 +5,10 @@
     python scripts/quick_tests.py out/costs
 
 Quick are tests that cost at most `--cheap` seconds, and those that cost at most `--line` seconds for each
-line or kernel of the package that no cheaper quick test runs. The first case of a test function counts as ten
-lines more, since tests of the same lines hold different things. The tests that need a module share its
-compilation.
+line or kernel of the package that no cheaper quick test runs. Tests of the same lines hold different things: the
+first case of a test function counts as ten lines more, that of a function marked `law` as sixty. Lines do not
+tell what a test compares, so tests that hold a law of mechanics, or that two engines agree, have this mark. The
+tests that need a module share its compilation.
 """
 
 import argparse
@@ -17,7 +18,7 @@ import json
 import pathlib
 
 SLOW = pathlib.Path(__file__).resolve().parents[1] / "tests" / "slow.txt"
-_FUNCTION = 10  # lines that a test function counts as
+_FUNCTION, _LAW = 10, 60  # lines that a test function counts as
 
 
 def measured(folder: pathlib.Path) -> dict[str, dict]:
@@ -47,7 +48,8 @@ def chosen(tests: dict[str, dict], line: float, cheap: float) -> tuple[set[str],
     }
     holds = {name: {ran for ran in row["runs"] if ran.startswith("biotac_mj")} for name, row in tests.items()}
     for name, held in holds.items():
-        held.update((name.partition("[")[0], i) for i in range(_FUNCTION))
+        function, law = name.partition("[")[0], "law" in tests[name]["marks"]
+        held.update((function, i) for i in range(_LAW if law else _FUNCTION))
     quick = {name for name in tests if cost[name] <= cheap}
     held = set().union(*map(holds.get, quick))
     queue = [(0.0, name) for name in sorted(tests.keys() - quick)]

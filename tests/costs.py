@@ -1,7 +1,7 @@
 """A plugin of pytest that writes what each test costs and what it runs, a line of JSON for each, one file for
 each process: `python -m pytest -p tests.costs`, with the folder in the environment's COSTS (out/costs).
 
-    {"test": "tests/test_x.py::test_y", "seconds": 0.21, "compiled": {"module_1a2b3c4": 1.3},
+    {"test": "tests/test_x.py::test_y", "marks": ["law"], "seconds": 0.21, "compiled": {"module_1a2b3c4": 1.3},
      "runs": ["biotac_mj/press/scene.py:50", "biotac_mj.skin.bodies:move", ...]}
 
 Seconds are of the processor, child processes included, compilation not. `runs` has lines of the package's
@@ -92,7 +92,9 @@ def pytest_runtest_protocol(item):
         return (yield)
     finally:
         seconds = round(spent() - began - sum(_compiled.values()), 3)
-        row = {"test": item.nodeid, "seconds": seconds, "compiled": _compiled, "runs": sorted(_runs)}
+        marks = sorted({mark.name for mark in item.iter_markers()})
+        row = {"test": item.nodeid, "marks": marks, "seconds": seconds, "compiled": _compiled}
+        row["runs"] = sorted(_runs)
         _FOLDER.mkdir(parents=True, exist_ok=True)
         with open(_FOLDER / f"{os.getpid()}.jsonl", "a") as file:
             print(json.dumps(row), file=file)

@@ -6,8 +6,8 @@ import json
 from quick_tests import SLOW, chosen, measured, shortened
 
 
-def row(test, seconds, *runs, compiled=None):
-    return {"test": test, "seconds": seconds, "runs": list(runs), "compiled": compiled or {}}
+def row(test, seconds, *runs, compiled=None, marks=()):
+    return {"test": test, "marks": marks, "seconds": seconds, "runs": list(runs), "compiled": compiled or {}}
 
 
 def lines(*numbers):
@@ -36,6 +36,13 @@ def test_one_case_of_a_function_stays_where_all_run_the_same():
     found, _ = quick(row("t::a", 0.05, *same), *rows)
     assert found == {"t::a", "t::f[0]"}
     assert shortened({"t::f[1]", "t::f[2]", "t::g[0]", "t::g[1]"}, found) == ["t::f[1]", "t::f[2]", "t::g"]
+
+
+def test_a_law_is_worth_more_than_its_lines():
+    same = row("t::a", 0.05, *lines(*range(30)))
+    for marks, kept in (((), set()), (["law"], {"t::f[0]"})):
+        laws = [row(f"t::f[{i}]", 4 + i, *lines(*range(30)), marks=marks) for i in range(2)]
+        assert quick(same, *laws)[0] == {"t::a"} | kept
 
 
 def test_a_module_is_compiled_once_and_shared():
