@@ -1,7 +1,7 @@
 """A plugin of pytest that writes what each test costs and what it runs, a line of JSON for each, one file for
 each process: `python -m pytest -p tests.costs`, with the folder in the environment's COSTS (out/costs).
 
-    {"test": "tests/test_x.py::test_y", "marks": ["law"], "seconds": 0.21, "compiled": {"module_1a2b3c4": 1.3},
+    {"test": "tests/test_x.py::test_y", "marks": ["law"], "seconds": 0.21, "compiled": {"module_1a2b": 1.3},
      "runs": ["biotac_mj/press/scene.py:50", "biotac_mj.skin.bodies:move", ...]}
 
 Seconds are of the processor, child processes included, compilation not. `runs` has lines of the package's

@@ -261,6 +261,7 @@ def _fields(material):
     return dataclasses.asdict(material)
 
 
+@pytest.mark.law
 def test_each_world_is_the_single_simulation():
     # on CUDA directions are single: what is left of a solve's error is felt where the film is thin
     counts = 4 if wp.is_cuda_available() else 1
@@ -374,6 +375,7 @@ def test_a_ten_gram_ball_rests_with_its_weight_on_the_pad():
     )
 
 
+@pytest.mark.law
 def test_sparse_and_dense_constraints_give_one_motion():
     qpos = []
     for jacobian in (mujoco.mjtJacobian.mjJAC_DENSE, mujoco.mjtJacobian.mjJAC_SPARSE):
@@ -388,6 +390,7 @@ def test_sparse_and_dense_constraints_give_one_motion():
     assert abs(qpos[0]) < 2e-3  # of 12 mm without the skin
 
 
+@pytest.mark.law
 def test_tangent_is_that_of_the_single_world():
     _, m, d, batch = make(ball_spec(mass=0.3), 2, readings=False)
     for _ in range(20):
@@ -400,6 +403,7 @@ def test_tangent_is_that_of_the_single_world():
     np.testing.assert_allclose(got / scale, expected / scale, atol=5e-3 * np.abs(expected / scale).max())
 
 
+@pytest.mark.law
 def test_finger_and_ball_exchange_momentum_and_lose_none():
     mjm, m, d, _ = make(impact_spec(), 2, body="finger", readings=False)
     velocity = d.qvel.numpy().copy()
@@ -450,6 +454,7 @@ def thrown(speeds, spins, mass, timestep, steps, neighbours=0, **settings):
     yield 0.5 * (weight * d.qvel.numpy().astype(float) ** 2).sum(axis=1), mjm, d, velocity
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "middle, fastest",
     [
@@ -481,6 +486,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do(middle, fastest
         np.testing.assert_allclose(d.qvel.numpy()[w, :3], data.qvel[:3], atol=0.03 * v[1])
 
 
+@pytest.mark.law
 def test_a_step_without_a_balance_pulls_no_ball():
     """Of 100 g, in `mj_step` and in a batch. Which solves are cut off as a ball leaves skin that lay on the
     core is a matter of rounding: some of these speeds have one."""
@@ -538,6 +544,7 @@ def test_no_ball_gains_energy(mass, spin, seed):
     np.testing.assert_allclose(d.qpos.numpy()[3], other.qpos.numpy()[0], atol=bound)
 
 
+@pytest.mark.law
 def test_a_skin_without_energy_pushes_nobody():
     """A ball that was pressed in and let go; of the second skin is forgotten what was put into it. It bears
     the ball's weight and no more."""
@@ -591,6 +598,7 @@ def shaken_spec():
     return spec
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "coupling, steps", [pytest.param("one-way", 12, marks=pytest.mark.slow), ("two-way", 9)]
 )
@@ -639,6 +647,7 @@ def test_inertia_of_the_skin_is_that_of_the_engine_plugin(coupling, steps):
     assert (batch.vert_xpos[1] == rest[1]).all() and batch.skin.fresh.numpy().tolist() == [0, 1]
 
 
+@pytest.mark.law
 def test_memory_and_liquids_of_worlds_equal_single_worlds():
     """Relaxation, friction in the rubber, adhesion, law of friction, fill and a modulus by element: two
     worlds, the second of which is reset and pressed again as if nothing had been."""

@@ -264,6 +264,7 @@ def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     assert sum(a.lost for a, _ in both) <= 1.5 * sum(b.lost for _, b in both) + 3
 
 
+@pytest.mark.law
 def test_a_thrown_box_has_the_force_of_the_plugin():
     """To single precision, also where the candidates of a long step find no room at first."""
     box = '<body><freejoint/><geom type="box" size=".004 .004 .004" mass="0.0486"/></body>'
@@ -278,6 +279,7 @@ def test_a_thrown_box_has_the_force_of_the_plugin():
     np.testing.assert_allclose(batch.force, single.force, atol=1e-5 * single.size.max())
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("integrator, bound", [("Euler", 1e-5), ("implicitfast", 3e-5)])
 def test_the_second_step_of_a_batch_has_the_force_of_the_plugin(integrator, bound):
     """Friction begins where it was at the end of the first step, in which the skin rests; and the body turns
@@ -294,6 +296,7 @@ def test_the_second_step_of_a_batch_has_the_force_of_the_plugin(integrator, boun
     np.testing.assert_allclose(batch.force, single.force, atol=bound * single.size.max())
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "timestep, integrator", [(0.004, "Euler"), (0.004, "implicitfast"), (0.002, "Euler")]
 )
@@ -315,6 +318,7 @@ def test_two_light_balls_on_a_pad_have_the_force_of_the_plugin(timestep, integra
     np.testing.assert_allclose(batch.force, single.force, atol=2e-5 * single.size.max())
 
 
+@pytest.mark.law
 def test_balls_that_slide_on_an_elliptic_cone_as_in_the_plugin():
     """Two spinning balls rub on each other over a pad, and their contact holds by the Hessian of its cone;
     without it six of twelve steps took another round, and forces parted by 6e-4."""
@@ -417,6 +421,7 @@ def test_a_body_that_turns_far_ends_where_predicted(integrator):
     assert np.max(off) < 1e-6
 
 
+@pytest.mark.law
 def test_a_ball_on_a_damped_slide_is_that_of_the_plugin():
     """What the integrator takes from joint damping counts: time step x damping / inertia is 2."""
     ball = (
@@ -536,6 +541,7 @@ def test_skin_and_core_are_reported_together(cone):
         np.testing.assert_allclose(reported, torque, atol=1e-4 * np.linalg.norm(torque) + 1e-4)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_a_light_box_gains_nothing_beside_a_press(tier):
     """What a fixed ball that presses has put into the skin is not for a box that hits beside it."""

@@ -60,6 +60,7 @@ def touch_and_part():
     return np.array(rows), np.array(awake)
 
 
+@pytest.mark.law
 def test_readings_equal_those_of_skins_solved_every_step(restless):
     rows, awake = touch_and_part()
     assert awake[:, 3].sum() == 0

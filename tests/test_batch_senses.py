@@ -103,6 +103,7 @@ FELT = {
 }
 
 
+@pytest.mark.law
 def test_a_world_is_the_single_sensor():
     steps = 50
     one = single(steps, sensor="phac_f1", options={"readings": {"noise": False}}, **FELT)

@@ -272,6 +272,7 @@ def test_bodies_are_where_an_unfinished_solver_sends_them(integrator, damping, m
         assert abs(data.qacc - real).max() > 0.1 * abs(real).max()  # there was something to get right
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
 def test_only_dampers_take_momentum(integrator):
     """A damped finger hit by a free ball: what both lose is what the joint's dampers take, at the end of each
@@ -295,6 +296,7 @@ def test_only_dampers_take_momentum(integrator):
     assert touched >= 2
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "masses, integrator, timestep",
     covering(
@@ -836,6 +838,7 @@ def test_a_core_elsewhere_reads_its_contact_once(order):
     np.testing.assert_allclose(both[:, 2], alone[:, 1], rtol=1e-4)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("turn", [0.02, 0.1, 0.4])
 def test_what_whirls_on_a_touched_body_gains_nothing(turn):
     """turn: [rad] in a step. With a tie's force of the first stage in all four, a whirl gained the square of

@@ -184,6 +184,7 @@ def test_a_ball_sticks_and_slips_at_mu(timestep):
     assert np.mean(ratio) == pytest.approx(mu, rel=0.05)  # what the pad's slope leaves: tan(1 degree) / mu
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("masses, timestep", covering([(0.02, 0.005), (0.05, 0.05)], [0.0005, 0.002]))
 def test_momentum_of_a_free_finger_and_a_ball_is_conserved(masses, timestep):
     """A spinning ball hits a free finger beside its centre and slides."""
@@ -296,6 +297,7 @@ def both(request):
     return two_biotacs(readings="biotac", options={"skin": {"dynamics": request.param}})
 
 
+@pytest.mark.law
 def test_replay_copies_and_reset_are_bit_equal(both):
     data = start(both)
     mujoco.mj_step(both, data, 2)

@@ -29,6 +29,7 @@ def another_shape(skin):
     return torch.tensor(skin.rest + 1e-5 * np.random.default_rng(6).normal(size=skin.rest.shape))
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("element, liquid", first(["linear", "quadratic"], [True, False]))
 def test_every_input_against_differences(element, liquid):
     """A press that sticks, slips and squeezes the skin on the core."""

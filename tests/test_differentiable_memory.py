@@ -52,6 +52,7 @@ CASES = {
 QUICK = (("all", "linear", False),)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "names, law, exact, element, liquid",
     [

@@ -17,6 +17,7 @@ UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 WIDTH = 1e-6  # [m], of the size by which a millimetre's contact overcloses
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("element, liquid", first(["linear", "quadratic"], [False, True]))
 def test_every_input_against_differences(element, liquid):
     """A press that sticks, slips and squeezes the skin on the core."""

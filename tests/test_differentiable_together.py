@@ -54,6 +54,7 @@ def test_worlds_together_are_worlds_alone(element):
         assert (a - b).abs().max() < 1e-6 * a.abs().max(), name
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 def test_every_input_against_differences(element):
     skin = ball(element=element, liquid=False)

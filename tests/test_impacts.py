@@ -96,6 +96,7 @@ def most_energy(model, data, seconds):
     return most / start
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "seed, integrator",
     [
@@ -249,6 +250,7 @@ def test_fast_turning_bodies_gain_nothing_from_withheld_force(integrator):
     assert most_energy(model, data, 0.1) < 1.02
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "integrator, light, quat, place, heavy, speed",
     [
@@ -389,6 +391,7 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
     assert touched > 1
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "seed, most",
     [
@@ -853,6 +856,7 @@ MOST_LEFT = [
 ON_SOME = [pytest.mark.slow, pytest.mark.xfail(reason="it keeps 99.3 % on some processors")]
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "mass, speed, tier, left",
     [

@@ -219,6 +219,7 @@ def test_tangent_is_exact(on_core, bound):
     check_tangent(*on_core, bound)
 
 
+@pytest.mark.law
 def test_tangent_is_exact_at_the_stiffness_of_the_default(coarse):
     """The turn of the core's normals goes with the overclosure, a thousandth of that in soft contact."""
     check_tangent(*pressed_onto_the_core(coarse, None), 0.01)

@@ -62,6 +62,7 @@ def way(steps=8):
     return np.stack([start + depth, start - [0, 5e-3, 0] + 0 * depth], axis=1)
 
 
+@pytest.mark.law
 def test_mjlabs_scene_reads_what_a_single_simulation_reads():
     cfg = mjlab.BioTacSensorCfg(name="biotac", body="world", skin=shell(), coupling="one-way", settings=QUIET)
     scene = Scene(press_spec(), [cfg], nworld=2)
@@ -109,6 +110,7 @@ def isaac(poses, nworld=2, **changes):
     return cfg.class_type(cfg)
 
 
+@pytest.mark.law
 def test_isaac_labs_scene_reads_what_a_single_simulation_reads():
     """All is turned and moved: what counts is where the bodies are against each other."""
     turn = np.array([0.8, 0.36, -0.48, 0.0])

@@ -101,6 +101,7 @@ def test_what_a_mocap_body_leads_slides():
     assert abs(force[0]) > 0.6 * abs(force[1])
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_in_a_batch_who_is_put_somewhere_did_not_slide_there(tier):
     mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
@@ -134,6 +135,7 @@ def test_in_a_batch_who_is_put_somewhere_did_not_slide_there(tier):
             np.testing.assert_allclose(jumped, fresh, atol=2e-3 * np.abs(fresh).max())
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "tier, depth, tolerance, bound",
     [

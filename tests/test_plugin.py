@@ -253,6 +253,7 @@ def test_threads_equal_the_loop(model):
         assert np.array_equal(state_of(model, a), state_of(model, b))
 
 
+@pytest.mark.law
 def test_rollout_with_two_threads_equals_the_loop(model):
     starts = np.stack([state_of(model, start(model, 0.01 * i), FULL) for i in range(4)])
     states, sensors = mujoco.rollout.rollout(

@@ -221,6 +221,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
         assert abs(cavity(model, c.vert_xpos) - model.rest.volume) < 5e-4 * model.rest.volume
 
 
+@pytest.mark.law
 def test_filled_stiffness_is_the_derivative_of_the_forces():
     model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=3e3))
     K = rest_tangent(model)

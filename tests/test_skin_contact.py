@@ -88,6 +88,7 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
     return np.array(forces), np.array(areas)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "cells, largest", [((2, 3), 0.2), pytest.param((4, 6), 0.06, marks=pytest.mark.slow)]
 )
@@ -223,6 +224,7 @@ def test_slab_on_an_incline(mu):
 # --- balance and tangent  ---
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("law, with_core", covering(["linear", "corotational", "neo_hookean"], [False, True]))
 def test_action_equals_reaction(law, with_core):
     """Force and torque of geom, core and held nodes on the skin cancel."""

@@ -90,6 +90,7 @@ def test_each_step_is_the_oscillators(mass_damping, stiffness_damping):
     )  # of the amplitude; the solver's tolerance is absolute here
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
 def test_energy_falls(law):
     """Backward Euler never gains energy, and loses more when damped."""

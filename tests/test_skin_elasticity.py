@@ -197,6 +197,7 @@ def skfem_newton(law, basis, dofs, load, fixed, mu, lam):
     return u[dofs].T
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("law", ["svk", pytest.param("neo_hookean", marks=pytest.mark.slow)])
 def test_hyperelasticity_equals_scikit_fem(law):
     model = block(law, cells=3, tolerance=1e-7)

@@ -258,6 +258,7 @@ def test_directions_in_single_precision(element):
     np.testing.assert_allclose(force[1], force[0], rtol=0, atol=1e-4 * abs(force).max())
 
 
+@pytest.mark.law
 def test_slip_is_in_the_plugins_state():
     """Pressed and drawn back in mj_step: less force on the way out, and a copy of mjData replays it bit by
     bit."""

@@ -132,6 +132,7 @@ def test_the_tangent_is_the_forces_derivative(law, element, beside):
     assert abs(force(0.0) - soft).max() > 1e-3 * abs(soft).max()  # it was softened
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("law", ["corotational", "neo_hookean", "svk"])
 def test_no_energy_comes_out_of_a_cycle(law):
     """Work of closed cycles of the deformation: zero for the elastic law, positive with memory, at any
@@ -311,6 +312,7 @@ def test_filled_skin_rests():
     np.testing.assert_array_equal(data.vert_xpos, at_rest)
 
 
+@pytest.mark.law
 def test_memory_is_in_the_plugins_state():
     """Pressed and held, the force relaxes in mj_step; a copy of mjData replays it bit by bit, and a reset
     forgets."""

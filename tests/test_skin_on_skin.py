@@ -266,6 +266,7 @@ def test_a_batch_does_what_one_does():
     assert felt == pytest.approx(np.array(alone), abs=0.03 * np.array(alone)[:, :, 1].max())
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("unseen", ["low", pytest.param("high", marks=pytest.mark.slow)])
 def test_in_a_batch_too_who_is_not_met_is_pushed_with_all(unseen):
     mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")

@@ -53,6 +53,7 @@ def far(name, answers, kind):
     return out
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("name, device, kind", RUNS)
 def test_answers_are_the_frozen_ones(name, device, kind):
     answers = solve(CASES[name], device, preconditioner=kind, **OPTIONS[kind])

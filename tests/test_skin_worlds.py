@@ -393,6 +393,7 @@ def test_elements_of_single_precision_are_those_of_double(law, element):
     assert (inverted.numpy() == 0).all()
 
 
+@pytest.mark.law
 def test_one_dense_world_equals_a_sparse_one(model):
     """Its inverse is applied in one pass, see `symmetric_product`."""
     worlds = random_worlds(1, seed=5)
@@ -409,6 +410,7 @@ DEVICES = [
 ]
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("device", DEVICES)
 def test_an_inverted_element_or_crossed_core_is_no_balance(element, device):

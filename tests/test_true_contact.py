@@ -269,6 +269,7 @@ def test_contact_sensors_feel_the_skin(tier, cone):
     check_contacts(lambda name: data.sensor(name).data, data.cfrc_ext[model.body("plate").id])
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("cone", first(["elliptic", "pyramidal"]))
 def test_in_a_batch_contact_sensors_feel_the_skin(cone):
     d, _ = batch_of(CONTACTS.format(cone=cone), 150)
@@ -440,6 +441,7 @@ def test_in_a_batch_a_cup_hangs_on_the_nail():
     assert np.abs(d.qvel.numpy()).max() < 0.5
 
 
+@pytest.mark.law
 def test_in_a_batch_a_margin_moves_no_load():
     xml = WRIST.format(integrator="implicitfast", cone="pyramidal")
     plain, wide = (batch_of(xml, 40, margin) for margin in (0.0, 0.002))
@@ -521,6 +523,7 @@ def test_tiers_find_one_balance_of_an_apex(share):
     np.testing.assert_allclose(others, counts, atol=share * np.abs(counts).max())
 
 
+@pytest.mark.law
 def test_in_a_batch_an_apex_comes_to_the_same_balance():
     mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
     from biotac_mj import batch
