@@ -33,7 +33,7 @@ def flat(readings):
     )
 
 
-def test_rest_counts():
+def test_at_rest_the_counts_are_the_rest_counts():
     acquisition, state = started(noise=False)
     run(acquisition, state, 1e-3, 0.05, lambda t: (REST, 0.0, channels.REST_TEMPERATURE))
     readings = acquisition.readings(state)
@@ -59,7 +59,7 @@ def test_every_electrode_is_sampled_at_its_slot(dt):
     assert np.array_equal(acquisition.readings(state)["electrodes"], expected)
 
 
-def test_pdc_step_response():
+def test_pdc_answers_a_step_as_its_low_pass_does():
     """A ramp of 1 ns, then level: a step; PDC's slot sees 1 - exp(-2 pi 1040 t)."""
     acquisition, state = started(noise=False)
     slot_time = 40 / SLOT_RATE
@@ -76,7 +76,7 @@ def test_pdc_step_response():
 
 
 @pytest.mark.parametrize("hertz", [2.0, 100.0, 800.0])
-def test_pac_gain(hertz):
+def test_the_gain_of_pac_is_that_of_the_band_pass(hertz):
     """Amplitude of a sine against |H| of the analogue band-pass."""
     acquisition, state = started(noise=False)
     amplitude, dt, values = 300.0, 1e-4, []
@@ -220,7 +220,7 @@ def test_impedance_is_held_between_solutions():
     assert acquisition.readings(state)["electrodes"][18] == np.round(expected)
 
 
-def test_bad_input():
+def test_bad_input_is_named_and_changes_no_state():
     acquisition, state = started()
     before = state.copy()
     broken = REST.copy()

@@ -369,7 +369,7 @@ def test_a_prefix_serves_one_biotac():
         springs(spec, body="arm")
 
 
-def test_unknown_channel():
+def test_an_unknown_channel_is_refused():
     handle = springs(spec_of())
     with pytest.raises(ValueError, match="has no channel 'e20': choose one of electrodes, pdc"):
         handle.sensor_name("e20")
@@ -502,7 +502,7 @@ def test_a_map_of_electrodes_has_the_colors_of_the_render():
     np.testing.assert_allclose(change_map()(share), electrode_colors(change), atol=0.01)
 
 
-def test_electrode_colors():
+def test_colors_of_electrodes_show_sign_and_size():
     colors = electrode_colors(np.array([0.0, -300.0, 900.0]))
     np.testing.assert_allclose(colors, [[0.85, 0.85, 0.85, 1], [0.8, 0.15, 0.1, 1], [0.1, 0.3, 0.85, 1]])
 

@@ -137,7 +137,7 @@ def test_a_case_that_cannot_be_solved_is_told(repo, shared, tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["cases"][0]["force_error_rel"] is None
 
 
-def test_no_cases(repo, tmp_path):
+def test_a_folder_without_cases_is_said(repo, tmp_path):
     done = _run_here(repo, "accuracy.py", "--cases", tmp_path, "--json", tmp_path / "out.json")
     assert done.returncode == 2
     assert "pass the folder that holds them" in done.stderr

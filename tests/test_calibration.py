@@ -242,7 +242,7 @@ def test_csv_round_trip_and_errors(way, tmp_path):
         read_indentation(tmp_path / "none.csv")
 
 
-def test_error_texts(way, shell, tmp_path):
+def test_parameters_that_cannot_be_fitted_are_refused(way, shell, tmp_path):
     for text, match in (
         ("hardness", "cannot fit 'hardness'"),
         ("E:2:1", "no interval"),
@@ -269,7 +269,7 @@ def test_error_texts(way, shell, tmp_path):
     assert read_material(tmp_path / "fit.json") == TRUTH
 
 
-def test_command_line_errors(capsys):
+def test_commands_name_the_missing_argument(capsys):
     assert cli.main(["lab", "calibrate"]) == 2
     assert "--synthetic" in capsys.readouterr().err
     assert cli.main(["lab", "compare", "--data", "press.csv"]) == 2

@@ -21,7 +21,7 @@ def test_what_bodies_did_is_put_into_the_store():
     assert in_store(1.0, -5.0, -5.0, 2.0) == 2.0  # at most what it holds
 
 
-def test_poor_corrections():
+def test_only_corrections_beyond_both_bounds_are_poor():
     assert poorly_corrected(0.02, 1.0, 0.5, 0.01) and not poorly_corrected(0.005, 1.0, 0.5, 0.01)
     assert not poorly_corrected(0.02, 1.0, 3.0, 0.01)
     assert not poorly_corrected(np.nan, 1.0, 1.0, 0.01)

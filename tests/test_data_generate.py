@@ -321,7 +321,7 @@ def test_same_seed_same_file_on_cuda(tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
-def test_condensed_tier(tmp_path):
+def test_the_condensed_tier_generates_the_same_steps(tmp_path):
     options = dataclasses.replace(
         SMALL, count=1, labelled=0, objects=("sphere_7mm",), tier="condensed", kinds=("press",)
     )
@@ -388,7 +388,7 @@ def test_readings_follow_a_ramp():
 
 
 @pytest.mark.slow
-def test_example(repo, tmp_path):
+def test_the_example_explains_unseen_interactions(repo, tmp_path):
     spec = importlib.util.spec_from_file_location("data_set", repo / "examples" / "data_set.py")
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)

@@ -44,7 +44,7 @@ def nvidia(path, lengths=(6, 4, 5, 7), seed=0, flat=False, **changes):
 
 
 @pytest.mark.parametrize("flat", [True, False])
-def test_nvidia(tmp_path, flat):
+def test_files_of_nvidia_are_read(tmp_path, flat):
     data = nvidia(tmp_path / "biotac1.hdf5", flat=flat)
     ones = read(tmp_path / "biotac1.hdf5")
     assert [len(one.time) for one in ones] == [6, 4, 5, 7]
@@ -145,7 +145,7 @@ def ruppel(path, header=True, order=None, n=30):
 
 
 @pytest.mark.parametrize("header, order", [(True, None), (False, None), (True, list(range(31))[::-1])])
-def test_ruppel(tmp_path, header, order):
+def test_tables_of_ruppel_are_read(tmp_path, header, order):
     value = ruppel(tmp_path / "data.csv", header, order)
     ones = read(tmp_path / "data.csv")
     assert [len(one.time) for one in ones] == [12, 18]
@@ -176,7 +176,7 @@ def test_bad_csv_is_named(tmp_path):
         read(path)
 
 
-def test_text_with_forces(tmp_path):
+def test_text_files_of_counts_and_forces_are_joined(tmp_path):
     rng = np.random.default_rng(0)
     counts, force = rng.integers(1500, 3500, (50, 19)), rng.normal(size=(50, 3)).round(6)
     np.savetxt(tmp_path / "e.txt", counts, fmt="%d", newline=" \n")
@@ -195,7 +195,7 @@ def test_text_with_forces(tmp_path):
         read(tmp_path / "g.txt")
 
 
-def test_the_command(tmp_path, capsys):
+def test_the_command_says_what_it_has_read(tmp_path, capsys):
     nvidia(tmp_path / "biotac1.hdf5")
     out = str(tmp_path / "set")
     assert cli.main(["data", "import", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 0

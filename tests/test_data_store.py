@@ -246,7 +246,7 @@ def test_splits_divide_interactions_and_objects(folder):
             split_by_interaction(data, fractions=(0.9, 0.0, 0.1))
 
 
-def test_the_papers_fractions():
+def test_a_split_has_the_fractions_of_the_paper():
     part = assign(359, seed=0)
     assert [int((part == name).sum()) for name in ("train", "validation", "test")] == [258, 65, 36]
     assert (assign(359, seed=0) == part).all() and (assign(359, seed=1) != part).any()

@@ -160,7 +160,7 @@ def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, fric
     ],
     ids=["neo_hookean", "svk", "incompressible", "filled", "averaged"],
 )
-def test_laws_and_liquids(material, options):
+def test_gradients_are_differences_for_all_laws_and_liquids(material, options):
     """Of Young's modulus, Poisson's ratio, the path, a filling, and rest positions."""
     skin = ball(material=material, modulus=lambda at: 1 + 50 * at[:, 0], **options)
     # the volume of what hardly yields is known to rounding alone, and with it the pressure of differences
@@ -260,7 +260,7 @@ def test_tangents_and_cotangents_are_of_one_jacobian():
         assert one == pytest.approx(other, rel=1e-7)
 
 
-def test_gradcheck():
+def test_torch_finds_the_gradients_right():
     skin = ball(element="linear", liquid=True, bulk_modulus=1e6)  # of water the pressure has noise
     pos, quat = path(5, 2e-4)
     stiff = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
@@ -347,7 +347,7 @@ def test_worlds_of_other_shapes_are_alone():
 
 
 @pytest.mark.slow  # quick: every step's inputs in five steps
-def test_sixty_steps():
+def test_gradients_through_sixty_steps_are_differences():
     skin = ball(element="linear", liquid=True)
     pos, quat = path(60, 2e-5)
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
@@ -361,7 +361,7 @@ def test_sixty_steps():
     assert differences(moved, 1e-8) == pytest.approx((shift.grad @ way).item(), rel=1e-4)
 
 
-def test_forward_mode():
+def test_forward_mode_gives_the_differences():
     skin = ball(element="linear", liquid=True, bulk_modulus=1e6)
     pos, quat = path(6, 2e-4)
     given = {"pos": pos, "quat": quat, "youngs_modulus": torch.tensor(1.4e6, dtype=torch.float64)}

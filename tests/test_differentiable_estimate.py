@@ -290,7 +290,7 @@ def test_what_is_no_contact_is_refused(estimator):
         estimator.learn([Touch(np.zeros(19), 0.0, 1.0, np.ones(3))])
 
 
-def test_the_verb(estimator, pressed, tmp_path, capsys):
+def test_the_command_writes_what_the_estimator_finds(estimator, pressed, tmp_path, capsys):
     counts, _, truth = pressed
     header = ",".join(f"e{i + 1}" for i in range(19))
     lines = [",".join(f"{v:.0f}" for v in row) for row in (REST, counts)]

@@ -36,7 +36,7 @@ def test_impedances_are_those_of_the_film(film, pressed):
         assert impedance(film, torch.from_numpy(nodes)).numpy() == pytest.approx(expected, rel=1e-9)
 
 
-def test_slopes_of_impedances(film, pressed):
+def test_slopes_of_impedances_are_differences(film, pressed):
     """By the nodes and by the sensor's constants."""
     draw = np.random.default_rng(0)
     given = {

@@ -43,7 +43,7 @@ def test_temperatures_are_those_of_the_sensor():
         assert np.allclose(found, other, rtol=1e-10, atol=1e-15)
 
 
-def test_slopes_of_temperatures():
+def test_slopes_of_temperatures_are_differences():
     """By areas, forces, the state that it begins at with its bodies, and every constant, of what TDC and TAC
     read."""
     area, force = touches(14)

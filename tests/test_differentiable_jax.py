@@ -52,7 +52,7 @@ def test_gradients_are_those_of_pytorch(pressed):
     assert float(found[1][1]) == pytest.approx(stiff.grad.item(), rel=1e-12)
 
 
-def test_jacobians_and_worlds(pressed):
+def test_jacobians_press_once_and_worlds_are_alone(pressed):
     """`jacrev` presses once, `vmap` goes from world to world, and what no output hangs on has slope 0."""
     function, calls = pressed
     pos = path(STEPS, 2e-4)[0].numpy()

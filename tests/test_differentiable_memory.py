@@ -194,7 +194,7 @@ def test_tangents_and_cotangents_are_of_one_jacobian():
 
 
 @pytest.mark.slow
-def test_gradcheck():
+def test_torch_finds_the_gradients_right():
     skin = remembering(("prony",), element="linear", liquid=True, bulk_modulus=1e6)
     pos, quat = path(5, 2e-4)
 
@@ -209,7 +209,7 @@ def test_gradcheck():
 
 @pytest.mark.slow  # quick: sixty steps without memory, every input with all
 @pytest.mark.parametrize("names, by", [(("prony",), 3e-9), (ALL, 1e-8)], ids=["prony", "all"])
-def test_sixty_steps(names, by):
+def test_gradients_through_sixty_steps_are_differences(names, by):
     """by: what poses are moved by [m]: over less rounding shows (with all, over 3 nm, 1.2e-4 on one processor
     and 1e-5 on another; over 10 nm 2e-6), over more a sample begins to touch."""
     skin = remembering(names, element="linear", liquid=True)

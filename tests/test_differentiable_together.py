@@ -145,7 +145,7 @@ def test_inverse_of_steps_solves_as_the_factor_does(preconditioner, transpose):
 
 
 @pytest.mark.parametrize("single", [False, True])
-def test_systems_of_worlds(single):
+def test_systems_of_worlds_are_each_solved(single):
     """Unsymmetric ones, one without a right-hand side, by an inverse that is near and may be single."""
     draw = torch.Generator().manual_seed(2)
     n, w = 40, 3

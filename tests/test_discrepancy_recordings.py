@@ -299,7 +299,7 @@ def late(e, k, change, share=0.35):
 
 
 @pytest.mark.slow
-def test_order_under_load():
+def test_electrodes_that_are_swapped_under_load_are_found():
     e, _, rng = pressed(6, seconds=120)
     mixed = noisy(e, rng)
     start = len(e) * 2 // 5

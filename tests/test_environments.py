@@ -91,7 +91,7 @@ def test_without_touch_there_is_none():
     assert sorted(names) == ["position", "target"]
 
 
-def test_bad_input():
+def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="unknown render_mode 'human': choose rgb_array or None"):
         BioTacEnv("finger", "press", render_mode="human")
     with pytest.raises(ValueError, match="domain 'finger' has no task 'pres'"):

@@ -30,7 +30,7 @@ def test_quickstart_ball_rests_on_the_pad(repo):
     )
 
 
-def test_press_example(repo):
+def test_the_example_of_a_press_feels_it(repo):
     record = load(repo, "press").main(skin="coarse", depth=0.5e-3)
     # the force opposes the press, which points inwards at 0.3 rad around the finger
     inwards = np.array([0, np.cos(0.3), -np.sin(0.3)])

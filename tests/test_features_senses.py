@@ -188,7 +188,7 @@ def cells():
 
 
 @pytest.mark.parametrize(("path", "sense"), cells())
-def test_sense(path, sense, file):
+def test_a_sense_changes_its_channel_or_is_refused(path, sense, file):
     refused = sense.cell(path)
     if refused is not None:
         with pytest.raises(ValueError, match=refused.match):

@@ -45,7 +45,7 @@ def skin(request):
     return load_skin(request.param)
 
 
-def test_regular_tetrahedron():
+def test_volume_and_angles_of_a_regular_tetrahedron_are_exact():
     mesh = TetMesh(
         REGULAR, [[0, 1, 3, 2]] if np.linalg.det(REGULAR[1:] - REGULAR[0]) < 0 else [[0, 1, 2, 3]]
     ).check()
@@ -77,7 +77,7 @@ def cube_mesh(n=2):
     return TetMesh(grid / n, elem)
 
 
-def test_cube_boundary():
+def test_the_boundary_of_a_cube_has_its_area_and_volume():
     mesh = cube_mesh().check()
     (part,) = mesh.boundary_components()
     np.testing.assert_allclose([mesh.volumes.sum(), enclosed_volume(mesh.vert, part)], 1.0)
@@ -124,7 +124,7 @@ def test_check_says_what_is_wrong(change, text):
         TetMesh(*change(mesh.vert, mesh.elem)).check()
 
 
-def test_bad_shapes():
+def test_arrays_of_bad_shapes_are_refused():
     with pytest.raises(ValueError, match=r"vert has shape \(3, 2\)"):
         TetMesh(np.zeros((3, 2)), [[0, 1, 2, 3]])
     with pytest.raises(ValueError, match=r"elem has shape \(0, 4\)"):
@@ -145,7 +145,7 @@ def test_areas_and_normals_of_a_box():
     assert (normal[:-1] * box.vertices > 0).all() and not normal[-1].any()
 
 
-def test_open_surface():
+def test_open_and_inconsistent_surfaces_are_refused():
     face = TetMesh(REGULAR, [[0, 1, 2, 3]]).boundary
     with pytest.raises(ValueError, match="skin is open: 3 edges have one face only.*fill the holes"):
         check_closed(face[1:], "skin")
@@ -171,7 +171,7 @@ def test_shipped_skin_is_sound(skin):
     assert len(skin.outer_face) + len(skin.inner_face) == len(mesh.boundary)
 
 
-def test_shipped_sizes():
+def test_shipped_skins_have_the_stated_sizes():
     nodes = [load_skin(name).nvert for name in SKINS]
     assert 2000 < nodes[0] < 3000 and 3600 < nodes[1] < 4400 and 11000 < nodes[2] < 19000
 
@@ -184,7 +184,7 @@ def test_boundary_lies_on_the_parametric_surfaces(skin):
         assert distance.max() < 0.3  # in the tight corners around the clamp, where a tetrahedron would fold
 
 
-def test_rigid_bodies(skin):
+def test_rigid_bodies_are_closed_and_face_outwards(skin):
     for vert, face in (
         (skin.core_vert, skin.core_face),
         (skin.nail_vert, skin.nail_face),
@@ -230,7 +230,7 @@ def test_held_nodes_are_those_on_rigid_bodies(skin):
     assert ((held[:, 1] > 1.8) | (held[:, 0] > 4.5)).all()  # never the pad
 
 
-def test_electrodes(skin):
+def test_electrodes_lie_on_the_core_and_face_outwards(skin):
     core = trimesh.Trimesh(skin.core_vert * 1e3, skin.core_face, process=False)
     _, distance, face = trimesh.proximity.closest_point(core, skin.electrode_pos * 1e3)
     assert distance.max() < 0.02
@@ -268,7 +268,7 @@ def test_surfaces_are_mirror_symmetric():
         np.testing.assert_array_equal(body.field(point), body.field(point * [1, 1, -1]))
 
 
-def test_projection_and_normals():
+def test_projection_and_normals_of_the_tip_are_a_sphere_s():
     """The core's tip is a sphere: distance zero, normals radial, and a point moved off it comes back."""
     body, d = biotac_bodies()["core"], BioTacDimensions()
     radius, angle = d.core[0][2], np.linspace(-0.6, 0.6, 9)
@@ -348,7 +348,7 @@ def rounded_cylinder(radius, length, edge=1.0):
 
 
 @pytest.mark.parametrize("name", INDENTERS)
-def test_indenter_shape(name):
+def test_indenters_have_their_volume_and_size(name):
     shape = indenter(name)
     vert, face = shape.mesh()
     check_closed(face, name)
@@ -388,7 +388,7 @@ def test_ring_is_a_ring():
     )
 
 
-def test_indenters_in_mujoco():
+def test_geoms_of_indenters_fill_the_boxes_of_their_meshes():
     """Each shape as a MuJoCo geom occupies the box of its mesh (MuJoCo's sizes are half sizes, its cylinders
     lie along z)."""
     for name in INDENTERS:
@@ -417,7 +417,7 @@ def test_indenters_in_mujoco():
             assert inside.any() and hit == pytest.approx(0.02 - mine[:, 1].max() * 1e-3, abs=2e-5)
 
 
-def test_meshes_in_mujoco():
+def test_mujoco_finds_the_same_volumes_of_meshes():
     """MuJoCo computes the same volumes and refuses meshes whose faces are inconsistent."""
     for name in ("core.obj", "nail.obj", "clamp.obj", "indenters/ring_7mm.obj", "indenters/cube_14mm.obj"):
         spec = mujoco.MjSpec()
@@ -430,7 +430,7 @@ def test_meshes_in_mujoco():
         assert spec.compile().body_mass[1] == pytest.approx(1000.0 * enclosed_volume(vert, face), rel=1e-4)
 
 
-def test_unknown_indenter():
+def test_an_unknown_indenter_is_refused():
     with pytest.raises(
         ValueError, match="unknown indenter 'sphere_9mm': choose one of sphere_3-5mm, .*ring_7mm"
     ):

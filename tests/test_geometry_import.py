@@ -47,7 +47,7 @@ def folder(tmp_path, coarse):
     return tmp_path
 
 
-def test_round_trip(folder, coarse):
+def test_a_skin_that_is_written_is_read_again(folder, coarse):
     skin = import_mesh(folder)
     np.testing.assert_array_equal(skin.vert, coarse.vert)
     np.testing.assert_array_equal(skin.outer_face, coarse.outer_face)
@@ -60,7 +60,7 @@ def test_round_trip(folder, coarse):
 
 
 @pytest.mark.parametrize("suffix", [".msh", ".vtu"])
-def test_meshio_formats(folder, coarse, suffix):
+def test_formats_of_meshio_are_read(folder, coarse, suffix):
     meshio = pytest.importorskip("meshio")
     (folder / "skin.tet").unlink()
     # a point of no tetrahedron and surface triangles, as mesh generators leave them
@@ -73,7 +73,7 @@ def test_meshio_formats(folder, coarse, suffix):
     np.testing.assert_array_equal(skin.fixed, coarse.fixed)
 
 
-def test_paths(tmp_path, folder):
+def test_missing_and_ambiguous_paths_are_refused(tmp_path, folder):
     with pytest.raises(FileNotFoundError, match="no mesh at .*nothing.tet"):
         import_mesh(tmp_path / "nothing.tet")
     (tmp_path / "empty").mkdir()
@@ -95,13 +95,13 @@ def test_paths(tmp_path, folder):
         ("\n".join(["v 0 0 0 1", "t 0 1 2"]), r"line 2 is cut short"),
     ],
 )
-def test_unreadable_tet(tmp_path, text, message):
+def test_a_tet_file_that_is_none_is_refused(tmp_path, text, message):
     (tmp_path / "a.tet").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_tet_mesh(tmp_path / "a.tet")
 
 
-def test_unreadable_binary(tmp_path):
+def test_binary_files_that_are_no_mesh_are_refused(tmp_path):
     for suffix in (".tet", ".msh", ".vtu"):
         path = tmp_path / f"a{suffix}"
         path.write_bytes(b"\xff\xfe\x00garbage")
@@ -109,14 +109,14 @@ def test_unreadable_binary(tmp_path):
             read_tet_mesh(path)
 
 
-def test_no_tetrahedra(tmp_path, coarse):
+def test_a_mesh_without_tetrahedra_is_refused(tmp_path, coarse):
     meshio = pytest.importorskip("meshio")
     meshio.write(tmp_path / "surface.vtu", meshio.Mesh(coarse.vert, [("triangle", coarse.outer_face)]))
     with pytest.raises(ValueError, match=r"holds no linear tetrahedra, only \['triangle'\]"):
         import_mesh(tmp_path / "surface.vtu")
 
 
-def test_bad_tetrahedra(folder, coarse):
+def test_inverted_and_misnumbered_tetrahedra_are_refused(folder, coarse):
     elem = coarse.elem.copy()
     elem[11] = elem[11][[1, 0, 2, 3]]
     write_tet(folder / "skin.tet", coarse.vert, elem)
@@ -135,7 +135,7 @@ def test_bad_tetrahedra(folder, coarse):
         (1e-6, "2.79", "scale it to metres"),
     ],
 )
-def test_wrong_units(folder, coarse, factor, size, remedy):
+def test_meshes_in_wrong_units_are_refused(folder, coarse, factor, size, remedy):
     write_tet(folder / "skin.tet", coarse.vert * factor, coarse.elem)
     with pytest.raises(
         ValueError, match=rf"largest dimension is {size}.* mm, not between 5 and 100 mm: {remedy}"
@@ -143,7 +143,7 @@ def test_wrong_units(folder, coarse, factor, size, remedy):
         import_mesh(folder)
 
 
-def test_missing_rigid_bodies(folder):
+def test_missing_rigid_bodies_are_named(folder):
     (folder / "core.obj").unlink()
     with pytest.raises(
         ValueError, match=r"found 2 rigid bodies .*plates.obj.* need three: core, nail plate and clamp plate"
@@ -151,13 +151,13 @@ def test_missing_rigid_bodies(folder):
         import_mesh(folder)
 
 
-def test_open_rigid_body(folder, coarse):
+def test_an_open_rigid_body_is_refused(folder, coarse):
     write_obj(folder / "core.obj", coarse.core_vert, coarse.core_face[1:])
     with pytest.raises(ValueError, match="core is open"):
         import_mesh(folder)
 
 
-def test_rigid_bodies_elsewhere(folder, coarse):
+def test_rigid_bodies_that_hold_no_node_are_refused(folder, coarse):
     for name in ("core", "plates"):
         write_obj(folder / f"{name}.obj", *_shifted(folder / f"{name}.obj"))
     with pytest.raises(ValueError, match="no skin node lies within 1e-05 m.*same frame and units"):
@@ -198,7 +198,7 @@ def test_held_nodes_against_a_plane():
 
 
 @needs_paper
-def test_papers_mesh():
+def test_the_mesh_of_the_paper_is_read():
     skin = import_mesh(PAPER)
     assert (skin.nvert, skin.nelem) == (4246, 15410)
     assert (len(np.unique(skin.outer_face)), len(skin.outer_face)) == (1686, 3368)
@@ -222,7 +222,7 @@ def test_papers_fixed_nodes_are_the_references():
 
 
 @needs_paper
-def test_papers_electrodes():
+def test_electrodes_of_the_paper_are_its_table_projected():
     """Against the table projected by ray casting: positions to 0.1 mm (E1 and E11 slide along the tip's
     edge), normals to 12 degrees."""
     skin, table = import_mesh(PAPER), np.loadtxt(TABLE, delimiter=",")

@@ -254,7 +254,7 @@ def test_another_hand_than_the_one_named_is_recognised():
         ),
     ],
 )
-def test_bad_hands(settings, text):
+def test_bad_settings_of_hands_are_refused(settings, text):
     with pytest.raises(ValueError, match=text):
         attach_to_hand(small_hand(), **({"hand": "shadow_hand"} | settings))
 

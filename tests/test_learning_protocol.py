@@ -21,7 +21,7 @@ def test_errors_are_averaged_within_an_interaction_first():
         interaction_errors(truth[:, :18], truth, np.zeros(5))
 
 
-def test_quartiles():
+def test_quartiles_are_those_of_the_values():
     assert quartiles([1, 2, 3, 4, 5]) == (3, 2, 4)
 
 

@@ -451,7 +451,7 @@ def test_contact_patch_takes_the_touch_and_tells_of_a_warm_up(with_force, traine
         assert "(recorded: 0.00 N)" in capsys.readouterr().out
 
 
-def test_patch_measures():
+def test_weak_nodes_are_no_part_of_a_patch():
     place = np.array([[0.0, 0, 0], [1e-3, 0, 0], [5e-3, 0, 0]])
     force = np.array([[1.0, 1.0, 0.1], [0, 0, 0]])
     centre = contact_centre(force, place)

@@ -42,7 +42,7 @@ def lame_pressure(filling, bulk, E, nu):
     "bulk, nu",
     [(math.inf, 0.3), *(pytest.param(*b, marks=pytest.mark.slow) for b in ((1e6, 0.3), (2.2e9, 0.45)))],
 )
-def test_inflated_sphere(bulk, nu):
+def test_the_pressure_in_a_filled_sphere_is_that_of_lame(bulk, nu):
     """The error of linear tetrahedra falls with the square of their size: two meshes give the limit."""
     exact = lame_pressure(1e-3, bulk, 1e6, nu)
     material = Material("linear", 1e6, nu)
@@ -54,7 +54,7 @@ def test_inflated_sphere(bulk, nu):
     )
 
 
-def test_balloon():
+def test_the_pressure_in_a_balloon_is_that_of_large_strain():
     """Large strain: p = 2 mu [1 / l + 1 / (4 l^4)] between the stretches at b and a of an incompressible
     neo-Hookean sphere."""
     filling, E = 0.3, 1e6
@@ -324,7 +324,7 @@ def test_filled_sensor_in_the_coupling(coarse):
 
 
 @pytest.mark.slow
-def test_bulging():
+def test_a_press_raises_pdc_and_bulges_the_skin_elsewhere():
     """Pressed at the pad's middle, PDC rises all the way to the core, and away from the contact Z falls (real
     sensors: 61-63 %)."""
     from benchmarks.bulging import presses
@@ -346,7 +346,7 @@ def test_bulging():
                                                  "them, a finite number"),
     (dict(rest_pressure=math.inf), "rest_pressure inf: pass one of them"),
 ])  # fmt: skip
-def test_bad_options(options, text):
+def test_bad_options_are_refused(options, text):
     with pytest.raises(ValueError, match=text):
         SkinOptions(**options)
 
@@ -372,7 +372,7 @@ def test_a_filling_that_is_too_much_is_refused_soon(coarse, monkeypatch, options
         _ = SkinModel(coarse, "default", SkinOptions(**options)).rest
 
 
-def test_bad_fillings():
+def test_fillings_without_an_equilibrium_are_refused():
     for filling in (-1.5, -0.995):
         with pytest.raises(ValueError, match="takes out nearly all the liquid .* more than -.*e-07 m.3"):
             _ = ball(Material("linear", 1e6, 0.3), 1, 1, filling=filling).rest

@@ -196,7 +196,7 @@ def real_table(repo, monkeypatch):
     return real_table
 
 
-def test_the_tables_measures(real_table):
+def test_measures_of_the_table_are_those_of_made_up_counts(real_table):
     """A sensor whose electrodes all lose 100 counts, but for E7 to E9, which lose 300."""
     rng = np.random.default_rng(0)
     rest = np.tile(np.full(19, 2500.0), (200, 1))

@@ -71,7 +71,7 @@ def record(model, data, handle, path):
     return np.array(pac)
 
 
-def test_tapping(pad):
+def test_tapping_is_felt_as_often_as_it_happens(pad):
     """A ball meets the pad at 13 mm/s, goes 0.1 mm deep and leaves, at 20 Hz."""
     point, normal, _ = pad
     dt, frequency = 5e-4, 20.0
@@ -117,7 +117,7 @@ def rub(pad, speed, periods, rate):
 # 200 Hz at 0.42 ms, 100 Hz at 0.5 ms
 @pytest.mark.slow  # quick: tapping
 @pytest.mark.parametrize("speed, rate", [(0.2, 12), pytest.param(0.1, 20, marks=pytest.mark.slow)])
-def test_rubbing_over_ridges(pad, speed, rate):
+def test_rubbing_over_ridges_shows_lines_at_speed_by_pitch(pad, speed, rate):
     """PAC without its noise shows the lines speed / pitch and its multiples, and next to nothing between
     them."""
     periods = 4
@@ -135,7 +135,7 @@ def test_rubbing_over_ridges(pad, speed, rate):
 
 @pytest.mark.parametrize("dt", [2e-4, 5e-4])
 @pytest.mark.parametrize("frequency", [50.0, 200.0, 400.0])
-def test_vibration_through_steps(frequency, dt):
+def test_vibration_passes_as_linear_pressure_between_steps(frequency, dt):
     """Pressure known at step ends, linear between: a tone passes as sinc^2(f dt) of what the continuous
     band-pass lets through."""
     acquisition = Acquisition(noise=False)

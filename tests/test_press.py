@@ -359,7 +359,7 @@ def test_record_refuses_wrong_shapes(synthetic_press):
         dataclasses.replace(synthetic_press, counts=np.zeros((12, 22)))
 
 
-def test_table(synthetic_press):
+def test_the_table_has_force_channels_and_failures(synthetic_press):
     text = report.table(synthetic_press, ["a.csv"])
     peak = 4 / 3 * 1.7e6 * np.sqrt(3.5e-3) * 1.5e-3**1.5
     assert (
@@ -378,7 +378,7 @@ def colors(image):
     return (count >= 20).sum()
 
 
-def test_picture_without_gl(synthetic_press, tmp_path):
+def test_a_picture_without_gl_shows_all_surfaces(synthetic_press, tmp_path):
     report.write_picture(synthetic_press, tmp_path / "press.png")
     image = imread(tmp_path / "press.png")
     # the surfaces, upper left: skin, dimple and indenter each bring their shades; a blank panel has black and

@@ -157,7 +157,7 @@ def test_a_clock_before_the_electrodes(tmp_path):
         (1, "", "t_ns"),
     ],
 )
-def test_named_columns(tmp_path, base, prefix, time):
+def test_columns_are_found_by_their_names(tmp_path, base, prefix, time):
     factor = 1e3 if time.endswith("ms") else 1e9 if time.endswith("ns") else 1.0
     rename = {f"ele_e{i}": f"ele_{i}" for i in range(1, 20)}
     rename |= {f"ele_{c}": c for c in ("pdc", "tac", "tdc", *(f"pac{i}" for i in range(1, 23)))}
@@ -189,7 +189,7 @@ def test_stamps_of_headers_are_the_clock_where_there_is_no_other(tmp_path, stamp
     np.testing.assert_allclose(one.time, ONE.time, atol=1e-5)
 
 
-def test_units_in_names(tmp_path):
+def test_units_in_names_are_those_of_the_numbers(tmp_path):
     """They are what the numbers are in, and said; without one they are N and m."""
     rename = {"force_x": "Fx_mN", "force_y": "Fy [mN]", "force_z": "Fz (mN)"}
     lines = [",".join(["time", *(f"e{i + 1}" for i in range(19)), *rename.values(), "object_pos_x_mm"])]
@@ -322,7 +322,7 @@ def test_poses_on_another_clock_are_interpolated_and_holes_stay(tmp_path):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_native_log(tmp_path, packed):
+def test_native_logs_are_read(tmp_path, packed):
     short = ONE.rows(slice(0, 40))
     write_btd(tmp_path / "t.btd", short, packed=packed, sensors=2)
     one, two = load(tmp_path / "t.btd")
@@ -347,7 +347,7 @@ def test_lost_frames_of_a_native_log_are_counted(tmp_path):
     )
 
 
-def test_matlab(tmp_path):
+def test_files_of_matlab_are_read(tmp_path):
     write_mat(tmp_path / "steel_01_02_HOLD.mat", ONE)
     one, two = load(tmp_path / "steel_01_02_HOLD.mat")
     agree(one, ONE, BUS)
@@ -380,7 +380,7 @@ def test_matlab_structs_and_73(tmp_path):
 
 
 @pytest.mark.parametrize("ros", [1, "SQLITE3", "MCAP"])
-def test_bags(tmp_path, ros):
+def test_bags_of_ros_are_read(tmp_path, ros):
     pytest.importorskip("rosbags", reason="needs rosbags: pip install 'biotac-mj[ros]'")
     path = write_bag(tmp_path, ONE, ros)
     (one,) = load(path)
@@ -462,7 +462,7 @@ def test_recording_from_a_port(tmp_path, serial_port, capsys):
 
 
 @pytest.mark.parametrize("ros", ["rclpy", "rospy"])
-def test_recording_from_topics(tmp_path, monkeypatch, ros):
+def test_topics_of_ros_are_recorded(tmp_path, monkeypatch, ros):
     """Stand-ins for ROS' libraries: a hand that sends as often as it is asked, or asks to be called back."""
     sent = []
 
@@ -523,7 +523,7 @@ def test_recording_without_libraries_says_what_to_install(tmp_path, capsys, monk
         assert said in error and error.count("\n") == 1
 
 
-def test_units():
+def test_units_are_told_from_the_values():
     tared = ONE.electrodes - REST_COUNTS["1"]
     for value, unit in (
         (ONE.electrodes, "counts"),
@@ -721,7 +721,7 @@ def test_spectrum_has_the_line_and_the_power():
     assert pac_spectrum(dataclasses.replace(ONE, pac=None)) is None
 
 
-def test_commands(tmp_path, capsys):
+def test_commands_import_and_show_a_recording(tmp_path, capsys):
     write_csv(tmp_path / "r.csv", ONE)
     rec, png = str(tmp_path / "rec.h5"), tmp_path / "show.png"
     assert cli.main(["recording", "import", str(tmp_path / "r.csv"), "--object", "ring", "--out", rec]) == 0
@@ -766,7 +766,7 @@ REAL = {
 
 
 @pytest.mark.parametrize("files", REAL)
-def test_real_sets(shared, files):
+def test_real_sets_are_read_with_rate_and_unit(shared, files):
     many, rows, rate, unit, fields = REAL[files]
     found = load([shared / "data" / name for name in files.split()])
     assert len(found) == many

@@ -44,7 +44,7 @@ def test_forms_of_a_table(tmp_path, text):
     np.testing.assert_array_equal(read_columns(path, NAMES), ROWS)
 
 
-def test_one_column(tmp_path):
+def test_a_file_of_one_column_is_read(tmp_path):
     (tmp_path / "t.txt").write_text("tdc\n1\n2\n")
     np.testing.assert_array_equal(read_columns(tmp_path / "t.txt", ("tdc",)), [[1], [2]])
 

@@ -163,7 +163,7 @@ def test_a_column_like_a_clock_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("names", [True, False])
-def test_numpy(tmp_path, names):
+def test_files_of_numpy_are_read(tmp_path, names):
     if names:
         np.savez(tmp_path / "r.npz", electrodes=E, force=F, time=T, other=np.array("x"))
         one = read(tmp_path / "r.npz")

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from biotac_mj.geometry import rigid
 
 
-def test_against_scipy():
+def test_rotations_equal_those_of_scipy():
     rng = np.random.default_rng(0)
     vector = np.concatenate([rng.normal(size=(20, 3)), 1e-6 * rng.normal(size=(3, 3)), np.zeros((1, 3))])
     expected = Rotation.from_rotvec(vector)
@@ -22,7 +22,7 @@ def test_against_scipy():
     np.testing.assert_allclose(np.abs(np.roll(expected.as_quat(), 1, axis=1)), np.abs(quat), atol=1e-14)
 
 
-def test_products_and_directions():
+def test_products_equal_numpy_s_and_frames_are_orthonormal():
     a, b = np.random.default_rng(1).normal(size=(2, 10, 3))
     np.testing.assert_allclose(rigid.cross(a, b), np.cross(a, b))
     np.testing.assert_allclose((rigid.skew(a) @ b[:, :, None])[..., 0], np.cross(a, b))

@@ -6,11 +6,11 @@ import pytest
 from biotac_mj.sensor import channels
 
 
-def test_names():
+def test_channels_have_their_names_and_order():
     assert channels.CHANNELS == (*(f"e{i}" for i in range(1, 20)), "pdc", "pac", "tdc", "tac")
 
 
-def test_divider():
+def test_counts_of_impedances_are_those_of_the_divider():
     assert channels.counts_from_impedance(10e3) == pytest.approx(2047.5)
     assert channels.impedance_from_counts(3276) == pytest.approx(2500)
     assert channels.impedance_from_counts(0) == np.inf
@@ -20,14 +20,14 @@ def test_divider():
     )
 
 
-def test_pressures():
+def test_a_count_is_36_5_pa_of_pdc_and_0_37_of_pac():
     assert channels.counts_from_pressure(3650.0) - channels.counts_from_pressure(0.0) == pytest.approx(100)
     assert channels.pressure_from_counts(channels.counts_from_pressure(1234.0)) == pytest.approx(1234.0)
     assert channels.counts_from_pac(37.0) - channels.counts_from_pac(0.0) == pytest.approx(100)
     assert channels.pac_from_counts(channels.counts_from_pac(-12.0)) == pytest.approx(-12.0)
 
 
-def test_temperature():
+def test_counts_of_temperatures_are_those_by_hand():
     """31 C by hand: exp(4025 / 304.15) = 5.59e5, r = 155183 / 6.055e5 = 0.2563."""
     assert channels.counts_from_temperature(31.0) == pytest.approx(4095 * 0.2563, rel=2e-3)
     celsius = np.linspace(5, 60, 30)
@@ -36,7 +36,7 @@ def test_temperature():
     assert np.all(np.diff(counts) > 0)
 
 
-def test_heating():
+def test_counts_of_heating_fall_and_come_back():
     def counts_of(rate):
         return channels.thermistor_counts(channels.heating_exponent(rate))
 

@@ -88,7 +88,7 @@ def sheet_laplacian(point, face, conductance):
     ).tocsr()
 
 
-def test_strip():
+def test_a_strip_conducts_as_its_closed_form():
     x, y = np.meshgrid(np.linspace(0, 6e-3, 13), np.linspace(0, 2e-3, 5), indexing="ij")
     point = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     face = grid(13, 5)
@@ -134,7 +134,7 @@ def test_tube_resistance_per_length(tube_film):
     assert slope == pytest.approx(1 / (SIGMA * GAP * 2 * np.pi * (RADIUS + GAP / 2)), rel=5e-3)
 
 
-def test_mesh_independent(tube_film):
+def test_a_finer_mesh_gives_the_same_impedances(tube_film):
     finer = FilmConduction(tube(84, 181), conductivity=SIGMA, excitation=EXCITATION, sensor=None)
     np.testing.assert_allclose(
         finer.impedance(finer.geometry.vert), tube_film.impedance(tube_film.geometry.vert), rtol=0.02
@@ -262,7 +262,7 @@ def test_worlds_equal_the_loop(tube_film):
     assert np.array_equal(batch, np.stack([tube_film.impedance(vert), tube_film.impedance(other)]))
 
 
-def test_bad_input(tube_film):
+def test_bad_vertices_are_refused(tube_film):
     vert = tube_film.geometry.vert
     with pytest.raises(ValueError, match=r"vert_xpos has shape \(5, 3\): the skin 'tube' needs"):
         tube_film.impedance(np.zeros((5, 3)))

@@ -280,7 +280,7 @@ def test_materials_by_the_words_of_a_name(name, material):
     assert material_of(name).name == material
 
 
-def test_table_of_materials():
+def test_materials_have_sources_and_unknown_ones_are_refused():
     assert len(MATERIALS) >= 60 and all(m.source for m in MATERIALS.values())
     assert STEEL.effusivity == pytest.approx(7870, rel=1e-3)
     effusivity = [m.effusivity for m in MATERIALS.values()]

@@ -84,7 +84,7 @@ def test_readings_follow_a_press(geometry, film):
     assert np.all(rows["tdc"] == rows["tdc"][0])
 
 
-def test_left_right_symmetry(film):
+def test_left_electrodes_read_as_right_ones_at_rest(film):
     """The skin is symmetric in z and so are the excitation electrodes: without calibration E1..E6 equal
     E11..E16 within the mesh."""
     free = FilmConduction(film.geometry, sensor=None)
@@ -117,7 +117,7 @@ def test_film_is_solved_once_per_frame(geometry, film, monkeypatch):
         assert len(calls) == expected
 
 
-def test_bad_motion(geometry, film):
+def test_motion_that_is_not_finite_changes_no_state(geometry, film):
     physics = PhysicsReadings(geometry, film=film)
     state = np.zeros(physics.nstate)
     physics.reset(state)

@@ -69,7 +69,7 @@ def test_a_product_is_the_inverse_and_its_own_entries(stiffness, thirds, close):
 
 
 @pytest.mark.parametrize("nodes", [1, 2, 40])
-def test_pieces_without_joints(nodes):
+def test_pieces_without_joints_are_inverted(nodes):
     """A single node, and two parts that only what holds them joins."""
     rng = np.random.default_rng(nodes)
     points = rng.uniform(0, 1, (nodes, 3)) + np.where(np.arange(nodes) < nodes // 2, 0.0, 9.0)[:, None]

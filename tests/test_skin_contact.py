@@ -92,7 +92,7 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
 @pytest.mark.parametrize(
     "cells, largest", [((2, 3), 0.2), pytest.param((4, 6), 0.06, marks=pytest.mark.slow)]
 )
-def test_hertz(cells, largest):
+def test_forces_on_a_sphere_come_to_those_of_hertz(cells, largest):
     """From the stiff side, with order 1.5 or better: the contact's edge falls between nodes."""
     depths = np.array([30e-6, 60e-6])  # contact radii of 0.55 and 0.77 mm; `cells` are per 0.77 mm
     exact = hertz_force(depths, 10e-3, 1e6, 0.3)
@@ -287,7 +287,7 @@ def evaluate(model, data, geoms, x):
 
 
 @pytest.mark.parametrize("mode", ["frictionless", "stick", "slip", "coupled"])
-def test_contact_tangent(mode):
+def test_the_contact_tangent_is_the_forces_derivative(mode):
     """The blocks are minus the derivative of the forces; where slipping, by tangential moves only (the normal
     force is lagged there), unless slip is coupled to the push, as in steps that were too long."""
     h, mu = 4e-3, {"frictionless": 0.0, "stick": 5.0, "slip": 0.1, "coupled": 0.1}[mode]

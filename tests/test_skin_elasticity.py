@@ -36,7 +36,7 @@ def forces(model, x):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_patch(law):
+def test_affine_displacements_go_on_inside(law):
     """An affine displacement of the boundary of an irregular block goes on inside, exactly."""
     vert, elem = box([np.linspace(0, 1e-2, 5)] * 3, jitter=0.3)
     outside = np.flatnonzero(np.isin(vert, [0, 1e-2]).any(1))
@@ -251,7 +251,7 @@ def test_cantilever_converges_to_timoshenko():
     assert extrapolated == pytest.approx(exact, rel=0.01)
 
 
-def test_bar_under_traction():
+def test_a_bar_under_traction_strains_uniformly():
     """Uniaxial traction: strain p / E along, -nu p / E across, at any point but near no clamp: the held nodes
     go where they belong."""
     p, E, nu = 1e3, 1e6, 0.45
@@ -325,13 +325,13 @@ def test_thick_sphere_under_pressure(nu, tolerance):
     (lambda v, e: (np.where(np.arange(len(v))[:, None] == 3, np.nan, v), e), "skin 'block' has 1 nodes that "
                                                                              "are NaN or infinite: repair"),
 ])  # fmt: skip
-def test_bad_meshes(change, text):
+def test_bad_meshes_are_refused(change, text):
     vert, elem = change(*box([np.linspace(0, 1e-2, 5)] * 3))
     with pytest.raises(ValueError, match=text):
         SkinModel(skin(vert, elem, [0, 1, 2], outer_face=[[0, 1, 2]]))
 
 
-def test_nothing_fixed():
+def test_a_skin_without_fixed_nodes_is_refused():
     vert, elem = box([np.linspace(0, 1e-2, 3)] * 3)
     with pytest.raises(
         ValueError,
@@ -345,6 +345,6 @@ def test_nothing_fixed():
                           r"3\)"),
     (np.full((1, 125, 3), np.nan), "pass finite numbers"),
 ])  # fmt: skip
-def test_bad_loads(force, text):
+def test_bad_loads_are_refused(force, text):
     with pytest.raises(ValueError, match=text):
         SkinData(block()).set_external(force)

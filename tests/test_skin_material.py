@@ -115,7 +115,7 @@ def test_stress_is_the_energys_gradient(law):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_stress_derivative(law):
+def test_the_tangent_is_the_derivative_of_stress(law):
     rng = np.random.default_rng(2)
     F = gradients(law, rng)
     dF = rng.standard_normal(F.shape)
@@ -222,12 +222,12 @@ def test_bulk_and_shear_modulus():
     (dict(density=-1.0), "must be from 100"),
     (dict(friction=-0.1), "material friction is -0.1: give a finite number >= 0"),
 ])  # fmt: skip
-def test_bad_constants(values, text):
+def test_bad_constants_are_refused(values, text):
     with pytest.raises(ValueError, match=text):
         Material(**values)
 
 
-def test_presets_by_name():
+def test_presets_are_found_by_name():
     assert material("paper") is PRESETS["paper"]
     assert not material("paper").liquid
     with pytest.raises(

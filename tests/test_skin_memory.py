@@ -174,7 +174,7 @@ def test_softening_of_a_cycle(element):
     assert pull(model, data, 1.2, None) == pytest.approx(E * 1.2 * 0.22 * AREA, rel=1e-6)
 
 
-def test_both_together():
+def test_softened_stress_relaxes():
     """The softened stress relaxes: after a jump, a hold and a jump back P = s (eta S2 + g (S1 e1 + (eta S2 -
     S1) e2))."""
     r, m = 2.0, 1e4

@@ -108,7 +108,7 @@ def test_functions_of_the_host_take_their_turn():
     assert seen == [0, 5, "branch"] and out.numpy()[0] == 10
 
 
-def test_blocks_of_threads():
+def test_blocks_of_threads_sum_their_rows():
     a = wp.array(np.arange(12.0).reshape(3, 4), dtype=wp.float64, ndim=2, device=CPU)
     out = wp.zeros(3, dtype=wp.float64, device=CPU)
     program = Program(CPU, lambda p: p.launch_blocks(sum_block, [3], [a], [out]))

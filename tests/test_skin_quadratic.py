@@ -46,7 +46,7 @@ def deformed(model, amplitude=4e-4, seed=0):
 
 # full integration, and mostly mean dilatation
 @pytest.mark.parametrize("nu, law", covering([0.4999, 0.3], LAWS))
-def test_derivatives(law, nu):
+def test_forces_and_products_are_derivatives_of_the_energy(law, nu):
     """Force is minus the energy's gradient, the product is the force's derivative: central differences along
     a random direction."""
     model = block(law, nu)
@@ -68,7 +68,7 @@ def test_derivatives(law, nu):
 
 
 @pytest.mark.parametrize("nu, law", covering([0.4999, 0.3], LAWS))
-def test_rest_stiffness(law, nu):
+def test_the_assembled_matrix_is_the_tangent_at_rest(law, nu):
     """The assembled matrix is the tangent at rest, so that it can precondition."""
     model = block(law, nu)
     elements = Elements(SkinData(model))
@@ -107,7 +107,7 @@ def test_stiffness_equals_scikit_fem():
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_patch(law):
+def test_affine_displacements_go_on_inside(law):
     """An affine displacement of the boundary of an irregular block goes on inside, exactly, also nearly
     incompressible."""
     vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, jitter=0.3)
@@ -159,14 +159,14 @@ def test_cook_does_not_lock():
 
 
 @pytest.mark.parametrize("nu", [pytest.param(0.3, marks=pytest.mark.slow), 0.4999])
-def test_inflated_sphere(nu):
+def test_quadratic_spheres_grow_as_that_of_lame(nu):
     """Lame's thick sphere; with this mesh the loads of the faceted inside are off by as much."""
     assert (abs(locking.sphere_growth(nu, "quadratic", 2, 2)) < 0.016).all()
     if nu > 0.49:
         assert (locking.sphere_growth(nu, "linear", 2, 2) < -0.5).all()
 
 
-def test_refined_geometry():
+def test_refined_skins_have_the_same_volume_and_surfaces():
     """Quadratic elements on four-node tetrahedra: the given nodes come first; the new ones fill the same
     volume and the same surfaces."""
     coarse = four_nodes("coarse")
@@ -209,12 +209,12 @@ def test_ansys_preset_presses():
                                            "None for the material's choice"),
     (lambda: Material(element="cubic"), "unknown element 'cubic': choose one of linear, quadratic"),
 ])  # fmt: skip
-def test_bad_element(make, text):
+def test_bad_elements_are_refused(make, text):
     with pytest.raises(ValueError, match=text):
         make()
 
 
-def test_folded_element():
+def test_a_folded_element_is_refused():
     vert, elem = box([np.linspace(0, 1e-2, 2)] * 3)
     refined = with_edge_nodes(skin(vert, elem, [0]))
     bent, elem = refined.vert.copy(), refined.elem

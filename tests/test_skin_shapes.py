@@ -118,7 +118,7 @@ def inside_distance(kind, size, p):
 
 
 @pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box"])
-def test_inside(kind):
+def test_distances_inside_are_the_smallest_to_a_face(kind):
     points = cloud(2000)
     _, ours, _ = evaluate(kind, SIZES[kind], points)
     expected = np.array([inside_distance(kind, np.array(SIZES[kind]), p) for p in points])
@@ -128,7 +128,7 @@ def test_inside(kind):
     np.testing.assert_array_equal(ours < 0, inside)
 
 
-def test_inside_ellipsoid():
+def test_distances_inside_an_ellipsoid_equal_a_search():
     """The nearest of very many points of the surface."""
     radii = np.array(SIZES["ellipsoid"])
     surface = trimesh.creation.icosphere(subdivisions=6).vertices * radii
@@ -154,7 +154,7 @@ def test_normal_is_the_gradient(kind):
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder"])
-def test_rounding(kind):
+def test_a_rounded_solid_is_a_smaller_one_grown(kind):
     """Outside, a rounded solid is the smaller one grown by r: MuJoCo's distance less r."""
     r, points = 0.2, cloud(seed=2)
     size = np.array(SIZES[kind])
@@ -371,12 +371,12 @@ def test_a_mesh_that_bounds_no_solid_says_why(face, text):
                                                                    "radius lies"),
     (dict(types=["sphere"], sizes=[(1.0,)], rounding=[np.nan]), "rounding of a sphere is nan"),
 ])  # fmt: skip
-def test_bad_geoms(arguments, text):
+def test_bad_geoms_are_refused(arguments, text):
     with pytest.raises(ValueError, match=text):
         GeomSet(**arguments)
 
 
-def test_bad_poses():
+def test_poses_that_are_not_finite_are_refused():
     geoms = GeomSet(["sphere"], [(1.0,)], nworld=2)
     with pytest.raises(
         ValueError,

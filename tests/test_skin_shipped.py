@@ -71,7 +71,7 @@ def test_pressure_is_proportional_to_overclosure(press):
     assert overclosure.max() < 0.02 * DEPTHS[-1]  # the springs give way by little
 
 
-def test_balance(press):
+def test_forces_on_a_pressed_skin_balance(press):
     model, data, forces = press
     total = data.contact_force[0].sum(0) + data.core_force[0].sum(0) + data.reaction[0]
     # the residual at the free nodes: the tolerance of 1e-3 is of the energy

@@ -376,7 +376,7 @@ def test_a_skin_that_is_left_comes_to_rest_in_one_step(adhesion):
     assert not data.wrench[0].any() and data.wrench[1].any()
 
 
-def test_numbers_of_worlds(model):
+def test_numbers_of_worlds_must_agree(model):
     with pytest.raises(
         ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"
     ):
@@ -399,7 +399,7 @@ def test_numbers_of_worlds(model):
     (dict(core_clearance=float("nan")), "core_clearance is nan: pass a finite number"),
     (dict(max_core_depth=-1e-3), "max_core_depth is -0.001: give a finite number >= 0"),
 ])  # fmt: skip
-def test_bad_options(options, text):
+def test_bad_options_are_refused(options, text):
     with pytest.raises(ValueError, match=text):
         SkinOptions(**options)
 

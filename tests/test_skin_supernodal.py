@@ -123,7 +123,7 @@ def test_chains_and_loose_parts(n):
         )
 
 
-def test_not_positive_definite():
+def test_matrices_that_are_not_positive_definite_are_refused():
     matrix = sp.csc_matrix(np.diag([1.0, 1, 1, 1, -1, 1]))
     with pytest.raises(ValueError, match="not positive definite: check for inverted elements"):
         SupernodalFactor(matrix, Elimination(matrix, np.eye(3)[:2]), np.arange(2))

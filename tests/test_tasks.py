@@ -76,7 +76,7 @@ SLOWER = ("gripper/lift", "finger/roll_ball", "finger/follow_edge")
     "domain, task",
     [pytest.param(*t.values, id=t.id, marks=[pytest.mark.slow] if t.id in SLOWER else []) for t in TASKS],
 )
-def test_a_task(domain, task):
+def test_a_task_keeps_its_specs_and_repeats_its_seed(domain, task):
     """Specs hold, rewards lie in [0, 1], nothing is NaN, the same seed gives the same trajectory and another
     one another."""
     check(domain, task, 3)
@@ -137,7 +137,7 @@ def environment(task, **settings):
     return composer.Environment(task, **options | settings)
 
 
-def test_presets_and_patch():
+def test_presets_have_their_shapes_and_patches_their_place():
     """TACTILE and PRIVILEGED have the documented shapes; force and patch say where a plate presses: from the
     pad, along +y."""
     task = PlateTask(0.6e-3, noise=False)
@@ -510,7 +510,7 @@ def test_an_entity_takes_settings_by_stage():
         ),
     ],
 )
-def test_bad_input(call, text):
+def test_bad_input_is_refused(call, text):
     with pytest.raises(ValueError) as caught:
         call()
     assert text in str(caught.value)
@@ -547,6 +547,6 @@ def test_scores_of_several_files_make_one_table(repo, tmp_path, monkeypatch, cap
     assert "--json FILE is missing" in capsys.readouterr().err
 
 
-def test_unknown_observable():
+def test_an_unknown_observable_is_refused():
     with pytest.raises(ValueError, match="a BioTac has no observable 'e1': choose from electrodes, pac"):
         BioTac().observables.enable(("e1",))

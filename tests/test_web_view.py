@@ -417,6 +417,6 @@ def test_a_model_is_shown_while_it_steps():
         ),
     ],
 )
-def test_bad_input(arguments, text, capsys):
+def test_bad_input_is_one_line(arguments, text, capsys):
     assert cli.main(arguments) == 2
     assert text in capsys.readouterr().err
