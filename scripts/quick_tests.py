@@ -5,10 +5,10 @@
     python scripts/quick_tests.py out/costs
 
 Quick are tests that cost at most `--cheap` seconds, and those that cost at most `--line` seconds for each
-line or kernel of the package that no cheaper quick test runs. Tests of the same lines hold different things: the
-first case of a test function counts as ten lines more, that of a function marked `law` as sixty. Lines do not
-tell what a test compares, so tests that hold a law of mechanics, or that two engines agree, have this mark. The
-tests that need a module share its compilation.
+line or kernel of the package that no cheaper quick test runs. Tests of the same lines hold different things:
+the first case of a test function counts as ten lines more, that of a function marked `law` as sixty. Lines do
+not tell what a test compares, so tests that hold a law of mechanics, or that two engines agree, have this
+mark. The tests that need a module share its compilation.
 """
 
 import argparse
