@@ -15,13 +15,15 @@ from blocks import four_nodes
 
 from biotac_mj import cli
 from biotac_mj.data import TactileSet, nodes_of
+from biotac_mj.data.contact import contact_labels
 from biotac_mj.data.generation import making
 from biotac_mj.data.generation.clearance import Placed, first_touch, surface_samples
 from biotac_mj.data.generation.generate import GenerateOptions, batches, generate
-from biotac_mj.data.generation.plan import KINDS, plan_motions, sensing_faces
+from biotac_mj.data.generation.plan import KINDS, Motion, plan_motions, sensing_faces
 from biotac_mj.data.generation.readings import sample
 from biotac_mj.data.generation.simulate import _simulate, _walk, simulate
 from biotac_mj.data.objects import OBJECTS, make_object
+from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.geometry import INDENTERS, load_skin
 from biotac_mj.geometry.rigid import matrix
 from biotac_mj.geometry.skins import skin_reference
@@ -352,6 +354,22 @@ def test_the_condensed_tier_generates_the_same_steps(tmp_path):
             assert np.sqrt(data["contact_area"][:].max() / np.pi) < 3.5e-3
         both = (fast["contact_area"][:] > 0) & (exact["contact_area"][:] > 0)
         assert np.abs(fast["contact_pos"][:] - exact["contact_pos"][:])[both].max() < 0.2e-3
+
+
+@pytest.mark.parametrize("name", ["sphere_7mm", "cylinder_long_7mm"])
+def test_contact_area_grows_no_faster_than_force(name):
+    """Pressed in steps of 0.05 mm on the coarse skin, whose faces are 0.6 mm2: without jumps."""
+    model = SkinModel(load_skin("coarse"))
+    pos = np.linspace([-8e-3, -11.2e-3, 0], [-8e-3, -9.3e-3, 0], 39)
+    turn = np.tile([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], (39, 1, 1))
+    out = simulate(model, name, [Motion("press", {}, pos, turn)], tier="condensed")
+    moved = out.displacement[0] * DISPLACEMENT_SCALE
+    area = contact_labels(model.geometry, moved, out.contact_force[0])["contact_area"]
+    force = np.linalg.norm(out.contact_force[0], axis=2).sum(1)
+    pressed = force > 1e-6
+    assert pressed.sum() > 25 and not area[~pressed].any()
+    grown = np.diff(np.log(area[pressed]))
+    assert (abs(grown) <= np.diff(np.log(force[pressed]))).all() and grown.sum() > 0.7
 
 
 def test_all_objects_take_turns():

@@ -5,6 +5,8 @@ import pytest
 from blocks import boundary, box, faces_on, half_space, place, shell, skin
 from grids import covering
 
+from biotac_mj.data.contact import pressure_area
+from biotac_mj.geometry.surface import face_areas, node_areas
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, prepare_step, step
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.meshes import bake_distance_grid
@@ -53,8 +55,8 @@ def hertz_force(d, R, E, nu):
 
 
 def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
-    """Forces and contact areas of a sphere on a block with `cells` cells per contact radius under the sphere,
-    coarser away from it.
+    """Forces and contact areas (by touched faces, by pressed nodes) of a sphere on a block with `cells` cells
+    per contact radius under the sphere, coarser away from it.
 
     The block is cut out of the half-space 4.5 contact radii away: sides and bottom go where the half-space's
     points go under Hertz's force at one point (the spread of the load matters less than 0.5 % there). Contact
@@ -84,7 +86,10 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
         assert data.converged.all()
         forces.append(data.wrench[0, 0, 2])
         touching = np.flatnonzero(data.outer.anchor_geom.numpy()[:, 0] >= 0)
-        areas.append(sample_areas(touching // nsample, data.model.outer.area.numpy()).sum())
+        nodes = np.unique(top)
+        share = node_areas(top, np.linalg.norm(face_areas(vert, top), axis=1), len(vert))[nodes]
+        pressed = pressure_area(np.linalg.norm(data.contact_force[:, nodes], axis=2), share)[0]
+        areas.append([sample_areas(touching // nsample, data.model.outer.area.numpy()).sum(), pressed])
     return np.array(forces), np.array(areas)
 
 
@@ -96,8 +101,10 @@ def test_forces_on_a_sphere_come_to_those_of_hertz(cells, largest):
     """From the stiff side, with order 1.5 or better: the contact's edge falls between nodes."""
     depths = np.array([30e-6, 60e-6])  # contact radii of 0.55 and 0.77 mm; `cells` are per 0.77 mm
     exact = hertz_force(depths, 10e-3, 1e6, 0.3)
-    forces, areas = np.array([hertz(n, depths) for n in cells]).swapaxes(0, 1)
-    np.testing.assert_allclose(areas[1] / (np.pi * 10e-3 * depths), 1, atol=0.25)
+    forces, areas = (np.array(both) for both in zip(*(hertz(n, depths) for n in cells)))
+    faces, pressed = np.moveaxis(areas[1], 1, 0) / (np.pi * 10e-3 * depths)
+    np.testing.assert_allclose(faces, 1, atol=0.25)
+    np.testing.assert_allclose(pressed, 1, atol=0.1)
     errors = forces / exact - 1
     assert (errors[1] > 0).all() and (errors[1] < largest).all(), errors
     ratio = cells[1] / cells[0]

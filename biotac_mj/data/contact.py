@@ -3,24 +3,34 @@
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.surface import node_normals
+from ..geometry.surface import face_areas, node_areas, node_normals
 from .schema import nodes_of
 
 _TOUCH = 1e-6  # [N]: less is no contact
+
+
+def pressure_area(force: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """(n,) area [m^2] on which forces (n, nnode) [N] press nodes with areas (nnode,) [m^2]; 0 without force.
+
+    9/8 (int p dA)^2 / int p^2 dA, which is the area of a contact whose pressure p falls to 0 at its edge as
+    Hertz's does. An even pressure has 9/8 of its area. The pressure is a node's force over its area, so that
+    the area follows the forces without steps; it is at least 9/8 of a node's."""
+    square = (force**2 / area).sum(1)
+    total = force.sum(1)
+    return 9 / 8 * np.divide(total**2, square, out=np.zeros(len(force)), where=total > _TOUCH)
 
 
 def contact_labels(
     geometry: SkinGeometry,
     displacement: np.ndarray,
     force: np.ndarray,
-    area: np.ndarray,
     rest: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """contact_pos, contact_normal, contact_depth and contact_area of n time steps, see `schema.Interaction`.
 
     Args:
       displacement: (n, nvert, 3) of the nodes against `geometry.vert` [m].
-      force: (n, nouter, 3) of the object on the outer nodes [N]. area: (n,) contact area [m^2].
+      force: (n, nouter, 3) of the object on the outer nodes [N].
       rest: (nvert, 3) displacements of the untouched skin, the zero of depth; None: 0.
     """
     outer, size = nodes_of(geometry), np.linalg.norm(np.asarray(force, float), axis=2)
@@ -37,9 +47,14 @@ def contact_labels(
         moved = (vert - at_rest)[outer][weight[i] > 0]
         depth[i] = max(0.0, -(moved * facing[weight[i] > 0]).sum(1).min())
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    at_node = node_areas(
+        geometry.outer_face,
+        np.linalg.norm(face_areas(at_rest, geometry.outer_face), axis=1),
+        len(at_rest),
+    )[outer]
     return {
         "contact_pos": pos,
         "contact_normal": normal,
         "contact_depth": depth,
-        "contact_area": np.where(touches, area, 0.0),
+        "contact_area": pressure_area(size, at_node),
     }

@@ -72,7 +72,7 @@ class Fields:
             "displacement": self.displacement[i, rows] * np.float32(DISPLACEMENT_SCALE),
             "wrench": self.wrench[i, rows],
             "contact_force": force,
-            **contact_labels(model.geometry, moved, force, self.area[i, rows], rest),
+            **contact_labels(model.geometry, moved, force, rest),
             "pressure": self.pressure[i, rows],
             "impedance": read.impedance,
             "counts": read.counts,
