@@ -62,6 +62,27 @@ def accuracy(repo):
     sys.path.remove(str(repo / "benchmarks"))
 
 
+@pytest.mark.slow  # quick: what it measures, in test_true_contact.py
+def test_rows_of_contact_are_judged_by_their_bars(accuracy, monkeypatch, capsys):
+    import contact_table
+
+    row = ["--rows", "around,wrist", "--tiers", "condensed"]
+    assert contact_table.main(row) == 0
+    said = capsys.readouterr().out.splitlines()[2:]
+    assert len(said) == 3 and all(line.endswith("| met |") for line in said)
+    assert "| force at a wrist, <force> | condensed | " in said[1]
+    monkeypatch.setattr(contact_table.test_true_contact, "WEIGHT", 0.97 * 0.1 * 9.81)
+    assert contact_table.main(row) == 1
+    assert [line.endswith("| missed |") for line in capsys.readouterr().out.splitlines()[2:]] == [
+        False,
+        True,
+        True,
+    ]
+    with pytest.raises(SystemExit):
+        contact_table.main(["--rows", "weight"])
+    assert "unknown row weight: choose from peak, pac" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_models_are_freed(repo, tmp_path):
     """Each cycle's model is of 20 MB and more."""

@@ -114,11 +114,9 @@ DRAGS = [
 ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("x, z, depth, angle, friction, first", DRAGS)
-def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, friction, first):
-    """A step down and five along, by 1 mm, on skin that lies on the core; the last ends 80 times 0.2 um
-    further on."""
+def changes_along(x, z, depth, angle, friction, first):
+    """Changes of the force by each of 80 moves by 0.2 um [N], which follow a step down and five along, by 1
+    mm, on skin that lies on the core."""
     radius, along = 4e-3, np.array([np.cos(angle), 0, np.sin(angle)])
     skin = Skin(load_skin("coarse"), "default", SkinOptions(liquid=False), ["sphere"], [[radius]], [friction])
     corner = skin.model.geometry.vert[skin.model.geometry.outer_face]
@@ -141,7 +139,13 @@ def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, fric
         record = advance(skin, geoms, before, 1.0, skin.constants)
         assert not record.changes[0].lost and (skin.data.core.trial_geom.numpy() >= 0).any()
         force.append(record.wrench[0, 0, :3].numpy())
-    change = np.linalg.norm(np.diff(force, axis=0), axis=1)
+    return np.linalg.norm(np.diff(force, axis=0), axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("x, z, depth, angle, friction, first", DRAGS)
+def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, friction, first):
+    change = changes_along(x, z, depth, angle, friction, first)
     assert change.max() < 3 * np.median(change)
 
 

@@ -72,22 +72,20 @@ def test_a_batch_bounces_as_a_single_ball_does():
     np.testing.assert_allclose(most, peak(4e-3, "condensed", "implicitfast"), rtol=1e-4)
 
 
+def loudness(timestep, tier="condensed"):
+    """RMS of PAC over three taps of 20 g that a motor moves, ten a second [counts]."""
+    spec = scene(timestep, height=0.014, up=0.001, mass=0.02)
+    handle = biotac_mj.attach(spec, site="fingertip", skin="coarse", tier=tier, readings={"noise": False})
+    model = spec.compile()
+    data, pac = mujoco.MjData(model), []
+    while data.time < 0.3 - 1e-9:
+        data.qfrc_applied[0] = -0.6 if (10 * data.time + 1e-6) % 1 < 0.5 else 0.6
+        mujoco.mj_step(model, data)
+        pac.append(handle.read(data, "pac").ravel().copy())
+    return np.concatenate(pac).std()
+
+
 def test_taps_are_as_loud_at_all_time_steps():
-    """PAC of 20 g that a motor taps on the pad, ten times a second."""
-
-    def loudness(timestep):
-        spec = scene(timestep, height=0.014, up=0.001, mass=0.02)
-        handle = biotac_mj.attach(
-            spec, site="fingertip", skin="coarse", tier="condensed", readings={"noise": False}
-        )
-        model = spec.compile()
-        data, pac = mujoco.MjData(model), []
-        while data.time < 0.3 - 1e-9:
-            data.qfrc_applied[0] = -0.6 if (10 * data.time + 1e-6) % 1 < 0.5 else 0.6
-            mujoco.mj_step(model, data)
-            pac.append(handle.read(data, "pac").ravel().copy())
-        return np.concatenate(pac).std()
-
     fine = loudness(5e-4)
     assert fine > 500
     for timestep in (1e-3, 2e-3, 4e-3):

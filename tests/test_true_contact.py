@@ -344,16 +344,23 @@ ON_THE_NAIL = """<mujoco><option timestep=".002"/><asset>{assets}</asset><worldb
 <geom type="mesh" mesh="cup" mass=".1" friction="1 .05 .001"/></body></worldbody></mujoco>"""
 
 
-@pytest.mark.parametrize("tier", ["condensed", "full"])
-def test_what_surrounds_a_finger_touches_nothing(tier):
+def force_of_what_surrounds(tier):
+    """The largest component in ten steps [N] on a finger in a cup and through a ring that touch nothing."""
     spec = mujoco.MjSpec.from_string(AROUND.format(assets=cup_and_ring()))
     handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings=False)
     model = spec.compile()
-    data = mujoco.MjData(model)
+    data, most = mujoco.MjData(model), 0.0
     for _ in range(10):
         mujoco.mj_step(model, data)
-        assert data.ncon == 0 and not handle.read(data, "contact_force").any()
+        most = max(most, np.abs(handle.read(data, "contact_force")).max())
+        assert data.ncon == 0
     assert not data.qvel.any()
+    return most
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_what_surrounds_a_finger_touches_nothing(tier):
+    assert force_of_what_surrounds(tier) == 0
 
 
 def test_a_trough_around_the_finger_touches_nothing():
@@ -392,20 +399,22 @@ def test_a_cup_hangs_on_the_nail():
     assert np.abs(data.qvel).max() < 0.5
 
 
+def change_of_electrodes(tier, margin):
+    """Counts of a ball with this margin [m] that has come to rest on the pad, less those before."""
+    spec = mujoco.MjSpec.from_string(WRIST.format(integrator="implicitfast", cone="pyramidal"))
+    spec.geom("ball").margin = margin
+    handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings={"noise": False})
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    rest = handle.read(data, "electrodes")
+    mujoco.mj_step(model, data, 40)
+    return handle.read(data, "electrodes") - rest
+
+
 @pytest.mark.parametrize("tier", ["condensed", "full"])
 def test_a_margin_moves_no_load(tier):
-    def pressed(margin):
-        spec = mujoco.MjSpec.from_string(WRIST.format(integrator="implicitfast", cone="pyramidal"))
-        spec.geom("ball").margin = margin
-        handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings={"noise": False})
-        model = spec.compile()
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        rest = handle.read(data, "electrodes")
-        mujoco.mj_step(model, data, 40)
-        return handle.read(data, "electrodes") - rest
-
-    plain, wide = pressed(0.0), pressed(0.002)
+    plain, wide = (change_of_electrodes(tier, margin) for margin in (0.0, 0.002))
     assert plain[16] < -500
     np.testing.assert_allclose(wide, plain, atol=0.02 * np.abs(plain).max())
 
