@@ -10,7 +10,8 @@ mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install 
 import warp as wp
 from test_batch import RADIUS, ball_spec, make, move, places, press, press_spec, read, shell
 
-from biotac_mj.batch.rest import Clearance, Rest
+from biotac_mj.batch.clearance import Clearance
+from biotac_mj.batch.rest import Rest
 from biotac_mj.coupling.steppers.fem import CLEAR
 from biotac_mj.skin import newton
 
@@ -91,7 +92,7 @@ def test_clearances_equal_distances_of_points_from_spheres():
     skin, clearance = batch.skin, Clearance(batch.skin.model, 6)
     corner = skin.model.rest.vert[skin.model.outer.face.numpy()]
     point = np.einsum("sk,fki->fsi", skin.model.sample.numpy(), corner).reshape(-1, 3)
-    clearance.ball, every = (clearance.ball[0], 1.0), wp.ones(6, dtype=int)  # [m] none is left out
+    clearance.skin.radius, every = 1.0, wp.ones(6, dtype=int)  # [m] none is left out
     away = 1e-3 * np.array([-1, -0.5, 0.2, 0.5, 3, 9])
     centre = places(6) - away[:, None] * [0, 1, 0]
     for turn in range(6):

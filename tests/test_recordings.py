@@ -14,9 +14,9 @@ from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
 
 from biotac_mj import cli
 from biotac_mj.recordings import FIELDS, Recording, findings, load, load_one, read, write
+from biotac_mj.recordings.formats.joining import guess_unit, join
 from biotac_mj.recordings.formats.messages import Topic
 from biotac_mj.recordings.formats.names import is_time, other_unit, place_of, unit_of
-from biotac_mj.recordings.formats.streams import guess_unit, join
 from biotac_mj.recordings.live import streams_of_lines
 from biotac_mj.recordings.picture import pac_spectrum
 from biotac_mj.sensor.channels import REST_COUNTS

@@ -11,7 +11,7 @@ from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.geometry.design import read_design
 from biotac_mj.recordings import Recording, load, load_one
 from biotac_mj.recordings import write as write_recordings
-from biotac_mj.recordings.formats.streams import join
+from biotac_mj.recordings.formats.joining import join
 from biotac_mj.recordings.inspection import findings
 from biotac_mj.recordings.live import streams_of_lines
 from biotac_mj.recordings.picture import pac_spectrum

@@ -8,8 +8,8 @@ import pytest
 from recorded import synthetic, write_bag
 
 from biotac_mj.recordings import load
+from biotac_mj.recordings.formats.joining import join
 from biotac_mj.recordings.formats.messages import Topic
-from biotac_mj.recordings.formats.streams import join
 
 ONE, TWO = synthetic(60), synthetic(60, seed=1)
 

@@ -170,6 +170,29 @@ def test_no_run_of_twelve_lines_stands_twice():
     assert not repeats({name: path.read_text() for name, path in modules().items()})
 
 
+def too_large(text, parameters=12, lines=150):
+    """[what] functions of a module with more parameters, besides self or cls, or more lines."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            a = node.args
+            names = [arg.arg for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs, a.vararg, a.kwarg) if arg]
+            count = len(names) - (names[:1] in (["self"], ["cls"]))
+            length = node.end_lineno - node.lineno + 1
+            if count > parameters or length > lines:
+                found.append(f"{node.name}: {count} parameters, {length} lines")
+    return found
+
+
+def test_functions_and_files_are_of_a_size_to_read():
+    assert not too_large("def f(self, a, *, b):\n    pass", 2, 2)
+    assert too_large("def f(a, b, **c):\n    pass", 2, 2) and too_large("def f():\n    1\n    2", 2, 2)
+    texts = {name: path.read_text() for name, path in modules().items()}
+    large = [f"{name}: {len(text.splitlines())} lines" for name, text in texts.items() if text.count("\n") > 600]
+    large += [f"{name}.{one}" for name, text in texts.items() for one in too_large(text)]
+    assert len(texts) > 400 and not large, "\n".join(large)
+
+
 def test_names_of_tests_have_at_most_60_characters():
     tests = {
         path.name: re.findall(r"^ *(?:async )?def (test_\w+)", path.read_text(), re.M)

@@ -20,6 +20,7 @@ from ..coupling.structs import ModelView
 from ..coupling.touches import find_touches
 from ..coupling.touching import Touching
 from . import kernels, solid
+from .engine import contacts_of, rows_of
 from .implicit import dynamics, integrator
 from .implicit.factor import Cones, Factor
 from .senses import Senses
@@ -134,14 +135,9 @@ class Batch(Skins):
     def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Finds the linear models' forces, and puts the rest of them into the rows."""
         self._find_wrenches()
-        efc = d.efc
-        self._launch(
-            write_rows,
-            (*self._row.shape, self._jacobian.shape[2]),
-            [self._of_step.square, self._group_slot, self._row, self._jacobian, self.model.tangent0]
-            + [self._jacobian.shape[2], int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
-            [efc.J, efc.D, efc.aref, efc.pos, self._no_basis],
-        )
+        nv = self._jacobian.shape[2]
+        known = [self._of_step.square, self._group_slot, self._row, self._jacobian, self.model.tangent0, nv]
+        self._launch(write_rows, (*self._row.shape, nv), known, [rows_of(m, d), self._no_basis])
 
     @property
     def nslot(self) -> int:
@@ -171,12 +167,11 @@ class Batch(Skins):
     def evaluate(self, m: "mjw.Model", d: "mjw.Data", qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv), where the skins are solved, and the work
         of mujoco_warp's contacts with core, nail and clamp."""
-        self._qacc, r, c, efc = qacc, self._of_step, d.contact, d.efc
+        self._qacc, r = qacc, self._of_step
         self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, r))
         r.lifted.zero_()
-        known = [self._core, self._body, self.dt, m.geom_bodyid, d.nacon, c.geom, c.worldid, c.efc_address]
-        known += [efc.force, efc.J, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind, d.qvel, qacc]
-        self._launch(solid.find_lift, c.worldid.shape, known, [r.lifted])
+        known = [self._core, self._body, self.dt, m.geom_bodyid, contacts_of(d), rows_of(m, d), d.qvel, qacc]
+        self._launch(solid.find_lift, d.naconmax, known, [r.lifted])
 
     def _put_bodies(self, m):
         """Lets bodies that were placed begin without contact; finds which were placed in the skin."""
@@ -314,15 +309,9 @@ class Batch(Skins):
           contact_force: (naconmax,) force and torque of d's contacts in the world's frame.
         """
         acting = self._acting if self.moving else self.model.wrench0
-        c = d.contact
-        contacts = [d.nacon, c.geom, c.worldid, c.efc_address, c.pos, contact_force, d.xpos, d.xmat]
+        known = [self._core, m.geom_bodyid, contacts_of(d), contact_force, d.xpos, d.xmat]
         self._on_solid.zero_()
-        self._launch(
-            solid.sum_contacts,
-            contact_force.shape,
-            [self._core, m.geom_bodyid, *contacts],
-            [self._on_solid],
-        )
+        self._launch(solid.sum_contacts, contact_force.shape, known, [self._on_solid])
         for other, group in self.skins_met:
             met = [self._core, other._core, group, other._acting, d.xpos, d.xmat]
             self._launch(solid.add_push, self.nworld, met, [self._on_solid])

@@ -10,7 +10,7 @@ from ..coupling.implicit.rounds import Model
 from ..coupling.implicit.rows import hold_by_rows
 from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
-from ..skin.newton.worlds import CONVERGED, NOT_FINITE
+from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from ..skin.types import double, mat33, mat66, real, vec3, vec6, widen
 
 wp.set_module_options({"enable_backward": False})
@@ -75,9 +75,7 @@ def geom_poses(
 @wp.kernel
 def accept_models(
     # In:
-    wanted: wp.array(dtype=int),
-    reason: wp.array(dtype=int),
-    load_factor: wp.array(dtype=real),
+    st: Worlds,
     began: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
@@ -94,20 +92,21 @@ def accept_models(
     was reached: the last step's model, or in a first step one about the target poses. No force where poses
     are not finite."""
     g, w = wp.tid()
-    if wanted[w] == 0:
+    if st.wanted[w] == 0:
         return
+    load_factor = st.load_factor[w]
     p = last.pos0[g, w]
     R = last.mat0[g, w]
-    if reason[w] == NOT_FINITE:
+    if st.reason[w] == NOT_FINITE:
         model.wrench0[g, w] = vec6()
         model.tangent0[g, w] = mat66()
-    elif began[w] == 1 and load_factor[w] == real(0.0):
+    elif began[w] == 1 and load_factor == real(0.0):
         model.wrench0[g, w] = last.wrench0[g, w]
         model.tangent0[g, w] = last.tangent0[g, w]
     else:
         p = pos[g, w]
         R = mat[g, w]
-        if load_factor[w] > real(0.0):
+        if load_factor > real(0.0):
             k = int(0)
             while geoms.group[k] != g:
                 k += 1
@@ -119,7 +118,7 @@ def accept_models(
     model.pos0[g, w] = p
     model.mat0[g, w] = R
     model.slack[g, w] = real(0.0)
-    if slack.shape[0] > 0 and load_factor[w] == real(1.0) and not at_rest[w]:
+    if slack.shape[0] > 0 and load_factor == real(1.0) and not at_rest[w]:
         model.slack[g, w] = slack[g, w]
 
 
@@ -220,21 +219,11 @@ def write_sensors(
     state: wp.array2d(dtype=real),
     wrench: wp.array2d(dtype=vec6),
     fraction: wp.array(dtype=real),
-    reason: wp.array(dtype=int),
-    valid: wp.array(dtype=int),
-    settled: wp.array(dtype=int),
-    failed: wp.array(dtype=int),
-    iterations: wp.array(dtype=int),
-    error: wp.array(dtype=real),
-    rounds: wp.array(dtype=int),
-    load_factor: wp.array(dtype=real),
-    push: wp.array2d(dtype=real),
-    tier: wp.array(dtype=int),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
-    """Readings at the addresses of electrodes, pdc, pac, tac, tdc, contact_force and status; -1: the model
-    has no such sensor. Each thread writes one number of every channel that has as many."""
+    """Readings at the addresses of electrodes, pdc, pac, tac, tdc and contact_force; -1: the model has no
+    such sensor. Each thread writes one number of every channel that has as many."""
     w, i = wp.tid()
     if address[0] >= 0 and i < at.nelectrode:
         sensordata_out[w, address[0] + i] = float(state[w, at.sampled + i])
@@ -250,23 +239,43 @@ def write_sensors(
         sensordata_out[w, address[3]] = float(state[w, at.tac])
     if address[4] >= 0:
         sensordata_out[w, address[4]] = float(state[w, at.tdc])
-    if address[6] >= 0:
-        good = float(0.0)
-        if reason[w] == CONVERGED and settled[w] == 1:
-            good = 1.0
-        residual = float(error[w])
-        if reason[w] == NOT_FINITE:
-            residual = wp.nan
-        if residual != residual or valid[w] == 0:
-            good = -1.0
-        sensordata_out[w, address[6]] = good
-        sensordata_out[w, address[6] + 1] = float(failed[w])
-        sensordata_out[w, address[6] + 2] = float(iterations[w])
-        sensordata_out[w, address[6] + 3] = residual
-        sensordata_out[w, address[6] + 4] = float(tier[w])
-        sensordata_out[w, address[6] + 5] = float(rounds[w])
-        sensordata_out[w, address[6] + 6] = float(load_factor[w])
-        least = real(1.0)
-        for g in range(push.shape[0]):
-            least = wp.min(least, push[g, w])
-        sensordata_out[w, address[6] + 7] = float(real(1.0) - least)
+
+
+@wp.kernel
+def write_status(
+    # In:
+    address: wp.array(dtype=int),
+    st: Worlds,
+    valid: wp.array(dtype=int),
+    settled: wp.array(dtype=int),
+    failed: wp.array(dtype=int),
+    rounds: wp.array(dtype=int),
+    push: wp.array2d(dtype=real),
+    tier: wp.array(dtype=int),
+    # Out:
+    sensordata_out: wp.array2d(dtype=float),
+):
+    """status at its address among those of `write_sensors`."""
+    w = wp.tid()
+    at = address[6]
+    if at < 0:
+        return
+    good = float(0.0)
+    if st.reason[w] == CONVERGED and settled[w] == 1:
+        good = 1.0
+    residual = float(st.error[w])
+    if st.reason[w] == NOT_FINITE:
+        residual = wp.nan
+    if residual != residual or valid[w] == 0:
+        good = -1.0
+    least = real(1.0)
+    for g in range(push.shape[0]):
+        least = wp.min(least, push[g, w])
+    sensordata_out[w, at] = good
+    sensordata_out[w, at + 1] = float(failed[w])
+    sensordata_out[w, at + 2] = float(st.iterations[w])
+    sensordata_out[w, at + 3] = residual
+    sensordata_out[w, at + 4] = float(tier[w])
+    sensordata_out[w, at + 5] = float(rounds[w])
+    sensordata_out[w, at + 6] = float(st.load_factor[w])
+    sensordata_out[w, at + 7] = float(real(1.0) - least)

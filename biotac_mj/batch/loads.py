@@ -8,10 +8,11 @@ import typing
 import mujoco
 import numpy as np
 import warp as wp
-from mujoco_warp._src.types import ContactType, vec5
+from mujoco_warp._src.types import ContactType
 
 from ..coupling.loads import PYRAMID, passes
 from ..skin.types import double, real, vec3, vec6, widen
+from .engine import Contacts, contacts_of, copy_contact, vec5
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -46,48 +47,14 @@ def clear_sums(address: wp.array(dtype=int), sensordata_out: wp.array2d(dtype=fl
     sensordata_out[w, address[i]] = 0.0
 
 
-@wp.struct
-class Contacts:
-    """The fields of mujoco_warp's contacts that its `<contact>` sensors read; `force` is that of the
-    constraint rows."""
-
-    dist: wp.array(dtype=float)
-    pos: wp.array(dtype=wp.vec3)
-    frame: wp.array(dtype=wp.mat33)
-    friction: wp.array(dtype=vec5)
-    dim: wp.array(dtype=int)
-    geom: wp.array(dtype=wp.vec2i)
-    efc_address: wp.array2d(dtype=int)
-    worldid: wp.array(dtype=int)
-    type: wp.array(dtype=int)
-    adhesion: wp.array(dtype=float)
-
-
 @wp.kernel
-def copy_contacts(
-    # In:
-    contact: Contacts,
-    count: wp.array(dtype=int),
-    # Out:
-    contact_out: Contacts,
-    count_out: wp.array(dtype=int),
-):
+def copy_contacts(contact: Contacts, contact_out: Contacts):
     i = wp.tid()
-    n = wp.min(count[0], contact.dist.shape[0])
+    n = wp.min(contact.nacon[0], contact.dist.shape[0])
     if i == 0:
-        count_out[0] = n
+        contact_out.nacon[0] = n
     if i < n:
-        contact_out.dist[i] = contact.dist[i]
-        contact_out.pos[i] = contact.pos[i]
-        contact_out.frame[i] = contact.frame[i]
-        contact_out.friction[i] = contact.friction[i]
-        contact_out.dim[i] = contact.dim[i]
-        contact_out.geom[i] = contact.geom[i]
-        contact_out.worldid[i] = contact.worldid[i]
-        contact_out.type[i] = contact.type[i]
-        contact_out.adhesion[i] = contact.adhesion[i]
-        for k in range(contact.efc_address.shape[1]):
-            contact_out.efc_address[i, k] = contact.efc_address[i, k]
+        copy_contact(contact, i, contact_out, i)
 
 
 @wp.kernel
@@ -105,7 +72,6 @@ def list_touches(
     wrench: wp.array2d(dtype=vec6),
     # In and out:
     contact: Contacts,
-    count: wp.array(dtype=int),
     row_force: wp.array2d(dtype=float),
 ):
     """Adds the touches of a skin to the contacts, each with six components; rows from `row` on are theirs."""
@@ -113,7 +79,7 @@ def list_touches(
     force = wp.spatial_top(wrench[k, w])
     if wp.dot(force, force) == real(0.0):
         return
-    i = wp.atomic_add(count, 0, 1)
+    i = wp.atomic_add(contact.nacon, 0, 1)
     turn = widen(xmat[w, core])
     n = turn * normal[k, w]
     t = vec3(real(0.0), real(1.0), real(0.0))  # as MuJoCo makes frames
@@ -168,20 +134,18 @@ class Loads:
         """A Data like `d` whose contacts have room for the skins'."""
         ngeom = sum(batch.ngeom for batch in batches)
         room, rows = d.naconmax + d.nworld * ngeom, d.njmax + _PYRAMID * ngeom
-        self._mujocos, self._listed, self._data = Contacts(), Contacts(), copy.copy(d)
+        self._data = copy.copy(d)
         self._data.contact, self._data.efc = copy.copy(d.contact), copy.copy(d.efc)
-        for name in Contacts.vars:
+        for name in set(Contacts.vars) - {"nacon"}:
             given = getattr(d.contact, name)
             shape = (room, max(_PYRAMID, given.shape[1])) if given.ndim == 2 else (room,)
-            array = wp.zeros(shape, dtype=given.dtype)
-            setattr(self._mujocos, name, given)
-            setattr(self._listed, name, array)
-            setattr(self._data.contact, name, array)
+            setattr(self._data.contact, name, wp.zeros(shape, dtype=given.dtype))
         for name in ("force", "type", "id"):  # what is read of rows; those of touches have no type
             given = getattr(d.efc, name)
             setattr(self._data.efc, name, wp.zeros((d.nworld, rows), dtype=given.dtype))
         self._data.nacon = wp.zeros(1, dtype=int)
         self._data.naconmax, self._data.njmax = room, rows
+        self._mujocos, self._listed = contacts_of(d), contacts_of(self._data)
 
     def write(self, m: "mjw.Model", d: "mjw.Data", batches: list) -> None:
         """Writes the force quantities, after each `Batch` has computed the forces that act on its bodies.
@@ -191,14 +155,14 @@ class Loads:
 
         if not self._lists:
             return
-        listed, device = [self._listed, self._data.nacon], d.qpos.device
-        wp.launch(copy_contacts, d.naconmax, [self._mujocos, d.nacon], listed, device=device)
+        device = d.qpos.device
+        wp.launch(copy_contacts, d.naconmax, [self._mujocos], [self._listed], device=device)
         for name in ("force", "type", "id"):
             wp.copy(getattr(self._data.efc, name)[:, : d.njmax], getattr(d.efc, name))
         row = d.njmax
         for batch in batches:
             batch.find_touches()
-            batch.list_touches(m, d, row, [*listed, self._data.efc.force])
+            batch.list_touches(m, d, row, [self._listed, self._data.efc.force])
             row += _PYRAMID * batch.ngeom
         if self._forces:
             rne_postconstraint(m, self._data)

@@ -159,8 +159,7 @@ class Skins:
         skin, st = self.skin, self.skin.data.worlds
         self.rest.come_to_rest()
         where = [pos, mat, skin.geoms.struct]
-        solved = [st.wanted, st.reason, st.load_factor, self.began, skin.wrench, skin.tangent]
-        solved += [skin.slack, self.rest.resets]
+        solved = [st, self.began, skin.wrench, skin.tangent, skin.slack, self.rest.resets]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
 
     def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
@@ -186,22 +185,11 @@ class Skins:
         state, skin = self._no_state, self.skin
         if self.senses:
             state = self.senses.sample()
-        outputs = [
-            state,
-            self.model.wrench0,
-            skin.fraction,
-            skin.reason,
-            self._valid,
-            self._settled,
-            self.failed,
-        ]
-        how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.load_factor, self._push, skin.tier]
-        self._launch(
-            kernels.write_sensors,
-            (self.nworld, self._widest),
-            [self._place, self._addresses, *outputs, *how],
-            [sensordata],
-        )
+        read = [self._place, self._addresses, state, self.model.wrench0, skin.fraction]
+        self._launch(kernels.write_sensors, (self.nworld, self._widest), read, [sensordata])
+        how = [self._valid, self._settled, self.failed, self._rounds, self._push, skin.tier]
+        status = [self._addresses, skin.data.worlds, *how]
+        self._launch(kernels.write_status, self.nworld, status, [sensordata])
 
     @property
     def groups(self) -> tuple:

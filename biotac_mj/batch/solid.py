@@ -4,6 +4,7 @@
 import warp as wp
 
 from ..skin.types import double, real, vec6, widen
+from .engine import Contacts, Rows
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,11 +14,7 @@ def sum_contacts(
     # In:
     core: int,
     geom_bodyid: wp.array(dtype=int),
-    count: wp.array(dtype=int),
-    geom: wp.array(dtype=wp.vec2i),
-    world: wp.array(dtype=int),
-    row: wp.array2d(dtype=int),
-    pos: wp.array(dtype=wp.vec3),
+    contact: Contacts,
     force: wp.array(dtype=wp.spatial_vector),
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
@@ -27,21 +24,21 @@ def sum_contacts(
     """Adds up the contacts of all worlds on the geoms of body `core`; forces and torques are those of
     `mujoco_warp.contact_force` in the world's frame."""
     i = wp.tid()
-    if i >= count[0] or row[i, 0] < 0:
+    if i >= contact.nacon[0] or contact.efc_address[i, 0] < 0:
         return
     sign = real(0.0)  # it acts on the second
     for k in range(2):
-        g = geom[i][k]
+        g = contact.geom[i][k]
         if g >= 0:  # -1: a flex
             if geom_bodyid[g] == core:
                 sign += real(2 * k - 1)
     if sign == real(0.0):
         return
-    w = world[i]
+    w = contact.worldid[i]
     turn = wp.transpose(widen(xmat[w, core]))
     push = sign * double(wp.spatial_top(force[i]))
     twist = sign * double(wp.spatial_bottom(force[i]))
-    twist += wp.cross(double(pos[i]) - double(xpos[w, core]), push)
+    twist += wp.cross(double(contact.pos[i]) - double(xpos[w, core]), push)
     f = turn * push
     t = turn * twist
     wp.atomic_add(wrench, w, vec6(f[0], f[1], f[2], t[0], t[1], t[2]))
@@ -54,16 +51,8 @@ def find_lift(
     body: wp.array(dtype=int),
     step: real,
     geom_bodyid: wp.array(dtype=int),
-    count: wp.array(dtype=int),
-    geom: wp.array(dtype=wp.vec2i),
-    world: wp.array(dtype=int),
-    row: wp.array2d(dtype=int),
-    force: wp.array2d(dtype=float),
-    J: wp.array3d(dtype=float),
-    sparse: int,
-    J_rownnz: wp.array2d(dtype=int),
-    J_rowadr: wp.array2d(dtype=int),
-    J_colind: wp.array3d(dtype=int),
+    contact: Contacts,
+    rows: Rows,
     qvel: wp.array2d(dtype=float),
     qacc: wp.array2d(dtype=float),
     # In and out:
@@ -71,29 +60,34 @@ def find_lift(
 ):
     """Adds up the work that contacts with body `core` do on the touching bodies in the step [J]."""
     i = wp.tid()
-    if i >= count[0] or row[i, 0] < 0 or wp.min(geom[i][0], geom[i][1]) < 0:  # -1: a flex
+    if i >= contact.nacon[0] or contact.efc_address[i, 0] < 0:
         return
-    first, second = geom_bodyid[geom[i][0]], geom_bodyid[geom[i][1]]
+    geom = contact.geom[i]
+    if wp.min(geom[0], geom[1]) < 0:  # -1: a flex
+        return
+    first, second = geom_bodyid[geom[0]], geom_bodyid[geom[1]]
     if first != core and second != core:
         return
-    w = world[i]
+    w = contact.worldid[i]
     work = real(0.0)
-    for k in range(row.shape[1]):
-        r = row[i, k]
-        if r >= 0 and force[w, r] != 0.0:
+    for k in range(contact.efc_address.shape[1]):
+        r = contact.efc_address[i, k]
+        if r >= 0 and rows.force[w, r] != 0.0:
             speed = real(0.0)
-            entries = wp.where(sparse == 1, J_rownnz[w, r], qvel.shape[1])
+            entries = int(qvel.shape[1])
+            if rows.sparse == 1:
+                entries = rows.J_rownnz[w, r]
             for n in range(entries):
                 line = int(r)
                 at = int(n)
                 column = int(n)
-                if sparse == 1:
+                if rows.sparse == 1:
                     line = 0
-                    at = J_rowadr[w, r] + n
-                    column = J_colind[w, 0, at]
+                    at = rows.J_rowadr[w, r] + n
+                    column = rows.J_colind[w, 0, at]
                 mean = real(qvel[w, column]) + real(0.5) * step * real(qacc[w, column])
-                speed += real(J[w, line, at]) * mean
-            work += step * real(force[w, r]) * speed
+                speed += real(rows.J[w, line, at]) * mean
+            work += step * real(rows.force[w, r]) * speed
     for g in range(body.shape[0]):
         if body[g] == wp.where(first == core, second, first):
             wp.atomic_add(lifted, g, w, work)

@@ -11,6 +11,7 @@ from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
 from ..coupling.solid_contacts import SolidPairs
 from ..skin.contact.overlap import MOST
 from ..skin.types import double, mat33, real, vec3, widen
+from .engine import Contacts, contacts_of, copy_contact
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -19,7 +20,6 @@ wp.set_module_options({"enable_backward": False})
 
 _CONSTRAINT = wp.constant(1)  # bit of mujoco_warp's ContactType
 _MINMU = wp.constant(wp.float32(mujoco.mjMINMU))
-vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
 @wp.kernel
@@ -29,14 +29,8 @@ def amend_contacts(
     part_of: wp.array(dtype=int),
     shape_of: wp.array(dtype=int),
     met: wp.array(dtype=int),
-    count: wp.array(dtype=int),
-    geom: wp.array(dtype=wp.vec2i),
-    world: wp.array(dtype=int),
-    friction: wp.array(dtype=vec5),
     # In and out:
-    includemargin: wp.array(dtype=float),
-    dim: wp.array(dtype=int),
-    kind: wp.array(dtype=int),
+    contact: Contacts,
     # Out:
     wanted_out: wp.array2d(dtype=int),
     source_out: wp.array2d(dtype=int),
@@ -47,24 +41,25 @@ def amend_contacts(
     non-convex shapes. The last removed contact of each pair [pair, world] is the template of those that
     replace it."""
     i = wp.tid()
-    if i >= count[0]:
+    if i >= contact.nacon[0]:
         return
-    g = geom[i]
+    g = contact.geom[i]
     if g[0] < 0 or g[1] < 0:  # a flex
         return
     for k in range(2):
         part = part_of[g[k]]
         other = g[1 - k]
         if part >= 0 and met[other] == 1:
-            mark(stopped, world[i])
-            includemargin[i] = 0.0
-            if friction[i][0] <= _MINMU:
-                dim[i] = 1
+            w = contact.worldid[i]
+            mark(stopped, w)
+            contact.includemargin[i] = 0.0
+            if contact.friction[i][0] <= _MINMU:
+                contact.dim[i] = 1
             shape = shape_of[other]
-            if shape >= 0 and (kind[i] & _CONSTRAINT) != 0:
-                kind[i] = kind[i] - _CONSTRAINT
-                wanted_out[part * nshapes + shape, world[i]] = 1
-                wp.atomic_max(source_out, part * nshapes + shape, world[i], i)
+            if shape >= 0 and (contact.type[i] & _CONSTRAINT) != 0:
+                contact.type[i] = contact.type[i] - _CONSTRAINT
+                wanted_out[part * nshapes + shape, w] = 1
+                wp.atomic_max(source_out, part * nshapes + shape, w, i)
                 any_out[0] = 1
 
 
@@ -101,55 +96,33 @@ def append_contacts(
     found_normal: wp.array3d(dtype=vec3),
     found_depth: wp.array3d(dtype=real),
     # In and out:
-    count: wp.array(dtype=int),
-    dist: wp.array(dtype=float),
-    pos: wp.array(dtype=wp.vec3),
-    frame: wp.array(dtype=wp.mat33),
-    includemargin: wp.array(dtype=float),
-    friction: wp.array(dtype=vec5),
-    solref: wp.array(dtype=wp.vec2),
-    solreffriction: wp.array(dtype=wp.vec2),
-    solimp: wp.array(dtype=vec5),
-    dim: wp.array(dtype=int),
-    geom: wp.array(dtype=wp.vec2i),
-    efc_address: wp.array2d(dtype=int),
-    world: wp.array(dtype=int),
-    kind: wp.array(dtype=int),
-    adhesion: wp.array(dtype=float),
+    contact: Contacts,
 ):
-    """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; `count` goes on beyond
+    """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; their number goes on beyond
     it, which shows the overflow."""
     pair, s, w = wp.tid()
     if found_depth[pair, s, w] <= real(0.0):
         return
     t = source[pair, w]
-    i = wp.atomic_add(count, 0, 1)
-    if i >= dist.shape[0]:
+    i = wp.atomic_add(contact.nacon, 0, 1)
+    if i >= contact.dist.shape[0]:
         return
     turn = widen(xmat[w, core])
     n = wp.vec3(turn * found_normal[pair, s, w])
-    if part_of[geom[t][0]] < 0:  # from the first geom to the second
+    if part_of[contact.geom[t][0]] < 0:  # from the first geom to the second
         n = -n
     across = wp.vec3(1.0, 0.0, 0.0)
     if wp.abs(n[0]) > 0.6:
         across = wp.vec3(0.0, 1.0, 0.0)
     a = wp.normalize(wp.cross(n, across))
     b = wp.cross(n, a)
-    dist[i] = -float(found_depth[pair, s, w])
-    pos[i] = wp.vec3(turn * found_pos[pair, s, w] + double(xpos[w, core]))
-    frame[i] = wp.mat33(n[0], n[1], n[2], a[0], a[1], a[2], b[0], b[1], b[2])
-    includemargin[i] = 0.0
-    friction[i] = friction[t]
-    solref[i] = solref[t]
-    solreffriction[i] = solreffriction[t]
-    solimp[i] = solimp[t]
-    dim[i] = dim[t]
-    geom[i] = geom[t]
-    world[i] = w
-    kind[i] = _CONSTRAINT
-    adhesion[i] = adhesion[t]
-    for k in range(efc_address.shape[1]):
-        efc_address[i, k] = -1
+    copy_contact(contact, t, contact, i)
+    contact.dist[i] = -float(found_depth[pair, s, w])
+    contact.pos[i] = wp.vec3(turn * found_pos[pair, s, w] + double(xpos[w, core]))
+    contact.frame[i] = wp.mat33(n[0], n[1], n[2], a[0], a[1], a[2], b[0], b[1], b[2])
+    contact.type[i] = _CONSTRAINT
+    for k in range(contact.efc_address.shape[1]):
+        contact.efc_address[i, k] = -1
 
 
 class SolidContacts:
@@ -175,27 +148,23 @@ class SolidContacts:
 
     def amend(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Makes the contacts what they should be, before constraints are made of them. Launches only."""
-        c = d.contact
         for array in (self._wanted, self._source, self._any):
             array.zero_()
         self.stopped.clear()
-        found = [len(self._shape), *self._of_geoms, d.nacon, c.geom, c.worldid, c.friction]
-        outputs = [c.includemargin, c.dim, c.type, self._wanted, self._source, self._any, self.stopped.struct]
-        self._launch(amend_contacts, len(c.dist), found, outputs)
+        outputs = [contacts_of(d), self._wanted, self._source, self._any, self.stopped.struct]
+        self._launch(amend_contacts, d.naconmax, [len(self._shape), *self._of_geoms], outputs)
         if self._overlaps:
             wp.capture_if(self._any, lambda: self._replace(d))
 
     def _replace(self, d):
-        c, found = d.contact, self._overlaps
+        found = self._overlaps
         frames = [d.xpos, d.xmat, d.geom_xpos, d.geom_xmat]
         where = [self._core, found.nparts, self._shape, *frames]
         self._launch(place_shapes, (found.nshapes, self._nworld), where, [found.pos, found.mat])
         found.find()
-        new = [self._source, found.contact_pos, found.contact_normal, found.depth]
-        contacts = [d.nacon, c.dist, c.pos, c.frame, c.includemargin, c.friction, c.solref, c.solreffriction]
-        contacts += [c.solimp, c.dim, c.geom, c.efc_address, c.worldid, c.type, c.adhesion]
-        known = [self._core, self._of_geoms[0], d.xpos, d.xmat, *new]
-        self._launch(append_contacts, (found.npair, MOST, self._nworld), known, contacts)
+        known = [self._core, self._of_geoms[0], d.xpos, d.xmat, self._source]
+        known += [found.contact_pos, found.contact_normal, found.depth]
+        self._launch(append_contacts, (found.npair, MOST, self._nworld), known, [contacts_of(d)])
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

@@ -15,11 +15,12 @@ from .formats.arrays import is_numpy, read_numpy
 from .formats.bags import is_bag, read_bag
 from .formats.btd import is_btd, read_btd
 from .formats.columns import open_bytes
+from .formats.joining import join
 from .formats.matlab import is_matlab, read_hdf5, read_matlab
 from .formats.nvidia import read_nvidia
 from .formats.pressed import KEYS, read_press
 from .formats.published import companions, is_companion, object_of, rate_of
-from .formats.streams import Stream, join
+from .formats.streams import Stream
 from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read

@@ -7,8 +7,9 @@ from collections.abc import Iterable
 
 from ..geometry.design import BIOTAC, design_of_channels
 from .formats.columns import parse_table
+from .formats.joining import join
 from .formats.messages import Topic
-from .formats.streams import join, make_streams
+from .formats.streams import make_streams
 from .recording import Recording
 
 

@@ -248,7 +248,7 @@ class _One:
         self.impedance, self.state = self._impedance.numpy()[0], self._state.numpy()[0]
         valid = wp.ones(1, dtype=int, device="cpu")
         self._at, self._still = at, wp.zeros((1, 0), dtype=real, device="cpu")
-        self._signals = [self._seed, self._due, valid, self._impedance, self._pressure, self._temperature]
+        self._signals = [self._due, valid, self._impedance, self._pressure, self._temperature]
         self._signals.append(self._liquid)
         self._found, self._sampled = {}, {}  # launches by the numbers that they have
 
@@ -264,7 +264,7 @@ class _One:
         shaken = self._still if shaken is None else shaken
         key = dt, noise, id(shaken)
         if key not in self._sampled:
-            known = [self._at, dt, int(noise), *self._signals, shaken]
+            known = [self._at, dt, _noise(noise, self._seed), *self._signals, shaken]
             made = recorded(kernels.sample_slots, 1, known, [self._time, self._state])
             self._sampled = {key: made}
         self.state[:] = state
@@ -274,6 +274,12 @@ class _One:
             self.impedance[:] = impedance
         self._sampled[key]()
         state[:] = self.state
+
+
+def _noise(on, seed):
+    made = kernels.Noise()
+    made.on, made.seed = int(bool(on)), seed
+    return made
 
 
 _mine = threading.local()
@@ -361,9 +367,10 @@ class BatchAcquisition:
         for s in (min(seeds), max(seeds)):
             Acquisition(seed=s)  # refuses what is out of range
         self.nworld, self.device = nworld, wp.get_device(device)
-        self._noise, self._every, self.redraws = int(bool(noise)), int(bool(film_every_step)), int(redraw)
+        self._every, self.redraws = int(bool(film_every_step)), int(redraw)
         with wp.ScopedDevice(self.device):
             self.seed = wp.array(np.array(seeds, np.uint64), dtype=wp.uint64)
+            self._noise = _noise(noise, self.seed)
             self.rest_states = wp.array(rows, dtype=real)
             self.drawn, self.row = (wp.zeros(nworld, dtype=int) for _ in range(2))
             self.state = wp.zeros((nworld, self.place.nstate), dtype=real)
@@ -403,6 +410,6 @@ class BatchAcquisition:
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
           shaken: (nworld, n) wp.array float64, see `Acquisition.advance`.
         """
-        inputs = [self.place, dt, self._noise, self.seed, self.due, valid, impedance, pressure]
+        inputs = [self.place, dt, self._noise, self.due, valid, impedance, pressure]
         inputs += [self.temperature, self.liquid, self._still if shaken is None else shaken]
         wp.launch(kernels.sample_slots, self.nworld, inputs, [self.time, self.state], device=self.device)

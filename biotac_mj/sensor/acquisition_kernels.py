@@ -83,6 +83,14 @@ class Place:
     nstate: int
 
 
+@wp.struct
+class Noise:
+    """Noise of all worlds: whether there is any, 0 or 1, and each world's seed."""
+
+    on: int
+    seed: wp.array(dtype=wp.uint64)
+
+
 @functools.cache
 def place_of(design: Design) -> Place:
     """Offsets of the fields of the state of a sensor of this design."""
@@ -286,8 +294,7 @@ def sample_slots(
     # In:
     at: Place,
     dt: real,
-    noise: int,
-    seed: wp.array(dtype=wp.uint64),
+    noise: Noise,
     due: wp.array(dtype=int),
     valid: wp.array(dtype=int),
     impedance: wp.array2d(dtype=real),
@@ -367,8 +374,8 @@ def sample_slots(
             else:
                 value = _thermistor_counts(_temperature_exponent(warm + heating * since))
                 deviation = state[w, at.tdc_noise]
-        if noise == 1:
-            hiss = deviation * draw_normal(slot, seed[w])
+        if noise.on == 1:
+            hiss = deviation * draw_normal(slot, noise.seed[w])
             if position % 2 == 0:
                 hiss += state[w, at.pac_colour] * state[w, at.hiss]
                 state[w, at.hiss] = hiss

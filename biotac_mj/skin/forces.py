@@ -108,6 +108,14 @@ class Forces:
         law = [m.sample, m.options.stick_ratio, stiffness, laws, self.k.x_start, bound]
         return cache, state.contact(*law)
 
+    def loads(self) -> nodes.Loads:
+        """What acts on the nodes."""
+        out = nodes.Loads()
+        out.outer, out.core, out.liquid = self.node_forces
+        if self.d.external is not None:
+            out.external = self.d.external
+        return out
+
     @property
     def contact(self) -> faces.Contact:
         """`Contact` of the outer surface."""
@@ -145,7 +153,7 @@ class Forces:
         )
         self.launch(
             program, nodes.assemble_force, self._summed,
-            [self._slots, k.elements.corner_force, d.external, st.pressure, on, *self.node_forces],
+            [self._slots, k.elements.corner_force, st.pressure, on, self.loads()],
             [d.force],
         )  # fmt: skip
         if self.implicit:
@@ -251,9 +259,10 @@ class Forces:
         area, touched = m.inner.area, [None, None, None]
         if c:
             area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
+        inner = liquid.inner_faces(m.inner.face, m.core_slot, m.sample, area)
         self.launch(
             program, liquid.wet_faces, (k.face_chunks, d.nworld),
-            [k.face_chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
+            [k.face_chunk, inner, *law, *touched, d.x, on],
             [k.fraction, k.wet, k.wet_corner],
         )  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume

@@ -78,14 +78,29 @@ def dry_fraction(
     return loss, overlap
 
 
+@wp.struct
+class InnerFaces:
+    """Faces of the cavity: their nodes, and their numbers `slot` among those that can touch the core, -1 of
+    others; of these the rest areas [m^2] and the samples' barycentric coordinates."""
+
+    face: wp.array(dtype=wp.vec3i)
+    slot: wp.array(dtype=int)
+    sample: wp.array(dtype=vec3)
+    area: wp.array(dtype=real)
+
+
+def inner_faces(face: wp.array, slot: wp.array, sample: wp.array, area: wp.array) -> InnerFaces:
+    """The struct of these arrays."""
+    out = InnerFaces()
+    out.face, out.slot, out.sample, out.area = face, slot, sample, area
+    return out
+
+
 @wp.kernel
 def wet_faces(
     # In:
     chunk: int,
-    face: wp.array(dtype=wp.vec3i),
-    slot: wp.array(dtype=int),
-    sample: wp.array(dtype=vec3),
-    area: wp.array(dtype=real),
+    inner: InnerFaces,
     stiffness: wp.array(dtype=real),
     reference: wp.array(dtype=real),
     touching: wp.array2d(dtype=int),
@@ -105,18 +120,21 @@ def wet_faces(
         return
     third = real(1.0) / real(3.0)
     total = real(0.0)
-    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
-        t = face[f]
+    for f in range(c * chunk, wp.min((c + 1) * chunk, inner.face.shape[0])):
+        t = inner.face[f]
         x0 = x[t[0], w]
         x1 = x[t[1], w]
         x2 = x[t[2], w]
         total -= wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
         wet = vec3(third, third, third)
         normal = wp.cross(x1 - x0, x2 - x0)
-        k = slot[f]
+        k = inner.slot[f]
         if k >= 0:
             if touching[k, w] == 1:
-                loss, overlap = dry_fraction(k, w, sample, area[k], stiffness[w], reference[w], geom, force)
+                area = inner.area[k]
+                loss, overlap = dry_fraction(
+                    k, w, inner.sample, area, stiffness[w], reference[w], geom, force
+                )
                 wet -= loss
                 total += overlap * wp.length(normal) / real(2.0)
         wet_out[f, w] = wet

@@ -464,10 +464,9 @@ class SkinStep:
 
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
-        forces = [d.force, *self._forces.node_forces, d.external]
         self._launch(
             self._nodes_kernels.residuals, (k.nchunk, d.nworld),
-            [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st],
+            [k.chunk, m.free_mask, d.force, self._forces.loads(), d.x, d.rest_vert, k.inertial, st],
             [k.r, k.norms, self._newton_on],
         )  # fmt: skip
         if self._compliant:

@@ -138,10 +138,6 @@ def _ball_before(spec, mount, geometry):
 
 def view(
     skin: str | pathlib.Path | SkinGeometry = "default",
-    material: str | dict = "default",
-    liquid: bool | None = None,
-    seed: int = 0,
-    device: str = "cpu",
     tier: str = "full",
     render: pathlib.Path | str | None = None,
     seconds: float = 0.3,
@@ -150,13 +146,12 @@ def view(
     web: bool = False,
     recording: pathlib.Path | str | Sequence | None = None,
     port: int = 8080,
-    options: dict | str | None = None,
+    **attach_options: object,
 ) -> object:
     """Opens the viewer and steps in real time, if the machine is fast enough; or renders; or serves a page.
 
     Args:
-      skin, material, liquid, seed, device, tier, options: see `biotac_mj.attach`; liquid None takes the
-        material's choice.
+      skin, tier, attach_options: see `biotac_mj.attach`.
       render: path of a picture to write after `seconds` [s] instead.
       hand, mount: files of a hand to show instead of one BioTac, with the condensed tier, and of its mounts
         if it is unknown; see `build_hand`.
@@ -177,18 +172,7 @@ def view(
     if web and not recording and hand is None:
         from .web_play import play_press
 
-        return play_press(
-            dict(
-                skin=skin,
-                tier=tier,
-                material=material,
-                liquid=liquid,
-                seed=seed,
-                device=device,
-                options=options,
-            ),
-            port=port,
-        )
+        return play_press(dict(skin=skin, tier=tier, **attach_options), port=port)
     if recording:
         from .web_play import play_file
 
@@ -207,14 +191,12 @@ def view(
             "no display to open a window on: use `biotac view --render FILE.png` or `biotac play`, or set "
             "DISPLAY"
         )
-    settings = dict(
-        material=material, liquid=liquid, seed=seed, device=device, options=read_dict(options, "options")
-    )
+    attach_options["options"] = read_dict(attach_options.get("options"), "options")
     if hand is None:
-        spec, handle = build_scene(skin, tier=tier, **settings)
+        spec, handle = build_scene(skin, tier=tier, **attach_options)
         handles, point_camera = {"biotac": handle}, lambda model, data, camera: _point_camera(camera)
     else:
-        spec, handles = build_hand(hand, mount=mount, tier="condensed", **settings)
+        spec, handles = build_hand(hand, mount=mount, tier="condensed", **attach_options)
         point_camera = functools.partial(_point_at_hand, spec, handles)
     model = spec.compile()
     data = mujoco.MjData(model)

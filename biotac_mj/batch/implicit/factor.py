@@ -8,6 +8,7 @@ import warp as wp
 from ...coupling.implicit.compliance import THREADS, factor
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
+from ..engine import Contacts, Rows, contacts_of, rows_of
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -22,21 +23,10 @@ _ELLIPTIC = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
 def find_hessians(
     # In:
     going: wp.array(dtype=int),
-    count: wp.array(dtype=int),
-    world: wp.array(dtype=int),
-    dim: wp.array(dtype=int),
-    friction: wp.array2d(dtype=float),
-    address: wp.array2d(dtype=int),
+    contact: Contacts,
+    rows: Rows,
     stretch: wp.array(dtype=float),
     qacc: wp.array2d(dtype=float),
-    state: wp.array2d(dtype=int),
-    J: wp.array3d(dtype=float),
-    D: wp.array2d(dtype=float),
-    aref: wp.array2d(dtype=float),
-    sparse: int,
-    J_rownnz: wp.array2d(dtype=int),
-    J_rowadr: wp.array2d(dtype=int),
-    J_colind: wp.array3d(dtype=int),
     # Out:
     cone_out: wp.array2d(dtype=int),
     hessian_out: wp.array2d(dtype=vec6),
@@ -48,37 +38,38 @@ def find_hessians(
       stretch: 1 / sqrt(impratio).
     """
     c = wp.tid()
-    if c >= count[0]:
+    if c >= contact.nacon[0]:
         return
-    first = address[c, 0]
-    w = world[c]
-    if first < 0 or going[w] == 0 or state[w, first] != _CONE:
+    first = contact.efc_address[c, 0]
+    w = contact.worldid[c]
+    if first < 0 or going[w] == 0 or rows.state[w, first] != _CONE:
         return
-    mu = real(friction[c, 0] * stretch[w % stretch.shape[0]])
+    friction = contact.friction[c]
+    mu = real(friction[0] * stretch[w % stretch.shape[0]])
     scale = vec6()
     u = vec6()
     square = real(0.0)
-    for k in range(dim[c]):
+    for k in range(contact.dim[c]):
         r = first + k
-        left = -real(aref[w, r])
-        if sparse == 1:
-            for n in range(J_rownnz[w, r]):
-                at = J_rowadr[w, r] + n
-                left += real(J[w, 0, at]) * real(qacc[w, J_colind[w, 0, at]])
+        left = -real(rows.aref[w, r])
+        if rows.sparse == 1:
+            for n in range(rows.J_rownnz[w, r]):
+                at = rows.J_rowadr[w, r] + n
+                left += real(rows.J[w, 0, at]) * real(qacc[w, rows.J_colind[w, 0, at]])
         else:
             for n in range(qacc.shape[1]):
-                left += real(J[w, r, n]) * real(qacc[w, n])
+                left += real(rows.J[w, r, n]) * real(qacc[w, n])
         scale[k] = mu
         if k > 0:
-            scale[k] = real(friction[c, k - 1])
+            scale[k] = real(friction[k - 1])
             square += scale[k] * left * scale[k] * left
         u[k] = scale[k] * left
     T = wp.max(wp.sqrt(square), real(1e-15))
     slope = mu * u[0] / T
-    stiff = real(D[w, first]) / (mu * mu * (real(1.0) + mu * mu))
-    for k in range(dim[c]):
+    stiff = real(rows.D[w, first]) / (mu * mu * (real(1.0) + mu * mu))
+    for k in range(contact.dim[c]):
         row = vec6()
-        for n in range(dim[c]):
+        for n in range(contact.dim[c]):
             h = slope * u[k] * u[n] / (T * T)
             if k == 0 and n == 0:
                 h = real(1.0)
@@ -96,26 +87,20 @@ class Cones:
     [world, row], empty where its cones are pyramids."""
 
     def __init__(self, m: "mjw.Model", d: "mjw.Data"):
-        self._wanted, friction = m.opt.cone == _ELLIPTIC, d.contact.friction
+        self._wanted = m.opt.cone == _ELLIPTIC
         self.rows = d.nworld, d.njmax
         shape = self.rows if self._wanted else (d.nworld, 0)
         with wp.ScopedDevice(d.qpos.device):
             self.cone, self.hessian = wp.full(shape, -1, dtype=int), wp.zeros(shape, dtype=vec6)
-        self._friction = wp.array(
-            ptr=friction.ptr, shape=(len(friction), 5), dtype=float, device=friction.device, copy=False
-        )
 
     def find(self, m: "mjw.Model", d: "mjw.Data", going: wp.array) -> None:
         """Finds them in worlds that are going (nworld,), after mujoco_warp's constraint solver. Launches
         only."""
         if not self._wanted:
             return
-        c, efc = d.contact, d.efc
-        contacts = [d.nacon, c.worldid, c.dim, self._friction, c.efc_address, m.opt.impratio_invsqrt]
-        rows = [d.qacc, efc.state, efc.J, efc.D, efc.aref]
-        rows += [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
+        known = [going, contacts_of(d), rows_of(m, d), m.opt.impratio_invsqrt, d.qacc]
         found = [self.cone, self.hessian]
-        wp.launch(find_hessians, d.naconmax, [going, *contacts, *rows], found, device=self.cone.device)
+        wp.launch(find_hessians, d.naconmax, known, found, device=self.cone.device)
 
 
 class Factor:
@@ -153,9 +138,8 @@ class Factor:
           springs: whether constraints hold, as its solver left them. own: (slot, nworld) the first of six
             rows each that do not.
         """
-        efc, (none, no_slot) = d.efc, self._none
-        held = [no_slot if own is None else own, d.nefc if springs else none]
-        held += [efc.state, efc.J, efc.D, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
+        none, no_slot = self._none
+        held = [no_slot if own is None else own, d.nefc if springs else none, rows_of(m, d)]
         held += [self._cones.cone, self._cones.hessian]
         if springs:
             self._cones.find(m, d, going)

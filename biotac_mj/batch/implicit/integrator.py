@@ -18,7 +18,7 @@ from ...coupling.implicit.rounds import Model, make_model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
 from ...skin.block import block_max, sync
-from ...skin.condensed.lanes import eliminate
+from ...skin.condensed.elimination import eliminate
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
 from .factor import Cones, Factor

@@ -14,6 +14,7 @@ import warp as wp
 from ...skin.block import MEMORY, block_memory, block_rank, sync
 from ...skin.types import real, vec6
 from .rounds import Model
+from .rows import ROWS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,11 +29,11 @@ _NONE = wp.constant(wp.float64(2e-15))  # of a row without stiffness, twice mjMI
 
 
 @wp.func
-def _entry(J: wp.array3d(dtype=Any), w: int, r: int, k: int, sparse: int, J_rowadr: wp.array2d(dtype=int)):
+def _entry(rows: Any, w: int, r: int, k: int):
     """Entry k of those that a constraint's row has in the Jacobian."""
-    if sparse == 1:
-        return real(J[w, 0, J_rowadr[w, r] + k])
-    return real(J[w, r, k])
+    if rows.sparse == 1:
+        return real(rows.J[w, 0, rows.J_rowadr[w, r] + k])
+    return real(rows.J[w, r, k])
 
 
 @wp.func
@@ -41,10 +42,7 @@ def _stiffness(
     spring: int,
     a: int,
     b: int,
-    J: wp.array3d(dtype=Any),
-    D: wp.array2d(dtype=Any),
-    sparse: int,
-    J_rowadr: wp.array2d(dtype=int),
+    rows: Any,
     cone: wp.array2d(dtype=int),
     hessian: wp.array2d(dtype=vec6),
 ):
@@ -55,24 +53,17 @@ def _stiffness(
         r = -1 - spring
         for k in range(6):
             if hessian[w, r][k] != real(0.0):
-                push += hessian[w, r][k] * _entry(J, w, cone[w, r] + k, b, sparse, J_rowadr)
+                push += hessian[w, r][k] * _entry(rows, w, cone[w, r] + k, b)
     else:
-        push = real(D[w, r]) * _entry(J, w, r, b, sparse, J_rowadr)
-    return push * _entry(J, w, r, a, sparse, J_rowadr)
+        push = real(rows.D[w, r]) * _entry(rows, w, r, b)
+    return push * _entry(rows, w, r, a)
 
 
 @wp.func
-def _is_spring(
-    r: int,
-    w: int,
-    own: wp.array2d(dtype=int),
-    state: wp.array2d(dtype=int),
-    D: wp.array2d(dtype=Any),
-    cone: wp.array2d(dtype=int),
-):
+def _is_spring(r: int, w: int, own: wp.array2d(dtype=int), rows: Any, cone: wp.array2d(dtype=int)):
     """Whether a constraint's row holds, 1 or 0: none of a skin's own, of which the first of six are `own`."""
-    spring = wp.where(state[w, r] == _QUADRATIC and real(D[w, r]) > _NONE, 1, 0)
-    if state[w, r] == _CONE:
+    spring = wp.where(rows.state[w, r] == _QUADRATIC and real(rows.D[w, r]) > _NONE, 1, 0)
+    if rows.state[w, r] == _CONE:
         spring = wp.where(cone[w, r] >= 0, 1, 0)
     for k in range(own.shape[0]):
         if own[k, w] >= 0 and r >= own[k, w] and r < own[k, w] + 6:
@@ -89,14 +80,8 @@ def factor(
     rowadr: wp.array(dtype=int),
     colind: wp.array(dtype=int),
     own: wp.array2d(dtype=int),
-    rows: wp.array(dtype=int),
-    state: wp.array2d(dtype=int),
-    J: wp.array3d(dtype=Any),
-    D: wp.array2d(dtype=Any),
-    sparse: int,
-    J_rownnz: wp.array2d(dtype=int),
-    J_rowadr: wp.array2d(dtype=int),
-    J_colind: wp.array3d(dtype=int),
+    count: wp.array(dtype=int),
+    rows: Any,
     cone: wp.array2d(dtype=int),
     hessian: wp.array2d(dtype=vec6),
     # Out:
@@ -104,7 +89,8 @@ def factor(
     L_out: wp.array3d(dtype=real),
 ):
     """Cholesky's factor of the inertia with what constraints now hold, and a list of their rows [world, k],
-    r or, of a cone, -1 - r; by the threads of a block, in worlds that have not finished.
+    r or, of a cone, -1 - r; by the threads of a block, in worlds that have not finished. `count` of the
+    `Rows` of a world are there.
 
     A contact that slides on its elliptic cone holds by its Hessian: `cone` is the first of its rows, or -1
     where it is not known, and `hessian` has a row for each. They have their entries in the same columns."""
@@ -113,16 +99,17 @@ def factor(
         return
     threads = wp.block_dim()
     n = L_out.shape[1]
-    count = int(0)
-    for begin in range(0, wp.min(rows[w], state.shape[1]), threads):
+    springs = int(0)
+    nrow = wp.min(count[w], rows.state.shape[1])
+    for begin in range(0, nrow, threads):
         spring = int(0)
-        if begin + t < wp.min(rows[w], state.shape[1]):
-            spring = _is_spring(begin + t, w, own, state, D, cone)
+        if begin + t < nrow:
+            spring = _is_spring(begin + t, w, own, rows, cone)
         rank = block_rank(spring)
         if spring == 1:
             r = begin + t
-            spring_out[w, count + rank[0]] = wp.where(state[w, r] == _CONE, -1 - r, r)
-        count += rank[1]
+            spring_out[w, springs + rank[0]] = wp.where(rows.state[w, r] == _CONE, -1 - r, r)
+        springs += rank[1]
     memory = block_memory()
     if memory == wp.uint64(0) or n * n > MEMORY:
         memory = L_out.ptr + wp.uint64(8 * n * n) * wp.uint64(w)
@@ -133,23 +120,23 @@ def factor(
         for k in range(rownnz[i]):
             L[i, colind[rowadr[i] + k]] = real(inertia[w, rowadr[i] + k])
     sync()
-    if sparse == 1:
-        for k in range(count):
+    if rows.sparse == 1:
+        for k in range(springs):
             spring = spring_out[w, k]
             r = wp.where(spring < 0, -1 - spring, spring)
-            size = J_rownnz[w, r]
+            size = rows.J_rownnz[w, r]
             for m in range(t, size * size, threads):
-                i = J_colind[w, 0, J_rowadr[w, r] + m / size]
-                j = J_colind[w, 0, J_rowadr[w, r] + m % size]
+                i = rows.J_colind[w, 0, rows.J_rowadr[w, r] + m / size]
+                j = rows.J_colind[w, 0, rows.J_rowadr[w, r] + m % size]
                 if i >= j:
-                    held = _stiffness(w, spring, m / size, m % size, J, D, sparse, J_rowadr, cone, hessian)
+                    held = _stiffness(w, spring, m / size, m % size, rows, cone, hessian)
                     L[i, j] = L[i, j] + held
             sync()
     else:
         for m in range(t, n * n, threads):
             held = real(0.0)
-            for k in range(wp.where(m / n >= m % n, count, 0)):
-                held += _stiffness(w, spring_out[w, k], m / n, m % n, J, D, sparse, J_rowadr, cone, hessian)
+            for k in range(wp.where(m / n >= m % n, springs, 0)):
+                held += _stiffness(w, spring_out[w, k], m / n, m % n, rows, cone, hessian)
             L[m / n, m % n] = L[m / n, m % n] + held
     sync()
     for j in range(n):
@@ -173,8 +160,7 @@ def factor(
 
 # an overload that a launch makes would change the module after it was compiled
 for _real in (wp.float32, wp.float64):
-    _arrays = {"inertia": wp.array2d(dtype=_real), "J": wp.array3d(dtype=_real), "D": wp.array2d(dtype=_real)}
-    wp.overload(factor, _arrays)
+    wp.overload(factor, {"inertia": wp.array2d(dtype=_real), "rows": ROWS[_real]})
 
 
 @wp.func

@@ -22,7 +22,7 @@ from ...skin.types import real, vec6
 from ..structs import MINVAL, DataView, ModelView
 from ..touching import Touching
 from .kinematics import row
-from .rows import write_rows
+from .rows import ROWS, write_rows
 
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
 _NEVER = int(mujoco.mjtSleepPolicy.mjSLEEP_NEVER)
@@ -92,15 +92,14 @@ class Metric:
         self.first, self.numbers = np.zeros(0, int), np.zeros(0, int)
         n = 6 * count
         with wp.ScopedDevice("cpu"):
-            J, D = wp.zeros((1, n, model.nv), dtype=real), wp.zeros((1, n), dtype=real)
-            basis, unused = wp.zeros((n, 1), dtype=vec6), wp.zeros((1, n), dtype=real)
+            held, basis = ROWS[real](), wp.zeros((n, 1), dtype=vec6)
+            held.J, held.D = wp.zeros((1, n, model.nv), dtype=real), wp.zeros((1, n), dtype=real)
+            held.pos = held.aref = wp.zeros_like(held.D)
             first = wp.array(np.arange(0, n, 6, dtype=np.int32)[:, None], dtype=int)
             square, jacobian, tangent = stiffness
             known = [square, wp.array(np.array(self._slot_of, np.int32), dtype=int), first, jacobian, tangent]
-            none = [wp.zeros((1,) * ndim, dtype=int) for ndim in (2, 2, 3)]
-        written = [J, D, unused, unused, basis]
-        self._find_stiffness = row((write_rows, (count, 1, 1), [*known, 1, 0, *none, *written]))
-        self._J, self._D, self._basis = J.numpy()[0], D.numpy()[0], basis.numpy().reshape(-1, 6, 6)
+        self._find_stiffness = row((write_rows, (count, 1, 1), [*known, 1, held, basis]))
+        self._J, self._D, self._basis = held.J.numpy()[0], held.D.numpy()[0], basis.numpy().reshape(-1, 6, 6)
 
     def switch_on(self, data: DataView) -> bool:
         """Activates the constraint slots. Returns whether one was inactive, so that MuJoCo has to build its

@@ -15,19 +15,47 @@ from .rounds import Rounds, follow
 wp.set_module_options({"enable_backward": False})
 
 
+def _motion(scalar, vector, matrix, spatial):
+    """`Motion` in one precision."""
+
+    @wp.struct
+    class Motion:
+        """Poses and velocities of all bodies, the fields of an engine's Model and Data by their names."""
+
+        body_rootid: wp.array(dtype=int)
+        body_isdofancestor: wp.array2d(dtype=int)
+        xpos: wp.array2d(dtype=vector)
+        xmat: wp.array2d(dtype=matrix)
+        subtree_com: wp.array2d(dtype=vector)
+        cvel: wp.array2d(dtype=spatial)
+        cdof: wp.array2d(dtype=spatial)
+
+    return Motion
+
+
+_PRECISIONS = ((wp.float32, wp.vec3, wp.mat33, wp.spatial_vector), (real, vec3, mat33, vec6))
+_MOTION = {types[0]: _motion(*types) for types in _PRECISIONS}
+
+
+def _motion_of(m, d):
+    out = _MOTION[d.qvel.dtype]()
+    for name in out._cls.vars:
+        setattr(out, name, getattr(m if name.startswith("body") else d, name))
+    return out
+
+
 @wp.func
-def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=Any),
-               com: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):  # fmt: skip
+def _ahead_pos(b: int, w: int, h: real, motion: Any):
     """Position of a body after time h at its present velocity."""
-    pos = double(xpos[w, b])
-    spin = double(wp.spatial_top(cvel[w, b]))
-    arm = pos - double(com[w, rootid[b]])
-    return pos + h * (double(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, arm))
+    pos = double(motion.xpos[w, b])
+    spin = double(wp.spatial_top(motion.cvel[w, b]))
+    arm = pos - double(motion.subtree_com[w, motion.body_rootid[b]])
+    return pos + h * (double(wp.spatial_bottom(motion.cvel[w, b])) + wp.cross(spin, arm))
 
 
 @wp.func
-def _ahead_mat(b: int, w: int, h: real, xmat: wp.array2d(dtype=Any), cvel: wp.array2d(dtype=Any)):
-    return rotation(h * double(wp.spatial_top(cvel[w, b]))) * widen(xmat[w, b])
+def _ahead_mat(b: int, w: int, h: real, motion: Any):
+    return rotation(h * double(wp.spatial_top(motion.cvel[w, b]))) * widen(motion.xmat[w, b])
 
 
 @wp.kernel
@@ -54,11 +82,7 @@ def advance_groups(
     core: int,
     body: wp.array(dtype=int),
     horizon: wp.array2d(dtype=real),
-    rootid: wp.array(dtype=int),
-    xpos: wp.array2d(dtype=Any),
-    xmat: wp.array2d(dtype=Any),
-    com: wp.array2d(dtype=Any),
-    cvel: wp.array2d(dtype=Any),
+    motion: Any,
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
@@ -67,10 +91,10 @@ def advance_groups(
     g, w = wp.tid()
     b = body[g]
     h = horizon[g, w]
-    frame = wp.transpose(_ahead_mat(core, w, h, xmat, cvel))
-    origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
-    pos_out[g, w] = frame * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
-    mat_out[g, w] = frame * _ahead_mat(b, w, h, xmat, cvel)
+    frame = wp.transpose(_ahead_mat(core, w, h, motion))
+    origin = _ahead_pos(core, w, h, motion)
+    pos_out[g, w] = frame * (_ahead_pos(b, w, h, motion) - origin)
+    mat_out[g, w] = frame * _ahead_mat(b, w, h, motion)
 
 
 @wp.kernel
@@ -78,12 +102,7 @@ def relative_jacobians(
     # In:
     core: int,
     body: wp.array(dtype=int),
-    rootid: wp.array(dtype=int),
-    isdofancestor: wp.array2d(dtype=int),
-    xpos: wp.array2d(dtype=Any),
-    xmat: wp.array2d(dtype=Any),
-    com: wp.array2d(dtype=Any),
-    cdof: wp.array2d(dtype=Any),
+    motion: Any,
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
     # Out:
@@ -93,14 +112,15 @@ def relative_jacobians(
     `advance_groups`."""
     g, w, i = wp.tid()
     b = body[g]
-    sign = real(isdofancestor[b, i] - isdofancestor[core, i])
+    sign = real(motion.body_isdofancestor[b, i] - motion.body_isdofancestor[core, i])
     # the bodies' own columns differ in sign alone: both are about the BioTac's origin
     j = vec6()
     if sign != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
-        turn = wp.transpose(widen(xmat[w, core]))
-        spin = double(wp.spatial_top(cdof[w, i]))
-        arm = double(xpos[w, core]) - double(com[w, rootid[wp.where(sign > real(0.0), b, core)]])
-        linear = sign * (turn * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+        turn = wp.transpose(widen(motion.xmat[w, core]))
+        spin = double(wp.spatial_top(motion.cdof[w, i]))
+        root = motion.body_rootid[wp.where(sign > real(0.0), b, core)]
+        arm = double(motion.xpos[w, core]) - double(motion.subtree_com[w, root])
+        linear = sign * (turn * (double(wp.spatial_bottom(motion.cdof[w, i])) + wp.cross(spin, arm)))
         angular = sign * (turn * spin)
         j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
     jacobian_out[g, w, i] = j
@@ -147,13 +167,7 @@ def advance_core(
     core: int,
     h: real,
     square: real,
-    rootid: wp.array(dtype=int),
-    isdofancestor: wp.array2d(dtype=int),
-    xpos: wp.array2d(dtype=Any),
-    xmat: wp.array2d(dtype=Any),
-    com: wp.array2d(dtype=Any),
-    cvel: wp.array2d(dtype=Any),
-    cdof: wp.array2d(dtype=Any),
+    motion: Any,
     qacc: wp.array2d(dtype=Any),
     # Out:
     pos_out: wp.array(dtype=vec3),
@@ -164,30 +178,30 @@ def advance_core(
     """Poses of the BioTac frame in the world: now, and after h at present velocities, moved by `square` times
     J a."""
     w = wp.tid()
-    here = double(xpos[w, core])
-    arm = here - double(com[w, rootid[core]])
+    here = double(motion.xpos[w, core])
+    arm = here - double(motion.subtree_com[w, motion.body_rootid[core]])
     linear = vec3()
     angular = vec3()
     if square > real(0.0):
-        for i in range(cdof.shape[1]):
-            if isdofancestor[core, i] != 0:
-                spin = double(wp.spatial_top(cdof[w, i]))
+        for i in range(motion.cdof.shape[1]):
+            if motion.body_isdofancestor[core, i] != 0:
+                spin = double(wp.spatial_top(motion.cdof[w, i]))
                 a = square * real(qacc[w, i])
-                linear += a * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
+                linear += a * (double(wp.spatial_bottom(motion.cdof[w, i])) + wp.cross(spin, arm))
                 angular += a * spin
     pos_out[w] = here
-    mat_out[w] = widen(xmat[w, core])
-    pos_end_out[w] = _ahead_pos(core, w, h, rootid, xpos, com, cvel) + linear
-    mat_end_out[w] = rotation(angular) * _ahead_mat(core, w, h, xmat, cvel)
+    mat_out[w] = widen(motion.xmat[w, core])
+    pos_end_out[w] = _ahead_pos(core, w, h, motion) + linear
+    mat_end_out[w] = rotation(angular) * _ahead_mat(core, w, h, motion)
 
 
 # an overload that a launch makes would change the module after it was compiled
-for _real, _vec3, _mat33, _vec6 in ((float, wp.vec3, wp.mat33, wp.spatial_vector), (real, vec3, mat33, vec6)):
-    _kinds = {"qvel": _real, "qacc": _real, "xpos": _vec3, "com": _vec3, "xmat": _mat33}
-    _kinds |= {"cvel": _vec6, "cdof": _vec6}
+for _real, _vec3, _mat33, _ in _PRECISIONS:
+    _kinds = {name: wp.array2d(dtype=_real) for name in ("qvel", "qacc")}
+    _kinds |= {"xpos": wp.array2d(dtype=_vec3), "xmat": wp.array2d(dtype=_mat33), "motion": _MOTION[_real]}
     for _kernel in (relative_poses, advance_groups, relative_jacobians, find_drift, accelerate, advance_core):
         _names = [a.label for a in _kernel.adj.args if a.label in _kinds]
-        wp.overload(_kernel, {name: wp.array2d(dtype=_kinds[name]) for name in _names})
+        wp.overload(_kernel, {name: _kinds[name] for name in _names})
 
 
 class Bodies:
@@ -207,13 +221,11 @@ class Bodies:
 
     def ahead(self, m: Any, d: Any, horizon: wp.array, pos: wp.array, mat: wp.array) -> tuple:
         """Finds poses after a horizon [group, world] [s] without acceleration."""
-        moving = [m.body_rootid, d.xpos, d.xmat, d.subtree_com, d.cvel]
-        return advance_groups, pos.shape, [*self._own, horizon, *moving, pos, mat]
+        return advance_groups, pos.shape, [*self._own, horizon, _motion_of(m, d), pos, mat]
 
     def jacobians(self, m: Any, d: Any, pos: wp.array, mat: wp.array, jacobian: wp.array) -> tuple:
         """Finds the Jacobians [group, world, dof], after poses."""
-        where = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cdof]
-        return relative_jacobians, jacobian.shape, [*self._own, *where, pos, mat, jacobian]
+        return relative_jacobians, jacobian.shape, [*self._own, _motion_of(m, d), pos, mat, jacobian]
 
     def drift(self, m: Any, d: Any, step: float, jacobian: wp.array, r: Rounds) -> tuple[tuple, tuple]:
         """Two that find where the bodies go without acceleration to where the skin is solved."""
@@ -226,5 +238,5 @@ class Bodies:
 
     def core_motion(self, m: Any, d: Any, step: float, square: float, qacc: wp.array, out: list) -> tuple:
         """Finds poses `out` of the BioTac in the world, see `advance_core`."""
-        where = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof, qacc]
-        return advance_core, out[0].shape, [self._own[0], real(step), real(square), *where, *out]
+        known = [self._own[0], real(step), real(square), _motion_of(m, d), qacc]
+        return advance_core, out[0].shape, [*known, *out]

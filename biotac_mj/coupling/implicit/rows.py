@@ -14,6 +14,30 @@ _NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
 _PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
 
 
+def _rows(precision):
+    """`Rows` whose numbers have this precision."""
+
+    @wp.struct
+    class Rows:
+        """Constraint rows of all worlds, the fields of an engine's `efc` by their names."""
+
+        state: wp.array2d(dtype=int)
+        force: wp.array2d(dtype=precision)
+        pos: wp.array2d(dtype=precision)
+        aref: wp.array2d(dtype=precision)
+        D: wp.array2d(dtype=precision)
+        J: wp.array3d(dtype=precision)
+        sparse: int  # 1: J and J_colind are lists of the entries that are not zero
+        J_rownnz: wp.array2d(dtype=int)
+        J_rowadr: wp.array2d(dtype=int)
+        J_colind: wp.array3d(dtype=int)
+
+    return Rows
+
+
+ROWS = {precision: _rows(precision) for precision in (wp.float32, wp.float64)}
+
+
 @wp.func
 def _pivot(S: mat66, whole: vec6, k: int):
     """Pivot k of the remaining matrix, 0 if it is negligible against the diagonal `whole`, and its column of
@@ -57,15 +81,8 @@ def write_rows(
     jacobian: wp.array3d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
     threads: int,
-    sparse: int,
-    rownnz: wp.array2d(dtype=int),
-    rowadr: wp.array2d(dtype=int),
-    colind: wp.array3d(dtype=int),
     # Out:
-    J_out: wp.array3d(dtype=Any),
-    D_out: wp.array2d(dtype=Any),
-    aref_out: wp.array2d(dtype=Any),
-    pos_out: wp.array2d(dtype=Any),
+    rows: Any,
     basis_out: wp.array2d(dtype=vec6),
 ):
     """beta h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L,
@@ -89,20 +106,20 @@ def write_rows(
         S -= pivot * wp.outer(column, column)
         r = first + k
         if t == 0:
-            D_out[w, r] = type(D_out[w, r])(wp.max(pivot, _NEGLIGIBLE))
-            aref_out[w, r] = type(aref_out[w, r])(0.0)
-            pos_out[w, r] = type(pos_out[w, r])(0.0)
+            rows.D[w, r] = type(rows.D[w, r])(wp.max(pivot, _NEGLIGIBLE))
+            rows.aref[w, r] = type(rows.aref[w, r])(0.0)
+            rows.pos[w, r] = type(rows.pos[w, r])(0.0)
             if r < basis_out.shape[0]:
                 basis_out[r, w] = column
         for n in range(t, jacobian.shape[2], threads):
-            if sparse == 0:
-                J_out[w, r, n] = type(J_out[w, r, n])(wp.dot(column, jacobian[group, w, n]))
-            elif n < rownnz[w, r]:
-                at = rowadr[w, r] + n
-                J_out[w, 0, at] = type(J_out[w, 0, at])(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
+            if rows.sparse == 0:
+                rows.J[w, r, n] = type(rows.J[w, r, n])(wp.dot(column, jacobian[group, w, n]))
+            elif n < rows.J_rownnz[w, r]:
+                at = rows.J_rowadr[w, r] + n
+                held = wp.dot(column, jacobian[group, w, rows.J_colind[w, 0, at]])
+                rows.J[w, 0, at] = type(rows.J[w, 0, at])(held)
 
 
 # an overload that a launch makes would change the module after it was compiled
-for _real in (wp.float32, wp.float64):
-    _arrays = {name: wp.array2d(dtype=_real) for name in ("D_out", "aref_out", "pos_out")}
-    wp.overload(write_rows, _arrays | {"J_out": wp.array3d(dtype=_real)})
+for _struct in ROWS.values():
+    wp.overload(write_rows, {"rows": _struct})

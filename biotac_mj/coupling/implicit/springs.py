@@ -12,6 +12,7 @@ from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
 from .compliance import factor
 from .kinematics import row, rows_of
+from .rows import ROWS
 
 _NEWTON = int(mujoco.mjtSolver.mjSOL_NEWTON)
 _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
@@ -47,16 +48,17 @@ class Springs:
 
     def _make_room(self, rows, entries):
         """For so many constraint rows, and entries of their Jacobian that are not zero."""
-        made = {}
+        made, self._copies = ROWS[real](), {}
+        made.sparse = 1  # also where MuJoCo's is not
         for name in ("state", "J", "D", "J_rownnz", "J_rowadr", "J_colind"):
             shape = (1, 1, entries) if name in _ENTRIES else (1, rows)
-            made[name] = wp.zeros(shape, dtype=real if name in "JD" else int, device="cpu")
+            array = wp.zeros(shape, dtype=real if name in "JD" else int, device="cpu")
+            setattr(made, name, array)
+            self._copies[name] = array.numpy().reshape(-1)
         cone, hessian = (wp.zeros((1, rows), dtype=kind, device="cpu") for kind in (int, vec6))
         self._cone, self._hessian = cone.numpy()[0], hessian.numpy()[0]
         self._room, self._factors = (rows, entries), {}
-        self._copies = {name: array.numpy().reshape(-1) for name, array in made.items()}
-        self._arrays = [*made.values(), cone, hessian, wp.zeros_like(cone)]
-        self._arrays.insert(3, 1)  # the Jacobian is sparse, also where MuJoCo's is not
+        self._arrays = [made, cone, hessian, wp.zeros_like(cone)]
 
     def take(self, inertia: np.ndarray | None) -> None:
         """Takes the rows as they are, and an inertia (nM,) laid out as MuJoCo's M; None: that."""

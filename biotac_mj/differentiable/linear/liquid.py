@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from ...geometry.rigid import skew
-from ...skin.liquid import wet_faces
+from ...skin.liquid import InnerFaces, inner_faces, wet_faces
 from ...skin.types import real, vec3
 from ..record import Record
 from ..skin import Skin
@@ -236,9 +236,9 @@ class _Inputs:
                 outputs, (volume, None, corner)
             )]  # fmt: skip
             law = [self.stiffness, self.reference, self.touching, self.geom, self.force, self.x]
-            inputs = [1, face, slot, sample, area, *law, wp.ones(k, dtype=int)]
+            inputs = [1, inner_faces(face, slot, sample, area), *law, wp.ones(k, dtype=int)]
             given = [self.stiffness.grad, self.reference.grad, None, None, self.force.grad, self.x.grad]
             wp.launch(
                 _adjoint, (n, k), inputs, outputs, adjoint=True,
-                adj_inputs=[1, None, None, None, None, *given, None], adj_outputs=slopes,
+                adj_inputs=[1, InnerFaces(), *given, None], adj_outputs=slopes,
             )  # fmt: skip

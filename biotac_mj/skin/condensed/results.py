@@ -8,10 +8,11 @@ from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
-from .lanes import dot_columns, eliminate, sum_rows
+from .elimination import eliminate
+from .lanes import dot_columns, sum_rows
 from .states import Linear
 from .structs import DU, Constants, F, G, Remembered, Scratch
-from .system import fill_contact, gather_blocks
+from .system import equations_of, fill_contact, gather_blocks
 
 wp.set_module_options({"enable_backward": False})
 
@@ -247,7 +248,7 @@ def find_tangents(
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
-            fill_contact(w, t, threads, outer, inner, nnode, nin, wide, 1.0, 1, l, c, s)
+            fill_contact(w, t, threads, equations_of(outer, inner, wide), nnode, nin, 1.0, 1, l, c, s)
             for k in range(t, outer, threads):
                 D = s.vector[w, DU, k] * widen(s.block[w, k, 0])
                 turned = -D * wp.skew(s.x[c.node[s.node[w, s.touched[w, k]]], w])

@@ -6,7 +6,8 @@ import warp as wp
 from ..block import block_rank, block_sum, sync
 from ..types import mat33, narrow, real, vec3, vec6
 from .bodies import move_nodes, number_bodies
-from .lanes import add_row, add_rows, begin_row, dot_column, eliminate, gather_rows, sum_rows
+from .elimination import eliminate
+from .lanes import add_row, add_rows, begin_row, dot_column, gather_rows, sum_rows
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
@@ -167,12 +168,33 @@ def coordinate_at(w: int, k: int, outer: int, nnode: int, s: Scratch):
     return 3 * nnode + s.touched[w, outer + k - 3 * outer] - nnode
 
 
+@wp.struct
+class Equations:
+    """Size of a system: numbers of touching outer and inner nodes, and the length of its rows."""
+
+    outer: int
+    inner: int
+    wide: int
+
+
+@wp.func
+def equations_of(outer: int, inner: int, wide: int):
+    size = Equations()
+    size.outer = outer
+    size.inner = inner
+    size.wide = wide
+    return size
+
+
 @wp.func
 def _fill_by_rows(
-    w: int, outer: int, inner: int, nnode: int, nin: int, wide: int, soft: float, lumped: int, scale: float,
-    c: Constants, s: Scratch,
+    w: int, size: Equations, nnode: int, nin: int, soft: float, lumped: int, scale: float, c: Constants,
+    s: Scratch,
 ):  # fmt: skip
     """The matrix of `fill_contact` by one thread."""
+    outer = size.outer
+    inner = size.inner
+    wide = size.wide
     n = 3 * outer + inner
     m = 3 * nnode + nin
     for j in range(m):
@@ -207,11 +229,14 @@ def _fill_by_rows(
 
 @wp.func
 def fill_contact(
-    w: int, t: int, threads: int, outer: int, inner: int, nnode: int, nin: int, wide: int, soft: float,
-    lumped: int, l: Linear, c: Constants, s: Scratch,
+    w: int, t: int, threads: int, size: Equations, nnode: int, nin: int, soft: float, lumped: int,
+    l: Linear, c: Constants, s: Scratch,
 ):  # fmt: skip
-    """1 + D W over what touches, in rows of length `wide`, D being softer by a factor. lumped: whether D is
-    diagonal, its blocks being the first of each node."""
+    """1 + D W over what touches, D being softer by a factor. lumped: whether D is diagonal, its blocks being
+    the first of each node."""
+    outer = size.outer
+    inner = size.inner
+    wide = size.wide
     n = 3 * outer + inner
     scale = soft * float(l.scale)
     pressed = float(l.bulk_stiffness * l.swell * l.scale)
@@ -242,7 +267,7 @@ def fill_contact(
         s.held[w, i] = held
     sync()
     if threads == 1:
-        _fill_by_rows(w, outer, inner, nnode, nin, wide, soft, lumped, scale, c, s)
+        _fill_by_rows(w, size, nnode, nin, soft, lumped, scale, c, s)
         return
     for m in range(t, outer * n, threads):
         k = m / n
@@ -363,7 +388,7 @@ def solve_system(
     sync()
     if equations > 0:
         soft = float(softer)
-        fill_contact(w, t, threads, outer, inner, nnode, nin, wide, soft, 0, l, c, s)
+        fill_contact(w, t, threads, equations_of(outer, inner, wide), nnode, nin, soft, 0, l, c, s)
         for k in range(t, outer, threads):
             p = s.node[w, s.touched[w, k]]
             total = wp.vec3()

@@ -15,7 +15,7 @@ import warp as wp
 from ..block import block_memory
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
-from .faces import Contact, FaceSum, with_sample, write_face
+from .faces import Contact, FaceSum, Laws, with_sample, write_face
 from .meshes import smooth_distance
 from .posed import (
     Geoms,
@@ -71,6 +71,38 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
 
 
 @wp.func
+def adhesive_traction(laws: Laws, w: int, k: real, area: real, gap: real, bonded: int):
+    """`normal_traction` of a sample of a law's surface, and whether it is bonded then. A bond that is there
+    takes the work of separation."""
+    joined = real(2.0) * laws.work[w] * area  # peak force times range
+    work = joined
+    if bonded == 1:
+        work = real(2.0) * laws.separation[w] * area
+    peak = real(0.0)
+    if laws.reach[w] > real(0.0):
+        peak = work / laws.reach[w]
+        joined = joined / laws.reach[w]
+    bond = int(bonded)
+    if k * gap <= joined:
+        bond = 1
+    return normal_traction(k, peak, laws.reach[w], gap), bond
+
+
+@wp.func
+def pressed_friction(laws: Laws, w: int, corner: wp.vec3i, b: vec3):
+    """Factors of a law's power of the pressure, at barycentric coordinates b of a face: on the friction
+    coefficient, and of the slope of the slip force over the normal force."""
+    pressure = real(0.0)
+    slope = real(1.0)
+    for n in range(3):
+        pressure += b[n] * laws.node_normal_force[corner[n], w] / laws.node_area[corner[n]]
+    if pressure > real(_LEAST_PRESSURE) * laws.pressure[w]:
+        slope = real(1.0) - laws.exponent[w]
+    pressure = wp.max(pressure, real(_LEAST_PRESSURE) * laws.pressure[w])
+    return wp.pow(pressure / laws.pressure[w], -laws.exponent[w]), slope
+
+
+@wp.func
 def smooth_traction(k: real, width: real, gap: real):
     """Normal traction and its slope of contact springs k: a parabola between the gaps `width` and -`width`,
     linear beyond. Without a width the slope has a kink at zero."""
@@ -108,6 +140,14 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
         kept = kept * kept * (real(3.0) - real(2.0) * kept)
         anchor = stick + (length - stretch) * along + kept * (local - stick - length * along)
     return force, K, anchor
+
+
+@wp.func
+def slide(local: vec3, stick: vec3, normal: vec3, most: real, kt: real, width: real):
+    """`smooth_stick_or_slip`, or without a width `stick_or_slip`."""
+    if width > real(0.0):
+        return smooth_stick_or_slip(local, stick, normal, most, kt, width)
+    return stick_or_slip(local, stick, normal, most, kt)
 
 
 # Sums of a face over its samples, in their order: 9 numbers of its corners and, where it touches, 6 blocks of
@@ -278,29 +318,14 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                 slope_factor = real(1.0)  # of the slip force over the normal force: exponent of its power law
                 fn = -k * gap
                 if wp.static(has_law):
-                    joined = real(2.0) * c.laws.work[w] * area  # peak force times range
-                    work = joined
-                    bond = int(-1)
-                    if c.anchor_geom[i, w] == touched:
-                        work = real(2.0) * c.laws.separation[w] * area
-                        bond = touched
-                    peak = real(0.0)
-                    if c.laws.reach[w] > real(0.0):
-                        peak = work / c.laws.reach[w]
-                        joined = joined / c.laws.reach[w]
-                    if k * gap <= joined:
-                        bond = touched
-                    traction = normal_traction(k, peak, c.laws.reach[w], gap)
+                    bonded = wp.where(c.anchor_geom[i, w] == touched, 1, 0)
+                    traction, bonded = adhesive_traction(c.laws, w, k, area, gap, bonded)
+                    bond = wp.where(bonded == 1, touched, -1)
                     fn = traction[0]
                     K = traction[1] * wp.outer(normal, normal)
                     if c.laws.exponent[w] != real(0.0):
-                        pressure = real(0.0)
-                        for n in range(3):
-                            pressure += b[n] * c.laws.node_normal_force[t[n], w] / c.laws.node_area[t[n]]
-                        if pressure > real(_LEAST_PRESSURE) * c.laws.pressure[w]:
-                            slope_factor = real(1.0) - c.laws.exponent[w]
-                        pressure = wp.max(pressure, real(_LEAST_PRESSURE) * c.laws.pressure[w])
-                        mu = mu * wp.pow(pressure / c.laws.pressure[w], -c.laws.exponent[w])
+                        weaker, slope_factor = pressed_friction(c.laws, w, t, b)
+                        mu = mu * weaker
                 else:
                     K = k * wp.outer(normal, normal)
                 if wp.static(smooth):
@@ -325,21 +350,13 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                     most = mu * fn
                     if friction_mode == LAGGED:
                         most = c.bound[i, w]
-                    if width > real(0.0):
-                        ft, Kt, stick = smooth_stick_or_slip(
-                            local, stick, normal, most, k * c.stick_ratio, width
-                        )
-                        force = force + ft
-                        K = K + Kt
-                    else:
-                        start = stick
-                        ft, Kt, stick = stick_or_slip(local, start, normal, most, k * c.stick_ratio)
-                        force = force + ft
-                        if friction_mode == CONSISTENT and wp.length_sq(stick - start) > real(
-                            0.0
-                        ):  # it slips
+                    start = stick
+                    ft, Kt, stick = slide(local, start, normal, most, k * c.stick_ratio, width)
+                    force = force + ft
+                    if friction_mode == CONSISTENT and width == real(0.0):
+                        if wp.length_sq(stick - start) > real(0.0):  # it slips
                             Kt = Kt + slope_factor * mu / most * wp.outer(ft, K * normal)
-                        K = K + Kt
+                    K = K + Kt
                 R = geoms.mat[touched, w]
                 force = R * force
                 K = R * K * wp.transpose(R)
@@ -357,15 +374,8 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
 
 
 @functools.cache
-def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample`, and `touch_faces`, a function for the threads of a block.
-
-    Args:
-      has_law: whether surfaces have a ContactLaw. smooth: whether Coulomb's law has smoothed kinks.
-      shapes: CORE, SOLIDS, MESHES or SKINS; fewer kinds take fewer registers.
-    """
-    law = "lawful" if has_law else "smooth" if smooth else "coulomb"
-    module = f"{__name__}.{law}_{shapes}"
+def _faces_functions(has_law: bool, smooth: bool, shapes: str) -> tuple[wp.Function, wp.Function]:
+    """`touch_face` and `touch_faces` for `contact_kernels`."""
     touch_samples = _samples_function(has_law, smooth, shapes)
 
     @wp.func
@@ -442,6 +452,22 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
             if mine >= 0 and s == 0:
                 c.touching[mine, w] = wp.where(clearance > real(-1.0), 0, 1)
                 free[w, mine] = travel + clearance
+
+    return touch_face, touch_faces
+
+
+@functools.cache
+def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
+    """Kernels `by_face` and `by_sample`, and `touch_faces`, a function for the threads of a block.
+
+    Args:
+      has_law: whether surfaces have a ContactLaw. smooth: whether Coulomb's law has smoothed kinks.
+      shapes: CORE, SOLIDS, MESHES or SKINS; fewer kinds take fewer registers.
+    """
+    law = "lawful" if has_law else "smooth" if smooth else "coulomb"
+    module = f"{__name__}.{law}_{shapes}"
+    touch_samples = _samples_function(has_law, smooth, shapes)
+    touch_face, touch_faces = _faces_functions(has_law, smooth, shapes)
 
     @wp.kernel(module=module, enable_backward=False)
     def by_face(

@@ -53,6 +53,17 @@ class LiquidForces:
     gradient: wp.array2d(dtype=vec3)  # [node, world] [m^2]
 
 
+@wp.struct
+class Loads:
+    """Forces on nodes other than those of elements and inertia; `external` [node, world] [N] has no memory
+    where none are prescribed."""
+
+    outer: SurfaceForces
+    core: SurfaceForces
+    liquid: LiquidForces
+    external: wp.array2d(dtype=vec3)
+
+
 @wp.kernel
 def begin_nodes(
     # In:
@@ -115,13 +126,10 @@ def assemble_force(
     # In:
     elements: NodeSlots,
     corner: wp.array2d(dtype=vec3),
-    external: wp.array2d(dtype=vec3),
     pressure: wp.array(dtype=real),
     on: wp.array(dtype=int),
     # In and out:
-    outer: SurfaceForces,
-    core: SurfaceForces,
-    liquid: LiquidForces,
+    loads: Loads,
     # Out:
     force_out: wp.array2d(dtype=vec3),
 ):
@@ -134,8 +142,11 @@ def assemble_force(
     for k in range(elements.start[i] + lane, elements.start[i + 1], lanes):
         total += corner[elements.slot[k], w]
     total = sum_of_lanes(total, lanes)
-    if external.shape[0] > 0:
-        total += external[i, w]
+    if loads.external.shape[0] > 0:
+        total += loads.external[i, w]
+    outer = loads.outer
+    core = loads.core
+    liquid = loads.liquid
     push = vec3()
     for k in range(outer.start[i] + lane, outer.start[i + 1], lanes):
         s = outer.slot[k]
@@ -301,10 +312,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         chunk: int,
         mask: wp.array(dtype=real),
         force: wp.array2d(dtype=vec3),
-        outer: SurfaceForces,
-        core: SurfaceForces,
-        liquid: LiquidForces,
-        external: wp.array2d(dtype=vec3),
+        loads: Loads,
         x: wp.array2d(dtype=vec3),
         rest: wp.array2d(dtype=vec3),
         inertial: wp.array2d(dtype=vec),
@@ -323,6 +331,8 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
             return
         if c == 0:
             st.touched[w] = 0
+        outer = loads.outer
+        core = loads.core
         rr = real(0.0)
         work = real(0.0)
         gg = real(0.0)
@@ -333,16 +343,16 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
                 f = force[i, w]
                 rr += wp.length_sq(f)
                 r = lower(f)
-                if liquid.node.shape[0] > 0 and liquid.node[i] == 1:
-                    gg += wp.length_sq(liquid.gradient[i, w])
+                if loads.liquid.node.shape[0] > 0 and loads.liquid.node[i] == 1:
+                    gg += wp.length_sq(loads.liquid.gradient[i, w])
             r_out[i, w] = r
             load = vec3()
             if outer.start[i + 1] > outer.start[i]:
                 load = outer.node_force[i, w]
             if core.start.shape[0] > 0 and core.start[i + 1] > core.start[i]:
                 load += core.node_force[i, w]
-            if external.shape[0] > 0:
-                load += external[i, w]
+            if loads.external.shape[0] > 0:
+                load += loads.external[i, w]
             if inertial.shape[0] > 0 or wp.length_sq(load) > real(0.0):  # few nodes have a load
                 u = x[i, w] - rest[i, w % rest.shape[1]]
                 work += wp.dot(load, u)

@@ -1,0 +1,206 @@
+"""Clearances of geoms from the skins of a batch: measured where a geom is near, elsewhere bounded by earlier
+ones."""
+
+import numpy as np
+import warp as wp
+
+from ..coupling.steppers.fem import CLEAR
+from ..geometry.rigid_warp import is_finite
+from ..skin.block import block_max
+from ..skin.contact.broadphase import ALL, contact_range, face_clearance, motion_bound, sample_clearance
+from ..skin.contact.faces import Laws
+from ..skin.contact.penetration import geoms_core_clearance
+from ..skin.contact.posed import Geoms, bound_to, place_on
+from ..skin.model import SkinModel
+from ..skin.program import Launcher
+from ..skin.types import mat33, real, vec3
+
+wp.set_module_options({"enable_backward": False})
+
+_CLEAR = wp.constant(wp.float64(CLEAR))
+# by which distances may change faster than places: grids are trilinear
+_ROOT3 = wp.constant(wp.float64(3**0.5))
+
+
+@wp.struct
+class Surfaces:
+    """Surfaces of a skin that geoms may reach, and a ball around it at rest."""
+
+    center: vec3
+    radius: real
+    face: wp.array(dtype=wp.vec3i)
+    sample: wp.array(dtype=vec3)
+    core_vert: wp.array(dtype=vec3)
+    core: Geoms
+
+
+@wp.struct
+class Seen:
+    """When clearances of the geoms from a skin at rest were measured last: poses of the geoms [geom, world],
+    not finite where they never were, and the clearances [world], of which poses since then give a bound; of
+    length zero where none are kept."""
+
+    pos: wp.array2d(dtype=vec3)
+    mat: wp.array2d(dtype=mat33)
+    clearance: wp.array(dtype=wp.vec2d)
+
+
+@wp.func
+def _bound(seen: Seen, w: int, skin: Surfaces, geoms: Geoms):
+    """Clearances from the skin and from the core are no less than this [m]; nan: it is not known."""
+    most = real(0.0)
+    for g in range(geoms.count):
+        pos = geoms.pos[g, w]
+        moved = motion_bound(seen.pos[g, w], seen.mat[g, w], pos, geoms.mat[g, w], skin.center, skin.radius)
+        if not moved <= most:
+            most = moved
+        most = wp.max(most, wp.length(pos - seen.pos[g, w]))  # its centre, which may be far from the skin
+    return seen.clearance[w] - _ROOT3 * most * wp.vec2d(real(1.0), real(1.0))
+
+
+@wp.func
+def forget(seen: Seen, w: int):
+    """Forgets what was seen: the next clearance is measured."""
+    for g in range(seen.pos.shape[0]):
+        seen.pos[g, w] = vec3(real(wp.nan), real(wp.nan), real(wp.nan))
+
+
+@wp.func
+def margin_of(laws: Laws, w: int):
+    """Distance of a geom beyond which it cannot reach the skin within a step [m]."""
+    margin = _CLEAR
+    if laws.reach.shape[0] > 0:
+        margin = wp.max(margin, laws.reach[w])
+    return margin
+
+
+@wp.kernel
+def find_clearance(
+    # In:
+    skin: Surfaces,
+    touch: int,
+    geoms: Geoms,
+    laws: Laws,
+    on: wp.array(dtype=int),
+    x: wp.array2d(dtype=vec3),
+    # In and out:
+    touched: wp.array(dtype=int),
+    seen: Seen,
+    # Out:
+    known_out: wp.array(dtype=int),
+    clearance_out: wp.array(dtype=wp.vec2d),
+):
+    """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core: as
+    `ProximityQuery` of one world, in the worlds that are on. It is measured where a geom comes near the ball
+    around the skin, and may be near the skin after its motion since the last time. In others with finite
+    poses it is infinite or, where a geom was near and may still be, a bound.
+
+    One block per world: each time its threads have measured a face each, they end if one is touched. They
+    begin with those among which the last touched face was.
+
+    Args:
+      touch: 1 where only contact matters, not what is near.
+    """
+    w, t = wp.tid()
+    known = on[w]
+    close = int(0)
+    clearance = wp.vec2d(real(wp.inf), real(wp.inf))
+    margin = margin_of(laws, w)
+    reach = contact_range(laws, w)
+    for g in range(geoms.count):
+        if not is_finite(geoms.pos[g, w], geoms.mat[g, w]):
+            known = 0
+        elif bound_to(geoms, g, skin.center, place_on(geoms, g, w, skin.center)) < skin.radius + margin:
+            close = 1
+    close *= known
+    if close == 1 and seen.clearance.shape[0] > 0:
+        bound = _bound(seen, w, skin, geoms)
+        if bound[0] >= wp.where(touch == 1, reach, margin) and bound[1] >= real(0.0):
+            close = 0
+        elif touch == 0 and seen.clearance[w][0] < margin and wp.isfinite(bound[0]):
+            clearance = bound
+            close = 0
+    if t == 0:
+        known_out[w] = known
+        clearance_out[w] = clearance
+    if close == 0:
+        return
+    threads = wp.block_dim()
+    own = w % x.shape[1]
+    parts = (skin.face.shape[0] + threads - 1) / threads
+    part = touched[w]
+    nearest = real(wp.inf)
+    done = int(0)
+    while done < parts:
+        f = part * threads + t
+        if f < skin.face.shape[0]:
+            i = skin.face[f]
+            least = sample_clearance(
+                x[i[0], own], x[i[1], own], x[i[2], own], skin.sample, w, geoms, ALL, margin, reach
+            )
+            if least >= margin:
+                ball, _beyond, _count, _within = face_clearance(
+                    x[i[0], own], x[i[1], own], x[i[2], own], w, geoms, ALL, margin
+                )
+                least = wp.max(least, ball)
+            nearest = wp.min(nearest, least)
+        nearest = -block_max(-nearest)
+        done += 1
+        if nearest < reach:
+            done = parts
+        else:
+            part = (part + 1) % parts
+    inside = real(wp.inf)
+    if nearest >= reach:
+        inside = geoms_core_clearance(w, t, threads, geoms, ALL, skin.core, skin.core_vert)
+    if t == 0:
+        touched[w] = part
+        clearance_out[w] = wp.vec2d(nearest, inside)
+        if seen.clearance.shape[0] > 0:
+            seen.clearance[w] = clearance_out[w]
+            for g in range(geoms.count):
+                seen.pos[g, w] = geoms.pos[g, w]
+                seen.mat[g, w] = geoms.mat[g, w]
+
+
+def make_seen(ngeom: int, nworld: int) -> Seen:
+    """Nothing seen, on Warp's default device."""
+    seen = Seen()
+    seen.pos, seen.mat = (wp.zeros((ngeom, nworld), dtype=kind) for kind in (vec3, mat33))
+    seen.clearance = wp.zeros(nworld, dtype=wp.vec2d)
+    return seen
+
+
+class Clearance:
+    """Distances of geoms from the skins of a batch.
+
+    Args:
+      seen: `Seen`, what is kept for bounds, of skins that do not change; None: all is measured.
+
+    Attributes:
+      skin: `Surfaces` of one at rest.
+      known: (nworld,) wp.array int, 1 where the last `find` ran, and all geoms have finite poses.
+      found: (nworld,) wp.array vec2d, clearance from the skin, beyond the margin a bound of it, and from the
+        core [m]; infinite where no geom is close. Where the skin is touched it is that of any touch.
+    """
+
+    def __init__(self, model: SkinModel, nworld: int, seen: object = None):
+        self._device, vert = model.device, model.rest.vert
+        center = (vert.min(0) + vert.max(0)) / 2
+        # wider than any skin at rest is than another of this model: liquids differ by world
+        self.skin, radius = Surfaces(), 1.1 * float(np.linalg.norm(vert - center, axis=1).max())
+        self.skin.center, self.skin.radius = vec3(*center), radius
+        self.skin.face, self.skin.sample = model.outer.face, model.sample
+        with wp.ScopedDevice(model.device):
+            self._seen = make_seen(0, 0) if seen is None else seen
+            self.known, self._touched = (wp.zeros(nworld, dtype=int) for _ in range(2))
+            self.found = wp.zeros(nworld, dtype=wp.vec2d)
+        if model.has_core:
+            self.skin.core_vert, self.skin.core = model.core_vert, model.core(nworld).struct
+
+    def find(self, on: wp.array, geoms: Geoms, laws: Laws, x: wp.array, touch: int = 0) -> None:
+        """Finds the clearance in worlds that are on (nworld,), of skins with nodes at (nvert, nworld or 1).
+        Launches only. touch: see `find_clearance`."""
+        known = [self.skin, touch, geoms, laws, on, x]
+        found = [self._touched, self._seen, self.known, self.found]
+        Launcher(self._device).launch_blocks(find_clearance, [len(on)], known, found)
