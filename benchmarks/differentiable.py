@@ -116,7 +116,7 @@ def measure_worlds(element: str, nworld: int, device: str) -> dict:
         left, all_of_it = torch.cuda.mem_get_info()
         out["memory_GB"] = (all_of_it - left) / 1e9  # of PyTorch and Warp together
         out["gpu"] = torch.cuda.get_device_name()
-    out["products"] = skin.together(nworld, device).products  # of a backward pass
+    out["products"] = skin.in_worlds(nworld, device).products  # of a backward pass
     out |= {
         "first_s": seconds[0].tolist(),
         "forward_s": np.median(forward),

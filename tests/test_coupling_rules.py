@@ -6,11 +6,11 @@ import pytest
 
 from biotac_mj.coupling.implicit.rules import (
     beta_of,
+    fraction_within,
     gamma_of,
     in_store,
     lacking,
     poorly_corrected,
-    share_within,
     spared,
 )
 
@@ -44,18 +44,18 @@ def test_newmarks_steps_are_stable(delay):
     assert gamma_of(0.1, 0.0) == 0.5 and beta_of(0.5) == pytest.approx(1 / 12)
 
 
-def test_a_share_of_a_push_gives_a_body_what_it_put_in():
+def test_a_fraction_of_a_push_gives_a_body_what_it_put_in():
     """Nearly; one that something presses in against an empty account gets what stops it."""
     rng = np.random.default_rng(0)
     for without, own, part in zip(rng.normal(size=200), rng.exponential(size=200), rng.uniform(size=200)):
         store = part * (without + own)
-        share = share_within(store, without, own)
+        fraction = fraction_within(store, without, own)
         if store > 0.0:
-            most = share / 0.99
+            most = fraction / 0.99
             assert 0.0 < most < 1.0 and most * without + most**2 * own == pytest.approx(store)
-            assert share * without + share**2 * own < store
-    assert share_within(-1.0, -1.0, 4.0) == pytest.approx(0.2475) and share_within(0.0, 1.0, 4.0) == 0.0
-    assert share_within(0.5, 1.0, 0.0) == pytest.approx(0.495)  # nothing moves it
+            assert fraction * without + fraction**2 * own < store
+    assert fraction_within(-1.0, -1.0, 4.0) == pytest.approx(0.2475) and fraction_within(0.0, 1.0, 4.0) == 0.0
+    assert fraction_within(0.5, 1.0, 0.0) == pytest.approx(0.495)  # nothing moves it
 
 
 def test_a_body_gets_what_it_put_in_and_what_others_do_now():

@@ -60,7 +60,7 @@ def test_every_input_against_differences(element):
     skin = ball(element=element, liquid=False)
     given = worlds(2)
     pressed = press(skin, **given, together="cpu")
-    assert (skin.together(2, "cpu").data.core_force != 0).any((1, 2)).all()
+    assert (skin.in_worlds(2, "cpu").data.core_force != 0).any((1, 2)).all()
     loss_of(pressed).backward()
     draw = np.random.default_rng(1)
     ways = {name: draw.normal(size=value.shape) for name, value in given.items()}

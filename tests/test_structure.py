@@ -188,7 +188,9 @@ def test_functions_and_files_are_of_a_size_to_read():
     assert not too_large("def f(self, a, *, b):\n    pass", 2, 2)
     assert too_large("def f(a, b, **c):\n    pass", 2, 2) and too_large("def f():\n    1\n    2", 2, 2)
     texts = {name: path.read_text() for name, path in modules().items()}
-    large = [f"{name}: {len(text.splitlines())} lines" for name, text in texts.items() if text.count("\n") > 600]
+    large = [
+        f"{name}: {len(text.splitlines())} lines" for name, text in texts.items() if text.count("\n") > 600
+    ]
     large += [f"{name}.{one}" for name, text in texts.items() for one in too_large(text)]
     assert len(texts) > 400 and not large, "\n".join(large)
 

@@ -144,7 +144,7 @@ class Batch(Skins):
         """Number of slots of six rows."""
         return len(self._slot)
 
-    def share(self, correction: integrator.Correction, first: int) -> None:
+    def keep_in(self, correction: integrator.Correction, first: int) -> None:
         """Keeps what is corrected in the arrays of all skins, its own bodies from number `first` on."""
         own, r, model = slice(first, first + self.groups[0]), self._of_step, self.model
         for name in Model.vars:

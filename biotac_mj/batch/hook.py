@@ -75,7 +75,7 @@ class Hook:
             first = np.cumsum([0, *(one.groups[0] for one in moving)]).tolist()
             self._correction = integrator.corrections(first[-1], d.nworld, d.qvel.shape[1])
         for one, number in zip(moving, first):
-            one.share(self._correction, number)
+            one.keep_in(self._correction, number)
 
     def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
         """Kernels of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is

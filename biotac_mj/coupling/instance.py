@@ -196,7 +196,7 @@ class Instance:
 
     def seen(self, wrench: np.ndarray) -> np.ndarray:
         """Wrenches (n, 6) in the BioTac frame with which the step began, in that of now."""
-        return _carried(wrench, self.begun, self.frame()) if self.lead else wrench.copy()
+        return _in_frame(wrench, self.begun, self.frame()) if self.lead else wrench.copy()
 
     @property
     def _skin(self):
@@ -412,7 +412,7 @@ class Instance:
         for other, group in self.skins_met:
             push = other.acting_wrench()[[group]]
             if push.any():
-                force += _carried(push, other.frame(), self.frame())[0]
+                force += _in_frame(push, other.frame(), self.frame())[0]
         return force
 
     def acting_wrench(self) -> np.ndarray:
@@ -453,7 +453,7 @@ class Instance:
         (of_stage, kept), solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs, held)
         if first:
             self._stages, self._first, self._stays = [], self.frame(), self._pushed() + kept
-        wrench = self._stays + _carried(of_stage[None], self.frame(), self._first)[0]
+        wrench = self._stays + _in_frame(of_stage[None], self.frame(), self._first)[0]
         self._stages.append((wrench, self._settled and solved))
 
     def _sum_up(self, settled):
@@ -534,7 +534,7 @@ class Instance:
         self._shown.update()
 
 
-def _carried(wrench, before, now):
+def _in_frame(wrench, before, now):
     """Wrenches (n, 6) in a frame and about its origin (3,), (3, 3), in another one."""
     (at, turned), (origin, frame) = before, now
     force, torque = wrench[:, :3] @ turned.T, wrench[:, 3:] @ turned.T

@@ -25,7 +25,7 @@ def find_touches(
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     normal_out: wp.array2d(dtype=vec3),
-    share_out: wp.array2d(dtype=real),
+    fraction_out: wp.array2d(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
 ):
     """Contact of each geom: centre of pressure, mean normal out of the skin there, fraction of the body's
@@ -39,7 +39,7 @@ def find_touches(
                 first = k
             pos_out[k, w] = vec3()
             normal_out[k, w] = vec3()
-            share_out[k, w] = real(0.0)
+            fraction_out[k, w] = real(0.0)
             wrench_out[k, w] = vec6()
     total = real(0.0)
     for f in range(kept.shape[0]):
@@ -55,7 +55,7 @@ def find_touches(
                     if group[k] == g:
                         push = wp.max(-wp.dot(force[f * nsample + s, w], n), real(0.0))
                         total += push
-                        share_out[k, w] += push
+                        fraction_out[k, w] += push
                         pos_out[k, w] += push / real(3.0) * (a + b + c)
                         normal_out[k, w] += push * n
     pushed = wp.spatial_top(acting[g, w])
@@ -65,22 +65,22 @@ def find_touches(
     if total < _TINY:
         pos_out[first, w] = wp.cross(pushed, wp.spatial_bottom(acting[g, w])) / square
         normal_out[first, w] = pushed
-        share_out[first, w] = real(1.0)
+        fraction_out[first, w] = real(1.0)
         total = real(1.0)
     centre = vec3()
     for k in range(group.shape[0]):
-        if group[k] == g and share_out[k, w] > real(0.0):
+        if group[k] == g and fraction_out[k, w] > real(0.0):
             centre += pos_out[k, w] / total
-            pos_out[k, w] = pos_out[k, w] / share_out[k, w]
+            pos_out[k, w] = pos_out[k, w] / fraction_out[k, w]
             normal_out[k, w] = wp.normalize(normal_out[k, w])
-            share_out[k, w] = share_out[k, w] / total
+            fraction_out[k, w] = fraction_out[k, w] / total
     turn = wp.spatial_bottom(acting[g, w]) - wp.cross(centre, pushed)
     for k in range(group.shape[0]):
         if group[k] == g:
-            share = share_out[k, w]
+            fraction = fraction_out[k, w]
             for i in range(3):
-                wrench_out[k, w][i] = share * pushed[i]
-                wrench_out[k, w][i + 3] = share * turn[i]
+                wrench_out[k, w][i] = fraction * pushed[i]
+                wrench_out[k, w][i + 3] = fraction * turn[i]
 
 
 class Touches:
@@ -109,6 +109,6 @@ class Touches:
         """Numbers (k,) of geoms on which something acts, and (k, 4, 3): centre of pressure [m], normal out of
         the skin there, force [N], and torque [N m] about the centre."""
         self._find()
-        pos, normal, share, wrench = self._found
-        which = share.nonzero()[0]
+        pos, normal, fraction, wrench = self._found
+        which = fraction.nonzero()[0]
         return which, np.concatenate([pos, normal, wrench], axis=1)[which].reshape(-1, 4, 3)

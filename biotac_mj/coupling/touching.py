@@ -118,10 +118,10 @@ class Touching:
         owner = mat[self.group]
         geom_pos, geom_mat = pos[self.group] + (owner @ self._geom_pos)[:, :, 0], owner @ self._geom_mat
         if self.parted:
-            geom_pos -= self._apart(geom_mat)
+            geom_pos -= self._separation(geom_mat)
         return geom_pos, geom_mat
 
-    def _apart(self, geom_mat):
+    def _separation(self, geom_mat):
         """Displacement that removes geoms from the pad, planes against their normals. MuJoCo's compiler, too,
         makes its one step without contact."""
         plane = np.array([[g.type == "plane"] for g in self.geoms], bool).reshape(-1, 1)
@@ -130,7 +130,7 @@ class Touching:
     def body_pose(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> tuple:
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies whose geoms are at (ngeom, 3), (ngeom, 3, 3)."""
         if self.parted:
-            geom_pos = geom_pos + self._apart(geom_mat)
+            geom_pos = geom_pos + self._separation(geom_mat)
         pos, turned = self._first_geom
         mat = geom_mat[self._first] @ turned
         return geom_pos[self._first] - (mat @ pos)[:, :, 0], mat

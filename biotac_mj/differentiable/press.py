@@ -139,7 +139,7 @@ def press(
     made = torch.stack([torch.stack([own[name] for name in NUMBERS]) for own in made])
     changes, mat, parts = [], _matrix(quat), []
     if together is not None:
-        worlds, own = skin.together(nworld, together), (pos, mat, friction, made, constants[0])
+        worlds, own = skin.in_worlds(nworld, together), (pos, mat, friction, made, constants[0])
         found = _Press.apply(worlds, changes, times, 0.0, *own, None, None, None)
     else:
         for w, shape in enumerate(rest):

@@ -340,12 +340,12 @@ class Skin(SkinWorlds):
         self._made_of, self.given = (geometry, modulus), geometry.nvert
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
         self.own = {name: float(value) for name, value in self.read(*NUMBERS).items()}
-        self._together = None, None
+        self._worlds = None, None
 
-    def together(self, nworld: int, device: str) -> SkinWorlds:
+    def in_worlds(self, nworld: int, device: str) -> SkinWorlds:
         """The skin in several worlds on "cpu" or a CUDA device; the last ones are cached."""
         with self.lock:
-            if self._together[0] != (nworld, device):
+            if self._worlds[0] != (nworld, device):
                 model, owner = self.model, self
                 if wp.get_device(device).is_cuda:
                     geometry, modulus = self._made_of
@@ -353,8 +353,8 @@ class Skin(SkinWorlds):
                     owner = None
                 made = SkinWorlds(model, self.made_with, nworld, self.precision, owner=owner)
                 made.lock = self.lock  # it may share the model
-                self._together = (nworld, device), made
-            return self._together[1]
+                self._worlds = (nworld, device), made
+            return self._worlds[1]
 
 
 def refuse_beyond(model: SkinModel) -> None:

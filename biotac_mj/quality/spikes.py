@@ -35,8 +35,8 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     bad &= bad.sum(1, keepdims=True) <= max(1, log.some(_FEW))  # an event of all has another cause
     off, noise = np.abs(x - running_median(x, _SPAN, "mirror")), noise_level(x, least=ROUNDING)
     # a touch moves others as well: so what a channel does mostly in their company is none of its own
-    alone = bad & ((off > _MOVED * noise).sum(1, keepdims=True) <= _CABLE)
-    bad = np.where(alone.sum(0) > 0.5 * bad.sum(0), bad, False)
+    single = bad & ((off > _MOVED * noise).sum(1, keepdims=True) <= _CABLE)
+    bad = np.where(single.sum(0) > 0.5 * bad.sum(0), bad, False)
     number = bad.sum(0)
     far = bad & (off > _FAR * (noise + 1))
     found = []

@@ -160,8 +160,8 @@ def _compile(device, modules):
         module = wp.get_module(module.__name__) if isinstance(module, types.ModuleType) else module
         # a module may have got more kernels since
         wanted[module, len(module.kernels), device.alias, threads] = module, threads
-    share = functools.partial(_share_headers, threading.get_ident())
-    pool = concurrent.futures.ThreadPoolExecutor(cores(), initializer=share)
+    use_headers = functools.partial(_share_headers, threading.get_ident())
+    pool = concurrent.futures.ThreadPoolExecutor(cores(), initializer=use_headers)
     for key, (module, threads) in wanted.items():
         if key not in _compiling:
             _compiling[key] = pool.submit(wp.load_module, module, device, block_dim=threads)

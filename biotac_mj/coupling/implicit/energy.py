@@ -11,13 +11,13 @@ from ...skin.newton.worlds import CONVERGED
 from ...skin.types import mat66, real, vec6
 from .marks import MarkedWorlds, mark
 from .rounds import Model, Rounds, Solid, force_of
-from .rules import EULER, beta_of, in_store, lacking, share_within, spared
+from .rules import EULER, beta_of, fraction_within, in_store, lacking, spared
 
 wp.set_module_options({"enable_backward": False})
 
 
 _in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))
-_beta_of, _share_within = (wp.func(rule) for rule in (beta_of, share_within))
+_beta_of, _fraction_within = (wp.func(rule) for rule in (beta_of, fraction_within))
 
 
 @wp.func
@@ -125,13 +125,13 @@ def restrain(
             acts = r.acting[g, w]
             moves = compliance[g, g, w] * acts
             own = real(0.5) / _beta_of(r.gamma[g, w]) * wp.dot(acts, moves)
-            share = real(0.0)
+            fraction = real(0.0)
             if r.push[g, w] == real(1.0):
-                share = _share_within(r.store[g, w], gets - own, own)
+                fraction = _fraction_within(r.store[g, w], gets - own, own)
             # the rows stay, and take their part of the change
-            change = (real(1.0) - share) * (acts + model.tangent0[g, w] * moves)
+            change = (real(1.0) - fraction) * (acts + model.tangent0[g, w] * moves)
             r.withheld[g, w] = r.withheld[g, w] + change
-            r.push[g, w] = share * r.push[g, w]
+            r.push[g, w] = fraction * r.push[g, w]
             mark(going, w)
 
 

@@ -67,7 +67,7 @@ def spared(left: Any, store: Any, given: Any) -> Any:
     return type(store)(0.0)
 
 
-def share_within(store: Any, without: Any, own: Any) -> Any:
+def fraction_within(store: Any, without: Any, own: Any) -> Any:
     """Share of a wrench with which it gives a body no more energy than `store` [J], see `lacking`.
 
     Args:
@@ -76,12 +76,12 @@ def share_within(store: Any, without: Any, own: Any) -> Any:
     """
     most = max(store, type(store)(0.0))
     root = math.sqrt(without * without + type(store)(4.0) * own * most)
-    share = type(store)(0.0)
+    fraction = type(store)(0.0)
     if without > type(store)(0.0):
-        share = (most + most) / (without + root)
+        fraction = (most + most) / (without + root)
     elif own > type(store)(0.0):
-        share = (root - without) / (own + own)
-    return type(store)(_LESS) * min(share, type(store)(1.0))
+        fraction = (root - without) / (own + own)
+    return type(store)(_LESS) * min(fraction, type(store)(1.0))
 
 
 def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> Any:

@@ -41,7 +41,7 @@ class FaceBlocks:
         return cls(which, nodes, add_rows(block.new_zeros((len(which), 9, 9)), place, block))
 
     @classmethod
-    def together(cls, parts: list[typing.Self]) -> typing.Self:
+    def joined(cls, parts: list[typing.Self]) -> typing.Self:
         """Sum of several matrices."""
         return cls(
             *(torch.cat([getattr(part, name) for part in parts]) for name in ("face", "node", "block"))

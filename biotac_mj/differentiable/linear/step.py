@@ -57,7 +57,7 @@ class LinearStep:
         surfaces = [surface for surface in (self._outer, self._core) if surface]
         self._blocks = [surface.blocks() for surface in surfaces]
         turn = [self._liquid.turn] if self._liquid else []
-        self._all_blocks = FaceBlocks.together(self._blocks + turn)
+        self._all_blocks = FaceBlocks.joined(self._blocks + turn)
 
     def _contact(self):
         skin, record = self._skin, self.record
@@ -101,7 +101,7 @@ class LinearStep:
                 ends = (-liquid.push * self._free, liquid.by_node * self._free) if liquid else (None, None)
                 free = self._free[:, 0, 0].numpy() > 0
                 soft = self.record.numbers["softness"]
-                blocks = FaceBlocks.together(self._blocks)
+                blocks = FaceBlocks.joined(self._blocks)
                 made = FactorInverse(skin.factors, soft, blocks, free, *ends, transpose)
             self._inverses[transpose] = made
         return self._inverses[transpose]

@@ -51,10 +51,8 @@ def on_ellipsoid(point: np.ndarray, semi_axes: ArrayLike, centre_y: float) -> np
     scaled = (point - centre) / np.asarray(semi_axes, float)
     out = centre + (point - centre) / np.linalg.norm(scaled, axis=1, keepdims=True)
     rim = point[:, 1] > -1e-9
-    beside = np.sqrt(1 - (centre_y / semi_axes[1]) ** 2)
-    out[rim] = (
-        point[rim] * beside / np.hypot(*(point[rim][:, [0, 2]] / np.take(semi_axes, [0, 2])).T)[:, None]
-    )
+    scale = np.sqrt(1 - (centre_y / semi_axes[1]) ** 2)
+    out[rim] = point[rim] * scale / np.hypot(*(point[rim][:, [0, 2]] / np.take(semi_axes, [0, 2])).T)[:, None]
     return out
 
 
