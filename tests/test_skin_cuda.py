@@ -1,6 +1,8 @@
 """The same kernels on CUDA: needs a CUDA device and torch."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -194,3 +196,34 @@ def test_a_press_done_twice_is_the_same_to_the_bit(nworld):
         results.append((data.wrench, data.vert_xpos, data.pressure))
     for first, second in zip(*results):
         np.testing.assert_array_equal(first, second)
+
+
+_FEW_LANES = """
+import numpy as np, warp as wp
+from biotac_mj.skin.block import sum_of_lanes, sync
+from biotac_mj.skin.types import real, vec3
+
+@wp.kernel(enable_backward=False)
+def add_up(lanes: int, out: wp.array2d(dtype=real)):
+    w, t = wp.tid()
+    for h in range(t / lanes, out.shape[1], wp.block_dim() / lanes):
+        total = sum_of_lanes(vec3(real(h + 1), real(t % lanes), real(w)), lanes)
+        if t % lanes == 0:
+            out[w, h] = total[0] + real(1000.0) * total[1]
+    sync()
+
+for lanes in (1, 2, 8, 32):
+    for sums in (1, 3, 5):
+        out = wp.zeros((4, sums), dtype=real, device="cuda:0")
+        wp.launch_tiled(add_up, [4], [lanes], [out], device="cuda:0", block_dim=256)
+        wanted = lanes * (np.arange(sums) + 1) + 1000 * lanes * (lanes - 1) / 2
+        assert (out.numpy() == wanted).all(), (lanes, sums, out.numpy())
+"""
+
+
+def test_a_sum_of_few_lanes_does_not_wait_for_others(tmp_path):
+    """Those of the warp that have nothing to add are at the next barrier; a shuffle that named them would
+    wait for ever."""
+    script = tmp_path / "few_lanes.py"
+    script.write_text(_FEW_LANES)
+    subprocess.run([sys.executable, script], check=True, timeout=300)

@@ -118,6 +118,39 @@ def test_an_observation_has_the_last_decisions():
         make("follow_edge", 1, device="cpu", history=0)
 
 
+def test_the_engine_runs_on_the_device_of_the_task(monkeypatch):
+    """mujoco_warp launches on Warp's default device, which may be another."""
+    import mujoco_warp
+    import warp
+
+    entered, called = [], []
+
+    class Scope(warp.ScopedDevice):
+        def __enter__(self):
+            entered.append(self.device)
+            return super().__enter__()
+
+        def __exit__(self, *raised):
+            entered.pop()
+            return super().__exit__(*raised)
+
+    def watched(name, function):
+        def call(m, d, *rest):
+            called.append(name)
+            assert entered and entered[-1] == d.qpos.device, f"{name} outside of the task's device"
+            return function(m, d, *rest)
+
+        return call
+
+    monkeypatch.setattr(warp, "ScopedDevice", Scope)
+    for name in ("reset_data", "step"):
+        monkeypatch.setattr(mujoco_warp, name, watched(name, getattr(mujoco_warp, name)))
+    env = make("follow_edge", 1, device="cpu", settings=dataclasses.replace(FollowEdge.settings, substeps=1))
+    env.reset()
+    env.step(torch.zeros(1, 4))
+    assert set(called) == {"reset_data", "step"}
+
+
 def test_errors_of_the_model_differ_between_episodes():
     """Of all electrodes of a finger, of each one, of PDC, of PAC; an electrode that does not change has as
     large an error as the others."""

@@ -73,20 +73,21 @@ def block_sum(own: vec3) -> vec3: ...  # noqa: F811
 def block_sum(own: vec6) -> vec6: ...  # noqa: F811
 
 
+# Lanes of other sums may be elsewhere, at a barrier: a shuffle whose mask has them never ends.
 _OF_LANES = """
 #if defined(__CUDA_ARCH__)
+    const unsigned mask = 0xffffffffu >> (32 - lanes) << threadIdx.x % 32 / lanes * lanes;
     for (int c = 0; c < 3; ++c)
-        for (int far = lanes / 2; far > 0; far /= 2) p[c] += __shfl_xor_sync(0xffffffffu, p[c], far);
+        for (int far = lanes / 2; far > 0; far /= 2) p[c] += __shfl_xor_sync(mask, p[c], far);
 #endif
     return p;
 """
 
 
-# A mask may contain lanes that have ended; the lanes of one sum take part or have ended together.
 @wp.func_native(_OF_LANES)
 def sum_of_lanes(p: vec3, lanes: int) -> vec3:
-    """Sum of a vector over `lanes` neighbouring lanes of a warp, a power of two; all lanes get it. On the CPU
-    there is one."""
+    """Sum of a vector over `lanes` neighbouring lanes of a warp, a power of two, which take part together and
+    get it. On the CPU there is one."""
     ...
 
 

@@ -421,7 +421,8 @@ class BatchTask(abc.ABC):
         mask, some = wp.from_torch(which), which[:, None]
         for one in self.batches.values():
             one.reset(mask)
-        mjw.reset_data(self._m, self._d, mask)
+        with wp.ScopedDevice(self.device):
+            mjw.reset_data(self._m, self._d, mask)
         self.qpos[:] = torch.where(some, self._start, self.qpos)
         self._place(some)
         self._draw_goals(which)
