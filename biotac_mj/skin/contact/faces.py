@@ -9,7 +9,7 @@ import warp as wp
 from ..block import block_sum
 from ..program import Program
 from ..types import mat33, real, vec3
-from .posed import Geoms, Meeting, distance_to, meet, place_on
+from .posed import Geoms, Meeting, distance_from, meet, place_on
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,57 +76,6 @@ def face_samples(order: int) -> np.ndarray:
     return np.column_stack([ab, 1 - ab.sum(axis=1)])
 
 
-@wp.struct
-class FaceSum:
-    """Forces on the corners of a face [N] and the six blocks of its tangent [N/m], summed over samples."""
-
-    f0: vec3
-    f1: vec3
-    f2: vec3
-    b00: mat33
-    b01: mat33
-    b02: mat33
-    b11: mat33
-    b12: mat33
-    b22: mat33
-
-
-@wp.func
-def with_sample(total: FaceSum, b: vec3, force: vec3, K: mat33):
-    """Adds a sample at barycentric coordinates b."""
-    total.f0 += b[0] * force
-    total.f1 += b[1] * force
-    total.f2 += b[2] * force
-    total.b00 += (b[0] * b[0]) * K
-    total.b01 += (b[0] * b[1]) * K
-    total.b02 += (b[0] * b[2]) * K
-    total.b11 += (b[1] * b[1]) * K
-    total.b12 += (b[1] * b[2]) * K
-    total.b22 += (b[2] * b[2]) * K
-    return total
-
-
-@wp.func
-def write_face(
-    f: int,
-    w: int,
-    touching: int,
-    total: FaceSum,
-    contact: Contact,
-):
-    contact.touching[f, w] = touching
-    contact.corner[3 * f, w] = total.f0
-    contact.corner[3 * f + 1, w] = total.f1
-    contact.corner[3 * f + 2, w] = total.f2
-    if touching == 1:
-        contact.block[6 * f, w] = total.b00
-        contact.block[6 * f + 1, w] = total.b01
-        contact.block[6 * f + 2, w] = total.b02
-        contact.block[6 * f + 3, w] = total.b11
-        contact.block[6 * f + 4, w] = total.b12
-        contact.block[6 * f + 5, w] = total.b22
-
-
 @wp.func
 def block_index(a: int, b: int):
     """Index of the stored block of a face between corners a <= b: 00 01 02 11 12 22."""
@@ -169,8 +118,9 @@ def normal_forces(
             p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
             deepest = Meeting()  # a sample touches one geom, as in `touch`
             for g in range(geoms.count):
-                dn = distance_to(geoms, g, w, p)
-                met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v, 1)
+                y = place_on(geoms, g, w, p)
+                dn = distance_from(geoms, g, p, y, geoms.mat[g, w])
+                met = meet(geoms, g, w, y, dn, b, u, v, 1)
                 if met.gap < deepest.gap:
                     deepest = met
             total -= k * deepest.weight * deepest.gap * deepest.at

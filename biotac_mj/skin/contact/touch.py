@@ -15,12 +15,12 @@ import warp as wp
 from ..block import block_memory
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
-from .faces import Contact, FaceSum, Laws, with_sample, write_face
+from .faces import Contact, Laws
 from .meshes import smooth_distance
 from .posed import (
     Geoms,
     convected_anchor,
-    distance_to,
+    distance_from,
     face_radius,
     least_to,
     meet,
@@ -151,8 +151,9 @@ def slide(local: vec3, stick: vec3, normal: vec3, most: real, kt: real, width: r
 
 
 # Sums of a face over its samples, in their order: 9 numbers of its corners and, where it touches, 6 blocks of
-# 9 numbers. All threads of a block take part; f is negative in a thread without a sample. Returns the least
-# clearance of the face, -1 where a sample touches.
+# 9 numbers. On CUDA all threads of a block take part; f is negative in a thread without a sample. Returns
+# the least clearance of the face, -1 where a sample touches. On the CPU the one thread adds the samples that
+# touch, one after the other, and tells the first: so many sums in variables were copied for each sample.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     typedef double numbers[16];
@@ -195,12 +196,24 @@ def slide(local: vec3, stick: vec3, normal: vec3, most: real, kt: real, width: r
     __syncthreads();
     return least;
 #else
+    double* blocks_[6];
+    for (int i = 0; i < 6; ++i) blocks_[i] = (double*)wp::address(blocks, 6 * f + i, w);
+    for (int a = 0, i = 0; a < 3; ++a) {
+        double* to = (double*)wp::address(corner, 3 * f + a, w);
+        for (int j = 0; j < 3; ++j) to[j] = (first ? 0.0 : to[j]) + at[a] * force[j];
+        for (int b = a; b < 3; ++b, ++i) {
+            const double weight = at[a] * at[b];
+            const double* k = &K.data[0][0];
+            for (int j = 0; j < 9; ++j) blocks_[i][j] = (first ? 0.0 : blocks_[i][j]) + weight * k[j];
+        }
+    }
     return free_;
 #endif
 """)
 def add_samples(
     f: int,
     w: int,
+    first: int,
     free_: real,
     force: vec3,
     K: mat33,
@@ -244,8 +257,8 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
     ):
         """Contact of the samples begin to end - 1 of face f with a set of geoms.
 
-        Returns whether they touch, their least clearance [m]; of the last one force [N], tangent [N/m] and
-        barycentric coordinates at which the force acts; and on the CPU the sum over all."""
+        Returns whether they touch, their least clearance [m], and of the last one force [N], tangent [N/m]
+        and barycentric coordinates at which the force acts. On the CPU they are added to the face's sums."""
         t = c.face[f]
         x0 = x[t[0], w]
         x1 = x[t[1], w]
@@ -254,7 +267,6 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
         radius = face_radius(x1 - x0, x2 - x0)
         touching = int(0)
         clearance = real(1.0)
-        total = FaceSum()
         force = vec3()
         K = mat33()
         at = vec3()
@@ -281,7 +293,7 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                     continue
                 y = place_on(geoms, g, w, p)
                 if wp.static(shapes == SKINS):
-                    dn = distance_to(geoms, g, w, p)
+                    dn = distance_from(geoms, g, p, y, geoms.mat[g, w])
                     clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3]), radius))
                 elif wp.static(shapes == CORE):
                     dn = smooth_distance(geoms.grids, geoms.grid[g], y)
@@ -363,12 +375,15 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
             c.trial_geom[i, w] = touched
             c.bond[i, w] = bond
             if touched >= 0:
-                touching = 1
                 c.trial_anchor[i, w] = stick
                 c.sample_force[i, w] = force
                 if one_thread() == 1:
-                    total = with_sample(total, at, force, K)
-        return touching, clearance, force, K, at, total
+                    first = 1 - touching
+                    add_samples(
+                        f, w, first, clearance, force, K, at, nsample, c.corner, c.block, block_memory()
+                    )
+                touching = 1
+        return touching, clearance, force, K, at
 
     return touch_samples
 
@@ -377,6 +392,13 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
 def _faces_functions(has_law: bool, smooth: bool, shapes: str) -> tuple[wp.Function, wp.Function]:
     """`touch_face` and `touch_faces` for `contact_kernels`."""
     touch_samples = _samples_function(has_law, smooth, shapes)
+
+    @wp.func
+    def leave_face(f: int, w: int, c: Contact):
+        """Face f touches nothing."""
+        c.touching[f, w] = 0
+        for a in range(3):
+            c.corner[3 * f + a, w] = vec3()
 
     @wp.func
     def touch_face(
@@ -389,12 +411,14 @@ def _faces_functions(has_law: bool, smooth: bool, shapes: str) -> tuple[wp.Funct
         near: wp.int64,
     ):
         """Evaluates face f on the CPU; returns a lower bound of its clearance [m], -1 where it touches."""
-        touching, clearance, _force, _K, _at, total = touch_samples(
+        touching, clearance, _force, _K, _at = touch_samples(
             f, 0, c.sample.shape[0], w, geoms, x, c, friction_mode, near
         )
-        write_face(f, w, touching, total, c)
         if touching == 1:  # evaluated again, for any range of adhesion
             clearance = real(-1.0)
+            c.touching[f, w] = 1
+        else:
+            leave_face(f, w, c)
         return clearance
 
     @wp.func
@@ -424,7 +448,7 @@ def _faces_functions(has_law: bool, smooth: bool, shapes: str) -> tuple[wp.Funct
                     x[v[0], w], x[v[1], w], x[v[2], w], w, geoms, near[w, f], contact_range(c.laws, w)
                 )
                 if met == 0:
-                    write_face(f, w, 0, FaceSum(), c)
+                    leave_face(f, w, c)
                 else:
                     clearance = wp.min(clearance, touch_face(f, w, geoms, x, c, friction_mode, within))
                 free[w, f] = travel + clearance
@@ -441,13 +465,13 @@ def _faces_functions(has_law: bool, smooth: bool, shapes: str) -> tuple[wp.Funct
             at = vec3()
             if k < count and t < parallel_faces * nsample:
                 mine = listed[w, k]
-                touching, clearance, force, K, at, _total = touch_samples(
+                touching, clearance, force, K, at = touch_samples(
                     mine, s, s + 1, w, geoms, x, c, friction_mode, near[w, mine]
                 )
                 if touching == 1:
                     clearance = real(-1.0)
             clearance = add_samples(
-                mine, w, clearance, force, K, at, nsample, c.corner, c.block, block_memory()
+                mine, w, 0, clearance, force, K, at, nsample, c.corner, c.block, block_memory()
             )  # fmt: skip
             if mine >= 0 and s == 0:
                 c.touching[mine, w] = wp.where(clearance > real(-1.0), 0, 1)
@@ -518,13 +542,13 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
                 f = cache.near[at] // x.shape[1]
                 w = cache.near[at] % x.shape[1]
                 t = contact.face[f]
-                touching, clearance, force, K, push, _total = touch_samples(
+                touching, clearance, force, K, push = touch_samples(
                     f, s, s + 1, w, geoms, x, contact, friction_mode[w], ALL
                 )
                 if touching == 1:
                     clearance = real(-1.0)  # evaluated again, for any range of adhesion
             clearance = add_samples(
-                f, w, clearance, force, K, push, nsample, contact.corner, contact.block, block_memory()
+                f, w, 0, clearance, force, K, push, nsample, contact.corner, contact.block, block_memory()
             )  # fmt: skip
             if f >= 0 and s == 0:
                 contact.touching[f, w] = wp.where(clearance > real(-1.0), 0, 1)
