@@ -240,6 +240,15 @@ def test_a_fault_is_of_its_electrodes_and_its_time(name):
     assert rows[0] >= 2000 and (rows[-1] <= 4000 or name == "drift")
 
 
+def test_exchanged_channels_show_each_the_next():
+    counts, log_z, _ = at_rest()
+    run = Run.of_counts(counts, log_z, np.arange(len(counts)) / 100)
+    kind = type(next(e for e in LOGGED if e.id == "swap"))
+    kind([3, 8, 12], 20.0, 40.0).apply(run, {"onset": 30.0})
+    assert (run.counts[2900] == counts[2900]).all()
+    assert (run.counts[3500, [3, 8, 12]] == counts[3500, [8, 12, 3]]).all()
+
+
 def test_lost_rows_leave_no_gap_in_the_clock():
     counts, log_z, _ = at_rest()
     time = np.arange(len(counts)) / 100
