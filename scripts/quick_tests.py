@@ -6,7 +6,7 @@
 
 Quick are tests that cost at most `--cheap` seconds, and those that cost at most `--line` seconds for each
 line or kernel of the package that no cheaper quick test runs. Tests of the same lines hold different things:
-the first case of a test function counts as ten lines more, that of a function marked `law` as sixty. Lines do
+the first case of a test function counts as ten lines more, that of a function marked `law` as sixty: lines do
 not tell what a test compares, so tests that hold a law of mechanics, or that two engines agree, have this
 mark. The tests that need a module share its compilation.
 """
@@ -77,7 +77,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("costs", type=pathlib.Path, help="folder of tests/costs.py")
     parser.add_argument("--line", type=float, default=0.08, help="seconds for each line that a test adds")
-    parser.add_argument("--cheap", type=float, default=0.1, help="seconds of a test that adds nothing")
+    parser.add_argument("--cheap", type=float, default=0.05, help="seconds of a test that adds nothing")
     args = parser.parse_args()
     tests = measured(args.costs)
     quick, spent = chosen(tests, args.line, args.cheap)

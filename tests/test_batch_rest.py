@@ -86,6 +86,7 @@ def test_a_step_in_which_all_rest_solves_nothing(monkeypatch):
     assert (read(mjm, d, "status")[:, 0] == 1).all() and not read(mjm, d, "contact_force").any()
 
 
+@pytest.mark.law
 def test_clearances_equal_distances_of_points_from_spheres():
     """Of spheres that touch the skin, are near it, and are far from it, in one world after the other."""
     batch = make(press_spec(), 6, readings=False)[-1]

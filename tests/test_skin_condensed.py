@@ -322,6 +322,7 @@ def test_friction_stays_in_its_cone(coarse):
     assert backwards @ along < 0 or np.linalg.norm(backwards) > 0.5 * mu * normal.sum()
 
 
+@pytest.mark.law
 def test_tangent_is_the_force_s_derivative(coarse):
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)

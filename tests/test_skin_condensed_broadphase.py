@@ -62,6 +62,7 @@ def near_core(share, c, x):
     return found.numpy(), true.numpy()
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("name", ["coarse", "ring", pytest.param("biotac_sp/coarse", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_no_face_that_meets_the_core_is_passed_over(name, share):
@@ -80,7 +81,7 @@ def test_no_face_that_meets_the_core_is_passed_over(name, share):
 
 
 def test_slopes_foretell_how_gaps_to_the_core_change():
-    """So that most faces need no look: the rest of a motion counts for 0.6 of it at most, for half of them."""
+    """So that most faces need no look: for half of them what is left of a motion is at most 0.6 of it."""
     model = SkinModel(load_skin("coarse"), PRESETS["default"], SkinOptions())
     assert np.median(LinearSkin.of(model).constants(model).inner_bend.numpy()) < 0.6
 

@@ -293,6 +293,7 @@ def evaluate(model, data, geoms, x):
     return data.contact_force[0], product
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("mode", ["frictionless", "stick", "slip", "coupled"])
 def test_the_contact_tangent_is_the_forces_derivative(mode):
     """The blocks are minus the derivative of the forces; where slipping, by tangential moves only (the normal

@@ -136,6 +136,7 @@ def test_large_strains_and_a_turn(law, element):
         )
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_the_tangent_is_the_forces_derivative(law, element):
     """Among points that slip and points that hold; symmetric."""

@@ -108,6 +108,7 @@ def test_two_jumps_and_a_turn(law, element):
     np.testing.assert_allclose(turned, turn @ expected, atol=1e-6 * abs(expected).max())
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "element, law, beside",
     covering(

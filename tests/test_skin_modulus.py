@@ -66,6 +66,7 @@ def test_one_factor_for_all_is_another_modulus(law, element):
     np.testing.assert_allclose(stress[0], stress[1], rtol=1e-10, atol=1e-10 * np.abs(stress).max())
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
 def test_the_tangent_is_the_forces_derivative(law, element):
     rng = np.random.default_rng(3)

@@ -44,6 +44,7 @@ def deformed(model, amplitude=4e-4, seed=0):
     return model.geometry.vert + amplitude * rng.uniform(-1, 1, (model.nvert, 3))
 
 
+@pytest.mark.law
 # full integration, and mostly mean dilatation
 @pytest.mark.parametrize("nu, law", covering([0.4999, 0.3], LAWS))
 def test_forces_and_products_are_derivatives_of_the_energy(law, nu):

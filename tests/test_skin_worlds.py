@@ -265,6 +265,7 @@ def test_slip_that_goes_with_the_push():
     np.testing.assert_allclose(z, exact, rtol=0, atol=1e-3 * abs(exact).max())
 
 
+@pytest.mark.law
 def test_worlds_move_as_single_skins_do():
     """Backward Euler with both dampings, on a core that is shaken: the same positions and velocities."""
     options = SkinOptions(
