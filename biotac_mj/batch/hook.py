@@ -7,7 +7,7 @@ Once per step, when mujoco_warp computes passive forces, and as in `coupling/imp
 2. The skins are solved, while their bodies give way from there as their inertia lets them.
 3. Their new linear models take the old ones' place. Where that moved a body mujoco_warp predicts again, and
    the skins of worlds in which something else held it are solved again.
-4. Push is withheld where the skins would give more energy than was put into them, and mujoco_warp goes on.
+4. Push is withheld where the skins would give more energy than was put into them, and mujoco_warp continues.
 The readings are written with mujoco_warp's velocity sensors. contact_force, the force that acts in the step,
 is written again with its acceleration sensors, after its constraint solver."""
 
@@ -51,7 +51,7 @@ class Hook:
 
     @classmethod
     def of(cls, m: "mjw.Model") -> "Hook":
-        """The Model's hook, made when first asked for."""
+        """The Model's hook, made at the first call."""
         return m.callback.passive.__self__ if cls.is_of(m) else cls(m)
 
     @classmethod

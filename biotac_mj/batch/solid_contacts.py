@@ -98,8 +98,8 @@ def append_contacts(
     # In and out:
     contact: Contacts,
 ):
-    """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; their number goes on beyond
-    it, which shows the overflow."""
+    """Adds what `Overlaps` found to mujoco_warp's contacts while there is room; their number counts those
+    without room too, which shows the overflow."""
     pair, s, w = wp.tid()
     if found_depth[pair, s, w] <= real(0.0):
         return

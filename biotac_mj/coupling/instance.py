@@ -205,7 +205,7 @@ class Instance:
 
     @property
     def inertial(self) -> bool:
-        """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
+        """Whether the skin has inertia, and so needs the motion of the BioTac."""
         return self.setup.skin.stepper.inertial
 
     def stay_at_rest(self, pos: np.ndarray, mat: np.ndarray) -> bool:

@@ -56,7 +56,7 @@ class SolidPairs:
         self.met[touching.geom] = True
 
     def overlaps(self, nworld: int = 1, device: object = "cpu") -> object:
-        """The `Overlaps` of these pairs; grids are made when it is asked for."""
+        """The `Overlaps` of these pairs; their grids are made at the call."""
         from ..skin.contact.overlap import Overlaps
         from ..skin.geoms import GeomSet
         from .steppers.fem import grid_of

@@ -177,7 +177,7 @@ class SkinStepper:
         return None
 
     def contact_push(self, state: np.ndarray) -> np.ndarray | None:
-        """Normal contact forces (nface,) on the geometry's outer faces in a state [N], likewise."""
+        """Normal contact forces (nface,) on the geometry's outer faces in a state [N], for the same."""
         return None
 
 

@@ -45,7 +45,7 @@ class Touching:
       by_mocap: (ngroup,) bool, whether a mocap body moves it or the BioTac: its motion is known from its
         poses alone, since a mocap body has no velocity.
       parted: whether nothing touches, wherever bodies are: the skin sees its geoms far away.
-      notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
+      notes: for the user: meshes that are met as their convex hulls, geoms that cannot touch.
 
     Raises:
       ValueError: a named geom is missing or ambiguous, or lies on the BioTac's own link; a rounding of one

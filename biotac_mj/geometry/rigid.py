@@ -102,8 +102,8 @@ def displace(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses after small motions (n, 6), the inverse of `displacement`. Reference points move along straight
     lines, as MuJoCo moves rotating bodies; `here` (n, 3) are these points where the motions were measured, by
-    default pos. `spin` (n, 3) are rotation vectors that led to mat: bodies rotate by the sum of both vectors,
-    which differs from two rotations in sequence."""
+    default pos. `spin` (n, 3) are rotation vectors that mat contains already: bodies rotate by the sum of
+    both, which differs from two rotations in sequence."""
     arm = pos if here is None else here
     turn = motion[:, 3:]
     if spin is not None:

@@ -42,9 +42,9 @@ def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
 
 @wp.func
 def displace_at_once(pos: vec3, mat: mat33, m: vec6, here: vec3, spin: vec3):
-    """The pose after a small motion that was measured with the body's reference point at `here`. A rotation
-    vector `spin` led to mat; the body rotates by the sum of both vectors, which differs from two rotations in
-    sequence."""
+    """The pose after a small motion that was measured with the body's reference point at `here`. The rotation
+    vector `spin` is already in mat. The body rotates by the sum of both rotation vectors; two rotations in
+    sequence would give another pose."""
     turn = vec3(m[3], m[4], m[5])
     p = pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here)
     return p, rotation(spin + turn) * wp.transpose(rotation(spin)) * mat

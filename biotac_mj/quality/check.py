@@ -18,8 +18,8 @@ _LEAST = 200  # rows: sixteen blocks of twelve; fewer do not show the noise
 
 
 class Checked(typing.NamedTuple):
-    """log: with lost upper bits restored. faults: what is wrong. weak: candidates with too little evidence to
-    be called a fault."""
+    """A log after the checks: `log` with lost upper bits restored, its `faults`, and `weak` candidates whose
+    evidence is too little to report."""
 
     log: Log
     faults: list[Fault]

@@ -47,12 +47,12 @@ class CompliantBodies:
         self._launch(program, bodies.begin_bodies, self._groups, inputs)
 
     def begin_pending(self, program: Launcher, path: LoadPath, any_out: wp.array) -> None:
-        """Finds the worlds with pending motion, and that motion."""
+        """Finds the worlds whose bodies still have a motion to make, and that motion."""
         inputs = [self._forces.geoms.struct, path, self._data.body_contact, self._data.worlds]
         self._launch(program, bodies.begin_pending, self._groups[1], inputs, [any_out])
 
     def start_pending(self, program: Launcher) -> None:
-        """Makes the worlds with pending motion active; their forces are those at the start of the step."""
+        """Makes those worlds active; their forces are those at the start of the step."""
         inputs, outputs = [self.has_pending], [self._data.worlds.active]
         self._launch(program, bodies.copy_flags, self._groups[1], inputs, outputs)
         self.begin_path(program, self.has_pending)

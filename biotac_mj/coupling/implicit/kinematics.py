@@ -65,8 +65,8 @@ class Kinematics:
             one.check(pos[part], mat[part])
 
     def predict(self, horizon: float | np.ndarray) -> tuple:
-        """Poses (nbody, 3) [m], (nbody, 3, 3) of the touching bodies when everything goes on at its present
-        velocity for `horizon` [s].
+        """Poses (nbody, 3) [m], (nbody, 3, 3) of the touching bodies after `horizon` [s] at the present
+        velocities.
 
         Raises:
           ValueError: a pose or a velocity is not finite, or huge.

@@ -77,8 +77,8 @@ class World:
         return SkinGroup(self.model, self.data, self.coupled)
 
     def passive(self, index: int) -> None:
-        """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
-        asked. What acts on each is found when all are solved."""
+        """Solves the skins: a one-way skin by itself, all two-way skins when MuJoCo computes their first. The
+        wrenches on each are found when all are solved."""
         try:
             self._pass(self.instances[index])
         finally:

@@ -412,7 +412,7 @@ def skin_settings(config: Config) -> Settings:
 
 
 def _in_time(config, settings):
-    """Settings with a bound on the work of a step for two-way coupling, where the simulation waits for it."""
+    """Settings that bound the work of a step under two-way coupling, since the simulation waits for it."""
     rubber, options, modulus = settings
     if config.coupling == "two-way" and "max_work" not in config.options.get("skin", {}):
         options = dataclasses.replace(options, max_work=_allowed(rubber.poissons_ratio))

@@ -119,7 +119,7 @@ def place_of(name: str) -> Place | None:
 
 
 def unit_of(name: str) -> tuple[str, float]:
-    """Unit in the name of a column that `place_of` knows, "" if none, and its size in N, Nm or m: ("mm",
+    """Unit in the name of a column that `place_of` recognises, "" if none, and its size in N, Nm or m: ("mm",
     1e-3) for `object_pos_x [mm]`."""
     plain = _plain(name)
     found = next((f for pattern, _ in _PATTERNS if (f := pattern.fullmatch(plain))), None)

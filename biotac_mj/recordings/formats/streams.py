@@ -170,7 +170,7 @@ def _with_dead(stream, electrodes):
     return np.where(dead & ~read & logged[:, None], 0.0, electrodes)
 
 
-def electrode_names(electrodes):
+def electrode_names(electrodes: np.ndarray) -> str:
     """Names of those electrodes (nelectrode,) of bool that are marked, in one line."""
     return ", ".join(f"e{k + 1}" for k in np.flatnonzero(electrodes))
 

@@ -96,7 +96,7 @@ def newton_from(predictor: int, before: Linear, l: Linear, most: real, tolerance
 
 
 @wp.func
-def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
+def _search_length(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
     """Line search after an evaluation of contact at the end of a step: accepts the step, or chooses another
     length. Returns whether it was accepted."""
     d.tried += 1
@@ -151,7 +151,7 @@ def _take_step(w: int, t: int, threads: int, d: Newton, o: Increment, geoms: Geo
         d.fresh = -1
         _find_motion(w, t, threads, o.nnode, o.nin, geoms, c, s)
     elif d.searching == 1:
-        d = _look_along(w, t, threads, n, d, s)
+        d = _search_length(w, t, threads, n, d, s)
     steps = 1 - d.searching  # whether a step is to be found
     while steps > 0:
         steps = 0

@@ -134,7 +134,7 @@ def _begin_increment(p: LoadStepping, most: real):
 
 @wp.func
 def _next_increment(last: Increment):
-    """A new increment, which knows the candidates of the last one."""
+    """A new increment with the candidates of the last one."""
     o = Increment()
     o.nface = last.nface
     o.ncore = last.ncore

@@ -76,7 +76,7 @@ class Constants:
 @wp.struct
 @declared("condensed")
 class Remembered:
-    """An equilibrium of the skin [item, world], see `state.VARIABLES`; the last step's is kept."""
+    """The equilibrium at the end of the last step [item, world]; `state.VARIABLES` has its fields."""
 
 
 @wp.struct

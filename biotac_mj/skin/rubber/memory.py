@@ -73,7 +73,7 @@ def begin_points(rubber: Rubber, dt: wp.array(dtype=real)):
 
 @wp.func
 def rotation(law: int, F: mat33):
-    """Rotation of a deformation gradient, where the law uses it."""
+    """Rotation of a deformation gradient for the corotational law, zero for laws that do not need it."""
     if law == Law.COROTATIONAL:
         return polar(F)
     return mat33()
