@@ -182,7 +182,7 @@ def add_ray(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ray",
         metavar="ADDRESS",
-        help="of a Ray cluster that shares the work (docs/howto/cluster.md); local: several processes here",
+        help="address of a Ray cluster that shares the work (docs/howto/cluster.md); local: processes here",
     )
 
 

@@ -96,7 +96,8 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         help="skin that simulates DATA; condensed is faster, but its own error may look like an effect",
     )
     verb.add_argument(
-        "--material", help="of the skin that simulates DATA: a preset, a .json file of a material, or JSON"
+        "--material",
+        help="material of the skin that simulates DATA: a preset, a .json file of a material, or JSON",
     )
     add_options(verb)
     verb.add_argument(
@@ -105,7 +106,10 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         help="constitutive effects inside the finite elements (full tier) in the proof",
     )
     verb.add_argument(
-        "--device", type=device, default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0"
+        "--device",
+        type=device,
+        default="cpu",
+        help="device of the full tier: cpu, or a CUDA device such as cuda:0",
     )
     files = "report.html", "verdict.json", "sensor_amended.yaml"
     add_results(verb, "out/diagnose", "folder of the report", *files)
@@ -139,9 +143,9 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--candidates", type=whole(4, 500), default=32, metavar="N", help="contacts to choose from"
     )
-    verb.add_argument("--seed", type=SEED, default=0, help="of the contacts to choose from")
+    verb.add_argument("--seed", type=SEED, default=0, help="seed of the contacts to choose from")
     verb.add_argument(
-        "--out", type=output_file(), default="out/plan.csv", metavar="FILE.csv", help="the plan"
+        "--out", type=output_file(), default="out/plan.csv", metavar="FILE.csv", help="file of the plan"
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -157,7 +161,7 @@ def add_checkup(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--against", metavar="NAME", help="object that the sensor will be pressed on")
     out = output_file(new=True)
     verb.add_argument(
-        "--out", type=out, default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
+        "--out", type=out, default="out/protocol.yaml", metavar="FILE.yaml", help="file of the protocol"
     )
 
 

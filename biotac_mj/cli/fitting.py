@@ -41,9 +41,9 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         "--noise",
         type=real(0, 1e3),
         metavar="N",
-        help="of each synthetic force component, standard deviation (default: 0.01)",
+        help="noise of each synthetic force component, standard deviation (default: 0.01)",
     )
-    verb.add_argument("--seed", type=SEED, default=0, help="of that noise")
+    verb.add_argument("--seed", type=SEED, default=0, help="seed of that noise")
     verb.add_argument(
         "--indenter", default=None, metavar="NAME", help=f"indenter, required for CSV: {INDENTER_HELP}"
     )
@@ -113,7 +113,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         default=list(CONFIGURATIONS),
         choices=CONFIGURATIONS,
         metavar="NAME",
-        help="which",
+        help="configurations to compare (default: all)",
     )
     verb.add_argument(
         "--data",
@@ -122,14 +122,20 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         help="measured indentations instead of our reference; the first one is for calibration",
     )
     verb.add_argument(
-        "--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which"
+        "--indenters",
+        nargs="+",
+        default=INDENTERS,
+        choices=INDENTERS,
+        metavar="NAME",
+        help="indenters of the reference (default: all)",
     )
     verb.add_argument(
         "--count", type=whole(1, 10_000), default=1, help="random indentations for each indenter"
     )
-    verb.add_argument("--seed", type=SEED, default=0, help="of the indentations")
+    verb.add_argument("--seed", type=SEED, default=0, help="seed of the indentations")
     verb.add_argument(
-        "--reference-material", help="of the reference: a preset, including its liquid (default: rubber)"
+        "--reference-material",
+        help="material of the reference: a preset, including its liquid (default: rubber)",
     )
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
     verb.add_argument(
@@ -157,7 +163,7 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         "file", metavar="FILE", help="a recording as `biotac recording show` reads it, or a row of counts"
     )
     verb.add_argument(
-        "--recording", metavar="NAME", help="which, where the file has several (default: the first)"
+        "--recording", metavar="NAME", help="name of the recording, in a file of several (default: the first)"
     )
     add_load_arguments(verb)
     verb.add_argument(

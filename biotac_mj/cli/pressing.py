@@ -153,7 +153,7 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         "--seed",
         type=SEED,
         default=0,
-        help="of touches and noise; 0 is in the package, others take minutes of simulation",
+        help="seed of touches and noise; 0 is in the package, others take minutes of simulation",
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -238,19 +238,21 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--mount", metavar="FILE", help="with --hand: file of `biotac hand mount` for an unknown hand"
     )
-    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
+    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="port of the page")
     verb.add_argument(
         "--policy",
         metavar="FILE",
-        help="of a task: what acts (default: the policy that comes with the package); script uses "
+        help="in a task, what acts (default: the policy that comes with the package); script uses "
         "the true state, random draws actions",
     )
-    verb.add_argument("--episodes", type=whole(1, 100000), help="of a task: score so many, show nothing")
+    verb.add_argument(
+        "--episodes", type=whole(1, 100000), help="in a task, number of episodes to score without a picture"
+    )
     verb.add_argument("--json", action="store_true", help="with --episodes: scores as JSON, with the card")
     verb.add_argument(
-        "--render", type=output_file(".gif"), metavar="FILE.gif", help="of a task: draw one episode"
+        "--render", type=output_file(".gif"), metavar="FILE.gif", help="in a task, picture of one episode"
     )
-    verb.add_argument("--window", action="store_true", help="of a task: MuJoCo's viewer in place of the page")
+    verb.add_argument("--window", action="store_true", help="in a task, MuJoCo's viewer in place of the page")
 
 
 def _play(args):
@@ -317,7 +319,9 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         metavar="GEOM",
         help="geoms that the BioTac replaces (default: all of the link)",
     )
-    verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
+    verb.add_argument(
+        "--out", type=output_file(), default="mount.yaml", metavar="FILE", help="file of the mounts"
+    )
     picture = output_file(picture=True)
     verb.add_argument("--picture", type=picture, metavar="PNG", help="the link before and after")
 
@@ -365,7 +369,9 @@ def add_design(verbs: argparse._SubParsersAction) -> None:
     """Adds its jobs to the command line."""
     verb = add_verb(verbs, "new", _new_design, "Make a custom pad: a folder for attach(design=FOLDER).")
     made = output_folder("default.npz", new="design.json")
-    verb.add_argument("folder", type=made, metavar="FOLDER", help="of the design; its name is the design's")
+    verb.add_argument(
+        "folder", type=made, metavar="FOLDER", help="folder of the design; its name is the design's"
+    )
     length, axes = quantity("length", 0.1, 1e-4), ("ALONG", "ACROSS", "DEPTH")
     for name, text in (
         ("dome", "shell: half an ellipsoid of these semi axes over a core, with liquid"),
@@ -374,8 +380,8 @@ def add_design(verbs: argparse._SubParsersAction) -> None:
     ):
         verb.add_argument(f"--{name}", type=length, nargs=3, metavar=axes, help=text)
     verb.add_argument("--mesh", metavar="FILE", help=".msh, .tet or .vtu [m], its rim or back on y = 0")
-    verb.add_argument("--core-mesh", metavar="FILE.obj", help="of the core [m]")
-    verb.add_argument("--thickness", type=length, default="1.5mm", help="of a dome's shell")
+    verb.add_argument("--core-mesh", metavar="FILE.obj", help="surface of the core [m]")
+    verb.add_argument("--thickness", type=length, default="1.5mm", help="thickness of a dome's shell")
     text = "of the tetrahedra (default: 1.2mm, of a block so much that all its front may touch at once)"
     verb.add_argument("--edge", type=length, help=text)
     text = "columns x y z [mm]: x to the fingertip, z out of the nail (default: no electrodes)"

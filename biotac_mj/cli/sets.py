@@ -15,9 +15,11 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         "data.verbs.generate_verb",
         "Make a synthetic data set of random interactions; continues an interrupted run.",
     )
-    verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="interactions")
+    verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="number of interactions")
     verb.add_argument("--steps", type=whole(8, 2000), default=20, help="time steps of each, at least 8")
-    verb.add_argument("--rate", type=real(1e-3, 1e6), default=20.0, metavar="HZ", help="of the time steps")
+    verb.add_argument(
+        "--rate", type=real(1e-3, 1e6), default=20.0, metavar="HZ", help="rate of the time steps"
+    )
     verb.add_argument(
         "--labelled",
         type=whole(0, 10_000_000),
@@ -41,7 +43,7 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--element",
         choices=("linear", "quadratic"),
-        help="of the skin (default: the material's, or the mesh's)",
+        help="element of the skin (default: the material's, or the mesh's)",
     )
     verb.add_argument(
         "--batch", type=whole(1, 100_000), default=160, help="most worlds in a batch; a shard holds one batch"
@@ -96,7 +98,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         "--objects", nargs="+", metavar="NAME", help="NVIDIA's files: names of indenter types 0, 1, ..."
     )
     add_load_arguments(verb)
-    verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
+    verb.add_argument("--seed", type=SEED, default=0, help="seed of the split by interaction")
     folder = output_folder(new="shard-00000.h5")
     verb.add_argument("--out", type=folder, required=True, metavar="DIR", help="folder of the set")
     verb = add_verb(
@@ -116,7 +118,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         "--rate",
         type=real(0.1, 1e4),
         metavar="HZ",
-        help="of LeRobot's frames, which hold the nearest rows (default: the set's)",
+        help="rate of LeRobot's frames, which hold the nearest rows (default: the set's)",
     )
     folder = output_folder(new="")
     verb.add_argument("--out", type=folder, required=True, metavar="DIR", help="folder to make")

@@ -285,7 +285,7 @@ class TactileSet:
         if (count > 1).any():
             raise ValueError(
                 f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: "
-                "one of them is left from another run"
+                "delete the one of an earlier run"
             )
 
     @property

@@ -32,7 +32,9 @@ def _add_train(verbs, verb):
         "interrupted.",
     )
     v.add_argument("source", metavar="SOURCE", help="a recording, a set, or a folder of trained networks")
-    v.add_argument("--force", metavar="FILE", help="of a recording: text, 3 columns of force [N] row by row")
+    v.add_argument(
+        "--force", metavar="FILE", help="force of a recording: text, 3 columns of force [N] row by row"
+    )
     add_which(v)
     v.add_argument(
         "--out",
@@ -44,12 +46,12 @@ def _add_train(verbs, verb):
     v.add_argument(
         "--fraction", type=real(0.2, 0.95), default=0.7, help="fraction of a recording, in time, for training"
     )
-    v.add_argument("--seed", type=SEED, default=0, help="of one model's random numbers")
+    v.add_argument("--seed", type=SEED, default=0, help="seed of one model's random numbers")
     v.add_argument(
         "--seeds",
         type=SEED,
         nargs="+",
-        help="of divisions, weights and batches (default: 0 to 4, on a CPU 0)",
+        help="seeds of divisions, weights and batches (default: 0 to 4, on a CPU 0)",
     )
     v.add_argument(
         "--splits",
@@ -66,9 +68,11 @@ def _add_train(verbs, verb):
     v.add_argument(
         "--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/lab/learning.md)"
     )
-    v.add_argument("--steps", type=whole(1, 10_000_000), help="of each training (default: the config's)")
+    v.add_argument(
+        "--steps", type=whole(1, 10_000_000), help="steps of each training (default: the config's)"
+    )
     v.add_argument("--limit", type=whole(1, 10_000_000), help="interactions to read, the first ones")
-    v.add_argument("--device", type=device, default="cpu", help="of torch: cpu, cuda")
+    v.add_argument("--device", type=device, default="cpu", help="device of torch: cpu, cuda")
     add_ray(v)
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -186,7 +190,9 @@ def _add_judge(verbs, verb):
         help="a folder that `biotac learn train` wrote, or a recording: reconstruction is judged, force too "
         "if it has one",
     )
-    v.add_argument("--force", metavar="FILE", help="of a recording: text, 3 columns of force [N] row by row")
+    v.add_argument(
+        "--force", metavar="FILE", help="force of a recording: text, 3 columns of force [N] row by row"
+    )
     add_which(v)
     v.add_argument(
         "--new-sensor",
@@ -201,12 +207,12 @@ def _add_judge(verbs, verb):
         "--sensor",
         type=output_file(),
         metavar="FILE.yaml",
-        help="of --new-sensor: writes the adapted sensor, for attach(effects=FILE)",
+        help="with --new-sensor, file for the adapted sensor, which attach(effects=FILE) takes",
     )
     v.add_argument(
         "--fraction", type=real(), default=0.7, help="fraction of the recording, in time, for training"
     )
-    v.add_argument("--seed", type=SEED, default=0, help="of the recording's networks")
+    v.add_argument("--seed", type=SEED, default=0, help="seed of the recording's networks")
     v.add_argument(
         "--json",
         type=output_file(),
@@ -321,7 +327,7 @@ def _add_predict(verbs, verb):
     v.add_argument(
         "--row",
         type=int,
-        help="of inverse weights: which row to draw, -1 the last (default: the one with the largest force; "
+        help="with inverse weights, number of the row to draw, -1 the last (default: the largest force's; "
         "where none was recorded, the one that differs most from rest)",
     )
     v.add_argument("--skin", default="default", help="mesh of inverse weights; of latent_projection any")

@@ -19,10 +19,10 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         "Read recordings of real BioTacs (text, CSV, MATLAB, .btd, ROS bags, HDF5) into one file; "
         "reports clock gaps, dropped and repeated rows, units, rate.",
     )
-    v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of its forces and poses")
+    v.add_argument("files", nargs="+", metavar="FILE", help="files of a sensor, and of its forces and poses")
     add_load_arguments(v)
     recording = output_file(".h5", new=True)
-    v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="the recording")
+    v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="file to write")
     v = verb(
         verbs,
         "export",
@@ -45,21 +45,21 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     add_which(v)
     add_load_arguments(v)
     picture = output_file(picture=True)
-    v.add_argument("--out", type=picture, default="out/show.png", metavar="PNG", help="the picture")
+    v.add_argument("--out", type=picture, default="out/show.png", metavar="PNG", help="file of the picture")
     v = verb(
         verbs, "record", _record, "Record a running sensor: a topic of ROS, or lines from a serial port."
     )
     source = v.add_mutually_exclusive_group(required=True)
     source.add_argument(
-        "--topic", nargs="+", metavar="NAME", help="of ROS 1 or 2, those of poses and forces too"
+        "--topic", nargs="+", metavar="NAME", help="topic of ROS 1 or 2, those of poses and forces too"
     )
     source.add_argument("--serial", metavar="PORT", help="as /dev/ttyUSB0, each line a row of numbers")
-    v.add_argument("--baud", type=whole(50, 10**8), default=115200, help="of --serial")
+    v.add_argument("--baud", type=whole(50, 10**8), default=115200, help="baud rate of --serial")
     v.add_argument(
         "--columns",
         nargs="+",
         metavar="NAME",
-        help="of --serial's lines, as time e1 e2 pdc (default: a header line, or all electrodes in order)",
+        help="names in --serial's lines, as time e1 e2 pdc (default: a header, or all electrodes in order)",
     )
     v.add_argument(
         "--seconds",
@@ -73,8 +73,8 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         help="announce the steps of a checkup from this plan (`biotac checkup`); when each was done is "
         "written beside the recording, as OUT_timeline.yaml",
     )
-    v.add_argument("--object", metavar="NAME", help="what touches")
-    v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="the recording")
+    v.add_argument("--object", metavar="NAME", help="name of the touching object")
+    v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="file to write")
 
 
 def add_which(verb: argparse.ArgumentParser) -> None:
@@ -89,7 +89,7 @@ def add_load_arguments(
 ) -> None:
     """Adds arguments for what files do not contain. touched: help of --object."""
     verb.add_argument(
-        "--rate", type=real(0.5, 1e4), metavar="HZ", help="of rows without times (default: guessed)"
+        "--rate", type=real(0.5, 1e4), metavar="HZ", help="rate of rows without times (default: guessed)"
     )
     verb.add_argument(
         "--scale", type=real(1e-9, 1e9), help="counts per unit of the channels: 4095 if they are normalised"

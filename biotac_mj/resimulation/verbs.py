@@ -18,7 +18,9 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
         "Drive the simulated skin along a recording: a set of deformations and measured electrodes; "
         "continues an interrupted run.",
     )
-    v.add_argument("recording", metavar="FILE", help="of any kind that `biotac recording import` reads")
+    v.add_argument(
+        "recording", metavar="FILE", help="recording of any kind that `biotac recording import` reads"
+    )
     v.add_argument("--force", metavar="FILE", help="its forces: text, 3 columns [N] row by row")
     add_which(v)
     add_load_arguments(v, "object: a name of `biotac data generate --objects`, geom:... or mesh:FILE")
@@ -50,7 +52,7 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     v.add_argument("--options", metavar="JSON", help="further settings of the skin (docs/features.md)")
     v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, parallel on a GPU")
     v.add_argument("--workers", type=whole(0, 1024), help="processes for the readings (default: one a core)")
-    v.add_argument("--seed", type=SEED, default=0, help="of the split, and of the simulated noise")
+    v.add_argument("--seed", type=SEED, default=0, help="seed of the split, and of the simulated noise")
     v.add_argument("--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
     v.add_argument(
         "--out", type=output_folder("resimulate.json"), required=True, metavar="DIR", help="folder of the set"

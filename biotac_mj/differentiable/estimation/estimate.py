@@ -118,8 +118,8 @@ def touch_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
     # (docs/lab/differentiable.md)
     if change.std() < min(least, 0.5 * abs(change.mean())):
         raise ValueError(
-            f"ln Z differs from rest by {change.mean():.4f}, and alike at all electrodes, as of a sensor "
-            "that warms up and not of a touch: choose a row under load, or a rest shortly before it"
+            f"ln Z differs from rest by {change.mean():.4f}, alike at all electrodes: this is a sensor that "
+            "warms up, not a touch; choose a row under load, or a rest shortly before it"
         )
     return change
 

@@ -248,14 +248,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("task", choices=TASKS)
     parser.add_argument(
-        "--observe", nargs="+", default=["electrodes"], choices=OBSERVE, help="kinds of touch"
+        "--observe",
+        nargs="+",
+        default=["electrodes"],
+        choices=OBSERVE,
+        help="kinds of touch that policies read",
     )
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of each kind")
-    parser.add_argument("--worlds", type=int, default=512, help="of each policy")
-    parser.add_argument("--minutes", type=float, default=5.0, help="of learning; more to compile and to play")
-    parser.add_argument("--device", help="of Warp")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder")
-    parser.add_argument("--resume", action="store_true", help="go on from what is in --out")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds, for each kind of touch")
+    parser.add_argument("--worlds", type=int, default=512, help="number of worlds for each policy")
+    parser.add_argument(
+        "--minutes", type=float, default=5.0, help="time to learn, besides compiling and playing"
+    )
+    parser.add_argument("--device", help="Warp device, cpu or cuda:0 say")
+    parser.add_argument(
+        "--out", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder of the policies"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue the training in --out")
     parser.add_argument("--hand", type=pathlib.Path, help="shadow_hand/right_hand.xml of MuJoCo Menagerie")
     options = parser.parse_args(arguments)
     begin = time.perf_counter()
