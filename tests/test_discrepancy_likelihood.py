@@ -63,6 +63,36 @@ def test_evidence_is_the_density_of_noise_poses_and_discrepancy(plain):
     )
 
 
+def test_a_likelihood_knows_no_rest_of_other_trajectories(plain):
+    """Others may touch in row 0, by poses that are not fitted; what the own ones' rest moves by is known."""
+    comparison, chosen = plain[0], np.arange(1, 4)
+    data = list(comparison.trajectories)
+    data[0] = dataclasses.replace(data[0], electrodes=data[0].electrodes + 300.0, pdc=data[0].pdc + 50.0)
+    other = Comparison(Springs(), data, comparison.fields, comparison.noise)
+    some, same = (of(c, chosen).stacked(c.measured) for c in (comparison, other))
+    np.testing.assert_allclose(same, some, atol=1e-9)
+    likelihood, offsets = of(comparison, chosen), np.zeros((6, 3))
+    offsets[1, 1], by = 1e-4, 1e-7  # it touches from the first row on
+    before, after = (
+        likelihood.turned(likelihood.stacked(comparison.raw([], offsets=o)))
+        for o in (offsets, offsets + by * (np.arange(18) == 4).reshape(6, 3))
+    )
+    moved = likelihood.poses(offsets)[1] / comparison.repeatability
+    np.testing.assert_allclose((before - after) / by, moved, atol=0.03 * np.abs(moved).max())
+
+
+def test_trajectories_apart_share_laws_and_no_discrepancy(plain):
+    """What the model misses in the others tells nothing of them; what a law lacks there does."""
+    comparison, every = plain[0], np.arange(6)
+    own, whole = of(comparison, every, every[4:]), of(comparison, every)
+    covariance, joint = ((k._vectors * k._scale) @ k._vectors.T for k in (own, whole))
+    first = sum(len(t.time) for t in comparison.trajectories[:4])
+    assert np.abs(covariance[:first, first:]).max() < 1e-9 < np.abs(joint[:first, first:]).max()
+    for part in (slice(first), slice(first, None)):
+        np.testing.assert_allclose(covariance[part, part], joint[part, part], atol=1e-9)
+    np.testing.assert_array_equal(own.courses, whole.courses)
+
+
 def test_the_kernel_is_a_covariance():
     data = measured([], n=3)
     K = kernel(data, [np.arange(len(t.time)) for t in data])

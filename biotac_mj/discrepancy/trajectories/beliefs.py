@@ -253,7 +253,9 @@ def believed(comparison: Comparison, search: Search, contacts: int) -> Beliefs:
     """Probabilities of the likeliest explanations that a search of so many contacts has tried, and of the
     base model alone."""
     fits = list(search.fits.values())
-    probable = weights([fit.told for fit in fits], [len(fit.effects) for fit in fits], contacts)
+    posed = np.array([_posed(comparison, fit, fits) for fit in fits])
+    told = [fit.told for fit in fits] - posed + posed * contacts / _CONTACTS
+    probable = weights(told, [len(fit.effects) for fit in fits], contacts)
     likely = set(np.argsort(-probable)[:_MOST])
     out = [
         Explanation(fit.effects, fit.nuisance, fit.score, fit.information, float(weight))
@@ -268,6 +270,19 @@ def believed(comparison: Comparison, search: Search, contacts: int) -> Beliefs:
     beside += sum(one.weight for one in out if {*out[0].ids} < {*one.ids} <= named)
     beside = float(beside / (out[0].weight + beside))
     return Beliefs(out, comparison.repeatability, comparison.noise, end, [], unseen, beside)
+
+
+def _posed(comparison, fit, fits):
+    """The part of the evidence of a Fit that its effects which move all poses owe to errors of poses [nats]:
+    these are another in every contact, by a known distribution, and no model's. Nothing where other effects
+    leave poses that are as likely, and explain the data as well."""
+    others = {e.id for e, _ in fit.effects if not e.pose_offset}
+    if len(others) == len(fit.effects):
+        return 0.0
+    plain = [f for f in fits if not any(e.pose_offset for e, _ in f.effects)]
+    rivals = [f for f in plain if f.score >= fit.score or {e.id for e, _ in f.effects} <= others]
+    least = min(f.scatter(comparison) for f in rivals)
+    return min(max(least - fit.scatter(comparison), 0.0), max(fit.told, 0.0))
 
 
 def _unseen(explanations, search):

@@ -18,6 +18,7 @@ if typing.TYPE_CHECKING:
 _NUISANCE = [f.name for f in dataclasses.fields(Nuisance)]
 _MOVES = np.array([0.05, 0.05, 0.02, 0.2, 0.2, 0.2, 0.2, 0.3])  # of the nuisance, for differences
 _SMALL, _SHAPE = 0.3, 0.2  # the same of a parameter's scale and of a shape's logarithm
+_TANGENT = 0.01  # the same where errors of poses, whose tangents are known, do what a parameter does
 _SHAPE_PRIOR = 1.0  # standard deviation of a shape's logarithm
 _STEPS, _DONE = 8, 0.1  # Gauss-Newton's; [nats] below which one more changes nothing
 _SHORTER = 1.0, 0.5, 0.2  # of a step
@@ -75,6 +76,10 @@ class Fit:
     def raw(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.raw(self.effects, self.nuisance, exact)
 
+    def scatter(self, comparison: "Comparison") -> float:
+        """Negative log density of its poses, whose errors are of `comparison.repeatability` [nats]."""
+        return 0.5 * float(np.square(self.offsets / comparison.repeatability).sum())
+
     def interval(self, k: int) -> tuple[float, float]:
         """95 % interval of free parameter k, from its posterior and the error of its effect's law."""
         effect, name = self.names[k]
@@ -113,9 +118,9 @@ def parameters(effects: list, free: Sequence[str] = _NUISANCE) -> list[tuple[int
     standard deviation of the prior; step of differences), of a shape those of its logarithm."""
     out = [(None, name, PRIOR[k], _MOVES[k]) for k, name in enumerate(_NUISANCE) if name in free]
     for k, (effect, _) in enumerate(effects):
+        step = _TANGENT if effect.pose_offset else _SMALL
         out += [
-            (k, name, SETTINGS.wide * effect.params[name].scale, _SMALL * size)
-            for name, size in sizes(effect)
+            (k, name, SETTINGS.wide * effect.params[name].scale, step * size) for name, size in sizes(effect)
         ]
         out += [(k, name, _SHAPE_PRIOR, _SHAPE) for name, p in effect.params.items() if p.shape]
     return out

@@ -94,20 +94,25 @@ class Likelihood:
     """Likelihood of some trajectories of a Comparison.
 
     Attributes:
-      chosen: their indices. courses: (k, n) of errors of laws. size: (width,) by how much the base model is
-        expected to be off [counts, N] under the deepest press; expected: (n,) fraction of it in each row.
+      chosen: their indices; apart: of these, those in which what the model misses is not known by the others,
+        as what the laws of effects lack is. courses: (k, n) of errors of laws. size: (width,) by how much the
+        base model is expected to be off [counts, N] under the deepest press; expected: (n,) fraction of it in
+        each row.
     """
 
-    def __init__(self, comparison: "Comparison", chosen: np.ndarray):
+    def __init__(self, comparison: "Comparison", chosen: np.ndarray, apart: np.ndarray = ()):
         self.comparison, self.chosen = comparison, np.asarray(chosen)
         data = [comparison.trajectories[i] for i in self.chosen]
         every = max(1, int(np.ceil(sum(len(t.time) for t in data) / _ROWS)))
         self._rows = [np.arange(0, len(t.time), every) for t in data]
-        values, vectors = np.linalg.eigh(kernel(data, self._rows))
+        side = np.repeat(np.isin(self.chosen, apart), [len(r) for r in self._rows])
+        values, vectors = np.linalg.eigh(kernel(data, self._rows) * (side[:, None] == side))
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
         self.expected = np.sqrt(vectors**2 @ self._scale)
         self.courses = courses(data, self._rows)
         self.noise = comparison.noises
+        self._resting = np.ones(comparison.width)  # force has no rest
+        self._resting[self.comparison.groups.get("force", slice(0))] = 0.0
         largest = np.abs(self.stacked(comparison.measured)).max(0)
         self.size = np.concatenate(
             [np.full(s.stop - s.start, SETTINGS.resolution * _upper(largest[s])) for s in self.groups]
@@ -118,8 +123,10 @@ class Likelihood:
         return list(self.comparison.groups.values())
 
     def stacked(self, values: list) -> np.ndarray:
-        """(n, width) of values (rows, width) of every trajectory, the chosen ones one after another."""
-        return np.concatenate([values[i][r] for i, r in zip(self.chosen, self._rows)])
+        """(n, width) of values (rows, width) of every trajectory, the chosen ones one after another, about
+        their own mean rest: the poses of others, whose row 0 may touch, are not fitted."""
+        rest = self._resting * np.mean([values[i][0] for i in self.chosen], axis=0)
+        return np.concatenate([values[i][r] - rest for i, r in zip(self.chosen, self._rows)])
 
     def turned(self, values: np.ndarray) -> np.ndarray:
         """(..., n, width) in the kernel's eigenvectors."""
@@ -134,8 +141,10 @@ class Likelihood:
         deviation each, in the eigenvectors: three of every trial. An offset that all share is evidence."""
         out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
         for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
-            own = self._vectors[edges[k] : edges[k + 1]].T  # all other rows stand still
-            out += [own @ column[rows] for column in self.comparison.moved(i, offsets[i])]
+            own = self._vectors[edges[k] : edges[k + 1]].T  # of all other rows the rest alone moves
+            for column in self.comparison.moved(i, offsets[i]):
+                rest = self._resting * column[0] / len(self.chosen)
+                out.append(own @ column[rows] - np.outer(self._vectors.sum(0), rest))
         return self.comparison.repeatability * np.array(out)
 
     def laws(self, changes: list[np.ndarray], errors: np.ndarray) -> np.ndarray:
@@ -214,11 +223,11 @@ class Likelihood:
         return out
 
 
-def of(comparison: "Comparison", chosen: np.ndarray) -> Likelihood:
+def of(comparison: "Comparison", chosen: np.ndarray, apart: np.ndarray = ()) -> Likelihood:
     """The Likelihood of the chosen trajectories of a Comparison, which keeps it."""
-    key = tuple(int(i) for i in chosen)
+    key = tuple(map(int, chosen)), tuple(map(int, apart))
     if key not in comparison.likelihoods:
-        comparison.likelihoods[key] = Likelihood(comparison, chosen)
+        comparison.likelihoods[key] = Likelihood(comparison, chosen, apart)
     return comparison.likelihoods[key]
 
 

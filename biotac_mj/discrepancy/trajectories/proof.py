@@ -50,11 +50,22 @@ def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np
 
 
 def _density(comparison, fit, aside):
-    """Logarithm of the likelihood of held-out trajectories, by as much as the model misses of them."""
-    own = likelihood.of(comparison, aside)
-    y = own.turned(own.stacked(fit.raw(comparison, exact=list(aside))))
+    """Logarithm of the density of held-out trajectories, by as much as the model misses of them, where the
+    others tell what the laws of its effects lack."""
+    every = np.arange(len(comparison.trajectories))
+    raw = comparison.raw(fit.effects, fit.nuisance, list(aside), fit.offsets)
+    known = _evidence(comparison, fit, raw, np.setdiff1d(every, aside))
+    return _evidence(comparison, fit, raw, every, aside) - known
+
+
+def _evidence(comparison, fit, raw, some, apart=()):
+    """Logarithm of the likelihood of some trajectories (indices), by residuals `raw` where a Fit has them."""
+    own = likelihood.of(comparison, some, apart)
     laws = own.laws(changes(comparison, own, fit.effects, fit.nuisance), fit.law_errors)
-    errors = np.concatenate([own.poses(np.zeros((len(comparison.trajectories), 3))), laws])
+    poses = own.poses(fit.offsets)
+    off = fit.offsets[some].ravel() / comparison.repeatability
+    y = own.turned(own.stacked(raw)) + np.tensordot(off, poses, 1)
+    errors = np.concatenate([poses, laws])
     amplitude = own.amplitudes(y, errors, fit.amplitude, fit.size)
     log = own.evidence(y, errors, own.variance(amplitude, fit.size))[0]
     return log + own.prior(amplitude, fit.law_errors)
