@@ -10,7 +10,7 @@ three forms each (FORMS), none of them the fitter's."""
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-__all__ = ["FORMS", "HIDDEN", "OUTSIDE", "Generator", "plan"]
+__all__ = ["FORMS", "HIDDEN", "OUTSIDE", "Generator", "plan", "slips"]
 
 _E_NEAR = {
     0: (1, 3, 7),
@@ -80,6 +80,11 @@ def plan(seed, count, skin="coarse"):
         )
         clock += t[-1] + 5
     return out
+
+
+def slips(count, seed, repeatability):
+    """(count, 3) by which the objects of so many trajectories are off [m], in data of this seed."""
+    return np.random.default_rng(seed).normal(0, repeatability, (count, 3))
 
 
 class Generator:
@@ -208,9 +213,9 @@ class Generator:
 
     def clean(self, plans, effects, seed, repeatability=0.02e-3):
         """`measure` without noise and rounding; the poses slip as they do there."""
-        rng = np.random.default_rng(seed)
         memory, out = {"end": max(one["clock"] for one in plans)}, []
-        states = [_State(one, self, rng.normal(0, repeatability, 3), memory) for one in plans]
+        off = slips(len(plans), seed, repeatability)
+        states = [_State(one, self, slip, memory) for one, slip in zip(plans, off)]
         for s in states:
             for name, size, form in effects:
                 if name in _BEFORE:

@@ -17,10 +17,10 @@ import pathlib
 import zlib
 
 import numpy as np
-from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator
+from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator, slips
 from records import write_json
 
-__all__ = ["carried_out", "clean", "draw", "opened", "read_plan", "seal"]
+__all__ = ["carried_out", "clean", "draw", "off", "opened", "read_plan", "seal"]
 
 # of 30 laboratories; wrong-base: a rubber that is half as stiff, or twice
 _OF_30 = {"single": 15, "pair": 5, "none": 4, "outside": 4, "wrong-base": 2}
@@ -120,6 +120,11 @@ def clean(lab: Generator, sensor: dict, contacts: list[dict], turn: int, effects
     """The same by the same poses without noise and rounding, with and without the hidden effects."""
     hidden = [tuple(e) for e in sensor["effects"]] if effects else []
     return lab.clean(contacts, hidden, sensor["seed"] + turn, _POSE)
+
+
+def off(sensor: dict, contacts: list[dict], turn: int) -> np.ndarray:
+    """(contacts, 3) by which their objects were off [m]."""
+    return slips(len(contacts), sensor["seed"] + turn, _POSE)
 
 
 def _write(path, contacts, readings):

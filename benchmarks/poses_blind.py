@@ -109,20 +109,21 @@ def _read(path, entry):
     return read_trajectories(path)
 
 
-def gap(measured, clean, sim, aside, modulus=False, noise=None):
+def gap(measured, clean, sim, aside, modulus=False, noise=None, offsets=None):
     """Share of what is hidden that an amended simulator repeats on trajectories `aside` (ids), or None where
     that is too small to be seen. modulus: whether the simulator's is one of the effects named, and no
     calibration. noise: of the sensor, as `measurement_noise` gives it, where `measured` has none itself: a
-    few contacts tell their own by a third too little or too much, which counts as a gap."""
+    few contacts tell their own by a third too little or too much, which counts as a gap. offsets:
+    (trajectories, 3) by which objects were off [m], where that is known: no model has to repeat it."""
     from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 
     expected = float(noise is None)  # square of noise
     noise = measurement_noise(measured) if noise is None else noise
     fields = sim.fields(measured, progress=False)
     rows = [i for i, t in enumerate(measured) if t.id in aside]
-    with_ = sim.run(measured, fields, rows)
+    with_ = sim.run(measured, fields, rows, offsets=offsets)
     bare = dataclasses.replace(sim, effects=[], modulus=1.0 if modulus else sim.modulus)
-    without = bare.run(measured, fields, False)
+    without = bare.run(measured, fields, False if offsets is None else rows, offsets=offsets)
     left = before = count = 0.0
     for i in rows:
         t, c, a, b = measured[i], clean[i], with_[i], without[i]

@@ -19,7 +19,7 @@ import pathlib
 import time
 
 import numpy as np
-from hidden_lab import carried_out, clean, generator_of, opened, read_plan
+from hidden_lab import carried_out, clean, generator_of, off, opened, read_plan
 from poses_blind import MEANT, gap
 from records import read_json, write_json
 
@@ -154,19 +154,22 @@ def run(task, args):
             _trajectories(contacts, clean(lab, sensor, contacts, turn, effects), name)
             for effects in (True, False)
         )
-        free.update((a.id, (a, b)) for a, b in zip(*both))
+        free.update((a.id, (a, b, slip)) for a, b, slip in zip(*both, off(sensor, contacts, turn)))
         return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), name)
 
     def hidden(t):
         """(n, width) what is hidden in a trajectory."""
-        shown, bare = (np.column_stack([one.electrodes, one.pdc, one.force]) for one in free[t.id])
+        shown, bare = (np.column_stack([one.electrodes, one.pdc, one.force]) for one in free[t.id][:2])
         return shown - bare
 
-    def closed(report, data, ids):
-        """Share of what is hidden in some trajectories (ids) of data that the amended sensor repeats."""
-        shown, bare = zip(*(free[t.id] for t in data))
+    def closed(report, data, ids, posed=False):
+        """Share of what is hidden in some trajectories (ids) of data that the amended sensor repeats; posed:
+        where the objects were, and not where they were meant to be."""
+        shown, bare, slip = zip(*(free[t.id] for t in data))
         # the base is the sensor's own
-        return gap(shown, bare, report.apply(sim), ids, noise=report.comparison.noise)
+        return gap(
+            shown, bare, report.apply(sim), ids, False, report.comparison.noise, slip if posed else None
+        )
 
     def judged(data, turn):
         began = time.process_time()
@@ -175,7 +178,8 @@ def run(task, args):
         if report.effects and sensor["effects"]:  # of nothing hidden there is no share
             record["true"] = closed(report, data, {data[i].id for i in report.locked})
             other = measured(_plan(unseen, _end(data)), turn, "unseen")
-            record["unseen"] = closed(report, other, {t.id for t in other})
+            for key, posed in (("unseen", True), ("unseen_meant", False)):
+                record[key] = closed(report, other, {t.id for t in other}, posed)
             rest = np.mean([hidden(t)[0] for t in data], axis=0)  # about which all is compared
             about = [hidden(t) - rest for t in other]
             some = in_place(report, other)

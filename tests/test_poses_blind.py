@@ -71,9 +71,11 @@ class Amended:
     def fields(self, data, progress):
         return None
 
-    def run(self, data, fields, exact):
+    def run(self, data, fields, exact, offsets=None):
         by = self.modulus + sum(theta["by"] for _, theta in self.effects)
-        rows = [(REST + by * (t.depth / 1e-3 * 200)[:, None] * np.ones(19), len(t.time)) for t in data]
+        deeper = np.zeros((len(data), 3)) if offsets is None else offsets
+        depth = [t.depth + off[1] for t, off in zip(data, deeper)]
+        rows = [(REST + by * (d / 1e-3 * 200)[:, None] * np.ones(19), len(d)) for d in depth]
         return [types.SimpleNamespace(counts=c, pdc=np.zeros(n), force=np.zeros((n, 3))) for c, n in rows]
 
 
@@ -94,6 +96,15 @@ def test_the_known_gap_closes_as_far_as_the_amendment_repeats():
         assert abs(poses_blind.gap([noisy], [clean], sim, {"a"}) - share) < 0.06
         exact = poses_blind.gap([shown], [clean], sim, {"a"}, noise=known)  # without noise of its own
         assert exact == pytest.approx(share, abs=1e-6)
+    deep, sim = 2e5 * 2e-4, Amended([(by_id("gain"), {"by": 0.3})])  # where the object was
+    both = [
+        dataclasses.replace(t, electrodes=t.electrodes + by * deep) for t, by in ((shown, 1.3), (clean, 1))
+    ]
+    meant, found = (
+        poses_blind.gap(*([one] for one in both), sim, {"a"}, noise=known, offsets=off)
+        for off in (None, [[0, 2e-4, 0]])
+    )
+    assert meant < 0.85 and found > 0.999
     assert poses_blind.gap([clean], [clean], Amended([]), {"a"}) is None
     stiffer = Amended([], modulus=1.3)
     assert poses_blind.gap([noisy], [clean], stiffer, {"a"}, modulus=True) > 0.94
