@@ -390,7 +390,6 @@ def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="a step of 10 ms: one world's solves find no balance and push nothing")
 @pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
 def test_a_body_that_turns_far_ends_where_predicted(integrator):
     """Velocity products act after the constraint solver: 0.56 rad in a step."""

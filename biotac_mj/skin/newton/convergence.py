@@ -124,7 +124,7 @@ def check_convergence(
     if iterations == start_iterations:
         st.start_error[w] = wp.sqrt(far / work)
     elif friction_mode == LAGGED:  # the friction bounds are not known more accurately
-        enough = wp.max(enough, _LAGGED_TOLERANCE * start_error)
+        enough = wp.max(enough, _LAGGED_TOLERANCE * wp.min(start_error, real(1.0)))
         needs_pressure = 0
     if far < real(0.25) * best:
         st.best_square[w] = far
