@@ -9,6 +9,7 @@ import warp as wp
 from grids import first
 
 import biotac_mj
+from biotac_mj.geometry import load_skin
 
 WEIGHT = 0.1 * 9.81
 # a ball of 100 g on the pad of a finger on a wrist on a spring; the world's z axis is the BioTac's -y
@@ -331,6 +332,24 @@ def cup_and_ring():
     )
     ring = trimesh.creation.torus(0.0112, 0.0022, 32, 12)
     return "".join(mesh_asset(name, m.vertices, m.faces) for name, m in (("cup", cup), ("ring", ring)))
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_the_nail_alone_meets_what_lies_on_it(tier):
+    """Where all its nodes are fixed the skin's surface is the nail's, which MuJoCo's contact holds; the skin
+    gives way to nothing there, and half a millimetre deep it pushed with kilonewtons, too."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><site name="mount" quat="1 1 0 0"/><body mocap="true"><geom size=".002"/></body>'
+        "</worldbody></mujoco>"
+    )
+    handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    skin = load_skin("coarse")
+    # in the nail, half a millimetre below the skin that is fixed to it; no contact of MuJoCo: neither moves
+    data.mocap_pos[0] = -0.0107, 0, skin.nail_vert[:, 1].min() + 0.0015
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "status")[0] == 1 and not handle.read(data, "contact_force").any()
 
 
 # the finger points down into the cup and through the ring; then, nail up, both rest on it

@@ -80,6 +80,7 @@ class ContactState:
         """`Contact` of this surface for kernels: its arrays, and the given fields."""
         out, surface = Contact(), self.surface
         out.face, out.area, out.sample, out.stick_ratio = surface.face, surface.area, sample, stick_ratio
+        out.bonded = surface.bonded
         out.stiffness, out.laws, out.x_last, out.bound = stiffness, laws, x_last, bound
         out.anchor_geom, out.anchor, out.kept = self.anchor_geom, self.anchor, self.kept
         out.corner, out.block, out.touching = self.corner, self.block, self.touching

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
@@ -165,22 +165,27 @@ def solved_geometry(
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A contact surface of the skin: faces (nface, 3), reference areas (nface,) [m^2], its nodes (n,), and
-    CSR lists of the faces' corners at each of the skin's nodes."""
+    """A contact surface of the skin: faces (nface, 3), reference areas (nface,) [m^2], which of them are
+    bonded, since all their nodes are `fixed`, its nodes (n,), and CSR lists of the faces' corners at each of
+    the skin's nodes."""
 
     face: wp.array
     area: wp.array
+    bonded: wp.array
     node: wp.array
     start: wp.array
     slot: wp.array
     face_np: np.ndarray
 
     @classmethod
-    def create(cls, vert: np.ndarray, face: np.ndarray, device: wp.DeviceLike) -> "Surface":
+    def create(
+        cls, vert: np.ndarray, face: np.ndarray, device: wp.DeviceLike, fixed: Sequence[int] = ()
+    ) -> "Surface":
         start, slot = incidence(len(vert), face)
         return cls(
             wp.array(face, dtype=wp.vec3i, device=device),
             wp.array(np.linalg.norm(face_areas(vert, face), axis=1), dtype=real, device=device),
+            wp.array(np.isin(face, fixed).all(axis=1), dtype=int, device=device),
             wp.array(np.unique(face), dtype=int, device=device),
             wp.array(start, dtype=int, device=device),
             wp.array(slot, dtype=int, device=device),
@@ -275,7 +280,7 @@ class SkinModel:
             self.vert = wp.array(vert[:, None], dtype=vec3)
             self.free_mask = wp.array(mask, dtype=real)
             self.sample = wp.array(face_samples(self.options.samples), dtype=vec3)
-            self.outer = Surface.create(vert, geometry.outer_face, self.device)
+            self.outer = Surface.create(vert, geometry.outer_face, self.device, self.fixed)
             self.spacing = math.sqrt(np.median(self.outer.area.numpy()) / len(self.sample))
             self.inner = (
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None

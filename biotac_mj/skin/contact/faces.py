@@ -44,6 +44,7 @@ class Contact:
 
     face: wp.array(dtype=wp.vec3i)
     area: wp.array(dtype=real)  # of the faces at rest [m^2]
+    bonded: wp.array(dtype=int)  # 1: a face of what the skin is fixed to, which meets geoms itself
     sample: wp.array(dtype=vec3)  # barycentric coordinates
     stick_ratio: real
     stiffness: wp.array(dtype=real)  # [world] [Pa/m]

@@ -289,7 +289,7 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
             at = b
             weight = real(1.0)
             for g in range(geoms.count):
-                if not has(near, g):
+                if not has(near, g) or c.bonded[f] == 1:
                     continue
                 y = place_on(geoms, g, w, p)
                 if wp.static(shapes == SKINS):
