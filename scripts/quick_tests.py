@@ -76,8 +76,8 @@ def shortened(slow: set[str], quick: set[str]) -> list[str]:
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("costs", type=pathlib.Path, help="folder of tests/costs.py")
-    parser.add_argument("--line", type=float, default=0.08, help="seconds for each line that a test adds")
-    parser.add_argument("--cheap", type=float, default=0.05, help="seconds of a test that adds nothing")
+    parser.add_argument("--line", type=float, default=0.07, help="seconds for each line that a test adds")
+    parser.add_argument("--cheap", type=float, default=0.03, help="seconds of a test that adds nothing")
     args = parser.parse_args()
     tests = measured(args.costs)
     quick, spent = chosen(tests, args.line, args.cheap)

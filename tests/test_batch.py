@@ -562,6 +562,7 @@ def test_a_skin_without_energy_pushes_nobody():
     assert read(mjm, d, "contact_force")[1, 1] == pytest.approx(0.01 * 9.81, rel=0.02)
 
 
+@pytest.mark.law
 def test_a_cut_back_step_has_the_model_of_where_it_ended():
     _, m, d, batch = make(press_spec(), 1, readings=False)
     start = places(1)
@@ -720,6 +721,7 @@ def test_each_world_has_its_liquid():
     assert force[1] < 0.98 * force[0] < 0.98 * force[2]
 
 
+@pytest.mark.law
 def test_reset_of_some_worlds():
     mjm, m, d, batch = make(press_spec(), 3)
     start = places(3)

@@ -52,6 +52,7 @@ def drive(m, d, steps, first=0):
         mjw.step(m, d)
 
 
+@pytest.mark.law
 def test_what_the_device_feels_is_what_one_sensor_feels():
     """`Touched`, by chunks and rows, against `Shaking.of_step`, by lists of contacts."""
     geoms = [Geom("pin", "sphere", np.array([RADIUS, 0, 0]), 0.6, 0, 0.0, None, None)]

@@ -383,6 +383,7 @@ def test_forward_mode_gives_the_differences():
     assert ahead == pytest.approx(back, rel=1e-6)
 
 
+@pytest.mark.law
 def test_worlds_are_alone():
     skin = ball(element="linear", liquid=False)
     pos, quat = path(6, 2e-4)

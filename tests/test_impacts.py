@@ -243,6 +243,7 @@ def pinched(integrator, **settings):
     return model, data, handle
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
 def test_fast_turning_bodies_gain_nothing_from_withheld_force(integrator):
     """A third of their energy came from nowhere."""
@@ -635,6 +636,7 @@ def test_a_thrown_box_takes_nothing_from_an_untouched_skin(monkeypatch):
     assert np.min(stiffness) > -1e-4 * np.max(stiffness)  # also where every node slips
 
 
+@pytest.mark.law
 def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
     """414 g turn a finger of 10 g on its hinge by 0.7 rad a step. That it went round in an arc was taken for
     a hand that had pressed the body in, and the skin was lent a quarter of all energy."""

@@ -72,6 +72,7 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     assert_told(rows)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     "integrator, tier, speed",
     [pytest.param("Euler", "full", 2.22, marks=pytest.mark.slow), ("implicit", "condensed", 2.2)],

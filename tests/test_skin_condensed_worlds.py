@@ -139,6 +139,7 @@ def test_liquids_and_materials_are_those_of_one_skin(settings):
     np.testing.assert_allclose(many.pressure[0], memory.pressure, rtol=5e-3)
 
 
+@pytest.mark.law
 def test_a_wide_contact_is_that_of_the_single_skin():
     """A plane of which the coarse skin touches with more than a hundred nodes."""
     geoms = [GeomSet(["plane"], [(0, 0, 0)], friction=[0.8], nworld=1, device=d) for d in (DEVICE, "cpu")]

@@ -103,6 +103,7 @@ def test_a_body_that_moves_obeys_newton():
     assert most > 0.5
 
 
+@pytest.mark.law
 def test_nothing_is_counted_twice_or_left_behind():
     model, data, _ = on_the_wrist("condensed")
     mujoco.mj_forward(model, data)
@@ -256,6 +257,7 @@ def check_contacts(read, external):
     assert read("clear")[0] == read("far")[0] == 0
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     ("tier", "cone"),
     [("condensed", "pyramidal"), pytest.param("full", "elliptic", marks=pytest.mark.slow)],  # quick: above
@@ -431,6 +433,7 @@ def change_of_electrodes(tier, margin):
     return handle.read(data, "electrodes") - rest
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("tier", ["condensed", "full"])
 def test_a_margin_moves_no_load(tier):
     plain, wide = (change_of_electrodes(tier, margin) for margin in (0.0, 0.002))
