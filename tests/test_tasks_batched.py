@@ -27,10 +27,11 @@ from biotac_mj.tasks.batched import (
     rsl_rl_env,
     skrl_env,
 )
-from biotac_mj.tasks.batched.playing import find_policy
+from biotac_mj.tasks.batched.playing import find_policy, seen_by
 from biotac_mj.tasks.batched.policy import Policy, load_policy, read_card, save_policy
 from biotac_mj.tasks.batched.ppo import Learner, Lessons, Numbers
 from biotac_mj.tasks.batched.roll_rod import Settings
+from biotac_mj.tasks.batched.touch import Touch
 from biotac_mj.tasks.batched.training import of_runs, train
 from biotac_mj.view.offscreen import find_gl
 
@@ -215,6 +216,41 @@ def test_a_lesson_is_sensed_anew():
     assert torch.equal(
         env.sense_anew("electrodes", **env.sensed()), torch.cat([seen["body"], seen["touch"]], 1)
     )
+
+
+def test_lessons_lack_electrodes_in_all_their_decisions():
+    """As many of each finger, others in each lesson; PDC and PAC are there. Without a number all are."""
+    touch = Touch.__new__(Touch)
+    touch._split = [19, 1, 22]
+    changes = 1.0 + torch.rand(300, 4, 2, 42)
+    out = touch.without(changes, 2, torch.Generator().manual_seed(0))
+    assert torch.equal(out[..., 19:], changes[..., 19:])
+    gone = out[..., :19] == 0
+    assert (gone.sum(-1) == 2).all() and torch.equal(gone, gone[:, :1].expand_as(gone))
+    assert torch.equal(out[..., :19][~gone], changes[..., :19][~gone])
+    often = gone[:, 0].float().mean(0)
+    assert 0.04 < often.min() and often.max() < 0.18 and not torch.equal(gone[:, 0, 0], gone[:, 0, 1])
+
+
+def test_electrodes_of_a_finger_have_one_scale():
+    """So that those that hardly change count little, as in counts; what is not alike has its own."""
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1)
+    env = make("follow_edge", 2, device="cpu", settings=settings, history=2)
+    for observe in OBSERVE[:-1]:
+        assert len(env.alike(observe)) == seen_by(env, observe).shape[1]
+    alike = env.alike("electrodes")
+    assert len(alike[:26].unique()) == 26 and not set(alike[:26].tolist()) & set(alike[26:].tolist())
+    assert torch.equal(alike[26:46], alike[46:]) and len(alike[26:46].unique()) == 2
+    torch.manual_seed(0)
+    seen = torch.randn(50, len(alike)) * torch.rand(len(alike)) + 3.0
+    at_once, in_parts = Policy(len(alike), 1), Policy(len(alike), 1)
+    at_once.update_statistics(seen, alike)
+    for part in (seen[:20], seen[20:]):
+        in_parts.update_statistics(part, alike)
+    for policy in (at_once, in_parts):
+        variance = policy.square - policy.mean.square()
+        wanted = torch.stack([seen.var(0, correction=0)[alike == k].mean() for k in alike])
+        np.testing.assert_allclose(variance, wanted, rtol=1e-2, atol=1e-4)
 
 
 def test_sensors_in_learning_have_their_own_gain_of_pdc():

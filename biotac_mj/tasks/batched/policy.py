@@ -33,12 +33,17 @@ class Network(torch.nn.Module):
             layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
         self.layers = torch.nn.Sequential(*layers, torch.nn.Linear(widths[-1], nout))
 
-    def update_statistics(self, seen: torch.Tensor) -> None:
-        """Adds observations (n, nseen) to the mean and variance that normalise them."""
+    def update_statistics(self, seen: torch.Tensor, alike: torch.Tensor | None = None) -> None:
+        """Adds observations (n, nseen) to the mean and variance that normalise them; those with one number in
+        alike, (nseen,) of int, have one variance."""
         self.count += len(seen)
         weight = len(seen) / self.count
         self.mean += weight * (seen.mean(0) - self.mean)
         self.square += weight * (seen.square().mean(0) - self.square)
+        if alike is not None:
+            variance = self.square - self.mean.square()
+            total = torch.zeros(int(alike.max()) + 1, device=seen.device).index_add_(0, alike, variance)
+            self.square = (total / alike.bincount().clamp(min=1))[alike] + self.mean.square()
 
     def forward(self, seen: torch.Tensor) -> torch.Tensor:
         deviation = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()

@@ -94,10 +94,12 @@ class Learner:
         )
         self._kept = []
 
-    def update_statistics(self, seen: torch.Tensor, known: torch.Tensor) -> None:
+    def update_statistics(
+        self, seen: torch.Tensor, known: torch.Tensor, alike: torch.Tensor | None = None
+    ) -> None:
         """Adds observations (n, nseen) and states (n, nknown) to the mean and variance that normalise them,
-        which stay as they are while the policy learns."""
-        self.policy.update_statistics(seen)
+        which stay as they are while the policy learns; alike: of observations, see `Network`."""
+        self.policy.update_statistics(seen, alike)
         self.critic.update_statistics(known)
 
     @torch.no_grad()

@@ -304,6 +304,13 @@ class BatchTask(abc.ABC):
         state, body = torch.cat(self._state(), dim=1), body + noise
         return {"body": body.flatten(1), "touch": touch.flatten(1), "state": state}
 
+    def alike(self, choice: str) -> torch.Tensor:
+        """Numbers (n,) of what `sense_anew` gives, one for all electrodes of a finger: divided by deviations
+        of their own, those that hardly change would count as much as the others, and their errors more."""
+        wide = self.history * self._past[0].shape[2]  # of body
+        touch = np.tile(wide + self._touch.alike(choice), self.history)
+        return torch.as_tensor(np.concatenate([np.arange(wide), touch]), device=self.device)
+
     def sensed(self) -> dict:
         """{"body" (num_envs, history, n), "changes" (num_envs, history, nfinger, k), "world" (num_envs,)} of
         the last decisions, without the encoders' error and the model's, for `sense_anew`."""
@@ -311,10 +318,20 @@ class BatchTask(abc.ABC):
         return {"body": body, "changes": changes, "world": torch.arange(self.num_envs, device=self.device)}
 
     def sense_anew(
-        self, choice: str, body: torch.Tensor, changes: torch.Tensor, world: torch.Tensor
+        self,
+        choice: str,
+        body: torch.Tensor,
+        changes: torch.Tensor,
+        world: torch.Tensor,
+        missing: int = 0,
     ) -> torch.Tensor:
         """Observations (n, m) of body and touch for what was `sensed` in n worlds, with new errors of
-        encoders and model; choice: of `touch.OBSERVE`."""
+        encoders and model.
+
+        Args:
+          choice: of `touch.OBSERVE`. missing: number of random electrodes of each finger that read no change.
+        """
+        changes = self._touch.without(changes, missing, self._draw) if missing else changes
         errors = self._touch.draw_errors(body.shape[:2], self.model_error, self._draw)
         for k in range(self.history - 1, 0, -1):  # the last decision comes first
             errors[:, k - 1] = _later(errors[:, k], errors[:, k - 1])

@@ -82,6 +82,15 @@ class Touch:
         out[..., :n] += own * changes[..., :n].square().mean(-1, keepdim=True).sqrt()
         return out
 
+    def without(self, changes: torch.Tensor, count: int, draw: torch.Generator) -> torch.Tensor:
+        """Changes of the channels (n, ..., nfinger, k) in which `count` random electrodes of each finger read
+        none."""
+        shape = len(changes), *[1] * (changes.ndim - 3), changes.shape[-2], self._split[0]
+        order = torch.rand(shape, generator=draw, device=changes.device).argsort(-1)
+        out = changes.clone()
+        out[..., : self._split[0]] *= order >= count
+        return out
+
     def observe(
         self, choice: str, changes: torch.Tensor, worlds: torch.Tensor | slice = slice(None)
     ) -> torch.Tensor:
@@ -110,6 +119,13 @@ class Touch:
             if choice == "electrodes+pac":
                 parts.append(pac / _COUNTS)
         return torch.cat(parts, dim=3).flatten(2)
+
+    def alike(self, choice: str) -> np.ndarray:
+        """Numbers (n,) of what `observe` gives of a decision, one for all electrodes of a finger and one for
+        its samples of PAC."""
+        channels = self._split[: 3 if choice == "electrodes+pac" else 2]
+        kinds = len(self._seeds) * {"none": [], "binary": [1], "force": 6 * [1]}.get(choice, channels)
+        return np.repeat(np.arange(len(kinds)), np.array(kinds, int))
 
     def reseed(self, worlds: torch.Tensor, seed: torch.Tensor) -> None:
         """Gives worlds (k,) other seeds, of seed (nworld,): of their noise, and of the sensor that the next

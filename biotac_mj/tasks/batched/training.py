@@ -31,6 +31,7 @@ from .task import BatchTask
 RANDOMISED = ("gain", "pdc_gain", "warmup", "drift")
 # of electrodes, PDC and PAC of coarse skins in the condensed tier, against the full one and the default skin
 _MODEL_ERROR = (0.08, 0.25, 0.15)  # (docs/lab/tasks.md)
+_MISSING = 2  # electrodes of each finger that a lesson lacks (docs/lab/tasks.md)
 _KEEP = 30.0  # [s] between files
 _STRAY = 0.3  # deviation of the teacher's actions, so that it also shows how to recover
 _HISTORY = 12  # decisions that a policy sees: noise of the encoders is new in each
@@ -179,7 +180,8 @@ def train(
             if first > 0:
                 first -= 1
                 for run in learners:
-                    run.learner.update_statistics(seen_by(env, run.observe), run.known(slice(None)))
+                    alike = env.alike(run.observe)
+                    run.learner.update_statistics(seen_by(env, run.observe), run.known(slice(None)), alike)
                 if learns:
                     actions = right + _STRAY * torch.randn_like(right)
             _, reward, terminated, truncated, extras = env.step(actions)
@@ -223,12 +225,14 @@ def _now(env):
 def _study(learners, lessons, acted, progress):
     """Trains by imitation for `Numbers.study` times the time spent on acting, `acted` [s]; progress: elapsed
     fraction of the phase with a teacher. Each lesson draws new errors of encoders and model, because a policy
-    would recognise the few states by these errors."""
+    would recognise the few states by these errors, and leaves electrodes out, because it would rely on few of
+    them, whose errors would then mislead it."""
     numbers, begin = learners[0].learner.numbers, time.perf_counter()
     for _ in range(numbers.lessons):
         for run in learners:
             sensed, right = lessons.draw(numbers.several)
-            run.learner.imitate(run.env.sense_anew(run.observe, **sensed), right, progress)
+            seen = run.env.sense_anew(run.observe, **sensed, missing=_MISSING)
+            run.learner.imitate(seen, right, progress)
         if _now(run.env) - begin > numbers.study * acted:
             break
 
