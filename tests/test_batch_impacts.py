@@ -14,6 +14,7 @@ from blocks import four_nodes
 import biotac_mj
 from biotac_mj import batch as batches
 from biotac_mj.batch import solid
+from biotac_mj.batch.engine import Contacts, Rows
 from biotac_mj.skin import SkinOptions
 
 # four nodes an element: a quarter of the work of the shipped skin's ten, which those tests take ("coarse")
@@ -586,26 +587,21 @@ def test_contacts_with_the_core_do_the_work_of_their_rows(sparse):
     """Two contacts with body 2, of the touching body 1 and of another, and one between these."""
     rng, step = np.random.default_rng(0), 0.004
     J, force, qvel, qacc = (rng.normal(size=shape).astype(np.float32) for shape in ((4, 3), 4, 3, 3))
-    kinds = {"i": int, "f": float, "pair": wp.vec2i}
-    arrays = [
-        wp.array(a, dtype=kinds[kind], ndim=ndim)
-        for a, kind, ndim in (
-            ([0, 1, 3, 2], "i", 1),  # bodies of the geoms
-            ([3], "i", 1),
-            ([[1, 3], [2, 3], [1, 2]], "pair", 1),
-            ([0, 0, 0], "i", 1),
-            ([[0, 1], [2, -1], [3, -1]], "i", 2),
-            (force[None], "f", 2),
-            (J.reshape(1, 1, -1) if sparse else J[None], "f", 3),
-        )
-    ]
-    layout = [[[3] * 4], [[0, 3, 6, 9]], [[list(range(3)) * 4]]]
-    layout = [wp.array(a, dtype=int, ndim=n) for a, n in zip(layout, (2, 2, 3))]
+    contact, rows = Contacts(), Rows()
+    contact.nacon = wp.array([3], dtype=int)
+    contact.geom = wp.array([[1, 3], [2, 3], [1, 2]], dtype=wp.vec2i)
+    contact.worldid = wp.zeros(3, dtype=int)
+    contact.efc_address = wp.array([[0, 1], [2, -1], [3, -1]], dtype=int, ndim=2)
+    rows.sparse, rows.force = sparse, wp.array(force[None], dtype=float, ndim=2)
+    rows.J = wp.array(J.reshape(1, 1, -1) if sparse else J[None], dtype=float, ndim=3)
+    rows.J_rownnz, rows.J_rowadr, rows.J_colind = (
+        wp.array(a, dtype=int, ndim=n)
+        for a, n in zip(([[3] * 4], [[0, 3, 6, 9]], [[list(range(3)) * 4]]), (2, 2, 3), strict=True)
+    )
     moved = [wp.array(a[None], dtype=float, ndim=2) for a in (qvel, qacc)]
     lifted = wp.zeros((1, 1), dtype=wp.float64)
-    body = wp.array([1], dtype=int)
-    given = [2, body, step, *arrays, sparse, *layout, *moved]
-    wp.launch(solid.find_lift, 3, given, [lifted])
+    body, bodies_of_geoms = (wp.array(a, dtype=int) for a in ([1], [0, 1, 3, 2]))
+    wp.launch(solid.find_lift, 3, [2, body, step, bodies_of_geoms, contact, rows, *moved], [lifted])
     work = step * (force * (J @ (qvel + 0.5 * step * qacc)))
     np.testing.assert_allclose(lifted.numpy()[0, 0], work[:2].sum(), rtol=1e-6)
 

@@ -215,7 +215,7 @@ def add_up(lanes: int, out: wp.array2d(dtype=real)):
 for lanes in (1, 2, 8, 32):
     for sums in (1, 3, 5):
         out = wp.zeros((4, sums), dtype=real, device="cuda:0")
-        wp.launch_tiled(add_up, [4], [lanes], [out], device="cuda:0", block_dim=256)
+        wp.launch_tiled(add_up, dim=[4], inputs=[lanes], outputs=[out], device="cuda:0", block_dim=256)
         wanted = lanes * (np.arange(sums) + 1) + 1000 * lanes * (lanes - 1) / 2
         assert (out.numpy() == wanted).all(), (lanes, sums, out.numpy())
 """
