@@ -303,3 +303,17 @@ def test_a_rod_between_three_fingers_stays_there():
     speed = env.qvel.abs()
     assert torch.isfinite(speed).all() and speed.max() < 20.0
     assert sum(int(b.failed.numpy().sum()) for b in env.batches.values()) == 0
+
+
+def test_a_body_that_the_engine_has_lost_is_owed_nothing():
+    """Its work is no number: both it and a sound body beside it were owed the most that the skin can hold."""
+    with wp.ScopedDevice("cpu"):
+        r, left = rounds.make_rounds(2, 1), wp.zeros((2, 1), dtype=wp.float64)
+        r.acting.assign(np.tile([1.0, 0, 0, 0, 0, 0], (2, 1, 1)))
+        r.travel.assign(np.array([[[np.nan] * 6], [[-0.25, 0, 0, 0, 0, 0]]]))
+        for pose in (r.here_mat, r.end_mat):
+            pose.assign(np.tile(np.eye(3), (2, 1, 1, 1)))
+        r.most.fill_(1.0)
+        every, reason = wp.ones(1, dtype=int), wp.zeros(1, dtype=int)
+        wp.launch(energy.conclude, 1, [every, reason, r, left])
+    np.testing.assert_allclose(left.numpy()[:, 0], [0.0, 0.25])

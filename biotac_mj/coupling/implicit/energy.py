@@ -200,7 +200,9 @@ def conclude(
     if taking_part[w] == 0:
         return
     both = draws(r, w)
-    passed = wp.min(both[0], both[1])  # from some bodies to others
+    passed = real(0.0)  # from some bodies to others
+    if wp.isfinite(both[0] + both[1]):
+        passed = wp.min(both[0], both[1])
     for g in range(r.pos.shape[0]):
         gets = given(r, g, w)
         left = r.store[g, w] - gets
@@ -211,6 +213,8 @@ def conclude(
         unknown = wp.isinf(r.left[g, w]) or (r.placed[g, w] == 1 and r.inside[w] == 1)
         if unknown and reason[w] != CONVERGED:  # what was put in is not known before an equilibrium is found
             left = real(wp.inf)
+        if wp.isnan(gets):  # the engine has lost the body
+            left = real(0.0)
         left_out[g, w] = left
 
 
