@@ -98,6 +98,11 @@ def test_electrodes_that_change_together_stand_out_of_the_others():
         counts[:, k] += 90 * (1 - np.exp(-t / tau))
     d = diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE))
     assert {(f.id, f.channels) for f in d.findings} == {("drift", (k,)) for k in (4, 6, 17)}
+    first, *others = d.to_dict()["tried"]  # what was found, and what these data could have shown
+    assert first["id"] == "drift" and first["confidence"] > 0.5
+    assert {"spikes", "stuck"} <= {one["id"] for one in others} and "latency" not in {
+        one["id"] for one in others
+    }
     size, used = np.log([9.0, 8, 7, *[1] * 16]), np.arange(19)
     assert ahead(size[[3, 0, 4, 5, 6, 7, 8, 9, 10, 11, 1, *range(12, 17), 2, 17, 18]], used, 10) > 2
     assert ahead(size, used, 0) < 0.3  # e1 to e3 are a patch

@@ -3,6 +3,7 @@
 import math
 
 from ...effects.catalogue import entries
+from ...effects.effect import Effect
 from ...effects.logged import LOGGED
 from .model import LEAST, WINDOW
 from .recording import FORCE_MOVED
@@ -12,12 +13,24 @@ from .session import Session
 def not_identifiable(session: Session) -> list[str]:
     """A line for each kind of data that the recording lacks (`Effect.requires`), with the names of the
     effects that require it. An effect is listed in the first of them."""
-    known = {e.id: e for e in (*entries("poses"), *LOGGED, *entries("log"))}
-    lacking, names = _lacking(session), {}
-    for effect in known.values():
+    lacking, kinds = _lacking(session), _by_need(session)
+    return [
+        f"{text}: {', '.join(e.name for e in kinds[need])}" for need, text in lacking.items() if need in kinds
+    ]
+
+
+def searched(session: Session) -> list[Effect]:
+    """The effects that the recording has the data for."""
+    return _by_need(session).get(None, [])
+
+
+def _by_need(session):
+    """Effects by the first of what they require that the recording lacks, None where it lacks nothing."""
+    lacking, kinds = _lacking(session), {}
+    for effect in {e.id: e for e in (*entries("poses"), *LOGGED, *entries("log"))}.values():
         first = next((need for need in lacking if need in effect.requires), None)
-        names.setdefault(first, []).append(effect.name)
-    return [f"{text}: {', '.join(names[need])}" for need, text in lacking.items() if need in names]
+        kinds.setdefault(first, []).append(effect)
+    return kinds
 
 
 def _lacking(session):

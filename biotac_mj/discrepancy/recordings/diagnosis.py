@@ -8,7 +8,7 @@ from ...recordings.protocol import Protocol
 from ...recordings.recording import REST_LIKE
 from ..report.verdict import Estimate, Finding, Picture, Verdict, experiments
 from .amended import amended_sensor, running
-from .blind import not_identifiable
+from .blind import not_identifiable, searched
 from .candidates import Candidate
 from .proof import views
 from .recording import PlainRecording
@@ -80,6 +80,8 @@ def concluded(
         where_note="electrodes that depart, from and to [s], RMS [counts]",
         remainder=left.text,
         unknown=left.significant,
+        tried=_tried(session, found),
+        tried_note="confidence of each cause that these data can show; none where nothing looks like it",
         notes=not_identifiable(session) + _order(r),
         next_experiment="; ".join(further + ([] if protocol else [_CHECKUP])),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
@@ -103,6 +105,15 @@ def concluded(
         late=late,
         rest=left,
     )
+
+
+def _tried(session, found):
+    """Rows of all effects that were searched, the most confident first."""
+    rows = {e.id: {"id": e.id, "name": e.name, "confidence": None} for e in searched(session)}
+    for f in sorted((*found, *session.weak), key=lambda f: f.confidence or 0.0):
+        rows.pop(f.id, None)
+        rows = {f.id: {"id": f.id, "name": f.kind.name, "confidence": f.confidence}} | rows
+    return list(rows.values())
 
 
 def _in_words(found, left):

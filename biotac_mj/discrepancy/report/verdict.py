@@ -314,7 +314,8 @@ class Verdict:
 
     @property
     def headline(self) -> str:
-        """The verdict in one line: the largest gap, what closes it, by how much."""
+        """The verdict in one line: the largest gap, what closes it, by how much; what was gained elsewhere
+        comes first where nothing is gained there."""
         gap = self.leading
         size = f"{gap.before:.3g} {gap.unit} RMS"
         size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""
@@ -340,8 +341,13 @@ class Verdict:
         if gap.gained:
             return f"{text}; with {what} added it is {gap.after:.3g} {gap.unit}{rest}."
         other = max(self.gap.values(), key=lambda one: one.taken / max(one.before, 1e-12))
-        there = f", but {other.name} goes from {other.before:.3g} to {other.after:.3g} {other.unit}"
-        return f"{text}; {what} gains nothing there{there if other.gained else ''}{rest}."
+        if not other.gained:
+            return f"{text}; {what} gains nothing there{rest}."
+        taken = f"{other.before:.3g} become {other.after:.3g} {other.unit} RMS in {other.name}, where"
+        return (
+            f"With {what} added, {taken} {other.floor} {other.unit} are noise and resolution; "
+            f"{text[0].lower()}{text[1:]}, and stays{rest}."
+        )
 
     def to_dict(self) -> dict:
         """Content of verdict.json: numbers, strings, lists and dicts only, no NaN."""
