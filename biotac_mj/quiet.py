@@ -1,10 +1,14 @@
-"""Starts Warp without its list of devices and modules, which would mix with a program's own output."""
+"""Starts Warp: without its list of devices and modules, which would mix with a program's own output, and on a
+machine without kernels with its headers."""
 
+import concurrent.futures
 import contextlib
+import functools
 import os
 import pathlib
 import sys
 import tempfile
+import threading
 
 import warp as wp
 
@@ -45,7 +49,32 @@ def _without(words):
 def announce_compilation(device: wp.DeviceLike) -> None:
     """Prints a note to standard error if Warp must first compile the skin's kernels for a kind of device."""
     cuda = wp.get_device(device).is_cuda
-    cache = pathlib.Path(wp.config.kernel_cache_dir)
-    if not any(cache.glob(f"wp_biotac_mj.skin.*/*.{'cu' if cuda else 'cpp'}")):
+    if not _compiled("cu" if cuda else "cpp"):
         kind, time = ("CUDA", "a minute or two") if cuda else ("the CPU", "half a minute")
         print(f"biotac_mj: compiling kernels for {kind}, once on this machine: {time}", file=sys.stderr)
+
+
+def _compiled(kind):
+    """Whether kernels of the skin are in Warp's cache, as files of that kind."""
+    return any(pathlib.Path(wp.config.kernel_cache_dir).glob(f"wp_biotac_mj.skin.*/*.{kind}"))
+
+
+@functools.cache
+def headers() -> concurrent.futures.Future | None:
+    """Begins to precompile Warp's headers for the CPU, which takes 4 s: as long as what a press imports
+    beside it. Returns the number of the thread that has them; None where kernels are in the cache."""
+    quiet_warp()
+    if _compiled("cpp"):
+        return None
+    wp.init()
+    pool = concurrent.futures.ThreadPoolExecutor(1)
+    found = pool.submit(_precompile)
+    pool.shutdown(wait=False)
+    return found
+
+
+def _precompile():
+    from . import launches  # a small module
+
+    wp.load_module(wp.get_module(launches.__name__), "cpu", block_dim=1)
+    return threading.get_ident()

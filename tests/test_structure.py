@@ -27,7 +27,7 @@ LAYERS = {
     "versions": "biotac_mj",
     "geometry": "cache short_repr fields files reading quiet triangles",
     "skin": "cache short_repr lazy geometry fields files reading threads quiet launches triangles",
-    "quiet": "",
+    "quiet": "launches",
     "sensor": "cache short_repr lazy fields files geometry threads quiet launches",
     "effects": "short_repr lazy skin sensor geometry fields files reading",
     "coupling": "cache short_repr lazy skin sensor effects geometry fields launches threads learning.serve",

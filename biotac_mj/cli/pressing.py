@@ -83,6 +83,9 @@ def _press(args):
     import sys
     import warnings
 
+    from ..quiet import headers
+
+    headers()  # in the background, while the rest is imported
     from ..press import PressOptions, press, render, report
     from ..press.record import write_readings, write_skin
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 import warp as wp
 
 from ..launches import in_a_row, recorded, repeated
+from ..quiet import headers
 from ..threads import cores
 
 
@@ -130,6 +131,9 @@ def compile_for_skin(device: wp.DeviceLike) -> None:
         [(module, 1) for name in names if (module := wp.get_module(f"{package}.{name}")).kernels]
         for names in (_MAKING, _STEPPING)
     )
+    begun = headers()
+    if begun is not None:
+        _share_headers(begun.result())
     for module, threads in making[:1]:  # in this thread, whose headers the others use
         wp.load_module(module, device, block_dim=threads)
     finish_compiling(_compile(device, making + stepping)[: len(making)])
