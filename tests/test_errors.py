@@ -206,6 +206,26 @@ def test_compiling_is_announced(monkeypatch, tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_threads_share_the_headers_that_a_press_compiles_first(monkeypatch, tmp_path):
+    import warp as wp
+
+    from biotac_mj.quiet import headers
+    from biotac_mj.skin.program import _share_headers
+
+    wp.init()
+    runtime = wp._src.context.runtime
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(runtime, "_pch_dirs", {})
+    monkeypatch.setattr(wp, "load_module", lambda *_, **__: runtime.get_clang_pch_dir())
+    thread = headers.__wrapped__().result()
+    assert thread != threading.get_ident()
+    _share_headers(thread)
+    assert runtime.get_clang_pch_dir() == runtime._pch_dirs[thread].name
+    (tmp_path / "wp_biotac_mj.skin.liquid_0").mkdir()
+    (tmp_path / "wp_biotac_mj.skin.liquid_0" / "liquid.cpp").touch()
+    assert headers.__wrapped__() is None  # nothing will be compiled
+
+
 def test_kernels_of_every_skin_are_compiled_beside_each_other(monkeypatch):
     """A module that is not in the list any more would be compiled alone, by the first launch."""
     import warp as wp
