@@ -70,7 +70,7 @@ def press(nworld, skin, radius, seed):
             rest.append(counts)
         elif step >= REST + DOWN // 2:
             vert, nodal = biotac.vert_xpos, np.swapaxes(biotac.skin.data.outer.node_force.numpy(), 0, 1)
-            labels = contact_labels(geometry, vert - geometry.vert, nodal[:, outer], zero)
+            labels = contact_labels(geometry, vert - geometry.vert, nodal[:, outer])
             rows.append((counts - np.mean(rest, 0), labels["contact_pos"], data[:, force.adr[0] :][:, :3]))
     return [np.stack(column, 1) for column in zip(*rows)]
 

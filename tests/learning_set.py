@@ -75,7 +75,7 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
             time=0.05 * np.arange(steps),
             displacement=u,
             contact_force=force,
-            **contact_labels(geometry, u, force, np.linalg.norm(force, axis=2).sum(1) * 1e-5),
+            **contact_labels(geometry, u, force),
             impedance=1e4 * np.exp(z0 + 0.8 * d),
             **zeros,
             counts=counts,
