@@ -153,7 +153,7 @@ class Forces:
         )
         self.launch(
             program, nodes.assemble_force, self._summed,
-            [self._slots, k.elements.corner_force, st.pressure, on, self.loads()],
+            [self._slots, k.elements.corner_force, d.external, st.pressure, on, *self.node_forces],
             [d.force],
         )  # fmt: skip
         if self.implicit:

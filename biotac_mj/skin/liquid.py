@@ -120,21 +120,24 @@ def wet_faces(
         return
     third = real(1.0) / real(3.0)
     total = real(0.0)
-    for f in range(c * chunk, wp.min((c + 1) * chunk, inner.face.shape[0])):
-        t = inner.face[f]
+    # read once: what a loop reads through a struct is loaded again after each store
+    face = inner.face
+    slot = inner.slot
+    sample = inner.sample
+    rest_area = inner.area
+    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
+        t = face[f]
         x0 = x[t[0], w]
         x1 = x[t[1], w]
         x2 = x[t[2], w]
         total -= wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
         wet = vec3(third, third, third)
         normal = wp.cross(x1 - x0, x2 - x0)
-        k = inner.slot[f]
+        k = slot[f]
         if k >= 0:
             if touching[k, w] == 1:
-                area = inner.area[k]
-                loss, overlap = dry_fraction(
-                    k, w, inner.sample, area, stiffness[w], reference[w], geom, force
-                )
+                area = rest_area[k]
+                loss, overlap = dry_fraction(k, w, sample, area, stiffness[w], reference[w], geom, force)
                 wet -= loss
                 total += overlap * wp.length(normal) / real(2.0)
         wet_out[f, w] = wet

@@ -126,10 +126,13 @@ def assemble_force(
     # In:
     elements: NodeSlots,
     corner: wp.array2d(dtype=vec3),
+    external: wp.array2d(dtype=vec3),
     pressure: wp.array(dtype=real),
     on: wp.array(dtype=int),
     # In and out:
-    loads: Loads,
+    outer: SurfaceForces,
+    core: SurfaceForces,
+    liquid: LiquidForces,
     # Out:
     force_out: wp.array2d(dtype=vec3),
 ):
@@ -142,11 +145,8 @@ def assemble_force(
     for k in range(elements.start[i] + lane, elements.start[i + 1], lanes):
         total += corner[elements.slot[k], w]
     total = sum_of_lanes(total, lanes)
-    if loads.external.shape[0] > 0:
-        total += loads.external[i, w]
-    outer = loads.outer
-    core = loads.core
-    liquid = loads.liquid
+    if external.shape[0] > 0:
+        total += external[i, w]
     push = vec3()
     for k in range(outer.start[i] + lane, outer.start[i + 1], lanes):
         s = outer.slot[k]
