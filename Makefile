@@ -30,7 +30,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: press test test-all test-wheel test-newest test-neighbours docs benchmarks assets clean
 
 press: $(VENV)/.installed
-	@echo "a press takes 20 s of processor time; the first on a machine 40, its kernels are compiled"
+	@echo "a press takes 10 s of processor time; the first on a machine a minute, its kernels are compiled"
 	$(BIN)/biotac press $(ARGS)
 
 test: $(VENV)/.installed-test
@@ -80,7 +80,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "installing into $(VENV), once: 40 s of processor time, and the time to download 0.5 GB"
+	@echo "installing into $(VENV), once: 25 s of processor time, and the time to download 0.5 GB"
 	$(BIN)/python $(PIP) --editable .
 	touch $@
 

@@ -63,7 +63,7 @@ def estimate_verb(args: argparse.Namespace) -> None:
         return estimator(then, rest, pressure, belief)
 
     if simulated and not args.quiet:
-        print(f"note: fitting a press to each of {len(rows)} rows, seconds to a minute each", file=sys.stderr)
+        print(f"note: fitting a press to each of {len(rows)} rows, seconds to minutes each", file=sys.stderr)
     found = [
         estimate(row)
         for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False)
