@@ -97,12 +97,27 @@ def found(
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         if not able:
             break
-        out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
         best = able[0]
+        best.fit, best.gain = _other_shapes(comparison, best, out.fit, chosen)
+        out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
         best.ties = [c.effect.id for c in able[1:] if _tied(best, c)]
         out.found.append(best)
         out.fit = best.fit
     return out
+
+
+def _other_shapes(comparison, one, current, chosen):
+    """Fit of a Candidate at the likeliest of its shapes, and its gain: a fit ends at the shape nearest to
+    its start."""
+    effect, theta = one.fit.effects[-1]
+    best = one.fit
+    for shape in effect.grid if len(effect.grid) > 1 else ():
+        begin = [*current.effects, (effect, theta | shape)]
+        fit = fit_effects(comparison, begin, chosen, current)
+        if fit.score > best.score and not effect.rejection_reason(fit.effects[-1][1]):
+            best = fit
+    gain = one.gain + float(best.score - one.fit.score)
+    return _beside(best, current, gain), gain
 
 
 def _beside(fit, current, gain) -> Fit:
