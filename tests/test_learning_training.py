@@ -411,6 +411,7 @@ def test_networks_of_other_designs_are_trained_and_serve_them(skin, dome, tmp_pa
     train_all(folder, out, (0,), ("trajectory",), config, paper=True, progress=False)
     rows = evaluate_models(out)["splits"]["trajectory"]["models"]
     assert rows["tare"]["median"] > 2 * rows["local_taught"]["median"]
+    assert rows["tare"]["median"] > 1.5 * rows["physics"]["median"]
     vert = geometry.vert + dent(geometry, geometry.vert[geometry.vert[:, 1].argmin()], 6e-4, 2e-3, 0.0)
     for weights in ("forward-trajectory", "latent_projection-trajectory"):
         film = NetworkFilm(geometry, out / f"{weights}.safetensors")
