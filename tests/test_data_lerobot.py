@@ -3,6 +3,7 @@ installed."""
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 from recorded import synthetic
@@ -162,7 +163,10 @@ def test_measured_counts_of_labelled_interactions(folder, tmp_path, capsys):
     )
     said = capsys.readouterr().out
     assert "LeRobotDataset v3.0" in said and "note: 2 of 19 time steps of the set did not converge" in said
-    assert json.loads((tmp_path / "m/source.json").read_text())["interaction"] == ["003", "004"]
+    source = json.loads((tmp_path / "m/source.json").read_text())
+    assert source["interaction"] == ["003", "004"] and source["force"] == "of the skin on the object"
+    with TactileSet(folder) as data:
+        assert source["frame"] == data.frame and data.frame.startswith("BioTac: tip at -x")
     rows = parquet.read_table(tmp_path / "m/data/chunk-000/file-000.parquet").to_pydict()
     with TactileSet(folder) as data:
         np.testing.assert_array_equal(
@@ -192,7 +196,10 @@ def test_a_recording_is_exported_with_what_it_has(tmp_path):
     features = {name for name in info["features"] if name.startswith(("observation", "action"))}
     assert features == {"observation.force", "observation.tactile.electrodes", "observation.tactile.pdc"}
     assert set(info["features"]) == set(table.column_names)
-    assert json.loads((tmp_path / "o/source.json").read_text())["synthetic"] is False
+    source = json.loads((tmp_path / "o/source.json").read_text())
+    assert source["synthetic"] is False and source["force"] == "as recorded"
+    with h5py.File(tmp_path / "set/shard-00000.h5") as file:  # not the BioTac's, which nobody knows
+        assert source["frame"] == file.attrs["frame"] == "the file's"
 
 
 def test_all_of_pac_and_dropped_rows_of_a_recording(tmp_path):

@@ -50,6 +50,7 @@ def exported(made, tmp_path_factory):
 def test_states_are_poses_and_lead_to_one_another(made, exported):
     """The model, its time step and the velocities: a step of MuJoCo is the next row."""
     index = json.loads((exported / "out" / "index.json").read_text())
+    assert index["frame"].startswith("BioTac: tip at -x") and index["force"] == "of the object on the BioTac"
     assert index["state"] == STATE.name and [one["id"] for one in index["interactions"]] == ["000", "001"]
     for one, about in zip(made, index["interactions"], strict=True):
         model = mujoco.MjModel.from_xml_path(str(exported / "out" / about["model"]))

@@ -193,6 +193,8 @@ class _Export:
             "set": self.data.path.name,
             "interaction": self.data.id[self.chosen].tolist(),
             "counts": self.counts,
+            "frame": self.data.frame,
+            "force": "as recorded" if self.recorded else "of the skin on the object",
         }
         synthetic = not self.recorded
         self._json("source.json", source | {"synthetic": synthetic, "versions": self.data.versions})

@@ -2,6 +2,7 @@
 `docs/howto/file_formats.md`."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -36,6 +37,7 @@ COLUMNS = {
     "measured_pac": (("npac",), "f4", "count"),
     "measured_wrench": ((6,), "f4", "N, N m"),
 }
+FRAME = "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x"
 # NaN without contact or measurement
 MAY_LACK = ("contact_pos", "contact_normal", "measured_counts", "measured_pac", "measured_wrench")
 
@@ -141,6 +143,12 @@ class Interaction:
         if n > 1 and not (np.diff(self.time) > 0).all():
             raise ValueError(f"time of {where} does not increase: sort its steps and drop repeated ones")
         return self
+
+
+def frame_of(parameters: Iterable[dict]) -> str:
+    """Frame of poses and forces: the BioTac's, or what recordings say of theirs, from interactions'
+    parameters."""
+    return "; ".join(sorted({one.get("frame", FRAME) for one in parameters}))
 
 
 def channel_sizes(design: Design) -> dict[str, int]:

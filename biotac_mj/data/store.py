@@ -24,6 +24,7 @@ from .schema import (
     SPLITS,
     Interaction,
     channel_sizes,
+    frame_of,
     nodes_of,
 )
 
@@ -97,7 +98,7 @@ def write_shard(
         file.attrs.update(
             {
                 "schema": SCHEMA,
-                "frame": "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x",
+                "frame": frame_of(one.parameters for one in interactions),
                 "channels": design.channels,
             }
         )
@@ -287,6 +288,12 @@ class TactileSet:
                 f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: "
                 "delete the one of an earlier run"
             )
+
+    @property
+    def frame(self) -> str:
+        """Frame of poses and forces, see `frame_of`."""
+        texts = [text for f in self._files for text in f["interaction/parameters"].asstr()[:]]
+        return frame_of(map(json.loads, texts))
 
     @property
     def unfinished(self) -> str:

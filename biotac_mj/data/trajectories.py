@@ -78,6 +78,7 @@ def export_mujoco(
             about = {"id": str(data.id[i]), "model": file, "object": thing, "kind": str(data.kind[i])}
             index.append(about | {"split": str(data.split[i]), "rows": len(rows)})
         about_set = {"state": STATE.name, "counts": counts, "versions": data.versions, "interactions": index}
+        about_set |= {"frame": data.frame, "force": "of the object on the BioTac"}
         (building / "index.json").write_text(json.dumps(about_set, indent=1) + "\n", encoding="utf-8")
     return out
 
