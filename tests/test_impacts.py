@@ -392,6 +392,13 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
     assert touched > 1
 
 
+LIFTED = pytest.mark.xfail(
+    strict=True,
+    reason="MuJoCo's contact with the core, 3.5 mm deep, alone adds 0.49 and 0.38 of what it came with in "
+    "two steps in which it turns by 0.7 and 0.9 radians",
+)
+
+
 @pytest.mark.law
 @pytest.mark.parametrize(
     "seed, most",
@@ -399,9 +406,7 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
         (48, 1.02),
         (54, 1.02),
         (56, 1.02),
-        pytest.param(
-            50, 1.02, marks=pytest.mark.xfail(strict=True, reason="the core lifts it: no skin acts")
-        ),
+        pytest.param(50, 1.02, marks=LIFTED),
         (50, 2.0),
     ],
 )
