@@ -25,6 +25,8 @@ WINDOW = 1.25  # radius around edges, over the distance of a face's corners from
 # it is a side of a solid, from the second on an edge
 TURN = 10.0, 25.0
 _FIRM = wp.constant(real(4.0))  # stiffness at an edge, where few samples take part, over that of a side
+# height above the solid, over the window, in which the normal turns where a sample leaves a side for an edge
+_ABOVE = wp.constant(real(0.1))
 _BEYOND = wp.constant(real(0.3))  # barycentric distance outside a face at which an edge leaves it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
 
@@ -201,10 +203,6 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     window = window * face_radius(u, v)
     if dn[3] > window:
         return met
-    if meshes == 1 and geoms.kind[g] == MESH:
-        if dn[3] > TRILINEAR * geoms.grids.spacing[geoms.grid[g]]:  # dn is from the grid alone
-            own = _closest(geoms, g, y, meshes)
-            met.normal = vec3(own[0], own[1], own[2])
     deep = wp.max(-dn[3], real(0.0))
     if distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, real(0.0)) > window + deep:
         return met
@@ -223,6 +221,13 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     if gap > dn[3]:  # in a hollow
         return met
     # every sample touches a side of the solid; only samples of the face above an edge touch that, at the edge
+    # the nearest side changes at once where a sample in the solid is as far from another one, and the force
+    # with it: the side is that of a point above the sample, outside of the solid, where its normal is
+    # continuous
+    above = y + (_ABOVE * window - wp.min(gap, real(0.0))) * normal
+    found = _closest(geoms, g, above, meshes)
+    met.normal = vec3(found[0], found[1], found[2])
+    met.gap = wp.dot(met.normal, y - above) + found[3]
     turn = geoms.turn[g]
     edge = wp.clamp((turn[0] - wp.dot(normal, met.normal)) / (turn[0] - turn[1]), real(0.0), real(1.0))
     near = wp.length_sq(off - gap * normal) / (window * window)
@@ -237,7 +242,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     blend = blend / met.weight
     met.at = b + blend * (at - b)
     met.normal = wp.normalize(met.normal + blend * (normal - met.normal))
-    met.gap = dn[3] + blend * (gap - dn[3])
+    met.gap = met.gap + blend * (gap - met.gap)
     return met
 
 
