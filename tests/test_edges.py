@@ -6,11 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import biotac_mj
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin.contact.meshes import bake_distance_grid
+from biotac_mj.skin.contact.posed import Geoms, meet
+from biotac_mj.skin.contact.shapes import primitive_distance
 from biotac_mj.skin.geoms import GeomSet
+from biotac_mj.skin.types import real, vec3
 
 HALF = np.array([4e-3, 6e-3, 4e-3])  # of the box [m]
 DEPTH, WAY = 1.3e-3, 3e-3  # [m] pressed, dragged
@@ -148,6 +152,37 @@ def test_edges_of_narrow_facets_are_no_edges(sides, begins):
     geoms.resolve(2e-4, 3)
     angles = np.degrees(np.arccos(geoms.struct.turn.numpy()[0]))
     assert angles == pytest.approx([begins, 2.5 * begins], rel=1e-3)
+
+
+@wp.kernel(enable_backward=False)
+def _push(y: wp.array(dtype=vec3), u: vec3, v: vec3, geoms: Geoms, out: wp.array(dtype=vec3)):
+    """Force over stiffness [m] of the samples y in the middle of faces with edges u, v on geom 0."""
+    i = wp.tid()
+    dn = primitive_distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], y[i])
+    third = real(1.0 / 3.0)
+    met = meet(geoms, 0, 0, y[i], dn, vec3(third, third, third), u, v, 0)
+    out[i] = -wp.min(met.gap, real(0.0)) * met.weight * met.normal
+
+
+@pytest.mark.parametrize("kind, size", [("box", [4e-3, 6e-3, 4e-3]), ("cylinder", [4e-3, 4e-3])])
+@pytest.mark.parametrize("tilt", [0.0, 6.5, 20.0, 45.0, 80.0])
+def test_force_is_continuous_where_two_sides_are_as_near(kind, size, tilt):
+    """A sample 12 um below a side goes out past an edge, under skin that is so far off the side's normal."""
+    geoms = GeomSet([kind], [size])
+    geoms.resolve(2e-4, 3)
+    geoms.set_pose(np.zeros((1, 3)), np.eye(3)[None])
+    z = np.arange(-60e-6, 20e-6, 2e-8)
+    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    u, v = vec3(0.0, 5e-4, 0.0), vec3(-5e-4 * s, 0.0, 5e-4 * c)  # the skin is on the side of -(u x v)
+    if np.cross(v, u)[0] < 0:
+        u = -u
+    out = wp.zeros(len(z), dtype=vec3)
+    y = wp.array(np.stack([np.full(len(z), 4e-3 - 12e-6), 0 * z, 4e-3 + z], axis=1), dtype=vec3)
+    wp.launch(_push, len(z), [y, u, v, geoms.struct], [out])
+    force = out.numpy()
+    jump = np.linalg.norm(np.diff(force, axis=0), axis=1)
+    assert force[:, 0].max() > 1e-6
+    assert jump.max() < 0.05 * np.linalg.norm(force, axis=1).max()
 
 
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
