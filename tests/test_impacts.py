@@ -392,28 +392,11 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
     assert touched > 1
 
 
-LIFTED = pytest.mark.xfail(
-    strict=True,
-    reason="MuJoCo's contact with the core, 3.5 mm deep, alone adds 0.49 and 0.38 of what it came with in "
-    "two steps in which it turns by 0.7 and 0.9 radians",
-)
-
-
 @pytest.mark.law
-@pytest.mark.parametrize(
-    "seed, most",
-    [
-        (48, 1.02),
-        (54, 1.02),
-        (56, 1.02),
-        pytest.param(50, 1.02, marks=LIFTED),
-        (50, 2.0),
-    ],
-)
-def test_a_ring_that_comes_into_the_core_gains_nothing(seed, most):
+@pytest.mark.parametrize("seed", [48, 50, 54, 56])
+def test_a_ring_that_comes_into_the_core_gains_nothing(seed):
     """Its contact with the core lifts it against a skin that holds it from the other side: both together give
-    no more than was put in. Where no skin fits, MuJoCo's contact alone lifts the ring out of the core: its
-    pyramid without width was so hard that it gave 4000 times the energy."""
+    no more than was put in."""
     ring = trimesh.creation.torus(6e-3, 2e-3, major_sections=28, minor_sections=14)
     corners, faces = (" ".join(str(x) for x in a.ravel()) for a in (ring.vertices.round(7), ring.faces))
     spec = mujoco.MjSpec.from_string(
@@ -422,7 +405,7 @@ def test_a_ring_that_comes_into_the_core_gains_nothing(seed, most):
         '<worldbody><site name="tip" quat="1 -1 0 0"/><body name="ring" pos="0 0 .021"><freejoint/>'
         '<geom type="mesh" mesh="ring" mass=".0068" friction="0"/></body></worldbody></mujoco>'
     )
-    handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", friction=0.0, readings=False)
+    biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", friction=0.0, readings=False)
     model = spec.compile()
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     data.qpos[:2] = [-0.012, 0] + rng.uniform(-3e-3, 3e-3, 2)
@@ -431,21 +414,12 @@ def test_a_ring_that_comes_into_the_core_gains_nothing(seed, most):
     data.qvel[:3] = *rng.uniform(-0.15, 0.15, 2), -rng.uniform(0.5, 1.2)
     data.qvel[3:] = 8 * rng.normal(size=3)
     mujoco.mj_forward(model, data)
-    start, into_core, force = kinetic(model, data), 0, np.zeros(6)
-    has, by_core_alone = start, 0.0
+    start, into_core = kinetic(model, data), 0
     for _ in range(14):
         mujoco.mj_step(model, data)
         into_core += data.ncon
-        total = np.zeros(3)
-        for i, contact in enumerate(data.contact):
-            assert contact.dim == 1
-            mujoco.mj_contactForce(model, data, i, force)
-            total += (1 if contact.geom[1] else -1) * force[:3] @ contact.frame.reshape(3, 3)
-        of_all = data.body(handle.body).xmat.reshape(3, 3) @ handle.read(data, "contact_force")[:3]
-        before, has = has, kinetic(model, data)
-        if np.abs(of_all - total).max() < 1e-9:  # the skin pushes nothing
-            by_core_alone += max(0.0, has - before)
-        assert has - by_core_alone < 1.02 * start and has < most * start
+        assert all(contact.dim == 1 for contact in data.contact)
+        assert kinetic(model, data) < 1.02 * start
     assert into_core
 
 
@@ -856,25 +830,15 @@ def test_a_ball_that_comes_to_rest_takes_few_iterations(mass):
     assert np.mean(iterations) < 3
 
 
-MOST_LEFT = [
-    pytest.mark.slow,
-    pytest.mark.xfail(strict=True, reason="they keep 94 and 99 %: three steps do not settle"),
-]
-ON_SOME = [pytest.mark.slow, pytest.mark.xfail(reason="it keeps 99.3 % on some processors")]
-
-
 @pytest.mark.law
 @pytest.mark.parametrize(
-    "mass, speed, tier, left",
+    "mass, speed, tier",
     [
-        *((mass, speed, "condensed", 0.9) for mass, speed in BESIDE),
-        *(pytest.param(*case, "full", 0.9, marks=pytest.mark.slow) for case in BESIDE[2:]),
-        *(pytest.param(*case, "full", 0.9, marks=MOST_LEFT) for case in BESIDE[:2]),
-        *(pytest.param(*case, "full", 1.0, marks=pytest.mark.slow) for case in BESIDE[:2]),
-        pytest.param(*BESIDE[0], "full", 0.99, marks=ON_SOME),
+        *((*case, "condensed") for case in BESIDE),
+        *(pytest.param(*case, "full", marks=pytest.mark.slow) for case in BESIDE),
     ],
 )
-def test_a_light_box_gains_nothing_beside_a_press(mass, speed, tier, left):
+def test_a_light_box_gains_nothing_beside_a_press(mass, speed, tier):
     """What a fixed ball that presses has put into the skin is not for a box that hits beside it."""
     model, data, _ = finger_under(BESIDE_A_PRESS.format(mass=mass), 0.004, skin="coarse", tier=tier)
     data.qvel[2] = -speed
@@ -883,7 +847,7 @@ def test_a_light_box_gains_nothing_beside_a_press(mass, speed, tier, left):
     for _ in range(14):
         mujoco.mj_step(model, data)
         most = max(most, kinetic(model, data))
-    assert kinetic(model, data) < left * start and most < 1.01 * start
+    assert kinetic(model, data) < 0.9 * start and most < 1.01 * start
 
 
 def test_a_box_that_sank_beside_a_press_comes_up_with_it():
