@@ -75,7 +75,7 @@ def _record(report, seconds):
         "decided": beliefs.decided,
         "explanations": [[one.ids, one.weight] for one in beliefs.explanations],
         "tried": [
-            [{key: one[key] for key in ("id", "gain", "overlap", "p", "refused", "ties")} for one in step]
+            [{key: one[key] for key in ("id", "gain", "overlap", "p", "rejections", "ties")} for one in step]
             for step in report.trace["rounds"]
         ],
         "contacts": len(report.selection) + len(report.locked),

@@ -130,7 +130,7 @@ def test_of_effects_that_tie_the_confirmed_one_has_the_name(monkeypatch):
     """As if held-out trajectories contradicted a low-pass, which explains the fitted ones best."""
     data = measured([(by_id("lowpass"), {"tau": 0.08})], n=12)
     upheld = workflow.borne_out
-    monkeypatch.setattr(search, "_tied", lambda best, other: other.effect.id == "latency")
+    monkeypatch.setattr(search, "not_distinguished", lambda best, other, law_error: True)
     monkeypatch.setattr(
         workflow,
         "borne_out",

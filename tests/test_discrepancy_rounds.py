@@ -208,7 +208,9 @@ def test_beliefs_are_the_same_after_saving(first, tmp_path):
     data, some, report = first
     report.beliefs.save(tmp_path / "round", Springs(), data)
     kept, sim = Beliefs.load(tmp_path)
-    assert kept.text == report.beliefs.text and sim.skin == "coarse" and kept.beside == report.beliefs.beside
+    assert (
+        kept.text == report.beliefs.text and sim.skin == "coarse" and kept.further == report.beliefs.further
+    )
     for a, b in zip(kept.explanations, report.beliefs.explanations):
         assert a.ids == b.ids and a.nuisance == b.nuisance and a.weight == b.weight
         np.testing.assert_array_equal(a.information, b.information)
@@ -244,7 +246,7 @@ def test_more_effects_do_not_contradict_an_explanation():
     assert beliefs.odds == pytest.approx(0.97 / 0.03) and beliefs.decided
     doubted = Beliefs(some, 5e-5, {}, 0.0, ["power-law relaxation may be as good"])
     assert not doubted.decided and "power-law" in doubted.text
-    more = Beliefs(some, 5e-5, {}, 0.0, beside=0.1)
+    more = Beliefs(some, 5e-5, {}, 0.0, further=0.1)
     assert more.told_apart and not more.decided and "may be there as well, 10%" in more.text
 
 
@@ -256,7 +258,7 @@ def test_excluded_effects_are_less_likely_than_unseen_ones():
     beliefs = diagnose(Springs(), data, effects=some, progress=False).beliefs
     likely = {one.ids[-1]: one.weight for one in beliefs.unseen}
     assert likely["fluidloss"] > 10 * likely["relax"]
-    assert beliefs.beside == pytest.approx(
+    assert beliefs.further == pytest.approx(
         sum(likely.values()) / (beliefs.explanations[0].weight + sum(likely.values()))
     )
 

@@ -10,10 +10,12 @@ __all__ = [
     "ODDS",
     "RATE",
     "asked",
+    "by_chance",
     "discoveries",
     "further_off",
     "log_ratio",
     "max_t",
+    "not_distinguished",
     "sign_flip",
     "signed_root_t",
 ]
@@ -36,6 +38,18 @@ def asked(count: int) -> float:
     """Evidence [nats] that makes one of so many candidates likelier than nothing by `ODDS`, where any may be
     there as well as none."""
     return float(np.log(ODDS) + np.log(max(count, 1)))
+
+
+def by_chance(gain: float, count: int) -> float:
+    """Probability at most with which any of so many candidates has this evidence [nats] of data without it:
+    without an effect the expected ratio of densities is one (Markov's inequality)."""
+    return float(np.exp(min(np.log(count) - gain, 0.0)))
+
+
+def not_distinguished(best: float, other: float, law_error: float) -> bool:
+    """Whether an effect with evidence `other` [nats] is nearly as likely as one with `best`: within the odds
+    that decide, or within what the law of the best one is off by (a fraction), which evidence has twice."""
+    return bool(best - other < max(np.log(ODDS), 2 * law_error * best))
 
 
 def discoveries(p: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ def page(verdict: Verdict, pictures: Sequence[Picture] = ()) -> str:
     kept = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = kept.from_string(source)
     more = {"stages": STAGES, "columns": columns, "cell": cell}
-    more["percent"] = lambda share: f"{share:.0%}" if math.isfinite(share) else ""
+    more["percent"] = lambda part: f"{part:.0%}" if math.isfinite(part) else ""
     return template.render(v=verdict, pictures=pictures, **more)
 
 

@@ -49,7 +49,7 @@ def _effect(f: Finding):
     more = [f"and {len(numbers) - _NUMBERS} more"] if len(numbers) > _NUMBERS else []
     lines += [f"    {', '.join(numbers[:_NUMBERS] + more)}"] if numbers else []
     lines += [f"    {f.note or f.physics}", f"    {f.proof}"]
-    return lines + [f"    not told from {name}: {how}" for name, how in f.apart.items()]
+    return lines + [f"    not told from {name}: {how}" for name, how in f.experiments.items()]
 
 
 def _gaps(v: Verdict):

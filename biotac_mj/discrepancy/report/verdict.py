@@ -187,7 +187,7 @@ class Finding:
         return f"{g.name}: {g.before:.3g} -> {g.after:.3g} {g.unit}, noise {g.floor} ({sign})"
 
     @property
-    def apart(self) -> dict[str, str]:
+    def experiments(self) -> dict[str, str]:
         """Name of each effect that it ties with -> experiment that would distinguish them."""
         return {name: self.experiment(i) for i, name in self.ties.items()}
 

@@ -127,7 +127,7 @@ class Beliefs:
 
     Attributes:
       explanations: see above. unseen: the likeliest explanation with one more effect each, for effects that
-        the data hardly show. beside: probability that one of these effects is present, without those that no
+        the data hardly show. further: probability that one of these effects is present, without those that no
         data of this kind show.
       repeatability: of poses [m]. noise: of `measurement_noise`. end: of the session's clock [s].
       doubts: why the diagnosis is not sure of the likeliest explanation.
@@ -139,7 +139,7 @@ class Beliefs:
     end: float
     doubts: list[str] = dataclasses.field(default_factory=list)
     unseen: list[Explanation] = dataclasses.field(default_factory=list)
-    beside: float = 0.0
+    further: float = 0.0
 
     @property
     def rivals(self) -> list[Explanation]:
@@ -163,7 +163,7 @@ class Beliefs:
     def decided(self) -> bool:
         """Whether no further contact is needed: explanations are distinguished, and a further effect is
         unlikely."""
-        return self.told_apart and self.beside < SETTINGS.rate
+        return self.told_apart and self.further < SETTINGS.rate
 
     @property
     def text(self) -> str:
@@ -171,7 +171,7 @@ class Beliefs:
         first, *others = self.rivals
         if self.told_apart:
             text = f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
-            hardly = f"; an effect that these data hardly show may be there as well, {self.beside:.0%}"
+            hardly = f"; an effect that these data hardly show may be there as well, {self.further:.0%}"
             return text + ("" if self.decided else hardly)
         against = sum(one.weight for one in others)
         rest = ", ".join(f"{one.name} {one.weight:.0%}" for one in others if one.weight > 0.02)
@@ -188,7 +188,7 @@ class Beliefs:
             "noise": {k: None if v is None else np.asarray(v).tolist() for k, v in self.noise.items()},
             "explanations": [_written(one) for one in self.explanations],
             "unseen": [_written(one) for one in self.unseen],
-            "beside": self.beside,
+            "beside": self.further,
         }
         with replacing(folder / "beliefs.json") as temporary:
             temporary.write_text(json.dumps(document, indent=1, allow_nan=False))
@@ -265,11 +265,11 @@ def believed(comparison: Comparison, search: Search, contacts: int) -> Beliefs:
     out.sort(key=lambda one: -one.weight)
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     unseen, hidden = _unseen(out, search), {effect.id for effect in search.hidden}
-    beside = sum(one.weight for one in unseen if one.ids[-1] not in hidden)
+    further = sum(one.weight for one in unseen if one.ids[-1] not in hidden)
     named = {one.effect.id for one in search.found}
-    beside += sum(one.weight for one in out if {*out[0].ids} < {*one.ids} <= named)
-    beside = float(beside / (out[0].weight + beside))
-    return Beliefs(out, comparison.repeatability, comparison.noise, end, [], unseen, beside)
+    further += sum(one.weight for one in out if {*out[0].ids} < {*one.ids} <= named)
+    further = float(further / (out[0].weight + further))
+    return Beliefs(out, comparison.repeatability, comparison.noise, end, [], unseen, further)
 
 
 def _posed(comparison, fit, fits):

@@ -130,21 +130,21 @@ def drawn(
     ]
     solved = sim.but(tier="condensed").solve(probes)
     out = []
-    for (contact, at, mat, share), probe, one in zip(found, probes, solved):
+    for (contact, at, mat, fraction), probe, one in zip(found, probes, solved):
         load = sim.modulus * np.linalg.norm(one["force"], axis=1)
         deepest = int(np.argmax(probe.depth)) + 1
         far = np.interp(_SAFE * bounds.force, np.maximum.accumulate(load[:deepest]), probe.depth[:deepest])
         if far > 1e-4:
-            deep = float(share * far)
+            deep = float(fraction * far)
             # rows of one trajectory lie no further apart than a hundred others
             hold = min(contact.hold, _LONGEST * deep / contact.speed)
             out.append((dataclasses.replace(contact, depth=deep, hold=hold), at, mat))
     return out
 
 
-def _between(limits, share):
+def _between(limits, fraction):
     """A number between two, uniform in its logarithm."""
-    return float(np.exp(np.log(limits[0]) + share * np.log(limits[1] / limits[0])))
+    return float(np.exp(np.log(limits[0]) + fraction * np.log(limits[1] / limits[0])))
 
 
 def trajectory_of(
@@ -168,11 +168,11 @@ def trajectory_of(
             legs.append((abs(contact.slide) / 5e-3, deep, contact.slide, _ROWS["slide"]))
         legs.append((wait, -_LEAD, contact.slide if last == 1 else 0.0, _ROWS["release"]))
     time, down, along = [0.0], [-_LEAD], [0.0]
-    for seconds, to, beside, rows in legs:
+    for seconds, to, sideways, rows in legs:
         step = np.arange(1, rows + 1) / rows
         time += (time[-1] + seconds * step).tolist()
         down += (down[-1] + (to - down[-1]) * step).tolist()
-        along += (along[-1] + (beside - along[-1]) * step).tolist()
+        along += (along[-1] + (sideways - along[-1]) * step).tolist()
     n = len(time)
     return Trajectory(
         name,

@@ -60,8 +60,8 @@ class Separation:
         comparison: Comparison,
         unseen: Sequence[Explanation] = (),
     ):
-        shown = [one.residuals(comparison) for one in explanations]
-        shown += [one.residuals(comparison, shown[0]) for one in unseen]
+        residuals = [one.residuals(comparison) for one in explanations]
+        residuals += [one.residuals(comparison, residuals[0]) for one in unseen]
         self.seen = len(explanations)
         explanations = [*explanations, *unseen]
         self.weight = np.array([one.weight for one in explanations])
@@ -71,12 +71,12 @@ class Separation:
         self.known = np.array([_filled(one.information, most) for one in explanations])
         # of every contact: (true, other) x'x; of each other its S'x (k, true), and its S'S
         self.square, self.pull, self.gram = [], [], []
-        for parts in zip(*shown):
+        for parts in zip(*residuals):
             left = np.stack([residual for residual, _ in parts])
             columns = np.stack([np.pad(own, ((0, 0), (0, most - own.shape[1]))) for _, own in parts])
-            apart = left[:, None] - left
-            self.square.append((apart**2).sum(2))
-            self.pull.append(np.einsum("bmk,bam->bka", columns, apart))
+            difference = left[:, None] - left
+            self.square.append((difference**2).sum(2))
+            self.pull.append(np.einsum("bmk,bam->bka", columns, difference))
             self.gram.append(np.einsum("bmk,bml->bkl", columns, columns))
 
     def _sums(self, times):
@@ -181,8 +181,8 @@ def planned(
     if not len(within):
         raise ValueError(f"no contact stays below {bounds.force:g} N: give a larger --force")
     # what the model is off by grows with what a contact shows
-    shown = [_showing(trajectories[u], runs[0][u]) for u in within]
-    comparison = Comparison(quick, shown, fields.part(within), beliefs.noise, beliefs.repeatability)
+    expected = [_showing(trajectories[u], runs[0][u]) for u in within]
+    comparison = Comparison(quick, expected, fields.part(within), beliefs.noise, beliefs.repeatability)
     separation = Separation(able, comparison, unseen)
     times, contacts, clock = np.zeros(len(within)), [], beliefs.end + _PAUSE
     for u in separation.chosen(budget):

@@ -254,15 +254,15 @@ class _Model:
                 y = point.y + np.tensordot(point.away, columns, 1)
                 whole = np.concatenate([point.errors, columns])
                 _, weights, factor = likelihood.evidence(y, whole, variance)
-            known, law_errors = law_errors, self._law_errors(law_errors, weights, factor)
+            known, law_errors = law_errors, likelihood.law_errors(law_errors, weights, factor, poses)
             laws = likelihood.laws(point.done, law_errors)
             point = dataclasses.replace(point, errors=np.concatenate([point.errors[:poses], laws]))
             step, off = weights[len(point.errors) :] - point.away, self._offsets(weights) - point.offsets
             far = max(np.abs(step).max(initial=0), np.abs(off).max() / self.comparison.repeatability)
             step, off = (by * min(1.0, _FARTHEST / max(far, 1e-9)) for by in (step, off))
             before, gain = self._log(point, variance)[0], 0.0
-            for share in _SHORTER:
-                trial = self._moved(point, share * step, point.offsets + share * off, law_errors)
+            for fraction in _SHORTER:
+                trial = self._moved(point, fraction * step, point.offsets + fraction * off, law_errors)
                 more = self._log(trial, variance)[0] - before
                 if more > 0:
                     point, gain = trial, more
@@ -280,14 +280,6 @@ class _Model:
                 own = law_errors[k] * weights[k * count : (k + 1) * count]
                 columns[j] = self.likelihood.times(1 + own @ self.likelihood.courses, columns[j])
         return columns
-
-    def _law_errors(self, law_errors, weights, factor):
-        """(effects,) most probable errors of laws by coefficients of what they do, and their precision."""
-        begin = 3 * len(self.likelihood.chosen)
-        rows = slice(begin, begin + len(law_errors) * likelihood.COURSES)
-        expected = weights[rows] ** 2 + (np.linalg.inv(factor)[:, rows] ** 2).sum(0)
-        square = expected.reshape(len(law_errors), likelihood.COURSES)
-        return self.likelihood.law_errors(law_errors[:, None] ** 2 * square)
 
     def _offsets(self, weights):
         """(trajectories, 3) of poses by their coefficients."""
@@ -321,10 +313,10 @@ class _Model:
             variance = likelihood.variance(amplitude, size)
             amplitude = likelihood.amplitudes(point.y, point.errors, amplitude, size, 1)
         variance = likelihood.variance(amplitude, size)
-        log, alone = self._log(point, variance)
+        log, of_errors = self._log(point, variance)
         _, _, factor = likelihood.evidence(y, whole, variance)
         score = log + likelihood.prior(amplitude, law_errors)
-        score += np.log(np.diag(alone)).sum() - np.log(np.diag(factor)).sum()
+        score += np.log(np.diag(of_errors)).sum() - np.log(np.diag(factor)).sum()
         marginal = np.linalg.inv(factor @ factor.T)[errors:, errors:]
         every = [p[:2] for p in parameters(point.effects)]
         at, information = [every.index(p[:2]) for p in self.parameters], np.eye(len(every))

@@ -24,7 +24,7 @@ if typing.TYPE_CHECKING:
 _ROWS = 1500  # of all trajectories, that eigenvectors are computed of; of more, some are left out
 # Lengths over which what a model misses changes: across the skin (a contact's radius), in depth, in heading,
 # in the logarithm of the time since touch, in the session.
-_PLACE, _DEPTH, _HEADING, _SINCE, _CLOCK = 3e-3, 0.4e-3, 0.5, 0.7, 60.0
+PLACE, _DEPTH, _HEADING, _SINCE, CLOCK = 3e-3, 0.4e-3, 0.5, 0.7, 60.0
 # Shares of the variance that come again wherever the same is touched as deep; that pass with the touch; that
 # have no length, as of films that touch and part; and that go with the session's clock alone, touched or not.
 _STATIC, _PASSING, _ROUGH, _DRIFTING = 0.6, 0.25, 0.05, 0.1
@@ -36,7 +36,7 @@ _TOUCH = 20e-6  # [m]
 _FACTORS = np.exp(np.arange(-0.4, 4.01, 0.4))
 _LAW_FACTORS = np.exp(np.arange(-1.2, 1.61, 0.2))  # of law errors, in their prior's median
 COURSES = 24  # along which the law of an effect may be another
-_LAW_PLACE = 10e-3  # [m] along the finger, over which a law is nearly the same
+LAW_PLACE = 10e-3  # [m] along the finger, over which a law is nearly the same
 
 
 def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
@@ -46,26 +46,38 @@ def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
         return _gathered(data, rows, of)
 
     depth = gathered(lambda t: t.depth)
-    place = _apart(gathered(lambda t: t.pos), _PLACE) + _apart(depth, _DEPTH)
-    heading = _apart(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
-    since = _apart(gathered(_since_touch), _SINCE)
-    clock = _apart(gathered(lambda t: t.clock + t.time), _CLOCK)
+    place = squared_distances(gathered(lambda t: t.pos), PLACE) + squared_distances(depth, _DEPTH)
+    heading = squared_distances(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
+    since = squared_distances(gathered(_since_touch), _SINCE)
+    clock = squared_distances(gathered(lambda t: t.clock + t.time), CLOCK)
     static = np.exp(-0.5 * (place + heading)) * _same_tool(data, rows)
-    passing = np.exp(-0.5 * (place + since + clock))
+    return covariance(static, np.exp(-0.5 * (place + since + clock)), np.exp(-0.5 * clock), depth)
+
+
+def covariance(
+    static: np.ndarray, passing: np.ndarray, drifting: np.ndarray, depth: np.ndarray
+) -> np.ndarray:
+    """(n, n) of what a model misses, by correlations (n, n) of what comes again, of what passes with a touch
+    and of what goes with the session, in rows where something presses as deep as depth (n,)."""
     load = _UNTOUCHED + np.clip(depth / max(depth.max(), 1e-9), 0.0, 1.0)
-    rough = _ROUGH * np.eye(len(load))
-    touched = (_STATIC * static + _PASSING * passing + rough) * load[:, None] * load
-    return touched + _DRIFTING * np.exp(-0.5 * clock)
+    touched = (_STATIC * static + _PASSING * passing + _ROUGH * np.eye(len(load))) * load[:, None] * load
+    return touched + _DRIFTING * drifting
 
 
 def courses(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     """(k, n) functions of depth, time since touch, the session's clock, place and tool whose sum with
     coefficients of unit variance is the process of a law's error."""
-    away = _apart(_gathered(data, rows, lambda t: t.depth), _DEPTH)
-    away += _apart(_gathered(data, rows, _since_touch), _SINCE)
-    away += _apart(_gathered(data, rows, lambda t: t.clock + t.time), _CLOCK)
-    away += _apart(_gathered(data, rows, lambda t: t.pos), _LAW_PLACE)
-    values, vectors = np.linalg.eigh(_same_tool(data, rows) * np.exp(-0.5 * away))
+    away = squared_distances(_gathered(data, rows, lambda t: t.depth), _DEPTH)
+    away += squared_distances(_gathered(data, rows, _since_touch), _SINCE)
+    away += squared_distances(_gathered(data, rows, lambda t: t.clock + t.time), CLOCK)
+    away += squared_distances(_gathered(data, rows, lambda t: t.pos), LAW_PLACE)
+    return largest_modes(_same_tool(data, rows) * np.exp(-0.5 * away))
+
+
+def largest_modes(correlation: np.ndarray) -> np.ndarray:
+    """(k, n) functions whose sum with coefficients of unit variance is a process with this correlation
+    (n, n), nearly."""
+    values, vectors = np.linalg.eigh(correlation)
     return (np.sqrt(np.maximum(values, 0.0)) * vectors).T[: -COURSES - 1 : -1]
 
 
@@ -79,8 +91,8 @@ def _gathered(data, rows, of):
     return np.concatenate([np.asarray(of(t))[r] for t, r in zip(data, rows)])
 
 
-def _apart(x, length):
-    """(n, n) squared distances of x (n, ...) over a length."""
+def squared_distances(x: np.ndarray, length: float) -> np.ndarray:
+    """(n, n) squares of distances of x (n, ...) over a length."""
     x = x.reshape(len(x), -1) / length
     square = (x**2).sum(1)
     return np.maximum(square[:, None] + square - 2 * x @ x.T, 0.0)
@@ -91,42 +103,31 @@ def _since_touch(t):
 
 
 class Likelihood:
-    """Likelihood of some trajectories of a Comparison.
+    """Likelihood of residuals (n, width) of rows under a model that is nearly right.
 
     Attributes:
-      chosen: their indices; apart: of these, those in which what the model misses is not known by the others,
-        as what the laws of effects lack is. courses: (k, n) of errors of laws. size: (width,) by how much the
-        base model is expected to be off [counts, N] under the deepest press; expected: (n,) fraction of it in
-        each row.
+      groups: slices of channels whose errors have something in common. noise: (width,) its standard deviation
+        [counts, N]. courses: (k, n) of errors of laws. size: (width,) by how much the base model is expected
+        to be off [counts, N] under the deepest press; expected: (n,) fraction of it in each row.
     """
 
-    def __init__(self, comparison: "Comparison", chosen: np.ndarray, apart: np.ndarray = ()):
-        self.comparison, self.chosen = comparison, np.asarray(chosen)
-        data = [comparison.trajectories[i] for i in self.chosen]
-        every = max(1, int(np.ceil(sum(len(t.time) for t in data) / _ROWS)))
-        self._rows = [np.arange(0, len(t.time), every) for t in data]
-        side = np.repeat(np.isin(self.chosen, apart), [len(r) for r in self._rows])
-        values, vectors = np.linalg.eigh(kernel(data, self._rows) * (side[:, None] == side))
+    def __init__(
+        self,
+        covariance: np.ndarray,
+        courses: np.ndarray,
+        noise: np.ndarray,
+        groups: list[slice],
+        largest: np.ndarray,
+    ):
+        """covariance: (n, n) of what the model misses, 1 under the deepest press; largest: (width,) change of
+        each channel."""
+        values, vectors = np.linalg.eigh(covariance)
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
         self.expected = np.sqrt(vectors**2 @ self._scale)
-        self.courses = courses(data, self._rows)
-        self.noise = comparison.noises
-        self._resting = np.ones(comparison.width)  # force has no rest
-        self._resting[self.comparison.groups.get("force", slice(0))] = 0.0
-        largest = np.abs(self.stacked(comparison.measured)).max(0)
+        self.courses, self.noise, self.groups = courses, noise, groups
         self.size = np.concatenate(
-            [np.full(s.stop - s.start, SETTINGS.resolution * _upper(largest[s])) for s in self.groups]
+            [np.full(s.stop - s.start, SETTINGS.resolution * _upper(largest[s])) for s in groups]
         )
-
-    @property
-    def groups(self) -> list[slice]:
-        return list(self.comparison.groups.values())
-
-    def stacked(self, values: list) -> np.ndarray:
-        """(n, width) of values (rows, width) of every trajectory, the chosen ones one after another, about
-        their own mean rest: the poses of others, whose row 0 may touch, are not fitted."""
-        rest = self._resting * np.mean([values[i][0] for i in self.chosen], axis=0)
-        return np.concatenate([values[i][r] - rest for i, r in zip(self.chosen, self._rows)])
 
     def turned(self, values: np.ndarray) -> np.ndarray:
         """(..., n, width) in the kernel's eigenvectors."""
@@ -135,17 +136,6 @@ class Likelihood:
     def times(self, process: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Values (n, width) in the eigenvectors times a process (n,) over rows."""
         return self._vectors.T @ (process[:, None] * (self._vectors @ values))
-
-    def poses(self, offsets: np.ndarray) -> np.ndarray:
-        """(m, n, width) what errors of poses do about offsets (trajectories, 3) [m], of one standard
-        deviation each, in the eigenvectors: three of every trial. An offset that all share is evidence."""
-        out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
-        for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
-            own = self._vectors[edges[k] : edges[k + 1]].T  # of all other rows the rest alone moves
-            for column in self.comparison.moved(i, offsets[i]):
-                rest = self._resting * column[0] / len(self.chosen)
-                out.append(own @ column[rows] - np.outer(self._vectors.sum(0), rest))
-        return self.comparison.repeatability * np.array(out)
 
     def laws(self, changes: list[np.ndarray], errors: np.ndarray) -> np.ndarray:
         """(m, n, width) what errors of laws do, of one standard deviation each, in the eigenvectors; changes:
@@ -157,11 +147,16 @@ class Likelihood:
         ]
         return np.array(out).reshape(len(out), len(self.courses[0]), len(self.size))
 
-    def law_errors(self, square: np.ndarray) -> np.ndarray:
-        """(effects,) most probable errors of laws whose coefficients (effects, k) have these expected
-        squares."""
+    def law_errors(
+        self, errors: np.ndarray, weights: np.ndarray, factor: np.ndarray, begin: int
+    ) -> np.ndarray:
+        """(effects,) most probable errors of laws, by what `evidence` gave with errors (effects,): weights
+        (m,) and the factor of their precision, those of laws from `begin` on."""
+        rows = slice(begin, begin + len(errors) * COURSES)
+        expected = weights[rows] ** 2 + (np.linalg.inv(factor)[:, rows] ** 2).sum(0)
+        square = errors[:, None] ** 2 * expected.reshape(len(errors), COURSES)
         log = np.log(SETTINGS.law * _LAW_FACTORS)
-        fits = -square.shape[1] * log - 0.5 * square.sum(1)[:, None] * np.exp(-2 * log)
+        fits = -COURSES * log - 0.5 * square.sum(1)[:, None] * np.exp(-2 * log)
         return np.exp(log[(fits + _law_prior(log)).argmax(1)])
 
     def variance(self, amplitude: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -223,11 +218,53 @@ class Likelihood:
         return out
 
 
-def of(comparison: "Comparison", chosen: np.ndarray, apart: np.ndarray = ()) -> Likelihood:
+class TrajectoryLikelihood(Likelihood):
+    """Likelihood of some trajectories of a Comparison.
+
+    Attributes:
+      chosen: their indices; independent: of these, those in which what the model misses is not known by the
+        others, as what the laws of effects lack is.
+    """
+
+    def __init__(self, comparison: "Comparison", chosen: np.ndarray, independent: np.ndarray = ()):
+        self.comparison, self.chosen = comparison, np.asarray(chosen)
+        data = [comparison.trajectories[i] for i in self.chosen]
+        every = max(1, int(np.ceil(sum(len(t.time) for t in data) / _ROWS)))
+        self._rows = [np.arange(0, len(t.time), every) for t in data]
+        side = np.repeat(np.isin(self.chosen, independent), [len(r) for r in self._rows])
+        self._resting = np.ones(comparison.width)  # force has no rest
+        self._resting[comparison.groups.get("force", slice(0))] = 0.0
+        super().__init__(
+            kernel(data, self._rows) * (side[:, None] == side),
+            courses(data, self._rows),
+            comparison.noises,
+            list(comparison.groups.values()),
+            np.abs(self.stacked(comparison.measured)).max(0),
+        )
+
+    def stacked(self, values: list) -> np.ndarray:
+        """(n, width) of values (rows, width) of every trajectory, the chosen ones one after another, about
+        their own mean rest: the poses of others, whose row 0 may touch, are not fitted."""
+        rest = self._resting * np.mean([values[i][0] for i in self.chosen], axis=0)
+        return np.concatenate([values[i][r] - rest for i, r in zip(self.chosen, self._rows)])
+
+    def poses(self, offsets: np.ndarray) -> np.ndarray:
+        """(m, n, width) what errors of poses do about offsets (trajectories, 3) [m], of one standard
+        deviation each, in the eigenvectors: three of every trial. An offset that all share is evidence."""
+        out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
+        for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
+            own = self._vectors[edges[k] : edges[k + 1]].T  # of all other rows the rest alone moves
+            for column in self.comparison.moved(i, offsets[i]):
+                rest = self._resting * column[0] / len(self.chosen)
+                out.append(own @ column[rows] - np.outer(self._vectors.sum(0), rest))
+        return self.comparison.repeatability * np.array(out)
+
+
+def of(comparison: "Comparison", chosen: np.ndarray, independent: np.ndarray = ()) -> TrajectoryLikelihood:
     """The Likelihood of the chosen trajectories of a Comparison, which keeps it."""
-    key = tuple(map(int, chosen)), tuple(map(int, apart))
+    key = tuple(map(int, chosen)), tuple(map(int, independent))
     if key not in comparison.likelihoods:
-        comparison.likelihoods[key] = Likelihood(comparison, chosen, apart)
+        comparison.likelihoods[key] = TrajectoryLikelihood(comparison, chosen, independent)
     return comparison.likelihoods[key]
 
 

@@ -46,7 +46,7 @@ def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np
         return False
     _, begin = _begun(comparison, smaller, aside)
     nearer = _nearer(comparison, begin, _measured(comparison, larger, aside), aside)
-    return nearer and _share(comparison, smaller, larger, aside) >= SETTINGS.explained
+    return nearer and _fraction_closed(comparison, smaller, larger, aside) >= SETTINGS.explained
 
 
 def _density(comparison, fit, aside):
@@ -58,9 +58,9 @@ def _density(comparison, fit, aside):
     return _evidence(comparison, fit, raw, every, aside) - known
 
 
-def _evidence(comparison, fit, raw, some, apart=()):
+def _evidence(comparison, fit, raw, some, independent=()):
     """Logarithm of the likelihood of some trajectories (indices), by residuals `raw` where a Fit has them."""
-    own = likelihood.of(comparison, some, apart)
+    own = likelihood.of(comparison, some, independent)
     laws = own.laws(changes(comparison, own, fit.effects, fit.nuisance), fit.law_errors)
     poses = own.poses(fit.offsets)
     off = fit.offsets[some].ravel() / comparison.repeatability
@@ -86,13 +86,13 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     if not _nearer(comparison, begin, end, aside):
         return Proof(start, before, before, (first, first), 0.0)
     if current.effects:
-        closed = _share(comparison, null, current, aside)
+        closed = _fraction_closed(comparison, null, current, aside)
     else:
         closed = _closed(comparison, begin, end, SETTINGS.law, aside)
     return Proof(current, before, after, (first, last), closed)
 
 
-def _share(comparison, smaller, larger, aside):
+def _fraction_closed(comparison, smaller, larger, aside):
     """Share of the gap that the effects which one Fit has beyond another close by themselves, with all that
     the base model is found to be off by on both sides."""
     known = {effect.id for effect, _ in smaller.effects}

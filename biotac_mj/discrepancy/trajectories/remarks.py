@@ -65,9 +65,9 @@ def _size(comparison, i, residual) -> str:
     loud = {g: np.mean((residual[:, s] / comparison.sigmas[i][s]) ** 2) for g, s in comparison.groups.items()}
     group = max(loud, key=loud.get)
     part = comparison.groups[group]
-    apart, of = (float(np.abs(x[:, part]).max()) for x in (residual, comparison.measured[i]))
+    error, of = (float(np.abs(x[:, part]).max()) for x in (residual, comparison.measured[i]))
     unit = "N" if group == "force" else "counts"
-    return f"{group} by up to {apart:.3g} {unit} of {of:.3g} in {comparison.trajectories[i].id}"
+    return f"{group} by up to {error:.3g} {unit} of {of:.3g} in {comparison.trajectories[i].id}"
 
 
 def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[str]:
@@ -123,7 +123,7 @@ def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
 
 def of_search(search: "Search") -> list[str]:
     """Remark on the effects that these data would hardly show."""
-    names = ", ".join(effect.name for _, effect, shown in search.unseen if shown < _SEEN)
+    names = ", ".join(effect.name for _, effect, visible in search.unseen if visible < _SEEN)
     return [f"too small to show in these data at a realistic size: {names}"] if names else []
 
 

@@ -8,7 +8,7 @@ import typing
 import numpy as np
 import tqdm
 
-from ..evidence import ODDS, asked
+from ..evidence import asked, by_chance, not_distinguished
 from .fitting import Fit, fit_effects, sizes
 from .model.in_skin import FOLLOWS, remember
 from .settings import SETTINGS
@@ -32,14 +32,15 @@ class Candidate:
 
     Attributes:
       effect, fit. gain: evidence over the fit without it [nats]; p: the largest probability with which any
-      effect has as much of data without it. refused: why it is not taken. ties: ids that are as likely.
+      effect has as much of data without it. rejections: reasons why it is not taken. ties: ids that are as
+      likely.
     """
 
     effect: "Effect"
     fit: Fit
     gain: float
     p: float
-    refused: list[str]
+    rejections: list[str]
     ties: list[str] = dataclasses.field(default_factory=list)
 
     def record(self) -> dict:
@@ -50,7 +51,7 @@ class Candidate:
             "gain": self.gain,
             "overlap": self.fit.overlap,
             "p": self.p,
-            "refused": self.refused,
+            "rejections": self.rejections,
             "ties": self.ties,
             "theta": theta,
         }
@@ -92,15 +93,17 @@ def found(
     while len(out.found) < SETTINGS.most:
         step = _round(comparison, out, usable, chosen, bar)
         out.rounds.append(step)
-        able = [c for c in step if not c.refused]
-        little = [c for c in step if c.refused == ["evidence"]]  # others contradict their names
+        able = [c for c in step if not c.rejections]
+        little = [c for c in step if c.rejections == ["evidence"]]  # others contradict their names
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
         if not able:
             break
         best = able[0]
         best.fit, best.gain = _other_shapes(comparison, best, out.fit, chosen)
         out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
-        best.ties = [c.effect.id for c in able[1:] if _tied(best, c)]
+        best.ties = [
+            c.effect.id for c in able[1:] if not_distinguished(best.gain, c.gain, best.fit.law_errors[-1])
+        ]
         out.found.append(best)
         out.fit = best.fit
     return out
@@ -117,19 +120,13 @@ def _other_shapes(comparison, one, current, chosen):
         if fit.score > best.score and not effect.rejection_reason(fit.effects[-1][1]):
             best = fit
     gain = one.gain + float(best.score - one.fit.score)
-    return _beside(best, current, gain), gain
+    return _with_told(best, current, gain), gain
 
 
-def _beside(fit, current, gain) -> Fit:
+def _with_told(fit, current, gain) -> Fit:
     """The Fit with what its evidence beside `current` tells: what the laws of other effects lack makes
     evidence for one that acts where they do."""
     return dataclasses.replace(fit, told=current.told + gain / (1 + fit.overlap))
-
-
-def _tied(best, other) -> bool:
-    """Whether another Candidate is nearly as likely: within the odds that decide, or within what the law of
-    the best one is off by, which evidence has twice."""
-    return bool(best.gain - other.gain < max(np.log(ODDS), 2 * best.fit.law_errors[-1] * best.gain))
 
 
 def _round(comparison, search, usable, chosen, bar):
@@ -140,12 +137,12 @@ def _round(comparison, search, usable, chosen, bar):
     same = {one.id for one in known}.union(*(one.equivalents for one in known))
     effects = [e for e in usable if e.id not in same and not same & {*e.equivalents}]
     ranked = screened(comparison, current, effects, chosen)
-    search.unseen = [(gain, effect, shown) for gain, effect, _, shown in ranked]
+    search.unseen = [(gain, effect, visible) for gain, effect, _, visible in ranked]
     short = [r for r in ranked[: SETTINGS.refit] if r[0] > 0]
     # differences do not reach far where poses are moved
     short += [r for r in ranked if r not in short and r[1].pose_offset and not known]
-    beside = {name for _, effect, *_ in short for name in effect.refit_with}
-    short += [r for r in ranked if r not in short and r[1].id in beside]
+    partners = {name for _, effect, *_ in short for name in effect.refit_with}
+    short += [r for r in ranked if r not in short and r[1].id in partners]
     bar.total += len(short)
     out = []
     for expected, effect, start, _ in short:
@@ -191,13 +188,12 @@ def _candidate(comparison, effect, fit, current, usable):
     # any electrode, or any pair, may have it
     forms = len(effect.free) * np.log(len(any_of)) if few else 0.0
     gain, theta = float(fit.score - current.score - forms), fit.effects[-1][1]
-    # without the effect the expected ratio of densities is one (Markov's inequality, of each that is tried)
-    p = float(np.exp(min(np.log(len(usable)) - gain, 0.0)))
-    refused = ["evidence"] if gain < asked(len(usable)) else []
-    refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
-    refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
-    refused += ["little"] if _little(comparison, effect, theta) else []
-    return Candidate(effect, _beside(fit, current, gain), gain, p, refused)
+    p = by_chance(gain, len(usable))
+    rejections = ["evidence"] if gain < asked(len(usable)) else []
+    rejections += [doubt] if (doubt := effect.rejection_reason(theta)) else []
+    rejections += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
+    rejections += ["little"] if _little(comparison, effect, theta) else []
+    return Candidate(effect, _with_told(fit, current, gain), gain, p, rejections)
 
 
 def _little(comparison, effect, theta) -> bool:
@@ -224,8 +220,8 @@ def _solved(comparison, fit, effect, current, chosen, times=_SOLVED, about=False
         if work is not None:
             new = comparison.sim.stick(comparison.fields, work)
         else:
-            beside = about and not k and len(effect.free) > 1  # each parameter is one solution more
-            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, beside)
+            slopes = about and not k and len(effect.free) > 1  # each parameter is one solution more
+            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, slopes)
         if not new:
             break
         before = fit.score
@@ -272,7 +268,7 @@ def screened(
         prior = np.array([[SETTINGS.wide * effect.params[name].scale / size] for name, size in sizes(effect)])
         columns = signatures.columns(effect, shape) * prior
         precision = np.eye(len(columns)) + columns @ signatures.own(columns).T
-        shown = 0.5 * float(((np.diag(precision) - 1) / prior[:, 0] ** 2).max())
+        visible = 0.5 * float(((np.diag(precision) - 1) / prior[:, 0] ** 2).max())
         pull = columns @ y
         some = _few(precision, pull) if effect.per_channel else []
         if effect.per_channel and not some and len(columns) > effect.design.nelectrode:
@@ -284,7 +280,7 @@ def screened(
         gain, weights = _gained(precision, pull), np.linalg.solve(precision, pull)
         gain -= len(some) * np.log(len(columns))
         if effect.id not in best or gain > best[effect.id][0]:
-            best[effect.id] = gain, effect, _begin(effect, shape, weights), shown
+            best[effect.id] = gain, effect, _begin(effect, shape, weights), visible
     return sorted(best.values(), key=lambda one: -one[0])
 
 

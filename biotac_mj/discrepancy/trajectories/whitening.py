@@ -119,8 +119,8 @@ class Comparison:
 
     def unposed(self, i: int, residual: np.ndarray) -> np.ndarray:
         """Residual (n, width) without the part that the most probable error of the trial's pose explains."""
-        (along, apart), (u, s, _) = self._split(i, residual), self._basis[i]
-        return (apart + u @ (along / (1 + s**2))).reshape(residual.shape) * self.sigmas[i]
+        (along, across), (u, s, _) = self._split(i, residual), self._basis[i]
+        return (across + u @ (along / (1 + s**2))).reshape(residual.shape) * self.sigmas[i]
 
     def astray(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(3,) errors of the trial's pose, of unit variance by noise and repeatability together."""
@@ -147,9 +147,9 @@ class Comparison:
     def vector(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n width + 3,) whose square is the trajectory's mean square: the whitened residual, rows together,
         and the pose's error in units of its repeatability."""
-        along, apart = self._split(i, residual)
+        along, across = self._split(i, residual)
         along = along / np.sqrt(1 + self._basis[i][1] ** 2)
-        return np.concatenate([apart / np.sqrt(self.width), along]) / np.sqrt(len(residual))
+        return np.concatenate([across / np.sqrt(self.width), along]) / np.sqrt(len(residual))
 
     def vectors(self, effects: list, nuisance: Nuisance = KNOWN) -> list:
         """`vector` of every trajectory."""

@@ -229,7 +229,7 @@ def _upheld(comparison, null, found, search, chosen, aside):
 def _tied(one, search):
     """Candidates that tie with one, the likeliest first, each with the ties after it."""
     step = next(step for step in search.rounds if any(c.fit is one.fit for c in step))
-    tied = [c for c in step if c.effect.id in one.ties and not c.refused]
+    tied = [c for c in step if c.effect.id in one.ties and not c.rejections]
     out, left = [], one.ties
     for c in tied:
         left = [name for name in left if name != c.effect.id]

@@ -38,11 +38,13 @@ def rested(
     own = np.mean([one["log_z"][0] for one in fields.base], axis=0) - _LOG_DIVIDER
     rest, simulated = np.mean([t.electrodes[0] for t in data], axis=0), counts_from_log_impedance(own)
     if reads:
-        shows, shown = np.transpose(reads)
-        rest[shown] = rest[shows]
-    apart = rest - simulated
+        shows, read = np.transpose(reads)
+        rest[read] = rest[shows]
+    difference = rest - simulated
     off = (
-        np.isin(np.arange(len(apart)), _standing(apart - np.median(apart))) | (rest < _LEAST) | (rest > _MOST)
+        np.isin(np.arange(len(difference)), _standing(difference - np.median(difference)))
+        | (rest < _LEAST)
+        | (rest > _MOST)
     )
     shift = np.where(off, 0.0, log_impedance(rest) - own)
     new = copy.copy(sim)

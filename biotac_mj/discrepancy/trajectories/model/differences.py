@@ -157,8 +157,8 @@ def _shifts(sim, trajectories, base, deeper, tick):
     for i, (t, side) in enumerate(zip(trajectories, sides)):
         straight = [deeper.slope(i, 0.0), *(one[i] for one in solved)]
         for k, axis in enumerate("xyz"):
-            share = t.heading[k], side[0][0, k], side[1][0, k]
-            out[axis].append(sum(by * slope for by, slope in zip(share, straight)))
+            weights = t.heading[k], side[0][0, k], side[1][0, k]
+            out[axis].append(sum(by * slope for by, slope in zip(weights, straight)))
     return out
 
 
@@ -212,7 +212,7 @@ def filled(sim: Solver) -> list[Change]:
         return []
     volume = settings.fill_volume + _FILL * model.liquid_volume
     options = sim.options | {"skin": {**plain(settings), "fill_volume": volume}}
-    return [Change("fill", _FILL, sim.but({"film": film}, options=options, cache=_beside(sim, "filled")))]
+    return [Change("fill", _FILL, sim.but({"film": film}, options=options, cache=_subfolder(sim, "filled")))]
 
 
 def sunk(sim: Solver) -> list[Change]:
@@ -223,10 +223,10 @@ def sunk(sim: Solver) -> list[Change]:
     if not model.has_liquid:
         return []
     models = {0.0: model, "film": SunkFilm(film, _SUNK)}
-    return [Change("sink", _SUNK, sim.but(models, cache=_beside(sim, "sunk")))]
+    return [Change("sink", _SUNK, sim.but(models, cache=_subfolder(sim, "sunk")))]
 
 
-def _beside(sim, name):
+def _subfolder(sim, name):
     """Folder of solutions that settings do not distinguish from the simulator's own."""
     return None if sim.cache is None else str(pathlib.Path(sim.cache) / name)
 

@@ -94,10 +94,10 @@ class Fields:
             if ids <= left:
                 there, curve, tangents = nearest(self.curves[ids], now)
                 along = sum(now[k] * v for k, v in there.items() if k in now and len(k) == 2)
-                share = max(along / max(square(there), 1e-12), 0.0)
-                out.append((curve, share**2))
+                fraction = max(along / max(square(there), 1e-12), 0.0)
+                out.append((curve, fraction**2))
                 for k, tangent in tangents.items():
-                    out.append((tangent, min(share, 1.0) * (now.get(k, 0.0) - share * there[k])))
+                    out.append((tangent, min(fraction, 1.0) * (now.get(k, 0.0) - fraction * there[k])))
                 left -= ids
         return out
 
@@ -107,8 +107,8 @@ class Fields:
         if effect.id not in self.remembered:
             return None
         there, missed = min(self.remembered[effect.id], key=lambda one: unlike(effect, theta, one[0]))
-        share = next(iter(effect.params))
-        return theta[share] / there[share] * missed[i]
+        name = next(iter(effect.params))
+        return theta[name] / there[name] * missed[i]
 
 
 class Curve:
@@ -163,9 +163,9 @@ def _tangents(at, changes):
     out[1:-1] = (secant[1:] * wide[:-1] + secant[:-1] * wide[1:]) / (wide[1:] + wide[:-1])
     limit = 3 * np.minimum(np.abs(secant[1:]), np.abs(secant[:-1]))
     out[1:-1] = np.clip(out[1:-1], -limit, limit)
-    for end, beside in ((0, 1), (-1, -2)):
+    for end, inner in ((0, 1), (-1, -2)):
         limit = 3 * np.abs(secant[end])
-        out[end] = np.clip(2 * secant[end] - out[beside], -limit, limit)
+        out[end] = np.clip(2 * secant[end] - out[inner], -limit, limit)
     return out
 
 
@@ -190,14 +190,14 @@ def square(there: dict) -> float:
     return sum(v**2 for k, v in there.items() if len(k) == 2)
 
 
-def apart(now: dict, there: dict) -> float:
+def squared_distance(now: dict, there: dict) -> float:
     """Square of the distance between parameters as of `sizes`; a shape that one of them has alone is far."""
     return sum((now[k] - v) ** 2 if k in now else 1.0 for k, v in there.items()) + len(now.keys() - there)
 
 
 def nearest(solved: list, now: dict) -> tuple:
     """The one of [(parameters, curve, tangents)] with the nearest parameters."""
-    return min(solved, key=lambda one: apart(now, one[0]))
+    return min(solved, key=lambda one: squared_distance(now, one[0]))
 
 
 def stack(one: dict) -> np.ndarray:

@@ -29,7 +29,7 @@ from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import BETWEEN, KNOWN, Nuisance, widen
 from ..trajectory import Trajectory
 from .differences import differences, softer, solved_fields, tacky
-from .fields import Fields, apart, nearest, sizes, square, stack
+from .fields import Fields, nearest, sizes, square, squared_distance, stack
 
 TIERS = ("condensed", "full")
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
@@ -336,11 +336,11 @@ class Simulator:
                 effect.apply(run, theta)
             runs.append(run)
         self._mechanics(trajectories, runs, fields, exact, modulus, before)
-        shares = [(getattr(nuisance, name), name) for name in BETWEEN if name in fields.slopes]
+        weights = [(getattr(nuisance, name), name) for name in BETWEEN if name in fields.slopes]
         if "modulus" in fields.slopes:
-            shares.append((np.log(modulus), "modulus"))
+            weights.append((np.log(modulus), "modulus"))
         for i, run in enumerate(runs):
-            between = sum(share * fields.slopes[name][i] for share, name in shares if share)
+            between = sum(by * fields.slopes[name][i] for by, name in weights if by)
             if nuisance.log_film and fields.film is not None:
                 between = between + fields.film.at(i, nuisance.log_film)
             if np.ndim(between):
@@ -385,7 +385,7 @@ class Simulator:
         ids, now = frozenset(e.id for e, _ in moving), sizes(moving)
         if ids in fields.curves:
             there, curve, known = nearest(fields.curves[ids], now)
-            near = apart(now, there) < _NEAR**2 * square(there)
+            near = squared_distance(now, there) < _NEAR**2 * square(there)
             if set(which) <= set(curve) and near and (known or not tangents):
                 return False
         some = [fields.trajectories[i] for i in which]
@@ -404,8 +404,8 @@ class Simulator:
             for name in effect.free:
                 p = effect.params[name]
                 by = _STEP if theta[name] + _STEP * p.scale < p.high else -_STEP
-                beside = (effect, theta | {name: theta[name] + by * p.scale})
-                other = missed([*moving[:k], beside, *moving[k + 1 :]])
+                nearby = (effect, theta | {name: theta[name] + by * p.scale})
+                other = missed([*moving[:k], nearby, *moving[k + 1 :]])
                 changes[effect.id, name] = {i: (other[i] - here[i]) / by for i in which}
         fields.curves.setdefault(ids, []).append((now, here, changes))
         return True
@@ -453,9 +453,9 @@ class Simulator:
                 if name in fields.slopes and (amount.any() if several else amount):
                     slope = fields.slopes[name][i]
                     change = change + slope * (amount[:, None] if several else amount)
-            for curve, share in curves:
+            for curve, weight in curves:
                 if i in curve:
-                    change = change + share * curve[i]
+                    change = change + weight * curve[i]
             if np.ndim(change):
                 run.add(change)
 
