@@ -3,12 +3,13 @@ r"""What a checkup finds in laboratories made of real recordings, with and witho
     python benchmarks/checkup_labs.py --data ../shared/data --authors ../shared/hidden_effects/authors \
         --half blind --seed 1 --json out/checkup.json
 
-A laboratory is one sensor in one session: rows of an unloaded sensor (rest), then rows of one that is pressed
-by hand on a force plate, or five grasps of a gripper where the effect is a temperature. The segments of the
-pressed rows are read off the force: where it stands still (hold), changes slowly (loops), fast (fast) or
-mostly tangentially (slides). The pressed logs have no rest in air: those of F2 have the same sensor's
-unloaded log before them, those of F1 another's of the same laboratory; the force of these rows is noise of
-5 mN, which is made up. Logs fade into each other within half a second, as a touch begins.
+A laboratory is one sensor that goes through the steps of `biotac checkup`, shortened. Where nothing touches
+its rows are those of an unloaded sensor's log, one after another; where something does, those of one that is
+pressed by hand on a force plate, from another place of that log for each touch. In between and in taps the
+change of ln Z goes from one to the other, each electrode by a power of its own, and the force with it: how
+touches begin and end is made up, and so is the plate's noise of 5 mN. The log of F2 has the same sensor's
+unloaded log, that of F1 another's of the same laboratory. Neither has a second temperature ('warm' is rest
+after load): an effect of temperature is put into five grasps of a gripper, which has a thermistor.
 
 Effects are put in by the forms of authors' generators (`discrepancy_recordings.py`), each in all of the
 laboratory. practice: F1 and the seventeenth author. blind: F2 and grasps, the twelfth and thirteenth author,
@@ -25,28 +26,31 @@ import pathlib
 import numpy as np
 from discrepancy_recordings import Authors, _recording, code_hash, judge, table
 from records import write_json
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
-from biotac_mj.recordings.protocol import Protocol, Segment
+from biotac_mj.recordings.protocol import STEPS, Protocol, Segment
+from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
 from biotac_mj.shards import Task, run_tasks
 
-_REST, _PRESSED = 40.0, 70.0  # [s] of a session
-_STILL = 0.35  # [N/s] below which the force stands still
-_FAST = 3.0  # [N/s] beyond which it changes fast
-_LEAST = 2.0  # [s] of a segment
-_FADE = 0.5  # [s] in which one log goes over into the next, as a touch begins
+_MOVE = 1.0  # [s] between steps
+# [s] of steps
+_STEPS = dict(rest=40, taps=10, hold=20, release=10, loops=20, fast=10, slides=15, warm=15)
+# touches of a step: how many, [s] in which one begins and ends, part of the time it lasts, share of a press
+_TOUCHES = dict(taps=(20, 0.06, 0.5, 0.5), hold=(1, 3.0, 1.0, 1.0), loops=(5, 1.9, 1.0, 1.0))
+_TOUCHES |= dict(fast=(8, 0.15, 0.7, 1.0), slides=(3, 0.5, 0.95, 0.7))
+_POWERS = 0.3  # spread of the logarithm of an electrode's power
+_FADE = 0.5  # [s] in which one grasp goes over into the next
 _PLATE = 5e-3  # [N] noise of a plate that nothing touches
 
 
 @dataclasses.dataclass
 class Lab:
-    """half; name; sensor: F1, F2 or THING/FINGER of a gripper; start: [s] of its rest and of its pressed
-    rows; author: module, or "" with nothing hidden; piece: number in that author's plan."""
+    """half; name; sensor: F1, F2 or THING/FINGER of a gripper; start: [s] in the log at rest; author: module,
+    or "" with nothing hidden; piece: number in that author's plan."""
 
     half: str
     name: str
     sensor: str
-    start: tuple = (0.0, 0.0)
+    start: float = 0.0
     author: str = ""
     piece: int = -1
 
@@ -78,10 +82,7 @@ def plan(authors: Authors, half: str, seed: int) -> list:
         # a grasp has no rest before it, and a thermistor
         grasp = half != "practice" and (kind == "thermal" or not name and rng.random() < 0.2)
         sensor = str(rng.choice(grasps)) if grasp else str(rng.choice(sensors))
-        start = (
-            float(rng.uniform(*((2, 45) if half == "practice" else (95, 135)))),
-            float(rng.uniform(2, 110)),
-        )
+        start = float(rng.uniform(0, 40))
         hidden = "+".join("".join(form) if isinstance(form, tuple) else form for form in _forms(spec))
         labs.append(Lab(half, f"{len(labs):03d} {sensor} {kind} {hidden}", sensor, start, name, i))
     return labs
@@ -96,20 +97,7 @@ def build(lab: Lab, authors: Authors):
     sources = authors.module("sources")
     data = pathlib.Path(authors.data)
     if lab.sensor in ("F1", "F2"):
-        at_rest, pressed = sources.source(data, "U"), sources.source(data, lab.sensor)
-        rows = slice(*np.searchsorted(at_rest.time, [lab.start[0], lab.start[0] + _REST]))
-        touched = slice(*np.searchsorted(pressed.time, [lab.start[1], lab.start[1] + _PRESSED]))
-        count, rng = rows.stop - rows.start, np.random.default_rng(int(lab.name[:3]))
-        x = np.rint(_joined([at_rest.x[rows], pressed.x[touched]], at_rest.rate))
-        force = _joined([rng.normal(0, _PLATE, (count, 3)), pressed.force[touched]], at_rest.rate)
-        count -= round(_FADE * at_rest.rate)
-        source = sources.Source(x, np.arange(len(x)) / at_rest.rate, at_rest.rate, force)
-        source.rest = np.median(at_rest.x[rows], 0)
-        rest_time = count / source.rate
-        segments = [
-            Segment("rest", 0.0, rest_time, "air"),
-            *_read_off(pressed.force[touched], source.rate, rest_time),
-        ]
+        source, segments = _session(lab, sources.source(data, "U"), sources.source(data, lab.sensor), sources)
     else:
         thing, finger = lab.sensor.split("/")
         trials = [sources.source(data, f"phac/{thing}_{k:02d}/F{finger}") for k in range(1, 6)]
@@ -120,6 +108,41 @@ def build(lab: Lab, authors: Authors):
         segments = [Segment("hold", long * k, long * (k + 1), thing) for k in range(5)]
     base = lab.sensor + "+f" if lab.sensor[0] == "F" else f"phac/{lab.sensor}"
     return _hidden(lab, authors, source, base), Protocol(tuple(segments))
+
+
+def _session(lab, at_rest, pressed, sources):
+    """Source and segments of a sensor that goes through the steps, from its logs at rest and pressed."""
+    rate, rng = at_rest.rate, np.random.default_rng([int(lab.name[:3]), int(1e6 * lab.start)])
+    segments, stop = [], 0.0
+    for kind, seconds in _STEPS.items():
+        start, stop = stop + _MOVE, stop + _MOVE + seconds
+        segments.append(Segment(kind, start, stop, "plate" if STEPS[kind].touched else "air"))
+    rows = slice(*np.searchsorted(at_rest.time, [lab.start, lab.start + stop]))
+    # rows that the bus repeats do so in both logs: new ones are put together, and repeated as at rest
+    held, fresh = at_rest.held[rows], np.cumsum(~at_rest.held[rows])
+    load, force = log_impedance(pressed.x[~pressed.held]), pressed.force[~pressed.held]
+    share, of, time = np.zeros(len(held)), np.zeros(len(held), int), at_rest.time[rows] - lab.start
+    for one in segments:
+        if not STEPS[one.kind].touched:
+            continue
+        number, ramp, part, most = _TOUCHES[one.kind]
+        begins = np.linspace(one.start, one.stop, number, endpoint=False)
+        places = rng.integers(len(load) - (one.stop - one.start) * rate, size=number)
+        for begin, place in zip(begins, places):
+            touch = slice(*np.searchsorted(time, [begin, begin + part * (one.stop - one.start) / number]))
+            passed = time[touch] - begin
+            inside = np.clip(np.minimum(passed, passed[-1] - passed) / ramp, 0, 1)
+            share[touch] = most * rng.uniform(0.8, 1.0) * np.sin(0.5 * np.pi * inside) ** 2
+            if one.kind == "loops":  # at one place
+                place = places[0] + fresh[touch.start] - fresh[np.searchsorted(time, one.start)]
+            of[touch] = place + fresh[touch] - fresh[touch.start]
+    z, power = log_impedance(at_rest.x[rows]), np.exp(_POWERS * rng.standard_normal(19))
+    x = counts_from_log_impedance(z + share[:, None] ** power * (load[of] - z))
+    new = np.maximum.accumulate(np.where(held, 0, np.arange(len(held))))
+    force = share[:, None] * force[of] + rng.normal(0, _PLATE, (len(held), 3))
+    source = sources.Source(np.rint(x)[new], time, rate, force)
+    source.rest = np.median(at_rest.x[rows], 0)
+    return source, segments
 
 
 def _joined(parts, rate):
@@ -147,27 +170,6 @@ def _hidden(lab, authors, source, base):
         spec = dataclasses.replace(spec, level=None, **clean)
     case, _ = module.make(spec, authors.data)
     return authors.words.Case(**case)
-
-
-def _read_off(force, rate, begin):
-    """Segments of pressed rows (n, 3) [N] that begin at a time [s]."""
-    smooth = gaussian_filter1d(force, 0.1 * rate, axis=0)
-    speed = np.abs(np.diff(smooth, axis=0, prepend=smooth[:1])) * rate
-    normal, along = (uniform_filter1d(v, round(rate)) for v in (speed[:, 2], np.hypot(*speed[:, :2].T)))
-    kind = np.where(
-        np.maximum(normal, along) < _STILL, 0, np.where(along > normal, 3, np.where(normal > _FAST, 2, 1))
-    )
-    edges = np.flatnonzero(np.diff(kind, prepend=-1, append=-1))
-    out = []
-    for first, last in zip(edges[:-1], edges[1:]):
-        if (last - first) / rate >= _LEAST or not out:
-            start = out[-1].stop if out else begin
-            out.append(
-                Segment(("hold", "loops", "fast", "slides")[kind[first]], start, begin + last / rate, "plate")
-            )
-        else:  # too short for a segment: it belongs to the one before
-            out[-1] = dataclasses.replace(out[-1], stop=begin + last / rate)
-    return out
 
 
 class Judge:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from logs import RATE, noisy, tapped, unloaded
+from scipy.ndimage import gaussian_filter1d
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search
@@ -74,6 +75,18 @@ def test_what_jumps_together_without_a_force_is_unknown():
 @pytest.mark.parametrize("rows", (5, 12))
 def test_sharp_touches_without_force_are_no_fault(rows):
     assert not diagnose_recording(PlainRecording(tapped(rows)[0], rate=RATE)).significant
+
+
+def test_rows_of_another_sensor_are_no_touches():
+    """All electrodes go there and back, by the same each time."""
+    counts, rng = unloaded(3, 12)
+    hand = gaussian_filter1d(rng.standard_normal((len(counts), 3)), 12, axis=0)
+    counts = counts + 60 * hand @ rng.standard_normal((3, 19))
+    other = rng.normal(0, 60, 19)
+    assert not diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE)).significant
+    for row in range(100, len(counts) - 100, 150):
+        counts[row : row + 5 + row % 19] += other
+    assert diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE)).verdict.startswith("unknown")
 
 
 def test_what_one_electrode_does_in_company_is_of_touch():

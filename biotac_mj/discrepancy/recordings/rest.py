@@ -4,6 +4,8 @@ others and from its own earlier blocks."""
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial import cKDTree
 
 from ...quality.adjacent import sharp
 from ...quality.clock import CLOCK_FAULT
@@ -123,11 +125,10 @@ def _of_rows(session):
     most_over = int(over.mean(1).argmax())
     swing = float(np.sort(beats[most_over])[-3])
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
-    # from one row to the next, more than noise and than the rows around, where nothing touches: so says the
-    # force, or without one the other electrodes
+    # from one row to the next, more than noise and than the rows around, where nothing touches
     least, log = 6 * noise_level(x) + 2, as_log(r)
-    many = (np.abs(np.diff(x, axis=0)) > least).sum(1) > log.some(_OWN)
-    jumps = sharp(x, least) & ~(many if r.force is None else log.touched[rows][1:])[:, None]
+    touch = log.touched[rows][1:] if r.force is not None else _together(np.diff(x, axis=0) / least, log)
+    jumps = sharp(x, least) & ~touch[:, None]
     jumps[[one[0] - 1 for one in series[1:]]] = False
     # noise never comes again in all electrodes
     same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
@@ -151,6 +152,18 @@ def _of_rows(session):
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),
     }, said
+
+
+def _together(step, log):
+    """(n,) bool, steps (n, c) of more than one in many electrodes, as a touch makes where no force says so.
+    No two touches are alike: what comes, stays and goes several times by the same is none."""
+    many = (np.abs(step) > 1).sum(1) > log.some(_OWN)
+    stays = np.flatnonzero(many & (uniform_filter1d(many.astype(float), 5) < 0.3))
+    if len(stays):
+        tree = cKDTree(step[stays])
+        alike = [tree.query_ball_point(way * step[stays], 1, p=np.inf, return_length=True) for way in (1, -1)]
+        many[stays] = sum(alike) <= 2 * _FEW
+    return many
 
 
 def _spectrum(x, series, size, least):
