@@ -30,7 +30,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: press test test-all test-wheel test-newest test-neighbours docs benchmarks assets clean
 
 press: $(VENV)/.installed
-	@echo "a press takes 10 s of processor time; the first on a machine a minute, its kernels are compiled"
+	@echo "a press takes 10 s of processor time; the first on a machine 45 s, its kernels are compiled"
 	$(BIN)/biotac press $(ARGS)
 
 test: $(VENV)/.installed-test

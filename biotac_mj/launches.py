@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
+from .kernels import kernel_module
+
 try:
     from warp._src.context import _build_cpu_args_structs as _pack
 except ImportError:
@@ -16,7 +18,7 @@ except ImportError:
 # versions of Warp in whose code the signature of CPU kernels was checked: addresses of bounds and arguments
 _KNOWN = ("1.19.",)
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 # Each of `count` entries of four numbers is a launch (0, kernel, bounds, arguments), or a loop over other

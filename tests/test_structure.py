@@ -18,34 +18,36 @@ LAYERS = {
     "files": "short_repr",
     "short_repr": "",
     "reading": "short_repr",
-    "launches": "",
+    "launches": "kernels",
+    "kernels": "",
     "lazy": "",
     "shards": "files versions",
     "threads": "",
     "triangles": "",
     "units": "short_repr",
     "versions": "biotac_mj",
-    "geometry": "cache short_repr fields files reading quiet triangles",
-    "skin": "cache short_repr lazy geometry fields files reading threads quiet launches triangles",
+    "geometry": "kernels cache short_repr fields files reading quiet triangles",
+    "skin": "kernels cache short_repr lazy geometry fields files reading threads quiet launches triangles",
     "quiet": "launches",
-    "sensor": "cache short_repr lazy fields files geometry threads quiet launches",
+    "sensor": "kernels cache short_repr lazy fields files geometry threads quiet launches",
     "effects": "short_repr lazy skin sensor geometry fields files reading",
-    "coupling": "cache short_repr lazy skin sensor effects geometry fields launches threads learning.serve",
+    "coupling": "kernels cache short_repr lazy skin sensor effects geometry fields launches threads "
+    "learning.serve",
     "plugin": "coupling",
-    "batch": "short_repr coupling skin sensor effects geometry fields learning.serve",
+    "batch": "kernels short_repr coupling skin sensor effects geometry fields learning.serve",
     "mjx": "batch coupling",
     "neighbours": "lazy batch coupling geometry recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading short_repr triangles units "
     "versions view.offscreen",
-    "differentiable": "cache short_repr fields coupling plugin geometry skin sensor threads calibration "
-    "recordings files press.indenter data.generation.clearance",
+    "differentiable": "kernels cache short_repr fields coupling plugin geometry skin sensor threads "
+    "calibration recordings files press.indenter data.generation.clearance",
     "calibration": "cache geometry skin sensor.channels fields files reading press.indenter press.path",
     "quality": "sensor.channels",
     "recordings": "short_repr lazy arguments quality sensor geometry fields files reading",
-    "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
-    "press.approach press.indenter press.path learning.serve",
-    "tasks": "cache short_repr lazy coupling plugin batch sensor effects geometry fields files reading "
-    "triangles versions data.objects view.offscreen",
+    "data": "kernels lazy recordings geometry skin sensor effects fields files reading shards triangles "
+    "versions press.approach press.indenter press.path learning.serve",
+    "tasks": "kernels cache short_repr lazy coupling plugin batch sensor effects geometry fields files "
+    "reading triangles versions data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry fields files reading triangles tasks press",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "

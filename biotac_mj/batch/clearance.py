@@ -6,6 +6,7 @@ import warp as wp
 
 from ..coupling.steppers.fem import CLEAR
 from ..geometry.rigid_warp import is_finite
+from ..kernels import kernel_module
 from ..skin.block import block_max
 from ..skin.contact.broadphase import ALL, contact_range, face_clearance, motion_bound, sample_clearance
 from ..skin.contact.faces import Laws
@@ -15,7 +16,7 @@ from ..skin.model import SkinModel
 from ..skin.program import Launcher
 from ..skin.types import mat33, real, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _CLEAR = wp.constant(wp.float64(CLEAR))
 # by which distances may change faster than places: grids are trilinear

@@ -9,8 +9,6 @@ from ..coupling.implicit.rows import ROWS
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-wp.set_module_options({"enable_backward": False})
-
 Rows = ROWS[wp.float32]
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 

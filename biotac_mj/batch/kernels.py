@@ -8,12 +8,13 @@ import warp as wp
 
 from ..coupling.implicit.rounds import Model
 from ..coupling.implicit.rows import hold_by_rows
+from ..kernels import kernel_module
 from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from ..skin.types import double, mat33, mat66, real, vec3, vec6, widen
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.kernel

@@ -11,13 +11,14 @@ import warp as wp
 from mujoco_warp._src.types import ContactType
 
 from ..coupling.loads import PYRAMID, passes
+from ..kernels import kernel_module
 from ..skin.types import double, real, vec3, vec6, widen
 from .engine import Contacts, contacts_of, copy_contact, vec5
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _FORCE, _TORQUE, _TOUCH, _CONTACT = (
     int(getattr(mujoco.mjtSensor, f"mjSENS_{n}")) for n in ("FORCE", "TORQUE", "TOUCH", "CONTACT")

@@ -15,6 +15,7 @@ import warp as wp
 from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
 from ..coupling.implicit.rounds import Model
 from ..coupling.implicit.rules import PATIENCE, stayed
+from ..kernels import kernel_module
 from ..skin.contact.broadphase import contact_range
 from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
@@ -23,7 +24,7 @@ from ..skin.state import allocate
 from ..skin.types import mat66, real, vec3, vec4, vec6
 from .clearance import Clearance, Seen, forget, make_seen, margin_of
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _PATIENCE = wp.constant(PATIENCE)
 _stayed = wp.func(stayed)

@@ -11,6 +11,7 @@ from ..coupling.sensing.counts import materials_of, textures_of
 from ..coupling.stepper import Geom
 from ..effects.sensors import take_sensor
 from ..geometry.design import BIOTAC, Design
+from ..kernels import kernel_module
 from ..sensor.acquisition import BatchAcquisition
 from ..sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
 from ..sensor.materials import Material
@@ -20,7 +21,7 @@ from ..skin.modes import skin_modes
 from ..skin.touched import Touched
 from .skin import BatchSkin
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _POOL = 256  # sensors that resets draw from, at least
 

@@ -2,11 +2,12 @@
 
 import warp as wp
 
+from ..kernels import kernel_module
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
 from ..skin.types import mat33, real, vec3, vec6
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.kernel

@@ -3,10 +3,11 @@
 
 import warp as wp
 
+from ..kernels import kernel_module
 from ..skin.types import double, real, vec6, widen
 from .engine import Contacts, Rows
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.kernel

@@ -9,6 +9,7 @@ import warp as wp
 
 from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
 from ..coupling.solid_contacts import SolidPairs
+from ..kernels import kernel_module
 from ..skin.contact.overlap import MOST
 from ..skin.types import double, mat33, real, vec3, widen
 from .engine import Contacts, contacts_of, copy_contact
@@ -16,7 +17,7 @@ from .engine import Contacts, contacts_of, copy_contact
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _CONSTRAINT = wp.constant(1)  # bit of mujoco_warp's ContactType
 _MINMU = wp.constant(wp.float32(mujoco.mjMINMU))

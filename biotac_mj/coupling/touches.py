@@ -3,10 +3,11 @@
 import numpy as np
 import warp as wp
 
+from ..kernels import kernel_module
 from ..skin.types import real, vec3, vec6
 from .implicit.kinematics import row
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _TINY = wp.constant(wp.float64(1e-12))  # [N]
 

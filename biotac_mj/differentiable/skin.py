@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..geometry.skin_geometry import SkinGeometry
+from ..kernels import kernel_module
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.meshes import DistanceGrid
 from ..skin.program import Program
@@ -30,7 +31,7 @@ FINEST = 1e-9  # least precision of linear solves, below which a step's own roun
 NUMBERS = ("mu", "lam", "contact_stiffness", "natural", "kappa")
 
 
-@wp.kernel(module=f"{__name__}.sums", enable_backward=False)
+@wp.kernel(module=kernel_module(f"{__name__}.sums"))
 def _sum_corners(
     # In:
     start: wp.array(dtype=int),

@@ -9,6 +9,7 @@ import typing
 import torch
 import warp as wp
 
+from ..kernels import kernel_module
 from ..skin.contact.posed import MESH, Geoms, meet
 from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
@@ -139,7 +140,7 @@ def find_touching(
     return Touching(sample, geom, face, node, at, area, plane, point, last, local, old, stick, nworld)
 
 
-@wp.kernel(module=f"{__name__}.met", enable_backward=False)
+@wp.kernel(module=kernel_module(f"{__name__}.met"))
 def _meet(
     # In:
     geom: wp.array(dtype=int),
@@ -192,7 +193,7 @@ def _in_frame(point, pos, mat):
     return torch.einsum("mki,mk->mi", mat, point - pos)
 
 
-@wp.kernel(module=f"{__name__}.behind", enable_backward=False)
+@wp.kernel(module=kernel_module(f"{__name__}.behind"))
 def _leaves_other_side(
     # In:
     geom: wp.array(dtype=int),

@@ -18,7 +18,9 @@ import warp as wp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-wp.set_module_options({"enable_backward": False})
+from ..kernels import kernel_module
+
+kernel_module(__name__)
 
 real, vec3 = wp.float64, wp.vec3d
 FACE = wp.constant(

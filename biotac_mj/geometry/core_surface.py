@@ -5,6 +5,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..kernels import kernel_module
 from ..quiet import quiet_warp
 from .closest import (
     FACE,
@@ -19,7 +20,7 @@ from .closest import (
 
 quiet_warp()
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _FARTHEST = 1.0e4  # [mm] largest distance of a query point from the core
 _NEAREST = 64  # most candidate triangles per point

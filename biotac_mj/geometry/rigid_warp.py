@@ -4,8 +4,6 @@ A small motion has the translation of the point at the origin first, then the ro
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
-
 real = wp.float64
 vec3 = wp.vec3d
 mat33 = wp.mat33d

@@ -14,9 +14,11 @@ from biotac_mj.sensor import channels
 from biotac_mj.sensor.formulas import for_kernels
 from biotac_mj.sensor.presets import MOST_LATENCY, numbers_of
 
+from ..kernels import kernel_module
+
 quiet_warp()
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 SLOT_RATE = 4400.0  # [Hz]
 

@@ -28,7 +28,9 @@ import warp as wp
 
 from biotac_mj.sensor.materials import Material
 
-wp.set_module_options({"enable_backward": False})
+from ..kernels import kernel_module
+
+kernel_module(__name__)
 
 NCELL = 8  # finite volumes through the skin
 NBRANCH = 10  # stores of a half-space

@@ -28,9 +28,10 @@ from numpy.typing import ArrayLike
 from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, draw_normal, slots_until
 from biotac_mj.sensor.materials import material_named
 
+from ..kernels import kernel_module
 from ..short_repr import short_repr
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 real = wp.float64
 

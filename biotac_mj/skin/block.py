@@ -5,8 +5,6 @@ import warp as wp
 
 from .types import real, vec3, vec6
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)

@@ -10,9 +10,10 @@ import warp as wp
 
 from ..geometry import rigid_warp
 from ..geometry.rigid import cross, rotation
+from ..kernels import kernel_module
 from .types import mat33, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.struct

@@ -24,11 +24,12 @@ from numpy.typing import ArrayLike
 
 from ..fields import as_numbers
 from ..geometry.surface import face_areas, node_areas
+from ..kernels import kernel_module
 from ..short_repr import short_repr
 from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 WATER = 2.2e9  # [Pa]
 

@@ -108,14 +108,13 @@ _compiling: dict[tuple, concurrent.futures.Future] = {}
 # Warp modules that every skin needs on the CPU: those of its geometry and sensor, which are launched before a
 # step is prepared, and those of the steps
 _MAKING = """
-    skin.contact.meshes skin.contact.penetration.rest_gap skin.contact.meshes.compare geometry.closest
-    geometry.core_surface sensor.film.kernels sensor.film.systems.solve_sheet coupling.implicit.poses
+    skin.contact.meshes skin.contact.distances geometry.closest geometry.core_surface sensor.film.kernels
+    sensor.film.systems.solve_sheet coupling.implicit.poses
 """.split()
 _STEPPING = """
-    skin.contact.penetration skin.contact.proximity skin.contact.broadphase skin.newton.load_path
-    skin.precondition.supernodal sensor.acquisition_kernels skin.contact.faces skin.contact.faces.sum_wrench
-    skin.newton.nodes skin.newton.worlds skin.newton.convergence skin.newton.krylov skin.newton.line_search
-    skin.liquid launches
+    skin.newton.load_path skin.precondition.supernodal sensor.acquisition_kernels skin.contact.faces
+    skin.contact.faces.sum_wrench skin.newton.nodes skin.newton.worlds skin.newton.convergence
+    skin.newton.krylov skin.newton.line_search skin.liquid launches
 """.split()
 
 

@@ -28,7 +28,8 @@ import warp as wp
 from ..threads import single_thread
 from .bodies import Bodies
 from .compliant_bodies import CompliantBodies
-from .contact import broadphase, faces, penetration
+from .contact import faces, penetration
+from .contact.meshes import DISTANCES
 from .contact.posed import LoadPath
 from .contact.touch import BLOCK, CORE, contact_kernels
 from .data import SkinData
@@ -119,7 +120,7 @@ def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, in
     `program.compile_ahead`. shapes: see `GeomSet.shapes`."""
     found = [(contact_kernels(False, False, kind).by_sample.module, BLOCK) for kind in (CORE, shapes)]
     found.append((batched_inverse.invert_kernel.module, batched_inverse.THREADS))
-    return [*found, (penetration, 256), (faces, 256), (broadphase, 256)]
+    return [*found, (wp.get_module(DISTANCES), 256), (faces, 256)]
 
 
 def _refuse_other_options(model, data):

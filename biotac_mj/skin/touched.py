@@ -8,11 +8,12 @@ friction anchors over the body."""
 import numpy as np
 import warp as wp
 
+from ..kernels import kernel_module
 from .data import SkinData
 from .modes import SkinModes
 from .types import real, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd

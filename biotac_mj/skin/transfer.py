@@ -5,9 +5,10 @@ from typing import Any
 
 import warp as wp
 
+from ..kernels import kernel_module
 from .types import real
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _CHUNK = 8  # items that a thread writes at a time on CUDA; on the CPU one thread writes an array
 _THREADS = 2**17  # on CUDA, about: most launches find little to write, and ending threads takes time too

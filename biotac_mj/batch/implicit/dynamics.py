@@ -7,10 +7,11 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
+from ...kernels import kernel_module
 from ...skin.newton.worlds import NOT_FINITE
 from ...skin.types import mat66, real, vec6
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 _EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))

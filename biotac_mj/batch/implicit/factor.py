@@ -6,6 +6,7 @@ import mujoco
 import warp as wp
 
 from ...coupling.implicit.compliance import THREADS, factor
+from ...kernels import kernel_module
 from ...skin.program import Launcher
 from ...skin.types import real, vec6
 from ..engine import Contacts, Rows, contacts_of, rows_of
@@ -13,7 +14,7 @@ from ..engine import Contacts, Rows, contacts_of, rows_of
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _CONE = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE))
 _ELLIPTIC = int(mujoco.mjtCone.mjCONE_ELLIPTIC)

@@ -17,6 +17,7 @@ from ...coupling.implicit.compliance import substitute
 from ...coupling.implicit.rounds import Model, make_model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
+from ...kernels import kernel_module
 from ...skin.block import block_max, sync
 from ...skin.condensed.elimination import eliminate
 from ...skin.program import Launcher
@@ -26,7 +27,7 @@ from .factor import Cones, Factor
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 BLOCK = 64  # threads that correct the forces of a world

@@ -11,12 +11,13 @@ from typing import Any
 import mujoco
 import warp as wp
 
+from ...kernels import kernel_module
 from ...skin.block import MEMORY, block_memory, block_rank, sync
 from ...skin.types import real, vec6
 from .rounds import Model
 from .rows import ROWS
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 THREADS = 64  # that factor a world's matrix on CUDA
 

@@ -7,13 +7,14 @@ MuJoCo: `Rounds.acting`."""
 import warp as wp
 
 from ...geometry.rigid_warp import is_finite, motion
+from ...kernels import kernel_module
 from ...skin.newton.worlds import CONVERGED
 from ...skin.types import mat66, real, vec6
 from .marks import MarkedWorlds, mark
 from .rounds import Model, Rounds, Solid, force_of
 from .rules import EULER, beta_of, fraction_within, in_store, lacking, spared
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 _in_store, _lacking, _spared = (wp.func(rule) for rule in (in_store, lacking, spared))

@@ -3,8 +3,6 @@ them."""
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.struct
 class MarkedWorlds:

@@ -9,10 +9,11 @@ from typing import Any
 import warp as wp
 
 from ...geometry.rigid_warp import is_finite, rotation
+from ...kernels import kernel_module
 from ...skin.types import double, mat33, real, vec3, vec6, widen
 from .rounds import Rounds, follow
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 def _motion(scalar, vector, matrix, spatial):

@@ -6,6 +6,7 @@ Poses are [group, world], in the BioTac frame."""
 import warp as wp
 
 from ...geometry.rigid_warp import LEVER, displace_at_once, is_finite, motion, motion_at_once, size_of
+from ...kernels import kernel_module
 from ...skin.bodies import Bodies
 from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
@@ -14,7 +15,7 @@ from ...skin.types import mat33, mat66, real, vec3, vec6
 from .marks import MarkedWorlds, mark
 from .rules import EULER, TELEPORT, TOLERANCE, beta_of, gamma_of
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 _gamma_of, _beta_of = (wp.func(rule) for rule in (gamma_of, beta_of))

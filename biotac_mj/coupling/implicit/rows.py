@@ -5,9 +5,10 @@ from typing import Any
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ...skin.types import mat66, real, vec6
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 _NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from ...kernels import kernel_module
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from ...skin.types import mat66, real, vec6
 from ..setup import Setup
@@ -20,7 +21,7 @@ from .rows import keep_held
 from .rules import LOSS_FREQUENCY
 from .springs import Springs
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.kernel

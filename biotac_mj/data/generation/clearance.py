@@ -4,6 +4,7 @@ depth."""
 import numpy as np
 import warp as wp
 
+from ...kernels import kernel_module
 from ...skin.contact.faces import face_samples
 from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
@@ -11,7 +12,7 @@ from ...skin.geoms import GeomSet
 from ...skin.types import real, vec3
 from ..objects import make_object
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _FAR = 2e-3  # [m] range of a mesh's distance grid
 

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from ...kernels import kernel_module
 from ...skin import GeomSet, SkinModel, step
 from ...skin.modes import SkinModes
 from ...skin.per_world import make_worlds
@@ -19,7 +20,7 @@ from ..schema import DISPLACEMENT_SCALE, nodes_of
 from .clearance import Placed
 from .readings import Readings, Touch
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _LARGEST_STEP = 1.0e-4  # [m] longest displacement in a step of the skin: twice that converges worse at edges
 _ARM = 4e-3  # [m] lever arm that converts rotations of an object to displacements

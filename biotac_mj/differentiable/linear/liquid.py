@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from ...geometry.rigid import skew
+from ...kernels import kernel_module
 from ...skin.liquid import InnerFaces, inner_faces, wet_faces
 from ...skin.types import real, vec3
 from ..record import Record
@@ -21,7 +22,7 @@ from .inverse import FaceBlocks
 from .samples import LinearSurface
 
 _NUMBERS = 9
-_adjoint = wp.kernel(wet_faces.func, module=f"{__name__}.adjoint", enable_backward=True)
+_adjoint = wp.kernel(wet_faces.func, module=kernel_module(f"{__name__}.adjoint"), enable_backward=True)
 
 
 class LinearLiquid:

@@ -10,6 +10,7 @@ import dataclasses
 import torch
 import warp as wp
 
+from ...kernels import kernel_module
 from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
 from ...skin.contact.touch import smooth_stick_or_slip, smooth_traction, stick_or_slip
@@ -22,7 +23,7 @@ from .inverse import FaceBlocks
 _OUTPUTS = 6  # force, anchor
 
 
-@wp.kernel(module=f"{__name__}.adjoint", enable_backward=True)
+@wp.kernel(module=kernel_module(f"{__name__}.adjoint"), enable_backward=True)
 def _sample_outputs(
     # In:
     stick_ratio: real,

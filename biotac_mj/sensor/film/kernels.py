@@ -6,7 +6,9 @@ import warp as wp
 from biotac_mj.geometry.core_surface import Core, NearestTriangles, nearest_listed_on_core
 from biotac_mj.geometry.design import MOST_EXCITATION
 
-wp.set_module_options({"enable_backward": False})
+from ...kernels import kernel_module
+
+kernel_module(__name__)
 
 NSAMPLE = 24  # sample points of equal area on a disc
 # barycentric tolerance for a sample on an edge: both faces accept it under rounding

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import splu
 from biotac_mj.geometry.design import MOST_DISCS
 from biotac_mj.sensor.film.kernels import Network, driving_point, real
 
-wp.set_module_options({"enable_backward": False})
+from ...kernels import kernel_module
 
 TILE = MOST_DISCS  # rows of a tile, and columns of right-hand sides: the discs, padded
 THREADS = 128  # of a block that solves a band
@@ -376,7 +376,7 @@ def _eliminate_band(world: int, nblock: int, reach: int, system: wp.array2d(dtyp
 
 
 # launched with its own block size: in this module all kernels would be compiled for both sizes
-@wp.kernel(module=f"{__name__}.solve_sheet", enable_backward=False, launch_bounds=(THREADS, 4))
+@wp.kernel(module=kernel_module(f"{__name__}.solve_sheet"), launch_bounds=(THREADS, 4))
 def solve_sheet(
     # In:
     due: wp.array(dtype=int),

@@ -18,8 +18,6 @@ from .states import BALANCED, Increment, Linear, Newton, Predictor
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import multiply, solve_system
 
-wp.set_module_options({"enable_backward": False})
-
 TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps would cause chatter
 # at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
 # where a search along a step has caught the jump so closely, as a fraction of the tolerance. Viscosity makes

@@ -15,8 +15,6 @@ from ..newton.load_path import partial_turn
 from ..types import real, vec3
 from .structs import Constants, F, Scratch
 
-wp.set_module_options({"enable_backward": False})
-
 vec6 = wp.spatial_vectord
 _LEVER = wp.constant(real(1e-2))  # lever arm of rotations [m]
 

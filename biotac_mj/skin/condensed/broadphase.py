@@ -22,8 +22,6 @@ from .lanes import keep_rows
 from .states import Increment
 from .structs import BACK, Constants, Scratch
 
-wp.set_module_options({"enable_backward": False})
-
 _MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
 _STILL = wp.constant(real(2e-4))  # so far, where the core's may be nearer than these tell [m]

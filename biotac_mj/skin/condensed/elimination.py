@@ -4,8 +4,6 @@ import warp as wp
 
 from ..block import block_memory
 
-wp.set_module_options({"enable_backward": False})
-
 MOST_EQUATIONS = 1024  # that `eliminate` has room for
 
 

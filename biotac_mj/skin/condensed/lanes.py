@@ -3,8 +3,6 @@ the threads of a block."""
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
-
 
 # By one thread the compliance between the candidates is kept, contiguous: B has rows of length m, one for
 # each candidate's coordinate, which are gathered when they are first used, and P what they have in the

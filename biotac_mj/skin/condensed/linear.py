@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from ...cache import cached
 from ...geometry.tet_mesh import enclosed_volume
+from ...kernels import kernel_module
 from ..contact.meshes import grid_value, mesh_distance, mesh_field
 from ..contact.posed import Geoms
 from ..liquid import volume_gradient
@@ -20,7 +21,7 @@ from .structs import Constants
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 # half a step of the differences that give the directions away from the core, half a cell of its grid [m]
 _PROBE = 2e-4

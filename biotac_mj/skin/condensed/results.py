@@ -3,6 +3,7 @@ bodies and their tangents."""
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import block_max, block_sum, sync
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
@@ -14,7 +15,7 @@ from .states import Linear
 from .structs import DU, Constants, F, G, Remembered, Scratch
 from .system import equations_of, fill_contact, gather_blocks
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)
 

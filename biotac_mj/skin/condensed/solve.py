@@ -7,6 +7,7 @@ import types
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..contact.posed import Geoms
 from ..contact.touch import SKINS
 from ..newton.worlds import Worlds
@@ -15,8 +16,6 @@ from .balance import newton_method
 from .states import BALANCED, DONE, NEWTON, SEARCH
 from .stepping import begin_step, conclude_balance, search
 from .structs import Constants, Remembered, Scratch
-
-wp.set_module_options({"enable_backward": False})
 
 LARGEST_BLOCK = 256  # threads of a world, the most samples of a face
 
@@ -32,7 +31,7 @@ def whole_step() -> wp.Kernel:
     """Kernel with all phases and all shapes of geoms, for the CPU."""
     balance = newton_method(SKINS)
 
-    @wp.kernel(module=f"{__name__}.whole", enable_backward=False)
+    @wp.kernel(module=kernel_module(f"{__name__}.whole"))
     def step(
         # In:
         law: int,
@@ -60,7 +59,7 @@ def whole_step() -> wp.Kernel:
     return step
 
 
-@wp.kernel(module=f"{__name__}.begin", enable_backward=False, launch_bounds=(LARGEST_BLOCK, 2))
+@wp.kernel(module=kernel_module(f"{__name__}.begin"), launch_bounds=(LARGEST_BLOCK, 2))
 def _begin(
     # In:
     law: int,
@@ -73,7 +72,7 @@ def _begin(
     begin_step(w, t, wp.block_dim(), law, geoms, s, st)
 
 
-@wp.kernel(module=f"{__name__}.search", enable_backward=False, launch_bounds=(LARGEST_BLOCK, 2))
+@wp.kernel(module=kernel_module(f"{__name__}.search"), launch_bounds=(LARGEST_BLOCK, 2))
 def _search(
     # In:
     geoms: Geoms,
@@ -92,7 +91,7 @@ def _search(
 def _balance(shapes):
     balance = newton_method(shapes)
 
-    @wp.kernel(module=f"{__name__}.balance.{shapes}", enable_backward=False, launch_bounds=(LARGEST_BLOCK, 2))
+    @wp.kernel(module=kernel_module(f"{__name__}.balance.{shapes}"), launch_bounds=(LARGEST_BLOCK, 2))
     def _balance(
         # In:
         geoms: Geoms,
@@ -107,7 +106,7 @@ def _balance(shapes):
     return _balance
 
 
-@wp.kernel(module=f"{__name__}.conclude", enable_backward=False, launch_bounds=(LARGEST_BLOCK, 2))
+@wp.kernel(module=kernel_module(f"{__name__}.conclude"), launch_bounds=(LARGEST_BLOCK, 2))
 def _conclude(
     # In:
     geoms: Geoms,

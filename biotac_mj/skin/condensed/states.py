@@ -7,8 +7,6 @@ import warp as wp
 
 from ..types import real
 
-wp.set_module_options({"enable_backward": False})
-
 # next phase: none; broad phase of an increment; Newton's method; decision about increment and step
 DONE, SEARCH, NEWTON, BALANCED = (wp.constant(i) for i in range(4))
 

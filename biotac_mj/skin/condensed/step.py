@@ -20,8 +20,6 @@ from .solve import block_of, phases, whole_step
 from .states import Increment, LoadStepping, Newton
 from .structs import NVECTOR, Previous, Remembered, Scratch
 
-wp.set_module_options({"enable_backward": False})
-
 
 def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
     """Modules of a step's kernels on CUDA that take long to compile, with their block sizes, for

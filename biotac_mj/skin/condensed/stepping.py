@@ -30,8 +30,6 @@ from .states import BALANCED, DONE, NEWTON, SEARCH, Increment, Linear, LoadStepp
 from .structs import Constants, F, G, Remembered, Scratch
 from .system import count_contacts, gather_load
 
-wp.set_module_options({"enable_backward": False})
-
 _is_measured = wp.func(is_measured)
 
 _REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]

@@ -11,8 +11,6 @@ from .lanes import add_row, add_rows, begin_row, dot_column, gather_rows, sum_ro
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.func
 def gather_load(w: int, t: int, threads: int, n: int, p: int, c: Constants, s: Scratch):

@@ -10,9 +10,8 @@ import warp as wp
 
 from ..types import double, mat33, real, single, vec3
 from .faces import Contact, Laws
+from .meshes import DISTANCES
 from .posed import Geoms, bound_to, place_on, touch_bound
-
-wp.set_module_options({"enable_backward": False})
 
 FREE = wp.constant(real(1.0))  # [m] clearance of a face far from all geoms
 
@@ -195,7 +194,7 @@ _STRETCHED = wp.constant(real(1.0 + 1.0e-6))  # above the stretch by rotations i
 _LONG = wp.constant(real(1.0e3))  # [m] of travel, to which small motions cannot be added exactly
 
 
-@wp.kernel
+@wp.kernel(module=DISTANCES)
 def track_geoms(
     # In:
     mark: int,
@@ -257,7 +256,7 @@ def store_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, clearance: rea
     cache.seen[3 * f + 2, w] = single(x2)
 
 
-@wp.kernel
+@wp.kernel(module=DISTANCES)
 def list_unknown(
     # In:
     contact: Contact,
@@ -280,7 +279,7 @@ def list_unknown(
         cache.unknown[wp.atomic_add(cache.count, 0, 1)] = f * x.shape[1] + w
 
 
-@wp.kernel
+@wp.kernel(module=DISTANCES)
 def list_near(
     # In:
     threads: int,

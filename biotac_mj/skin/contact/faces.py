@@ -6,12 +6,13 @@ Each face has `nsample` points with equal parts of its rest area, so that contac
 import numpy as np
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import block_sum
 from ..program import Program
 from ..types import mat33, real, vec3
 from .posed import Geoms, Meeting, distance_from, meet, place_on
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.struct
@@ -92,7 +93,7 @@ def clear_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
 
 
 # in a module of its own: it takes as long to compile as all others here, and few uses need it
-@wp.kernel(module=f"{__name__}.normal_forces", enable_backward=False)
+@wp.kernel(module=kernel_module(f"{__name__}.normal_forces"))
 def normal_forces(
     # In:
     geoms: Geoms,
@@ -271,7 +272,7 @@ def partial_wrench(
 
 
 # in a module of its own: the others are launched with another block size, and would be compiled for both
-@wp.kernel(module=f"{__name__}.sum_wrench", enable_backward=False)
+@wp.kernel(module=kernel_module(f"{__name__}.sum_wrench"))
 def sum_wrench(partial: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
     """Wrench on each group of geoms [group, world, 6] [N, N m], summed by the threads of a block."""
     k, w, t = wp.tid()

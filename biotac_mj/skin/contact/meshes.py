@@ -21,9 +21,14 @@ from ...geometry.closest import (
     pseudonormals,
 )
 from ...geometry.solid import no_solid
+from ...kernels import kernel_module
 from ..types import double, real, single, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
+
+# Warp module of all kernels that look for the distance of any shape, whose functions take most of the time to
+# compile
+DISTANCES = kernel_module(f"{__package__}.distances")
 
 _MAX_TRIANGLES = 48  # in the list of a cell; the bounding volume hierarchy is faster for more
 
@@ -174,8 +179,7 @@ def _spline_of(grid):
     return {"coefficient": coefficient, "error": error.numpy().max(initial=0.0)}
 
 
-# in a module of its own, since it needs both kinds of distance
-@wp.kernel(module=f"{__name__}.compare", enable_backward=False)
+@wp.kernel(module=DISTANCES)
 def _compare(sharp: Grids, smooth: Grids, point: wp.array(dtype=vec3), error_out: wp.array(dtype=real)):
     """Difference of both kinds of distance at point i, near the surface [m]."""
     i = wp.tid()

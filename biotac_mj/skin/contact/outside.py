@@ -2,11 +2,12 @@
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import block_max, block_sum
 from ..types import mat33, real, vec3
 from .posed import Geoms, bound_to, distance_from
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _ROUNDS = wp.constant(24)  # each takes the deepest point's depth off
 _LEFT = wp.constant(wp.float64(1e-6))  # [m] of depth that will do

@@ -10,12 +10,13 @@ import numpy as np
 import warp as wp
 
 from ...geometry.solid import farthest_points, spread_points
+from ...kernels import kernel_module
 from ..geoms import GeomSet
 from ..types import real, vec3
 from .meshes import TRILINEAR, DistanceGrid, grid_value, mesh_distance
 from .posed import Geoms, place_on
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 MOST = 6  # contacts of a part with a shape, and seeds of a part
 _SPACING, _POINTS = (

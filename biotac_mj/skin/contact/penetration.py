@@ -1,22 +1,19 @@
-"""Penetration checks: geoms in the rigid core, inner faces in the core, and start poses of geoms whose path
-is not known."""
+"""Penetration checks: geoms in the rigid core, inner faces in the core, start poses of geoms whose path is
+not known, and clearances of the undeformed skin."""
 
 import warp as wp
 
 from ..block import block_max
 from ..types import mat33, real, vec3
-from .broadphase import has
-from .meshes import TRILINEAR, grid_value
+from .broadphase import ALL, geoms_within, has, sample_clearance
+from .meshes import DISTANCES, TRILINEAR, grid_value
 from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
-
-wp.set_module_options({"enable_backward": False})
 
 _ROUNDS = 4  # steps out of the skin: the distance from a mesh outside its grid is only a lower bound
 
 
-# in a module of its own: it is needed first, while the others compile
-@wp.kernel(module=f"{__name__}.rest_gap", enable_backward=False)
+@wp.kernel(module=DISTANCES)
 def rest_gap(
     # In:
     face: wp.array(dtype=wp.vec3i),
@@ -35,7 +32,7 @@ def rest_gap(
     gap_out[f * sample.shape[0] + s] = dn[3]
 
 
-@wp.kernel
+@wp.kernel(module=DISTANCES)
 def mark_crushed(
     # In:
     limit: real,
@@ -100,7 +97,7 @@ def geoms_core_clearance(
     return -block_max(-least)
 
 
-@wp.kernel
+@wp.kernel(module=DISTANCES)
 def mark_deep_geoms(
     # In:
     chunk: int,
@@ -144,7 +141,7 @@ def _outside(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: m
     return p
 
 
-@wp.kernel
+@wp.kernel(module=DISTANCES)
 def start_path_outside(
     # In:
     center: vec3,
@@ -174,4 +171,39 @@ def start_path_outside(
             path.mat_start[g, w] = R
 
 
-# in a module of its own: only the condensed tier needs it
+@wp.kernel(module=DISTANCES)
+def measure_faces(
+    # In:
+    count: wp.array(dtype=int),
+    number: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    center: vec3,
+    radius: real,
+    reach: wp.array(dtype=real),
+    # Out:
+    clearance_out: wp.array(dtype=real),
+):
+    """Clearances of the faces number[:count[0]], at most reach[0] [m]; below reach[1] any lower bound. The
+    ball around all faces excludes most geoms."""
+    _count, near = geoms_within(center, radius + reach[0], 0, geoms, ALL)
+    for i in range(count[0]):
+        t = face[number[i]]
+        clearance_out[i] = sample_clearance(
+            x[t[0], 0], x[t[1], 0], x[t[2], 0], sample, 0, geoms, near, reach[0], reach[1]
+        )
+
+
+@wp.kernel(module=DISTANCES)
+def measure_core(
+    # In:
+    core_vert: wp.array(dtype=vec3),
+    core: Geoms,
+    geoms: Geoms,
+    # Out:
+    clearance_out: wp.array(dtype=real),
+):
+    """Clearance of the geoms of world 0 from the core [m]."""
+    clearance_out[0] = geoms_core_clearance(0, 0, 1, geoms, ALL, core, core_vert)

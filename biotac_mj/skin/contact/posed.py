@@ -18,8 +18,6 @@ from .shapes import (
     primitive_distance,
 )
 
-wp.set_module_options({"enable_backward": False})
-
 WINDOW = 1.25  # radius around edges, over the distance of a face's corners from its samples, see `meet`
 # angles between two normals [degrees] at edges of facets as narrow as the spacing of samples: up to the first
 # it is a side of a solid, from the second on an edge

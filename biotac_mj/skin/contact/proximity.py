@@ -16,17 +16,13 @@ from ...geometry.surface import face_areas
 from ...launches import recorded
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
-from .broadphase import ALL, geoms_within, sample_clearance
 from .meshes import TRILINEAR
 from .outside import leave_skin
-from .penetration import geoms_core_clearance
-from .posed import Geoms
+from .penetration import measure_core, measure_faces
 from .touch import SOLIDS
 
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
-
-wp.set_module_options({"enable_backward": False})
 
 _REGION = 2e-3  # motion of the geoms for which a region is valid [m]
 _MAX_REGIONS = 16  # stored regions; several BioTacs of one model share a skin
@@ -35,43 +31,6 @@ _CORE = 1e-6  # [m] accuracy of the position at which a geom leaves the core
 _LEAST_INTERVAL = 1e-9  # of a path in a bisection
 _FAR = 1.0  # [m] most motion of a geom out of the skin
 _NONE = np.zeros(0, int)
-
-
-@wp.kernel
-def _measure_faces(
-    # In:
-    count: wp.array(dtype=int),
-    number: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    center: vec3,
-    radius: real,
-    reach: wp.array(dtype=real),
-    # Out:
-    clearance_out: wp.array(dtype=real),
-):
-    """Clearances of the faces number[:count[0]], at most reach[0] [m]; below reach[1] any lower bound. The
-    ball around all faces excludes most geoms."""
-    _count, near = geoms_within(center, radius + reach[0], 0, geoms, ALL)
-    for i in range(count[0]):
-        t = face[number[i]]
-        clearance_out[i] = sample_clearance(
-            x[t[0], 0], x[t[1], 0], x[t[2], 0], sample, 0, geoms, near, reach[0], reach[1]
-        )
-
-
-@wp.kernel
-def _measure_core(
-    # In:
-    core_vert: wp.array(dtype=vec3),
-    core: Geoms,
-    geoms: Geoms,
-    # Out:
-    clearance_out: wp.array(dtype=real),
-):
-    clearance_out[0] = geoms_core_clearance(0, 0, 1, geoms, ALL, core, core_vert)
 
 
 def poses(geoms: GeomSet) -> tuple[np.ndarray, ...]:
@@ -156,10 +115,10 @@ class ProximityQuery:
         center = (points.min(0) + points.max(0)) / 2
         radius = float(np.linalg.norm(points - center, axis=1).max())
         faces = [count, number, model.outer.face, model.sample, geoms.struct, x, vec3(*center), radius, reach]
-        self._measure_faces = recorded(_measure_faces, 1, faces, [clearance])
+        self._measure_faces = recorded(measure_faces, 1, faces, [clearance])
         if model.has_core and geoms.count:
             inputs = [model.core_vert, model.core(1).struct, geoms.struct]
-            self._measure_core = recorded(_measure_core, 1, inputs, [core])
+            self._measure_core = recorded(measure_core, 1, inputs, [core])
         if geoms.count:
             self._left, self._turned = zeros((ngeom, 1), vec3)[0], zeros((ngeom, 1), mat33)[0]
             self._known = wp.ones(1, dtype=int, device="cpu"), model.outer.face, model.sample, x, geoms.struct

@@ -9,9 +9,6 @@ import warp as wp
 from ..types import real, vec3
 from .meshes import NEAR_SURFACE, TRILINEAR, Grids, grid_value, mesh_distance, spline_field, to_triangles
 
-wp.set_module_options({"enable_backward": False})
-
-
 # MuJoCo's mjtGeom, and the skin of another BioTac
 GEOM_TYPES = {
     "plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7, "skin": 8,

@@ -12,6 +12,7 @@ import types
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import block_memory
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, contact_range, face_clearance, has, store_clearance
@@ -29,8 +30,6 @@ from .posed import (
     touch_bound,
 )
 from .shapes import distance, lower_bound, primitive_distance
-
-wp.set_module_options({"enable_backward": False})
 
 # kinds of geoms that kernels support: one smooth mesh; and three kinds, each with the ones before
 CORE, SOLIDS, MESHES, SKINS = "core", "solids", "meshes", "skins"
@@ -489,11 +488,11 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
       shapes: CORE, SOLIDS, MESHES or SKINS; fewer kinds take fewer registers.
     """
     law = "lawful" if has_law else "smooth" if smooth else "coulomb"
-    module = f"{__name__}.{law}_{shapes}"
+    module = kernel_module(f"{__name__}.{law}_{shapes}")
     touch_samples = _samples_function(has_law, smooth, shapes)
     touch_face, touch_faces = _faces_functions(has_law, smooth, shapes)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def by_face(
         # In:
         threads: int,
@@ -512,7 +511,7 @@ def contact_kernels(has_law: bool, smooth: bool, shapes: str) -> types.SimpleNam
             clearance = touch_face(f, w, geoms, x, contact, friction_mode[w], ALL)
             store_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
-    @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=(BLOCK, 2))
+    @wp.kernel(module=kernel_module(f"{module}.listed"), launch_bounds=(BLOCK, 2))
     def by_sample(
         # In:
         blocks: int,

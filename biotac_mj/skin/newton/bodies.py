@@ -20,6 +20,7 @@ import types
 import warp as wp
 
 from ...geometry.rigid_warp import motion
+from ...kernels import kernel_module
 from ..block import block_sum, sync
 from ..bodies import Bodies
 from ..contact.faces import Contact, block_index
@@ -27,7 +28,7 @@ from ..contact.posed import Geoms, LoadPath
 from ..types import Precision, mat33, real, vec3, vec6
 from .worlds import Worlds, total_of
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.struct
@@ -371,10 +372,10 @@ def add_slope(st: Worlds, b: Bodies, d: BodyContact, partial: wp.array3d(dtype=r
 @functools.cache
 def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
     """Kernels with directions, for one precision of these."""
-    module = f"{__name__}.{precision.name}"
+    module = kernel_module(f"{__name__}.{precision.name}")
     vec, lower, raised = precision.vec, precision.lower, precision.raised
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def body_load(
         # In:
         chunk: int,
@@ -409,7 +410,7 @@ def bodies_kernels(precision: Precision) -> types.SimpleNamespace:
                 partial_out[k, c, w] = partial_out[k, c, w] + push
                 partial_out[k + 1, c, w] = partial_out[k + 1, c, w] + turn
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def add_body_forces(
         # In:
         chunk: int,

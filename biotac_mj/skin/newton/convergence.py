@@ -3,13 +3,14 @@ artificial viscosity."""
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import block_sum
 from ..contact.touch import LAGGED
 from ..types import real, vec6
 from .line_search import MAX_TRIES
 from .worlds import NEGLIGIBLE_RESIDUAL, VISCOUS_AFTER, Worlds, set_viscosity
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution

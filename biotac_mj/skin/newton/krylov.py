@@ -6,6 +6,7 @@ import types
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import sum_of_lanes
 from ..contact.faces import block_index
 from ..types import Precision, real, vec3
@@ -13,7 +14,7 @@ from .line_search import begin_line_search
 from .nodes import LiquidForces, NodeSlots, SurfaceForces
 from .worlds import Worlds, total_of, totals_of
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.struct
@@ -116,7 +117,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
 
 
 def _product_kernels(precision):
-    module = f"{__name__}.{precision.name}"
+    module = kernel_module(f"{__name__}.{precision.name}")
     scalar, vec, lower, raised = precision.scalar, precision.vec, precision.lower, precision.raised
 
     @wp.func(inline=True)
@@ -130,7 +131,7 @@ def _product_kernels(precision):
             total += K * raised(p[surface.face[f][b], w])
         return lower(total)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def assemble_product(
         # In:
         elements: NodeSlots,
@@ -192,7 +193,7 @@ def _product_kernels(precision):
             push += scalar(real(0.5) * st.tangent_pressure[w]) * bend
         q_out[i, w] = q + sum_of_lanes(push, lanes)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def measure_product(
         # In:
         chunk: int,
@@ -228,10 +229,10 @@ def _product_kernels(precision):
 
 
 def _update_kernels(precision):
-    module = f"{__name__}.{precision.name}"
+    module = kernel_module(f"{__name__}.{precision.name}")
     scalar, vec, lower = precision.scalar, precision.vec, precision.lower
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def update_solution(
         # In:
         chunk: int,
@@ -268,7 +269,7 @@ def _update_kernels(precision):
                 rr += real(wp.dot(residual, residual))
         partial_out[0, c, w] = rr
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def next_direction(z: wp.array2d(dtype=vec), st: Worlds, p: wp.array2d(dtype=vec)):
         """p = z + beta p at node i."""
         i, w = wp.tid()
@@ -281,7 +282,7 @@ def _update_kernels(precision):
 def _search_kernels(precision):
     module, vec, raised = f"{__name__}.{precision.name}", precision.vec, precision.raised
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def first_length(
         # In:
         chunk: int,
@@ -306,14 +307,14 @@ def _search_kernels(precision):
             x[i, w] = x[i, w] + d
         partial_out[1, c, w] = slope
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def move(dx: wp.array2d(dtype=vec), st: Worlds, x: wp.array2d(dtype=vec3)):
         """Moves node i by the change of the step length."""
         i, w = wp.tid()
         if st.moving[w] == 1:
             x[i, w] = x[i, w] + st.alpha_change[w] * raised(dx[i, w])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def measure_slope(
         # In:
         chunk: int,

@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..types import real
 from .worlds import Worlds, totals_of
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 MAX_TRIES = wp.constant(12)  # evaluations of a line search
 

@@ -3,6 +3,7 @@ load factor, and the load factor at the end. Most worlds take the whole path in 
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..bodies import Bodies, follow_wrench
 from ..contact.posed import Geoms, LoadPath
 from ..contact.touch import CURRENT, LAGGED, RECORDED
@@ -20,7 +21,7 @@ from .worlds import (
     set_viscosity,
 )
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _FIRST_INCREMENT = wp.constant(wp.float64(0.25))  # load increment after a first try that failed
 _FAR = wp.constant(wp.float64(1e3))  # [m] coordinate of a geom that touches nothing

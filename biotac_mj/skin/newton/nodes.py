@@ -9,11 +9,12 @@ from typing import Any
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import sum_of_lanes
 from ..types import Precision, mat33, real, vec3, vec6
 from .worlds import Worlds
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.struct
@@ -243,10 +244,10 @@ def end_core(
 @functools.cache
 def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
     """Kernels with directions, for one precision of these."""
-    module = f"{__name__}.{precision.name}"
+    module = kernel_module(f"{__name__}.{precision.name}")
     vec, lower, raised = precision.vec, precision.lower, precision.raised
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def add_inertia(
         # In:
         density: wp.array(dtype=real),
@@ -272,7 +273,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         inertial_out[i, w] = lower(inertial)
         force[i, w] = force[i, w] + inertial
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def displacement(
         x_last: wp.array2d(dtype=vec3),
         x: wp.array2d(dtype=vec3),
@@ -284,7 +285,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         if on[w] == 1:
             out[i, w] = lower(x[i, w] - x_last[i, w])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def add_damping(
         # In:
         start: wp.array(dtype=int),
@@ -306,7 +307,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
             total += raised(c)
         force[i, w] = force[i, w] - damping / dt[w] * total
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def residuals(
         # In:
         chunk: int,

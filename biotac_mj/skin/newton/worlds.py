@@ -3,13 +3,14 @@ thread per world. `convergence` and `line_search` decide about iterations."""
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..block import block_sum
 from ..contact.posed import Geoms, LoadPath
 from ..contact.touch import CURRENT
 from ..rubber.law import Law
 from ..types import real, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 # reason of a world's last step
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))

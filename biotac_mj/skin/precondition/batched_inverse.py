@@ -8,8 +8,6 @@ import warp as wp
 if typing.TYPE_CHECKING:
     from ..program import Launcher
 
-wp.set_module_options({"enable_backward": False})
-
 THREADS = 512  # of a block: one for each row
 
 # By panels of eight columns: thread t has row t of the panel, and a warp updates a row by the panel.

@@ -28,8 +28,6 @@ import warp as wp
 from .nested_dissection import cut
 from .right_hand_sides import LOW
 
-wp.set_module_options({"enable_backward": False})
-
 _ALIGN = 64  # rows are padded to tiles of the tensor cores; other sizes run at a third of the speed
 _MAX_PIECES = 32  # pieces that are tried
 _CUTS = (0.42, 0.46, 0.48, 0.5, 0.52, 0.54, 0.58)  # fractions of a piece's nodes on one side that are tried

@@ -5,10 +5,11 @@ cores."""
 import numpy as np
 import warp as wp
 
+from ...kernels import kernel_module
 from ..program import Launcher
 from .block_inverse import DissectedInverse
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _COLUMNS = 8  # worlds are padded to tiles of the tensor cores
 

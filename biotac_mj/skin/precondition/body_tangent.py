@@ -15,9 +15,10 @@ import numpy as np
 import warp as wp
 
 from ...geometry.rigid import rigid_motions
+from ...kernels import kernel_module
 from ..types import mat33, real, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _BLOCK = np.array(
     [[0, 1, 2], [1, 3, 4], [2, 4, 5]]

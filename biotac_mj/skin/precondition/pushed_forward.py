@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ...kernels import kernel_module
 from ...launches import recorded
 from ..block import sum_of_lanes
 from ..rubber.law import LAWS
@@ -21,7 +22,7 @@ from ..types import DOUBLE, SINGLE, Precision, mat33, real, vec3
 if typing.TYPE_CHECKING:
     from ..rubber.tetrahedra import Tetrahedra
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _LEAST_DETERMINANT = 0.1  # of a node's deformation gradient; below it M is the identity
 _MOST_NORM = (
@@ -47,7 +48,7 @@ def _measurement(precision: Precision) -> wp.Kernel:
     """Kernel that computes M in this precision."""
     narrow = precision.narrow
 
-    @wp.kernel(module=f"{__name__}.{precision.name}", enable_backward=False)
+    @wp.kernel(module=kernel_module(f"{__name__}.{precision.name}"))
     def measure(
         # In:
         lanes: int,

@@ -6,10 +6,11 @@ times that with the forces of contact and liquid, so that the second number is n
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..newton.worlds import Worlds, total_of
 from ..types import real, single, vec3
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 # [N/m] stiffness along the scaled gradient of the liquid: like that of contact, so that single precision
 # suffices

@@ -18,10 +18,11 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.linalg import lapack
 
+from ...kernels import kernel_module
 from ...launches import recorded
 from .nested_dissection import dissect
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 _LANES = 8  # numbers of a SIMD multiplication, to which rows of panels are padded with zeros
 _TOGETHER = 4  # nodes whose rows are computed together, since right-hand sides share reading the panels

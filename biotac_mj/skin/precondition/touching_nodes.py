@@ -2,12 +2,13 @@
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds, total_of
 from ..types import real
 from .right_hand_sides import TINY
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.kernel

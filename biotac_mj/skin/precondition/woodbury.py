@@ -5,6 +5,7 @@ node to the nodes of its faces, and their springs."""
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..bodies import Bodies
 from ..contact.faces import block_index
 from ..newton.nodes import SurfaceForces
@@ -12,7 +13,7 @@ from ..newton.worlds import Worlds, total_of
 from ..types import narrow, real, vec3, vec6
 from .right_hand_sides import STIFF, InverseEntries, entry, liquid_scale
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.kernel
@@ -216,7 +217,7 @@ def _spring_products(adjoint):
             return wp.transpose(K) * wp.vec3(X[w, 0, row], X[w, 0, row + 1], X[w, 0, row + 2])
         return K * wp.vec3(X[w, row, 0], X[w, row + 1, 0], X[w, row + 2, 0])
 
-    @wp.kernel(module=f"{__name__}.{'adjoint' if adjoint else 'product'}", enable_backward=False)
+    @wp.kernel(module=kernel_module(f"{__name__}.{'adjoint' if adjoint else 'product'}"))
     def multiply(
         # In:
         has_liquid: int,

@@ -10,20 +10,10 @@ import types
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..types import DOUBLE, Precision, mat33, real, vec3
 from .element_points import Kind, material_functions
 from .points import Mesh, Rubber, deformation_of
-
-wp.set_module_options({"enable_backward": False})
-
-
-def _deep_module():
-    """Module and compiler options of the product on the CPU. Warp limits LLVM's search for SIMD operations to
-    a depth of 4; a depth of 12 saves a sixth of this kernel's time for the corotational law, 2 % of a press,
-    and nothing for the others."""
-    flags = wp.config.cpu_compiler_flags
-    deep = flags and flags.replace("-slp-recursion-max-depth=4", "-slp-recursion-max-depth=12")
-    return {"module": "unique", "module_options": {"cpu_compiler_flags": deep}}
 
 
 @functools.cache
@@ -44,7 +34,7 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     f = material_functions(kind)
 
-    @wp.kernel(enable_backward=False, **kind.placement)
+    @wp.kernel(**kind.placement)
     def force(
         # In:
         cap: real,
@@ -128,7 +118,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         else:
             return F[i, w], mat33()
 
-    @wp.kernel(enable_backward=False, **(kind.placement if is_single else _deep_module()))
+    @wp.kernel(**kind.placement)
     def product(
         # In:
         cap: real,
@@ -203,7 +193,7 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
     thin, wide = kind.precision.narrow, kind.precision.widen
     f = material_functions(kind)
 
-    @wp.kernel(module=f"{module}.read", enable_backward=False)
+    @wp.kernel(module=kernel_module(f"{module}.read"))
     def cauchy(
         # In:
         cap: real,
@@ -230,7 +220,7 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
         cauchy_out[e, w] = sigma
         von_mises_out[e, w] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
 
-    @wp.kernel(module=f"{module}.points", enable_backward=False)
+    @wp.kernel(module=kernel_module(f"{module}.points"))
     def point_slopes(
         # In:
         cap: real,

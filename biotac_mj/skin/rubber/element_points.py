@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from ...kernels import kernel_module
 from ..types import Precision, mat33, real, vec3
 from .law import (
     Law,
@@ -21,8 +22,6 @@ from .law import (
     stress_derivative,
 )
 from .points import Mesh, Rubber, beyond_derivative, beyond_stress, deformation_of, has_effects
-
-wp.set_module_options({"enable_backward": False})
 
 # of kernels for many worlds: threads of a block, and blocks that a multiprocessor has registers for. Fewer
 # threads would wait for memory, more have no room for what they hold
@@ -65,7 +64,7 @@ class Kind(NamedTuple):
     @property
     def placement(self) -> dict:
         """Module and launch bounds of a kernel for many worlds."""
-        return {"module": self.module, "launch_bounds": BOUNDS if self.is_single else None}
+        return {"module": kernel_module(self.module), "launch_bounds": BOUNDS if self.is_single else None}
 
 
 @functools.cache

@@ -16,8 +16,6 @@ import warp as wp
 from ..types import mat33, real
 from .law import Law
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.func
 def deviator(A: mat33):

@@ -23,8 +23,6 @@ import warp as wp
 
 from ..types import double, mat33, narrow, real, single, vec3, widen
 
-wp.set_module_options({"enable_backward": False})
-
 COMPRESSED = wp.constant(wp.float64(0.2))  # J0
 _FLAT = wp.constant(wp.float64(0.02))  # J below which the parabolas continue
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...kernels import kernel_module
 from ..program import Launcher
 from ..state import allocate
 from ..types import mat33, real, vec3
@@ -17,7 +18,7 @@ from .law import Law, polar
 from .material import Material
 from .points import Mesh, Rubber, deformation_of
 
-wp.set_module_options({"enable_backward": False})
+kernel_module(__name__)
 
 
 @wp.func
@@ -100,10 +101,10 @@ def largest_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33
 
 @functools.cache
 def _kernels(corners: int) -> types.SimpleNamespace:
-    module = f"{__name__}.{corners}"
+    module = kernel_module(f"{__name__}.{corners}")
     deformation = deformation_of(corners)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def commit(
         # In:
         cap: real,
@@ -137,7 +138,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
                 T = deviator(A - E)
                 rubber.slip[b, i, w] = E + (real(1.0) - sticking_fraction(T, rubber.branch[b, w][1])) * T
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def forget(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3), mask: wp.array(dtype=bool)):
         """Resets point q to the relaxed, virgin state at x, without stress of the friction elements."""
         e, q, w = wp.tid()
@@ -156,7 +157,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
         for b in range(rubber.branch.shape[0]):
             rubber.slip[b, i, w] = deviator(strain(rubber.law, F))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module)
     def recall(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3)):
         """Computes the stress that relaxes at x, the end of the last step."""
         e, q, w = wp.tid()
@@ -167,7 +168,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
         worst = largest_energy(rubber, e, w, mu, lam, F, rubber.worst[i, w])
         rubber.last[i, w] = relaxing_stress(rubber, e, w, mu, lam, F, worst)
 
-    @wp.kernel(module=f"{module}.points", enable_backward=False)
+    @wp.kernel(module=kernel_module(f"{module}.points"))
     def point_slopes(
         # In:
         cap: real,

@@ -32,8 +32,6 @@ from .friction import deviator, push_forward, push_forward_change, sticking_frac
 from .law import Law, energy_density, stress, stress_derivative
 from .stiffening import added_derivative, added_energy, added_stress
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.struct
 class Mesh:

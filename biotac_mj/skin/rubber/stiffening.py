@@ -15,8 +15,6 @@ import warp as wp
 from ..types import mat33, real
 from .law import Law, energy_density, stress, stress_derivative
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.func
 def unit_lame(law: int):

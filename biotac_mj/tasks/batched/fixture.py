@@ -6,7 +6,10 @@ import functools
 import torch
 import warp as wp
 
+from ...kernels import kernel_module
 from .task import BatchTask, TaskSettings
+
+kernel_module(__name__)
 
 
 @wp.struct
