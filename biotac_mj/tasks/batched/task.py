@@ -17,7 +17,7 @@ from .bank import Bank
 from .touch import OBSERVE, Touch, as_deviations
 
 _FELT = 0.02  # force of a finger that holds something, at least [N]
-_STAYS = 0.85  # correlation of errors of the model in consecutive decisions
+_STAYS = 0.97  # correlation of errors of the model in consecutive decisions
 
 
 @dataclasses.dataclass(frozen=True)
