@@ -131,7 +131,8 @@ class GeomSet:
         """Sets the windows around edges whose radius is below the spacing [m] of a skin's samples^2 contact
         samples in a face, and the angles from which on they count, see `contact.posed.meet`. The wider the
         facets beside an edge, the further it stands out of a smooth surface: facets as wide as the skin's
-        faces would lock with them if samples alone touched, and narrow ones are as good as smooth."""
+        faces would lock with them if samples alone touched, and narrow ones are as good as smooth. Wider
+        ones lock no more: at smaller angles contact would only change from side to edge the more at once."""
         size = self.struct.size.numpy().reshape(-1, 3)
         curved = np.isin(self.types, "ellipsoid")  # a thin one has an edge
         radius = np.where(curved, size.min(1) ** 2 / np.maximum(size.max(1), 1e-12), self._rounding)
@@ -139,7 +140,8 @@ class GeomSet:
         self.struct.window.assign(np.where(edged & (radius < spacing), WINDOW / samples, 0.0))
         widths = iter([grid.facet_width for grid in self._grids])
         width = np.array([next(widths) if kind in ("mesh", "skin") else 0.0 for kind in self.types])
-        turn = np.outer(np.minimum(spacing / np.maximum(width, 1e-12), 1.0), TURN)
+        width = np.clip(width, spacing, 2 / 3**0.25 * samples * spacing)  # at most an edge of the skin's
+        turn = np.outer(spacing / width, TURN)
         self.struct.turn.assign(np.cos(np.radians(turn)))
 
     def advance(self) -> None:
