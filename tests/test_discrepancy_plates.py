@@ -87,8 +87,9 @@ def test_what_two_sensors_share_is_the_base_models(of_both):
     by_id = {f.id: f for f in of_both.models}
     for sensor, tested in zip(of_both.sensors, by_id["fill"].tested):
         assert set(sensor.worst) & set(TIP), "it finds the tip by itself"
-        assert np.allclose(tested.value, 0.8 * CALIBRATED_FILL, atol=0.25 * CALIBRATED_FILL)
-        assert tested.locked["worst"][1] < 0.6 * tested.locked["worst"][0]
+        low, value, high = CALIBRATED_FILL * np.array([tested.low, tested.amount, tested.high])
+        assert low < 0.8 * CALIBRATED_FILL < high and abs(value / CALIBRATED_FILL - 0.8) < 0.25
+        assert tested.closed(sensor.worst) > 1 - 0.6**2
 
 
 def test_what_is_written_runs(of_both, answers, tmp_path):
@@ -98,7 +99,7 @@ def test_what_is_written_runs(of_both, answers, tmp_path):
     cells = verdict["simulated"]["where"]["synthetic 1"]["cells"]
     assert cells[0]["red"] and cells[0]["counts"] > cells[0]["expected"]
     first = diagnose_recording(synthetic(answers, AT_TIP, 1)[0])
-    joined = of_both.beside(first)
+    joined = of_both.joined(first)
     paths = write_report(joined, tmp_path)
     written = json.loads(paths[1].read_text())
     check_verdict(verdict)

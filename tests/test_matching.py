@@ -11,7 +11,7 @@ from made_up_plate import MIRROR, made_up_states
 
 from biotac_mj.geometry.design import read_design
 from biotac_mj.geometry.skins import load_skin
-from biotac_mj.matching.fit import SIGNS, Constants, Rows, Setup, fit_constants, fit_states, rows_of
+from biotac_mj.matching.fit import SIGNS, Constants, Rows, Setup, fit_constants, fit_states, rows_of, tangent
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import PlateGrid, frame, plate_states
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
@@ -69,6 +69,30 @@ def test_constants_and_states_come_back(response, truth):
     assert np.abs(found.gain - const.gain).max() < 0.1
     assert np.abs(found.drifted(rows.time) - const.drifted(rows.time)).max() < 0.03
     assert np.sqrt(((matched.state - state[:170]) ** 2).mean(0)).max() < 0.05
+
+
+def test_a_tangent_is_how_the_model_moves(response, truth):
+    const, state, rows = truth
+    rows, state, setup, rng = rows[:6], state[:6], Setup(gains=0.0), np.random.default_rng(0)
+
+    def model(const, state):
+        value, _ = response.at_load(rows.force[:, 2] / const.modulus)(state, False)
+        counts = counts_from_log_impedance(const.log_z(value[:, :19], rows.time))
+        return np.hstack([counts, value[:, 19:] * const.modulus])
+
+    _, columns, here, scale = tangent(response, rows, const, state, setup)
+    others = (
+        (const, state + 1e-3 * rng.standard_normal(state.shape)),
+        (dataclasses.replace(const, offset=const.offset + 1e-3 * rng.standard_normal(19)), state),
+        (dataclasses.replace(const, modulus=const.modulus * np.exp(1e-2)), state),
+    )
+    for one in others:
+        away = tangent(response, rows, *one, setup)[2] - here
+        moved, predicted = model(*one) - model(const, state), np.tensordot(away, columns, 1)
+        for part in (slice(19), slice(19, 21)):  # counts, and newtons
+            size = np.abs(moved[:, part]).max()
+            np.testing.assert_allclose(predicted[:, part], moved[:, part], atol=0.02 * size)
+    assert away[-1] * scale == pytest.approx(1e-2)  # of the modulus
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ def diagnose_with_states(
     response = tables.with_effects(base, states, geometry, effects, quiet)
     found = diagnose_presses(recordings, response, effects, quiet)
     first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
-    _reported(found.beside(first), folder)
+    _reported(found.joined(first), folder)
     return found
 
 

@@ -16,6 +16,7 @@ _CORRELATED = 25  # rows per independent one, relative to the priors: model erro
 _STEPS, _LEAST = 40, 16  # most and fewest joint steps
 _NESTED = 8  # fewest steps if the search starts from a nested model
 _AGAIN = (6, 14)  # steps before which all states are searched globally, as some are in a local minimum
+_WIDE = 3.0  # standard deviation of a logarithm without a prior, in `tangent`
 _STARTS = 3  # starting directions from the table for each row's state
 
 
@@ -234,6 +235,35 @@ def fit_states(
     value, _ = problem.loaded(const)(state, False)
     counts = counts_from_log_impedance(const.log_z(value[:, :-2], rows.time))
     return Match(state, counts, value[:, -2:] * const.modulus, cost)
+
+
+def tangent(
+    response: Response, rows: Rows, const: Constants, state: np.ndarray, setup: Setup
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """The model of n rows as a linear one about constants and states (n, 4), with m parameters: four of each
+    row's state, then combinations of the free constants, the last of which is the last constant alone.
+
+    Returns:
+      residual (n, nelectrode + 2) measured less modelled: electrodes [counts], tangential forces [N]; columns
+      (m, n, nelectrode + 2) increase of the model by one standard deviation of each prior; away (m,) from the
+      priors' means in these; standard deviation of the last constant.
+    """
+    problem = _Problem(response, rows, const, setup)
+    now, n, free = problem.evaluate(state, const), len(rows), problem._free
+    used = [*problem.electrodes, -2, -1]
+    unit = np.append(np.ones(len(problem.electrodes)), [setup.shear / _COUNTS] * 2)
+    half, weight = _COUNTS / problem._pull, _COUNTS * np.sqrt(_CORRELATED)
+    P, at = problem._prior[:, free] / weight, problem._prior_at / weight
+    # what has no prior, the common level and the modulus, has a wide one
+    factor = np.linalg.cholesky(P.T @ P + np.eye(len(free)) / _WIDE**2)
+    spread = np.linalg.inv(factor).T
+    states = np.zeros((n, 4, n, len(used)))
+    states[np.arange(n), :, np.arange(n)] = (now.Js[:, used] * half).swapaxes(1, 2) * unit
+    constants = np.moveaxis(problem._constant_slopes(now)[:, used][..., free] @ spread, -1, 0) * unit
+    columns = np.concatenate([states.reshape(-1, *constants.shape[1:]), constants])
+    away = factor.T @ const._vector[free] - spread.T @ (P.T @ at)
+    away = np.append((state - problem._middle) / half, away)
+    return -now.r[:, used] * unit, columns, away, float(spread[-1, -1])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

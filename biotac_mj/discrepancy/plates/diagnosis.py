@@ -12,22 +12,22 @@ from tqdm import tqdm
 from ...effects.effect import STAGES
 from ...effects.plate import PLATE, PlateEffect
 from ...effects.sensor_file import SensorFile
-from ...matching.fit import Rows, fit_constants, fit_states
+from ...matching.fit import SIGNS, Rows
 from ...matching.response import Response
 from ...quality.noise import noise_level
 from ...skin import Material
 from ...skin.rubber.material import PRESETS
 from ...skin.settings import plain
-from ..evidence import RATE, asked, discoveries, sign_flip
+from ..evidence import RATE, asked, by_chance, not_distinguished
 from ..recordings.diagnosis import RecordingDiagnosis
 from ..recordings.recording import PlainRecording
 from ..report import plots
 from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, electrode_names
-from .models import BASE, Judged, Model, judge, models, press_rows
+from .models import BASE, Fit, Model, fitted, models, press_rows
 from .where import leading, missing, press_cells
 
 _TIMES = 4000  # permutations of the electrodes
-_BLOCKS = "blocks of time that took no part in the fit"
+_LEAST = 5e-3  # [N] noise of a force
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,15 +35,14 @@ class Sensor:
     """One recording with the base model.
 
     Attributes:
-      recording; rows: of the first 70 %; locked: the held-out ones; judged; noise: (nelectrode,) [counts];
-        cells: see `press_cells`; worst: electrodes that lead, from 0; slope, error: (nelectrode,) see
-        `missing`.
+      recording; rows: of the first 70 %, and the held-out ones; fit: of the base model; noise:
+        (nelectrode + 2,) [counts, N]; cells: see `press_cells`; worst: electrodes that lead, from 0; slope,
+        error: (nelectrode,) see `missing`.
     """
 
     recording: PlainRecording
-    rows: Rows
-    locked: Rows
-    judged: Judged
+    rows: tuple[Rows, Rows]
+    fit: Fit
     noise: np.ndarray
     cells: list[dict]
     worst: list[int]
@@ -52,12 +51,12 @@ class Sensor:
 
     @classmethod
     def of(cls, recording: PlainRecording, response: Response) -> "Sensor":
-        rows, locked = press_rows(recording)
-        # every model goes on from here: what going on alone brings must not count for it
-        judged = judge(response, rows, BASE, judge(response, rows, BASE))
+        rows, force = press_rows(recording), (recording.force @ SIGNS)[:, :2]
         noise = noise_level(recording.electrodes, recording.repeated)
-        cells = press_cells(rows, judged, noise)
-        return cls(recording, rows, locked, judged, noise, cells, leading(judged), *missing(judged))
+        noise = np.append(noise, noise_level(force, recording.repeated, _LEAST))
+        fit = fitted(Model(None, response, BASE), recording, rows, noise)
+        cells = press_cells(rows[0], fit, noise[:-2])
+        return cls(recording, rows, fit, noise, cells, leading(fit), *missing(fit))
 
     @property
     def name(self) -> str:
@@ -65,63 +64,16 @@ class Sensor:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Tested:
-    """A model against the smaller one on one recording, on rows that neither was fitted on.
-
-    Attributes:
-      gain: (blocks,) [nats] by which the larger model makes each block likelier.
-      rms: "worst" or "all" electrodes -> (smaller, larger) [counts]; locked: the same on held-out rows,
-        None without held-out rows.
-      value: of the parameter by the constants of either half; modulus: their mean Young's modulus [Pa].
-    """
-
-    gain: np.ndarray
-    rms: dict
-    value: tuple[float, ...]
-    modulus: float
-    locked: dict | None = None
-
-    @classmethod
-    def of(cls, sensor: Sensor, model: Model) -> "Tested":
-        small, rows = sensor.judged, model.of(sensor.recording, sensor.rows)
-        large = judge(model.response, rows, model.setup, small)
-        value = tuple(model.value(c) for c in large.constants)
-        modulus = float(np.mean([c.modulus for c in large.constants]))
-        return cls(large.gain(small, sensor.noise), _rms(sensor, small.error, large.error), value, modulus)
-
-    @property
-    def nats(self) -> float:
-        return float(self.gain.sum())
-
-    @property
-    def p(self) -> float:
-        return sign_flip(self.gain)
-
-    def closed(self, which: str = "worst") -> float:
-        """Share of the squared error that the larger model takes away; below 0 where it adds to it."""
-        before, after = self.rms[which]
-        return 1 - (after / max(before, 1e-12)) ** 2
-
-
-def _rms(sensor, *errors):
-    """RMS of errors (n, nelectrode) at the electrodes that lead and at all."""
-    return {
-        "worst": tuple(float(np.sqrt((e[:, sensor.worst] ** 2).mean())) for e in errors),
-        "all": tuple(float(np.sqrt((e**2).mean())) for e in errors),
-    }
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class Tried:
     """A model that was tried on all sensors.
 
     Attributes:
-      model. tested: by sensor. significant: by sensor, of all models one in twenty-one false. whose: "base
-        model", "sensor NAME", "nobody", or "unknown" where there is but one sensor.
+      model. tested: Fit by sensor. significant: by sensor, 20 times likelier than none. whose: "base model",
+        "sensor NAME", "nobody", or "unknown" where there is but one sensor.
     """
 
     model: Model
-    tested: tuple[Tested, ...]
+    tested: tuple[Fit, ...]
     significant: tuple[bool, ...]
     whose: str
 
@@ -134,6 +86,11 @@ class Tried:
         return self.model.effect.name
 
     @property
+    def values(self) -> list[float]:
+        """Of the parameter, by sensor."""
+        return [self.model.value(t.amount) for t in self.tested]
+
+    @property
     def evidence(self) -> float:
         """[nats] of the sensor that has least."""
         return min(t.nats for t in self.tested)
@@ -141,15 +98,14 @@ class Tried:
     @property
     def further_off(self) -> bool:
         """Whether it is further off than the base model from what a sensor held out."""
-        rms = [t.locked["all"] for t in self.tested if t.locked]
-        return any(after > before for before, after in rms)
+        return any(t.closed() < 0 for t in self.tested)
 
     @property
     def attached(self) -> list[dict] | None:
         """Arguments of `biotac_mj.attach` for a sensor with the effect, by sensor; None if no running sensor
         can have it."""
         attach = self.model.effect.attach
-        return attach and [attach(sum(t.value) / len(t.value)) for t in self.tested]
+        return attach and [attach(value) for value in self.values]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -159,7 +115,7 @@ class PlateDiagnosis(Verdict):
     Attributes:
       sensors; models: those with most evidence first; named: those that the evidence names, all of them tied
         where it cannot part them; alike: correlation of the sensors' `slope` and its p, None with one sensor;
-        first: what was found in the first recording alone, see `beside`.
+        first: what was found in the first recording alone, see `joined`.
     """
 
     sensors: list[Sensor]
@@ -175,9 +131,9 @@ class PlateDiagnosis(Verdict):
         some = (f for f in self.named if f.attached and not f.further_off)
         return max(some, key=lambda f: f.evidence, default=None)
 
-    def beside(self, first: RecordingDiagnosis) -> "PlateDiagnosis":
+    def joined(self, first: RecordingDiagnosis) -> "PlateDiagnosis":
         """This one with what was found in its first recording alone."""
-        joined = {
+        lists = {
             name: [*getattr(first, name), *getattr(self, name)]
             for name in ("warnings", "effects", "not_named", "where", "notes", "amended")
         }
@@ -195,21 +151,27 @@ class PlateDiagnosis(Verdict):
             next_command=first.next_command,
             details=first.details | self.details,
             first=first,
-            **joined,
+            **lists,
         )
 
     def pictures(self) -> list[Picture]:
-        """Error by electrode, what each electrode's change lacks, what each model takes away."""
-        figure = plots.plates(
-            [s.name for s in self.sensors],
-            [_listed(s.worst) for s in self.sensors],
-            [np.sqrt((s.judged.error**2).mean(0)) for s in self.sensors],
-            [(s.slope, s.error) for s in self.sensors],
-            [f"{f.name}{' *' if f in self.named else ''}" for f in self.models],
-            [[f.tested[i].closed() for f in self.models] for i in range(len(self.sensors))],
-        )
-        own = Picture("simulated", "tried", figure)
-        return [*self.first.pictures(), own] if self.first else [own]
+        """What each model takes away, what each electrode's change lacks, and its error."""
+        names, models = [s.name for s in self.sensors], self.models
+        closed = [[100 * f.tested[i].closed(s.worst) for i, s in enumerate(self.sensors)] for f in models]
+        dots = [(models.index(f), i) for f in self.named for i in range(len(names))]
+        taken = "squared error of the worst electrodes that each takes away [%]; dots: named"
+        lacks = np.array([100 * s.slope for s in self.sensors])
+        electrodes = electrode_names(range(lacks.shape[1]))
+        own = [
+            Picture("models", "tried", plots.matrix(closed, [f.name for f in models], names, dots, taken)),
+            Picture("lacking", "where", plots.matrix(lacks, names, electrodes, [], "change that lacks [%]")),
+            Picture(
+                "simulated",
+                "gap",
+                plots.channels([_gap(s, self.named, k) for k, s in enumerate(self.sensors)]),
+            ),
+        ]
+        return [*self.first.pictures(), *own] if self.first else own
 
     def sensor(self) -> SensorFile | None:
         """The first recording's sensor (rest, noise, effects), with the rubber that its poses were fitted
@@ -221,7 +183,7 @@ class PlateDiagnosis(Verdict):
             return file
         given, tested = acting.attached[0], acting.tested[0]
         radius = PRESETS["calibrated"].electrode_radius
-        rubber = Material(youngs_modulus=float(tested.modulus), electrode_radius=radius)
+        rubber = Material(youngs_modulus=float(tested.constants.modulus), electrode_radius=radius)
         rubber = dataclasses.replace(rubber, **given.get("material", {}))
         options = {"options": given["options"]} if "options" in given else {}
         base = {**file.base, "material": plain(rubber), **options}
@@ -244,29 +206,27 @@ def diagnose_presses(
     """
     some, sensors = list(models(response, effects)), []
     base = response.amended(np.zeros(len(response.changes)))
-    tested = {id(model): [] for model in some}
+    tested = [[] for _ in some]
     total = len(recordings) * (1 + len(some))
     with tqdm(total=total, desc="models", unit="model", disable=quiet or None) as bar:
         for recording in recordings:
             sensors.append(Sensor.of(recording, base))
             bar.update()
-            for model in some:
-                tested[id(model)].append(Tested.of(sensors[-1], model))
+            for model, parts in zip(some, tested):
+                one = sensors[-1]
+                parts.append(fitted(model, recording, one.rows, one.noise, one.fit))
                 bar.update()
-    tried = _tried(some, [tuple(tested[id(model)]) for model in some], sensors)
-    named = _named(tried)
-    proved = {id(f): _proved(f, sensors, base) for f in named}
-    tried, named = ([proved.get(id(f), f) for f in fs] for fs in (tried, named))
-    return _concluded(sensors, tried, named, _alike(sensors))
+    tried = _tried(some, tested, sensors)
+    return _concluded(sensors, tried, _named(tried), _alike(sensors))
 
 
 def _tried(some, tested, sensors):
-    enough = discoveries([[t.p for t in parts] for parts in tested])
+    """Tried of models with what was tested on each sensor, those with most evidence first."""
     out = []
-    for model, parts, by_chance in zip(some, tested, enough):
-        significant = tuple(bool(b and t.nats > asked(len(some))) for b, t in zip(by_chance, parts))
+    for model, parts in zip(some, tested):
+        significant = tuple(t.nats > asked(len(some)) for t in parts)
         # an amount to one side on one sensor and to the other on the other is not the base model's
-        side = {np.sign(t.value[0] - model.effect.base) for t in parts}
+        side = {np.sign(t.amount) for t in parts}
         if not any(significant):
             whose = "nobody"
         elif len(sensors) == 1:
@@ -275,7 +235,7 @@ def _tried(some, tested, sensors):
             whose = "base model"
         else:
             whose = "sensor " + ", ".join(s.name for s, yes in zip(sensors, significant) if yes)
-        out.append(Tried(model, parts, significant, whose))
+        out.append(Tried(model, tuple(parts), significant, whose))
     return sorted(out, key=lambda f: -f.evidence)
 
 
@@ -284,27 +244,10 @@ def _named(tried):
     good = [f for f in tried if f.whose in ("base model", "unknown")]
 
     def tied(other):
-        return all(sign_flip(b.gain - o.gain) > RATE for b, o in zip(good[0].tested, other.tested))
+        pairs = zip(good[0].tested, other.tested)
+        return all(not_distinguished(b.nats, o.nats, b.law_error) for b, o in pairs)
 
     return [f for f in good if f is good[0] or tied(f)]
-
-
-def _proved(tried, sensors, base):
-    """With what it does on the held-out rows by constants of all others."""
-    model, tested = tried.model, []
-    for s, t in zip(sensors, tried.tested):
-        rows, locked = (model.of(s.recording, r) for r in (s.rows, s.locked))
-        small = fit_constants(base, rows, BASE)
-        large = fit_constants(model.response, rows, model.setup, (small[0], small[1].state))
-        errors = [
-            fit_states(response, locked, constants, setup).counts - locked.counts
-            for response, (constants, _), setup in (
-                (base, small, BASE),
-                (model.response, large, model.setup),
-            )
-        ]
-        tested.append(dataclasses.replace(t, locked=_rms(s, *errors)))
-    return dataclasses.replace(tried, tested=tuple(tested))
 
 
 def _alike(sensors):
@@ -328,20 +271,23 @@ def _concluded(sensors, tried, named, alike):
     out = PlateDiagnosis(
         kind="flat presses, simulated",
         name=", ".join(s.name for s in sensors),
-        data=f"{', '.join(str(len(s.rows)) for s in sensors)} loaded rows, each with a fitted pose",
+        data=f"{', '.join(str(len(s.rows[0])) for s in sensors)} loaded rows, each with a fitted pose",
         verdict=_in_words(sensors, named, alike) if red else "no significant disagreement",
         significant=bool(red),
-        effects=[_finding(f, named, sensors) for f in named],
-        gap=dict(_gap(s, named, k) for k, s in enumerate(sensors)),
-        aside=_BLOCKS,
+        effects=[_finding(f, named, tried, sensors) for f in named],
+        gap={
+            f"worst electrodes of {s.name} in simulated presses": _gap(s, named, k)
+            for k, s in enumerate(sensors)
+        },
+        aside="rows that took no part in any fit",
         where=[{"sensor": s.name} | {k: v for k, v in c.items() if k != "red"} for s, c in red],
         where_note="electrodes and conditions of simulated presses that are off; RMS [counts], and expected",
         remainder="" if named or not red else "no effect that was tried takes the gap away",
         unknown=bool(red) and not named,
         tried=[_row(f, s, t) for f in tried for s, t in zip(sensors, f.tested)],
         tried_note=(
-            f"RMS [counts] without -> with it on {_BLOCKS}, how much likelier it makes them, and how often "
-            "chance gives as much; its value by either half of the rows"
+            "evidence of each over the base model, all states marginalised; RMS [counts] without -> with it "
+            "on rows that took no part in any fit; its value, 95 %"
         ),
         details={
             "simulated": {
@@ -380,22 +326,21 @@ def _in_words(sensors, named, alike):
 
 
 def _gap(sensor, named, k):
-    """Name and Gap of the electrodes of sensor k that lead."""
-    worst = electrode_names(sensor.worst)
-    phases = [c for c in sensor.cells if c["channel"] in worst and c["condition"].startswith("phase")]
-    before = float(np.sqrt((sensor.judged.error[:, sensor.worst] ** 2).mean()))
-    after = named[0].tested[k].rms["worst"][1] if named else before
-    noise = float(np.sqrt(np.mean([c["expected"] ** 2 for c in phases]))) if phases else np.nan
-    gap = Gap("counts", before, after, noise, f"{_listed(sensor.worst)} of {sensor.name}")
-    return f"worst electrodes of {sensor.name} in simulated presses", gap
+    """Gap of the electrodes of sensor k that lead."""
+    fit, worst = named[0].tested[k] if named else sensor.fit, sensor.worst
+    noise = float(np.sqrt((sensor.noise[worst] ** 2).mean()))
+    channels = electrode_names(range(len(sensor.slope)))
+    each = zip(*(fit.rms([i]) for i in range(len(channels))))
+    name = f"{_listed(worst)} of {sensor.name}"
+    return Gap("counts", *fit.rms(worst), noise, name, tuple(channels), *map(tuple, each))
 
 
-def _finding(f, named, sensors):
-    effect, locked = f.model.effect, np.square([t.locked["worst"] for t in f.tested])
+def _finding(f, named, tried, sensors):
+    effect, locked = f.model.effect, np.square([t.rms(s.worst) for s, t in zip(sensors, f.tested)])
     before, after = np.sqrt(locked.mean(0)).tolist()
     parameters = {
         effect.parameter + (f" of {s.name}" if len(sensors) > 1 else ""): Estimate(
-            float(np.mean(t.value)), unit=effect.unit
+            *_interval(f.model, t), effect.unit
         )
         for s, t in zip(sensors, f.tested)
     }
@@ -404,12 +349,17 @@ def _finding(f, named, sensors):
         channels=tuple(sorted({k for s in sensors for k in s.worst})),
         parameters=parameters,
         evidence=f.evidence,
-        p=max(t.p for t in f.tested),
+        p=by_chance(f.evidence, len(tried)),
         confirmed=bool((locked[:, 1] < locked[:, 0]).all()),
         ties={one.id: one.name for one in named if one is not f},
         gap=Gap("counts", before, after, name="worst electrodes, RMS on held-out rows"),
         note=f"of the {f.whose}" if f.whose == "base model" else "",
     )
+
+
+def _interval(model, t):
+    """Value of a model's parameter by a Fit, and its interval of 95 %."""
+    return model.value(t.amount), *sorted(map(model.value, (t.low, t.high)))
 
 
 def _row(f, sensor, t):
@@ -422,14 +372,13 @@ def _row(f, sensor, t):
         "sensor": sensor.name,
         "parameter": effect.parameter,
         "unit": effect.unit,
-        "by_halves": ", ".join(f"{v:.3g}" for v in t.value),
-        **{f"{which}_electrodes": "{:.0f} -> {:.0f}".format(*rms) for which, rms in t.rms.items()},
-        "kept_aside": "{:.0f} -> {:.0f}".format(*t.locked["worst"]) if t.locked else "",
+        "value": "{:.3g} ({:.3g} .. {:.3g})".format(*_interval(f.model, t)),
+        "worst_electrodes": "{:.0f} -> {:.0f}".format(*t.rms(sensor.worst)),
+        "all_electrodes": "{:.0f} -> {:.0f}".format(*t.rms()),
         "nats": t.nats,
-        "p": t.p,
         "whose": f.whose,
-        "closed": t.closed(),
-        "attach": attach and attach(sum(t.value) / len(t.value)),
+        "closed": t.closed(sensor.worst),
+        "attach": attach and attach(f.model.value(t.amount)),
     }
 
 
@@ -437,7 +386,7 @@ def _where(s):
     """Location of the disagreement of one sensor, as numbers."""
     return {
         "worst": electrode_names(s.worst),
-        "rms": float(np.sqrt((s.judged.error**2).mean())),
+        "rms": float(np.sqrt((s.fit.error**2).mean())),
         "missing": dict(zip(electrode_names(range(len(s.slope))), s.slope.tolist())),
         "missing_error": s.error.tolist(),
         "cells": s.cells,

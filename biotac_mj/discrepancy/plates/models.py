@@ -1,24 +1,28 @@
-"""Candidate models of presses of a flat plate: the base model, and the base model with one effect added. Each
-is fitted on one half of the blocks of time and judged on the other."""
+"""Candidate models of presses of a flat plate: the base model, and the base model with one effect added. A
+model is judged by the one likelihood, the state of every row marginalised."""
 
 import dataclasses
+import types
 from collections.abc import Callable, Iterator
 
 import numpy as np
 from scipy.signal import lfilter
 
 from ...effects.plate import PlateEffect
-from ...matching.fit import Constants, Rows, Setup, fit_constants, fit_states, rows_of
+from ...matching.fit import Constants, Rows, Setup, fit_constants, fit_states, rows_of, tangent
 from ...matching.response import Response
+from ...matching.states import frame
 from ...sensor.channels import counts_from_log_impedance
-from ..evidence import log_ratio
 from ..recordings.recording import PlainRecording
+from ..trajectories.likelihood import Likelihood, courses, kernel
+from ..trajectories.settings import SETTINGS
 
 BASE = Setup(gains=0.0)
 _DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chosen; the rest is held out
 _ROWS = 300  # loaded rows that are looked at: time to fit goes with them
-_BLOCKS = 16  # of time: rows of one press are one piece of evidence
+_JUDGED = 100  # rows of the evidence, whose four columns each it marginalises
 _MEMORY = 0.5, 5.0  # [s] of a grip's relaxation, as measured on holds (docs/lab/memory.md)
+_ROUNDS = 3  # of amplitudes and errors of laws in turn
 
 
 def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
@@ -38,14 +42,14 @@ class Model:
     """The base model with one effect.
 
     Attributes:
-      effect: in words, and what attaches it. response, setup: of the fit. value: of its parameter by
-        constants. tau: of the load's memory [s], or None.
+      effect: in words, and what attaches it; None: the base model. response, setup: of the fit. value: of
+        its parameter by the last of the constants. tau: of the load's memory [s], or None.
     """
 
-    effect: PlateEffect
+    effect: PlateEffect | None
     response: Response
     setup: Setup
-    value: Callable[[Constants], float]
+    value: Callable[[float], float] = float
     tau: float | None = None
 
     def of(self, recording: PlainRecording, rows: Rows) -> Rows:
@@ -63,69 +67,115 @@ def models(response: Response, effects: tuple[PlateEffect, ...]) -> Iterator[Mod
     for tau in _MEMORY:
         one = PlateEffect(f"memory_{tau:g}s", f"relaxation within {tau:g} s", "C", "", "fraction of the load")
         setup = dataclasses.replace(BASE, memory=0.3)
-        yield Model(one, plain, setup, lambda c: c.memory, tau)
+        yield Model(one, plain, setup, tau=tau)
     for k, one in enumerate(effects):
         setup = dataclasses.replace(BASE, amount=1.0)
-        yield Model(one, response.only(k), setup, lambda c, one=one: one.value(float(c.amount[0])))
+        yield Model(one, response.only(k), setup, one.value)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Judged:
-    """A model on both halves of n rows, each by constants that the other half gave.
+class Fit:
+    """A model with the constants and states that fit n rows best.
 
     Attributes:
-      constants: of the first and of the second half. state: (n, 4). error: (n, nelectrode) modelled less
-        measured [counts]. own: (n, nelectrode) error by the half's own constants. change: (n, nelectrode)
-        modelled change of the counts from rest.
+      constants. state: (n, 4). error, change: (n, nelectrode) modelled less measured, and modelled change
+        from rest [counts]. unseen: (m, nelectrode) error on held-out rows.
+      score: log evidence of the rows for the model [nats]. amount, low, high: of its last constant, with
+        95 %; law_error: of what this one does, as a fraction. base: Fit of the base model; None: it is.
     """
 
-    constants: tuple[Constants, Constants]
+    constants: Constants
     state: np.ndarray
     error: np.ndarray
-    own: np.ndarray
     change: np.ndarray
+    unseen: np.ndarray
+    score: float
+    amount: float
+    low: float
+    high: float
+    law_error: float
+    base: "Fit | None"
 
     @property
-    def uncertainty(self) -> np.ndarray:
-        """(n, nelectrode) standard deviation of a prediction: the constants of both halves, compared on the
-        same rows."""
-        return np.abs(self.error - self.own) / np.sqrt(2)
+    def nats(self) -> float:
+        """Evidence over the base model."""
+        return self.score - self.base.score
 
-    def square(self) -> np.ndarray:
-        """(blocks,) mean squared error of each block."""
-        return np.array([(self.error[b] ** 2).mean() for b in blocks(len(self.error))])
+    def rms(self, electrodes: list | slice = slice(None)) -> tuple[float, float]:
+        """RMS on held-out rows without and with the effect [counts]."""
+        parts = (one.unseen[:, electrodes] for one in (self.base or self, self))
+        return tuple(float(np.sqrt((part**2).mean())) for part in parts)
 
-    def gain(self, smaller: "Judged", noise: np.ndarray) -> np.ndarray:
-        """(blocks,) [nats] by which it makes each block likelier than a smaller model does, errors of rows of
-        one block alike; noise: (nelectrode,) of the electrodes [counts]."""
-        return log_ratio(smaller.square(), self.square(), len(noise), np.mean(noise**2))
-
-
-def blocks(n: int) -> list[np.ndarray]:
-    """Row numbers of the blocks of n rows, in order."""
-    return np.array_split(np.arange(n), _BLOCKS)
+    def closed(self, electrodes: list | slice = slice(None)) -> float:
+        """Share of the squared error that the effect takes away; below 0 where it adds to it."""
+        before, after = self.rms(electrodes)
+        return 1 - (after / max(before, 1e-12)) ** 2
 
 
-def judge(response: Response, rows: Rows, setup: Setup, begin: Judged | None = None) -> Judged:
-    """Fits a model to every other block and judges it on the others: no drift is carried beyond where it was
-    seen.
+def fitted(
+    model: Model,
+    recording: PlainRecording,
+    rows: tuple[Rows, Rows],
+    noise: np.ndarray,
+    base: Fit | None = None,
+) -> Fit:
+    """Fits a model to rows, and finds their evidence for it by the likelihood of `trajectories.likelihood`,
+    all constants and the state of every row marginalised about the fit.
 
     Args:
-      begin: a smaller model from whose constants and states the search goes on; None begins anew.
+      rows: that are fitted, and held-out ones. noise: (nelectrode + 2,) of the electrodes [counts] and of the
+        tangential force [N]. base: from which the search goes on, of a model with an effect.
     """
-    parts = [np.concatenate(blocks(len(rows))[k::2]) for k in (0, 1)]
-    constants = []
-    for k, part in enumerate(parts):
-        start = begin and (begin.constants[k], begin.state[part])
-        constants.append(fit_constants(response, rows[part], setup, start)[0])
-    state, error = np.zeros((len(rows), 4)), np.zeros((len(rows), rows.counts.shape[1]))
-    own, change = np.zeros_like(error), np.zeros_like(error)
-    for k, part in enumerate(parts):
-        other, mine = constants[1 - k], constants[k]
-        also = None if begin is None else begin.state[part]
-        found = fit_states(response, rows[part], other, setup, also=also)
-        again = fit_states(response, rows[part], mine, setup, also=found.state)
-        rest = counts_from_log_impedance(other.offset + other.drifted(rows[part].time)[:, None])
-        state[part], error[part] = found.state, found.counts - rows[part].counts
-        own[part], change[part] = again.counts - rows[part].counts, found.counts - rest
-    return Judged(tuple(constants), state, error, own, change)
+    response, setup, (rows, locked) = model.response, model.setup, (model.of(recording, r) for r in rows)
+    const, match = fit_constants(response, rows, setup, base and (base.constants, base.state))
+    rest = counts_from_log_impedance(const.offset + const.drifted(rows.time)[:, None])
+    change = match.counts - rest
+    some = slice(None, None, -(-len(rows) // _JUDGED))
+    residual, columns, away, scale = tangent(response, rows[some], const, match.state[some], setup)
+    largest = np.abs(np.hstack([change, match.force])).max(0)
+    contact = _contact(response, rows, match, const.modulus, len(recording) / recording.rate)
+    every = [np.arange(len(rows))[some]]
+    groups = [slice(0, len(noise) - 2), slice(len(noise) - 2, len(noise))]
+    own = Likelihood(kernel([contact], every), courses([contact], every), noise, groups, largest)
+    done = [] if base is None else [columns[-1] * away[-1]]  # by the effect
+    columns, here = own.turned(columns), own.turned(residual)
+    y = here + np.tensordot(away, columns, 1)  # as from the priors' means
+    law_errors, amplitude = np.full(len(done), SETTINGS.law), own.amplitude_of(here**2, own.size)
+    for _ in range(_ROUNDS):
+        whole = np.concatenate([columns, own.laws(done, law_errors)])
+        amplitude = own.amplitudes(y, whole, amplitude, own.size)
+        log, weights, factor = own.evidence(y, whole, own.variance(amplitude, own.size))
+        known, law_errors = law_errors, own.law_errors(law_errors, weights, factor, len(columns))
+    last = len(columns) - 1
+    half = 1.96 * scale * np.linalg.norm(np.linalg.inv(factor)[:, last])
+    amount = float(weights[last] * scale)
+    return Fit(
+        const,
+        match.state,
+        match.counts - rows.counts,
+        change,
+        fit_states(response, locked, const, setup).counts - locked.counts,
+        log + own.prior(amplitude, known),
+        amount,
+        amount - half,
+        amount + half,
+        float(known.max(initial=0.0)),
+        base,
+    )
+
+
+def _contact(response, rows, match, modulus, seconds):
+    """Rows as those of one contact of a plate, of which `trajectories.likelihood` reads the poses."""
+    states, axes = response.states, np.array([frame(*turn) for turn in match.state[:, :2]])
+    load = rows.force[:, 2] / modulus
+    depth = np.interp(load, states.grid.load, states.depth.mean((0, 1, 2)))
+    push = axes[:, 2] + np.einsum("nk,nki->ni", match.state[:, 2:], axes[:, :2])
+    touched = states.rest[(axes[:, 2] @ states.rest.T).argmin(1)]  # under the plate at first touch
+    return types.SimpleNamespace(
+        tool="plane",
+        clock=0.0,
+        time=rows.time * seconds,
+        pos=touched + depth[:, None] * push,
+        mat=np.stack([axes[:, 0], axes[:, 2], axes[:, 1]], 2),
+        depth=depth,
+    )

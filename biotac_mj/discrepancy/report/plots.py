@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...sensor.colors import line_color
-from .verdict import Gap, electrode_names
+from .verdict import Gap
 
 _UNAMENDED, _AMENDED = "0.6", "tab:blue"
 _ASIDE = "0.92"  # grey behind held-out rows
@@ -127,46 +127,4 @@ def matrix(
     ax.set_xticks(np.arange(len(names)), names, fontsize=7)
     ax.set_yticks(np.arange(len(rows)), rows, fontsize=7)
     figure.colorbar(image, label=label)
-    return figure
-
-
-def plates(
-    sensors: Sequence[str],
-    worst: Sequence[str],
-    rms: Sequence[np.ndarray],
-    missing: Sequence[tuple[np.ndarray, np.ndarray]],
-    tried: Sequence[str],
-    closed: Sequence[Sequence[float]],
-) -> object:
-    """Error by electrode, what each electrode's change lacks, what each model takes away.
-
-    Args:
-      sensors: names (s,). worst: electrodes of each that are furthest off, in words. rms: (n,) error of each
-        [counts]. missing: share (n,) of the change and its standard error, of each.
-      tried: names (t,) of models. closed: (t,) fractions of the squared error, of each sensor.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 9), layout="constrained")
-    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.5])
-    errors, lacks, models = (figure.add_subplot(g) for g in (grid[0, 0], grid[0, 1], grid[1, :]))
-    x, width, y = np.arange(len(rms[0])), 0.8 / len(sensors), np.arange(len(tried))[::-1]
-    for i, name in enumerate(sensors):
-        at = (i - (len(sensors) - 1) / 2) * width
-        errors.bar(x + at, rms[i], width, label=name)
-        lacks.bar(x + at, 100 * missing[i][0], width, yerr=100 * missing[i][1], error_kw={"lw": 0.7})
-        models.barh(y - at, 100 * np.asarray(closed[i]), width, label=f"{name}, {worst[i]}")
-    for ax, title in ((errors, "error [counts RMS]"), (lacks, "what the modelled change lacks [%]")):
-        ax.set_xticks(x, electrode_names(x), fontsize=7, rotation=60)
-        ax.set_title(title + ", blocks not fitted on", fontsize=9)
-        ax.legend(fontsize=7) if ax is errors else ax.axhline(0, color="k", lw=0.6)
-    models.axvline(0, color="k", lw=0.6)
-    models.set_yticks(y, tried, fontsize=8)
-    models.set_xlim(left=max(models.get_xlim()[0], -50))
-    models.set_title(
-        "squared error of the worst electrodes that each model takes away [%], blocks not fitted on "
-        "(* named)",
-        fontsize=9,
-    )
-    models.legend(fontsize=7)
     return figure

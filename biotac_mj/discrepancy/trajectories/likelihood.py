@@ -24,7 +24,7 @@ if typing.TYPE_CHECKING:
 _ROWS = 1500  # of all trajectories, that eigenvectors are computed of; of more, some are left out
 # Lengths over which what a model misses changes: across the skin (a contact's radius), in depth, in heading,
 # in the logarithm of the time since touch, in the session.
-PLACE, _DEPTH, _HEADING, _SINCE, CLOCK = 3e-3, 0.4e-3, 0.5, 0.7, 60.0
+_PLACE, _DEPTH, _HEADING, _SINCE, _CLOCK = 3e-3, 0.4e-3, 0.5, 0.7, 60.0
 # Shares of the variance that come again wherever the same is touched as deep; that pass with the touch; that
 # have no length, as of films that touch and part; and that go with the session's clock alone, touched or not.
 _STATIC, _PASSING, _ROUGH, _DRIFTING = 0.6, 0.25, 0.05, 0.1
@@ -36,48 +36,37 @@ _TOUCH = 20e-6  # [m]
 _FACTORS = np.exp(np.arange(-0.4, 4.01, 0.4))
 _LAW_FACTORS = np.exp(np.arange(-1.2, 1.61, 0.2))  # of law errors, in their prior's median
 COURSES = 24  # along which the law of an effect may be another
-LAW_PLACE = 10e-3  # [m] along the finger, over which a law is nearly the same
+_LAW_PLACE = 10e-3  # [m] along the finger, over which a law is nearly the same
 
 
 def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
-    """(n, n) covariance of what a model misses, 1 under the deepest press; rows: of each trajectory."""
+    """(n, n) covariance of what a model misses, 1 under the deepest press; rows: of each trajectory, whose
+    `time`, `clock`, `pos`, `mat`, `depth` and `tool` count."""
 
     def gathered(of):
         return _gathered(data, rows, of)
 
     depth = gathered(lambda t: t.depth)
-    place = squared_distances(gathered(lambda t: t.pos), PLACE) + squared_distances(depth, _DEPTH)
-    heading = squared_distances(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
-    since = squared_distances(gathered(_since_touch), _SINCE)
-    clock = squared_distances(gathered(lambda t: t.clock + t.time), CLOCK)
+    place = _distances(gathered(lambda t: t.pos), _PLACE) + _distances(depth, _DEPTH)
+    heading = _distances(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
+    since = _distances(gathered(_since_touch), _SINCE)
+    clock = _distances(gathered(lambda t: t.clock + t.time), _CLOCK)
     static = np.exp(-0.5 * (place + heading)) * _same_tool(data, rows)
-    return covariance(static, np.exp(-0.5 * (place + since + clock)), np.exp(-0.5 * clock), depth)
-
-
-def covariance(
-    static: np.ndarray, passing: np.ndarray, drifting: np.ndarray, depth: np.ndarray
-) -> np.ndarray:
-    """(n, n) of what a model misses, by correlations (n, n) of what comes again, of what passes with a touch
-    and of what goes with the session, in rows where something presses as deep as depth (n,)."""
+    passing = np.exp(-0.5 * (place + since + clock))
     load = _UNTOUCHED + np.clip(depth / max(depth.max(), 1e-9), 0.0, 1.0)
-    touched = (_STATIC * static + _PASSING * passing + _ROUGH * np.eye(len(load))) * load[:, None] * load
-    return touched + _DRIFTING * drifting
+    rough = _ROUGH * np.eye(len(load))
+    touched = (_STATIC * static + _PASSING * passing + rough) * load[:, None] * load
+    return touched + _DRIFTING * np.exp(-0.5 * clock)
 
 
 def courses(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     """(k, n) functions of depth, time since touch, the session's clock, place and tool whose sum with
     coefficients of unit variance is the process of a law's error."""
-    away = squared_distances(_gathered(data, rows, lambda t: t.depth), _DEPTH)
-    away += squared_distances(_gathered(data, rows, _since_touch), _SINCE)
-    away += squared_distances(_gathered(data, rows, lambda t: t.clock + t.time), CLOCK)
-    away += squared_distances(_gathered(data, rows, lambda t: t.pos), LAW_PLACE)
-    return largest_modes(_same_tool(data, rows) * np.exp(-0.5 * away))
-
-
-def largest_modes(correlation: np.ndarray) -> np.ndarray:
-    """(k, n) functions whose sum with coefficients of unit variance is a process with this correlation
-    (n, n), nearly."""
-    values, vectors = np.linalg.eigh(correlation)
+    away = _distances(_gathered(data, rows, lambda t: t.depth), _DEPTH)
+    away += _distances(_gathered(data, rows, _since_touch), _SINCE)
+    away += _distances(_gathered(data, rows, lambda t: t.clock + t.time), _CLOCK)
+    away += _distances(_gathered(data, rows, lambda t: t.pos), _LAW_PLACE)
+    values, vectors = np.linalg.eigh(_same_tool(data, rows) * np.exp(-0.5 * away))
     return (np.sqrt(np.maximum(values, 0.0)) * vectors).T[: -COURSES - 1 : -1]
 
 
@@ -91,8 +80,8 @@ def _gathered(data, rows, of):
     return np.concatenate([np.asarray(of(t))[r] for t, r in zip(data, rows)])
 
 
-def squared_distances(x: np.ndarray, length: float) -> np.ndarray:
-    """(n, n) squares of distances of x (n, ...) over a length."""
+def _distances(x, length):
+    """(n, n) squared distances of x (n, ...) over a length."""
     x = x.reshape(len(x), -1) / length
     square = (x**2).sum(1)
     return np.maximum(square[:, None] + square - 2 * x @ x.T, 0.0)
