@@ -12,6 +12,7 @@ import pytest
 import torch
 from blocks import four_nodes
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from biotac_mj import cli
 from biotac_mj.calibration import plan_indentation
@@ -134,6 +135,24 @@ def test_a_press_of_the_simulated_sensor_is_fitted(estimator, pressed):
     assert found.size == pytest.approx(truth.force, rel=0.1) and found.low < truth.force < found.high
     assert found.high / found.low < 0.2 * blind.high / blind.low
     assert found.unexplained < 0.1
+
+
+def test_a_fits_slopes_are_those_of_moved_presses():
+    """By all seven coordinates of a press that tilts and slides: readings, force and centre. By moves before
+    the next samples begin to touch, of a geom that is not round."""
+    skin = four_nodes("coarse")
+    table, film = Estimator(skin, "geom:capsule:3mm,5mm")._starts, FilmConduction(skin)
+    start = int(np.abs(table.at - [-0.011, 0.38, 0.375]).sum(1).argmin())
+    search = fitting._Search(table, film, np.zeros(20), np.full(20, 0.01), start, tqdm(disable=True))
+    press = search._linear(search._simulate(np.array([0.1, -0.2, -0.3, 0.05, -0.05, 0.2, 0.1])))
+    least = {"missed": 0.02, "outcome": 0.005}  # where slopes nearly vanish
+    for k, move in enumerate(3e-4 * np.eye(7)):
+        low, high = (search._simulate(press.at + sign * move) for sign in (-1, 1))
+        for of, parts in {"missed": (slice(19), [19]), "outcome": ([0], slice(1, 4))}.items():
+            slope = (getattr(high, of) - getattr(low, of)) / 6e-4
+            for part in parts:
+                off = np.linalg.norm((getattr(press, f"{of}_by")[:, k] - slope)[part])
+                assert off < 0.02 * np.linalg.norm(slope[part]) + least[of], (k, of, part)
 
 
 def test_secants_correct_gradients_that_hide_a_small_one():

@@ -1,10 +1,11 @@
 """Contact of a known sensor: fits a press such that the simulator has the measured readings.
 
-A Gauss-Newton method moves, tilts and slides the press. The condensed tier supplies the start and, by
-differences, the gradients: it is a hundred times faster than the full skin, whose readings are fitted.
+A Gauss-Newton method moves, tilts and slides the press: by the condensed tier and its differences, a hundred
+times faster, for the start, and by the full skin, whose readings are fitted, and the tangents of its steps
+from there.
 Several combinations of place, depth, tilt and slide may have nearly the same readings. Gradients at one press
-cannot tell how far these lie apart: samples begin and cease to touch, and errors of a few percent in large
-gradients hide small ones. Therefore presses at both ends of the interval correct the gradients there.
+cannot tell how far these lie apart, since samples begin and cease to touch. Therefore presses at both ends of
+the interval correct the gradients there.
 """
 
 import dataclasses
@@ -16,12 +17,14 @@ from tqdm import tqdm
 
 from ...sensor.channels import electrode_noise, log_impedance, pressure_from_counts
 from ...sensor.film import FilmConduction, NoFilmError
-from ..record import follow
+from ..record import Trajectory, follow
+from ..sweep import Inputs, push_forward
 from .belief import TILT
-from .presses import Presses, Solved, frame_of
+from .presses import Presses, Solved, frame_of, slopes_of_film
 
 _STARTS, _SPACING = 3, 2e-3  # starting positions from the table at most, and their least distance [m]
 _ITERATIONS, _LONGEST = 30, 1.0  # per start and tier; longest move of an iteration [mm]
+_ALONG = 1e-4  # of a coordinate, in differences of paths
 _STEP = 5e-4  # [m] longest step of a path: forces are those of steps of a quarter to 0.5 %
 _SLIDE = 1.0  # [mm] standard deviation of a slide that follows a press, in each of two directions
 _APART = np.array([0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05])  # of coordinates in differences [mm], [rad]
@@ -56,12 +59,14 @@ class Fit:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Press:
     """A simulated press at seven coordinates: its outcome, residuals in standard deviations (k,), -2 ln of
-    its likelihood, and derivatives of outcome and residuals by the coordinates, None if not computed."""
+    its likelihood, the steps of the full skin, None by the condensed tier, and derivatives of outcome and
+    residuals by the coordinates, None if not computed."""
 
     at: np.ndarray
     outcome: np.ndarray
     missed: np.ndarray
     cost: float
+    trajectory: Trajectory | None = None
     outcome_by: np.ndarray | None = None
     missed_by: np.ndarray | None = None
 
@@ -157,21 +162,19 @@ class _Search:
         """The press of the condensed tier; None: none can be simulated."""
         try:
             start = self._differentiated(self._approximated(np.zeros(len(_PRIOR))))
-            return self._fitted(start, self._approximated, _ROUGHLY)
+            return self._fitted(start, self._approximated, self._differentiated, _ROUGHLY)
         except _IMPOSSIBLE:
             return None
 
     def fine(self, start: _Press) -> _Press | None:
         """The press of the full skin from that of the condensed tier; None: it cannot be simulated."""
         try:
-            start = self._differentiated(start)
-            by = {"missed_by": start.missed_by, "outcome_by": start.outcome_by}
-            press = dataclasses.replace(self._simulate(start.at), **by)
-            return self._with_secants(self._fitted(press, self._simulate, _CONVERGED))
+            press = self._linear(self._simulate(start.at))
+            return self._with_secants(self._fitted(press, self._simulate, self._linear, _CONVERGED))
         except _IMPOSSIBLE:
             return None
 
-    def _fitted(self, here: _Press, simulate: Callable, least: float) -> _Press:
+    def _fitted(self, here: _Press, simulate: Callable, differentiate: Callable, least: float) -> _Press:
         """Levenberg-Marquardt iterations, whose derivatives every press corrects (Broyden) and which takes
         new ones where these lead no further. The scale of the noise is estimated with the press, so the prior
         limits tilts and slide while the residual is large."""
@@ -196,7 +199,7 @@ class _Search:
             if gain > least:
                 damping, fresh = damping / 5, False
             elif not fresh:
-                here, fresh = self._differentiated(here), True
+                here, fresh = differentiate(here), True
             elif gain > 0:
                 break
             else:
@@ -224,19 +227,20 @@ class _Search:
                 break
         return press
 
-    def _path(self, at):
+    def _path(self, at, like=None):
         """Poses (nstep, 1, 3) [m], (nstep, 1, 3, 3) of a press at seven coordinates: moved along and around
         the finger, deeper [mm], tilted by two [rad], and then slid by two [mm]. The skin's curvature is in
-        the moves, so that a place is changed at a depth."""
+        the moves, so that a place is changed at a depth. As many points as the path at `like`, or at `at`."""
         capsule, (along, around) = self._presses.capsule, self._place
         around_by = 1e-3 / (capsule.radius * max(np.cos(capsule.turn(along)), 0.3))
         there = along + 1e-3 * at[0], around + around_by * at[1]
         moved = capsule.frame(*there).T @ capsule.frame(*self._place)
         turn = Rotation.from_rotvec(at[3:5] @ self._axes).as_matrix()
         start, down = self._steps.pos[0, 0], (self._steps.pos[-1] - self._steps.pos[0])[0]
-        down = turn @ down * (1 + 1e-3 * at[2] / np.linalg.norm(down))
-        slide = 1e-3 * at[5:] @ self._axes
-        first, then = (np.linspace(0, 1, _count(leg))[:, None] * leg for leg in (down, slide))
+        length, counted = np.linalg.norm(down), at if like is None else like
+        down, slide = turn @ down * (1 + 1e-3 * at[2] / length), 1e-3 * at[5:] @ self._axes
+        counts = _count(length + 1e-3 * counted[2]), _count(1e-3 * np.linalg.norm(counted[5:]))
+        first, then = (np.linspace(0, 1, n)[:, None] * leg for n, leg in zip(counts, (down, slide)))
         pos = start - capsule.at(*self._place) + np.concatenate([first, down + then[1:]])
         pos = pos @ moved.T + capsule.at(*there)
         return pos[:, None], np.repeat((moved @ turn @ self._steps.mat[0])[None], len(pos), axis=0)
@@ -247,33 +251,54 @@ class _Search:
         skin, (pos, mat) = self._presses.skin, self._path(at)
         with skin.lock:
             trajectory = follow(skin, pos[None], mat[None], skin.friction, skin.own)
-        return self._read(at, self._presses.solved(trajectory.steps[-1], trajectory.rest))
+        last = self._presses.solved(trajectory.steps[-1], trajectory.rest)
+        return self._read(at, last, trajectory)
 
     def _approximated(self, at):
         """Simulates a press of the condensed tier."""
         *_, last = self._presses.approximate(*self._path(at))
         return self._read(at, last)
 
-    def _read(self, at, step: Solved):
+    def _read(self, at, step: Solved, trajectory=None):
         if not len(step.touches):
             raise _NoPressError
         change = np.log(self._film.impedance(step.x)) - self._rest
         signal = np.append(change, 1e-3 * step.pressure)[: len(self._signal)]
-        missed = (signal - self._signal) / self._noise[: len(signal)]
+        missed = (signal - self._signal) / self._noise
         scale = max(1.0, missed @ missed / len(missed))
         cost = missed @ missed / scale + len(missed) * np.log(scale) + at**2 @ _PRIOR
-        return _Press(at, self._presses.outcome_of_step(step), missed, cost)
+        return _Press(at, self._presses.outcome_of_step(step), missed, cost, trajectory)
+
+    def _linear(self, press):
+        """A press of the full skin with its derivatives by the coordinates, tangents of its steps; the middle
+        of the contact stays."""
+        presses, trajectory, k = self._presses, press.trajectory, len(_PRIOR)
+        pose = np.zeros((k, 1, len(trajectory.steps), 1, 6))
+        for one, move in zip(pose[:, 0, :, 0], _ALONG * np.eye(k)):
+            (low, before), (high, after) = (self._path(press.at + m, press.at) for m in (-move, move))
+            one[:, :3] = (high - low)[:, 0] / (2 * _ALONG)
+            turn = after[:, 0] @ before[:, 0].mT
+            one[:, 3:] = Rotation.from_matrix(turn).as_rotvec() / (2 * _ALONG)
+        inputs = Inputs(pose, np.zeros((k, 1, 1)), {name: np.zeros((k, 1)) for name in presses.skin.own})
+        with presses.skin.lock:
+            tangents = push_forward(presses.skin, trajectory, inputs)
+        last = presses.solved(trajectory.steps[-1], trajectory.rest)
+        _, slopes = slopes_of_film(self._film, last.x, tangents.nodes[:, 0, -1, : presses.geometry.nvert])
+        signal_by = np.column_stack([slopes, 1e-3 * tangents.pressure[:, 0, -1]])[:, : len(self._signal)]
+        outcome_by = presses.outcome_slopes(last, tangents.wrench[:, 0, -1, 0])
+        missed_by = signal_by.T / self._noise[:, None]
+        return dataclasses.replace(press, missed_by=missed_by, outcome_by=outcome_by.T)
 
     def _differentiated(self, press):
-        """A press with its derivatives by the coordinates, differences of the condensed tier."""
-        here, columns = self._approximated(press.at), []
+        """A press of the condensed tier with its derivatives by the coordinates, differences."""
+        columns = []
         for move in np.diag(_APART):
             try:
                 there = self._approximated(press.at + move)
             except _IMPOSSIBLE:  # the other way
                 move = -move
                 there = self._approximated(press.at + move)
-            by = ((getattr(there, of) - getattr(here, of)) / move.sum() for of in ("missed", "outcome"))
+            by = ((getattr(there, of) - getattr(press, of)) / move.sum() for of in ("missed", "outcome"))
             columns.append(tuple(by))
         missed_by, outcome_by = (np.array(rows).T for rows in zip(*columns))
         return dataclasses.replace(press, missed_by=missed_by, outcome_by=outcome_by)
@@ -291,6 +316,6 @@ def _corrected(press, begin, end, move, slope):
     return by, errors[0]
 
 
-def _count(leg):
-    """Points of a straight part of a path, two or more."""
-    return 1 + max(1, int(np.ceil(np.linalg.norm(leg) / _STEP)))
+def _count(length):
+    """Points of a straight part of a path of that length [m], two or more."""
+    return 1 + max(1, int(np.ceil(length / _STEP)))

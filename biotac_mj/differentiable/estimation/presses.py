@@ -233,6 +233,13 @@ class Presses:
         middle = torch.from_numpy(self.middle(step.touches))
         return outcome_of(torch.from_numpy(step.wrench), middle).numpy()
 
+    def outcome_slopes(self, step: Solved, wrench: np.ndarray) -> np.ndarray:
+        """(k, 7) derivatives of `outcome_of` from those of the wrench (k, 6), at the same middle."""
+        middle = torch.from_numpy(self.middle(step.touches))
+        outcome = functools.partial(outcome_of, middle=middle)
+        slopes = torch.autograd.functional.jacobian(outcome, torch.from_numpy(step.wrench))
+        return wrench @ slopes.numpy().T
+
     def path(self, along: float, around: float, fraction: float = 1.0) -> Steps:
         """The steps of a press at a position [m], [rad]."""
         point, samples = self.capsule.at(along, around), len(_FRACTIONS) - 1
@@ -287,11 +294,7 @@ class Presses:
                 table["outcome"][here][0] -= np.log(_FRACTIONS[k])
                 if self._slopes:
                     table["by_press"][here][:, -1] = 1e-3 * tangents.pressure[:, 0, end]
-                    middle = torch.from_numpy(self.middle(step.touches))
-                    slopes = torch.autograd.functional.jacobian(
-                        functools.partial(outcome_of, middle=middle), torch.from_numpy(step.wrench)
-                    )
-                    table["outcome_by"][here] = tangents.wrench[:, 0, end, 0] @ slopes.numpy().T
+                    table["outcome_by"][here] = self.outcome_slopes(step, tangents.wrench[:, 0, end, 0])
         for name in {"outcome", "outcome_by"} & table.keys():
             table[name][:, :, 0] = table[name][:, :, 1]
         return table
