@@ -53,6 +53,15 @@ def _run_here(repo, script, *arguments):
     return subprocess.CompletedProcess(sys.argv, code, out.getvalue(), err.getvalue())
 
 
+@pytest.mark.slow
+def test_every_benchmark_starts_and_says_what_it_does(repo):
+    """What it imports is there, its options are told, and nothing is measured or written."""
+    for path in sorted((repo / "benchmarks").glob("*.py")):
+        if "ArgumentParser" in path.read_text():
+            done = _run_here(repo, path.name, "--help")
+            assert done.returncode == 0 and done.stdout.startswith("usage: "), (path.name, done.stderr)
+
+
 @pytest.fixture(scope="module")
 def accuracy(repo):
     sys.path.insert(0, str(repo / "benchmarks"))
