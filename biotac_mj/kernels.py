@@ -4,22 +4,24 @@ import warp as wp
 
 # Warp's flags repeat a function wherever it is called (LLVM inlines what has 40 times as many instructions as
 # by its own limit), and end the search for SIMD operations early. By LLVM's own limits a press's kernels take
-# a fifth less time to compile, and run as fast
+# a fifth less time to compile, and all but the elements' run as fast
 _LIMITS = "-mllvm=-inline-", "-mllvm=-slp-"
 
 
-def kernel_module(name: str) -> str:
+def kernel_module(name: str, inlined: bool = False) -> str:
     """Names the Warp module of kernels: without adjoints, compiled for the CPU by LLVM's own limits. Other
     flags in `warp.config.cpu_compiler_flags` when this is called remain.
 
     Args:
       name: of the Warp module; `__name__` for the kernels of a file that name no other.
+      inlined: whether functions are repeated by Warp's limits: kernels of small matrices take half the time.
 
     Returns:
       The name, for `warp.kernel`.
     """
     flags = wp.config.cpu_compiler_flags
     if flags is not None:
-        flags = " ".join(flag for flag in flags.split() if not flag.startswith(_LIMITS))
+        limits = _LIMITS[1:] if inlined else _LIMITS
+        flags = " ".join(flag for flag in flags.split() if not flag.startswith(limits))
     wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": flags}, name)
     return name

@@ -64,7 +64,8 @@ class Kind(NamedTuple):
     @property
     def placement(self) -> dict:
         """Module and launch bounds of a kernel for many worlds."""
-        return {"module": kernel_module(self.module), "launch_bounds": BOUNDS if self.is_single else None}
+        module = kernel_module(self.module, inlined=True)
+        return {"module": module, "launch_bounds": BOUNDS if self.is_single else None}
 
 
 @functools.cache
