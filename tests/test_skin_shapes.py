@@ -1,5 +1,7 @@
 """Signed distances against MuJoCo's, closed forms and trimesh."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -431,9 +433,7 @@ def test_normals_tell_the_side_as_rays_do(shape):
     found = []
     for normal in (grids.normal, wp.zeros_like(grids.normal)):
         grids.normal = normal
-        out = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
-        wp.launch(mesh_distances, len(points), [grids, wp.array(points, dtype=wp.vec3d)], [out], device="cpu")
-        found.append(out.numpy())
+        found.append(of_grids(grids, points))
     np.testing.assert_array_equal(*found)
 
 
@@ -447,19 +447,17 @@ def test_the_nearest_triangle_is_on_its_cells_list(shape):
     rng = np.random.default_rng(3)
     share = rng.dirichlet([1.0] * 3, 6000)
     base = (vert[face[rng.integers(len(face), size=len(share))]] * share[:, :, None]).sum(1)
-    points = wp.array(base + 2e-4 * rng.normal(size=base.shape), dtype=wp.vec3d, device="cpu")
+    points = base + 2e-4 * rng.normal(size=base.shape)
     found = []
     for of_cell in (grids.of_cell, wp.full_like(grids.of_cell, -1)):
         grids.of_cell = of_cell
-        out = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
-        wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
-        found.append(out.numpy()[:, 3])
+        found.append(of_grids(grids, points)[0, :, 3])
     # the tree's own choice is in single precision
     np.testing.assert_allclose(*found, rtol=0, atol=1e-8)
     everywhere = np.full(grid.value.shape, 7, np.int32)
     grids.of_cell = wp.array(everywhere.ravel(), dtype=int, device="cpu")
-    wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
-    assert abs(out.numpy()[:, 3] - found[0]).max() > 1e-4  # a wrong list is noticed
+    # a wrong list is noticed
+    assert abs(of_grids(grids, points)[0, :, 3] - found[0]).max() > 1e-4
 
 
 @wp.kernel(enable_backward=False)
@@ -503,9 +501,17 @@ def test_corners_nearly_in_one_place():
 
 
 @wp.kernel(enable_backward=False)
-def mesh_distances(grids: Grids, point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec4d)):
-    i = wp.tid()
-    out[i] = distance(7, wp.vec3d(), wp.float64(0.0), grids, 0, point[i])
+def mesh_distances(grids: Grids, point: wp.array(dtype=wp.vec3d), out: wp.array2d(dtype=wp.vec4d)):
+    k, i = wp.tid()
+    out[k, i] = distance(7, wp.vec3d(), wp.float64(0.0), grids, k, point[i])
+
+
+def of_grids(grids, points):
+    """Normals and distances (ngrid, n, 4)."""
+    out = wp.zeros((len(grids.mesh), len(points)), dtype=wp.vec4d, device="cpu")
+    given = [grids, wp.array(points, dtype=wp.vec3d, device="cpu")]
+    wp.launch(mesh_distances, out.shape, given, [out], device="cpu")
+    return out.numpy()
 
 
 def test_a_smooth_mesh_has_a_normal_without_jumps():
@@ -520,6 +526,21 @@ def test_a_smooth_mesh_has_a_normal_without_jumps():
         turned[smooth] = np.linalg.norm(np.diff(normal, axis=0), axis=1).max()
     step = np.pi / 1999
     assert turned[False] > 20 * step and turned[True] < 4 * step
+
+
+def test_smooth_and_sharp_meshes_are_one_set():
+    """Each has the distance that it has alone, in any order."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=1.0)
+    sharp, smooth, other = (
+        bake_distance_grid(scale * ball.vertices, ball.faces, spacing=0.1, margin=0.5, smooth=is_smooth)
+        for scale, is_smooth in ((1.0, False), (1.0, True), (0.9, True))
+    )
+    points = cloud(500, reach=1.2)
+    found = {}
+    for order in [[sharp], [smooth], [other], *itertools.permutations([sharp, smooth, other])]:
+        grids, _meshes = pack_grids(order, "cpu")
+        for grid, distances in zip(order, of_grids(grids, points)):
+            np.testing.assert_array_equal(distances, found.setdefault(id(grid), distances))
 
 
 def test_a_smooth_mesh_keeps_to_its_triangles_within_its_error():

@@ -123,7 +123,7 @@ class GeomSet:
     @property
     def shapes(self) -> str:
         """Kind of their shapes, see `contact.touch.contact_kernels`."""
-        if len(self.types) == 1 and len(self._grids) == 1 and self._grids[0].coefficient is not None:
+        if self.types == ["mesh"] and self._grids[0].coefficient is not None:
             return CORE
         return shapes_of(self.types)
 

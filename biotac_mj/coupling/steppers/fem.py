@@ -126,7 +126,7 @@ class FemStepper(SkinStepper):
     @property
     def grids(self) -> list[DistanceGrid]:
         """Distance grids of its meshes."""
-        return [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type in ("mesh", "skin")]
+        return _grids_of(self._geoms)
 
     def used(self, state: np.ndarray) -> SavedState:
         """Copy of the part of a state that is in use."""
@@ -446,8 +446,8 @@ def geom_set(
         [g.friction for g in geoms],
         [g.group for g in geoms],
         [g.rounding for g in geoms],
-        [_grid(g.vert.tobytes(), g.face.tobytes()) for g in geoms if g.type in ("mesh", "skin")],
-        _grid(*(a.tobytes() for a in own)) if any(g.type == "skin" for g in geoms) else None,
+        _grids_of(geoms),
+        _grid(*(a.tobytes() for a in own), True) if any(g.type == "skin" for g in geoms) else None,
         nworld=nworld,
         device=device,
     )
@@ -458,10 +458,19 @@ def grid_of(vert: np.ndarray, face: np.ndarray) -> DistanceGrid:
     return _grid(vert.tobytes(), face.tobytes())
 
 
+def _grids_of(geoms):
+    """Grids of the meshes and skins. A skin is smooth: between facets of its mesh the force would jump."""
+    return [
+        _grid(g.vert.tobytes(), g.face.tobytes(), g.type == "skin")
+        for g in geoms
+        if g.type in ("mesh", "skin")
+    ]
+
+
 @functools.lru_cache(maxsize=16)
-def _grid(vert, face):
+def _grid(vert, face, smooth=False):
     return bake_distance_grid(
-        np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3)
+        np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3), smooth=smooth
     )
 
 

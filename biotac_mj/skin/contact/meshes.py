@@ -48,7 +48,8 @@ class Grids:
     normal: wp.array2d(dtype=wp.vec3)  # of each face, `closest.pseudonormals`
     of_cell: wp.array(dtype=int)  # index of a cell's list, or -1; a cell has the index of its first corner
     lists: TriangleLists
-    coefficient: wp.array(dtype=wp.float32)  # of splines, see `DistanceGrid`; empty if meshes have edges
+    coefficient: wp.array(dtype=wp.float32)  # of splines, see `DistanceGrid`
+    spline: wp.array(dtype=int)  # where those of each grid begin; -1: its mesh has edges
     error: wp.array(dtype=real)  # of each spline [m]
 
 
@@ -224,10 +225,6 @@ def _mesh(vert, face, device) -> wp.Mesh:
 def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Grids, list]:
     """The grids as one Warp struct, and the meshes, which must live as long as the struct."""
     grids = list(grids)
-    if len({g.coefficient is None for g in grids}) > 1:
-        raise ValueError(
-            "some grids of the set are smooth and others are not: bake all with the same `smooth`"
-        )
     meshes = [_mesh(g.vert, g.face, device) for g in grids]
     packed = Grids()
     with wp.ScopedDevice(device):
@@ -249,8 +246,10 @@ def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Gr
         cells = [np.where(g.of_cell < 0, -1, g.of_cell + n) for g, n in zip(grids, before)]
         packed.of_cell = wp.array(np.concatenate([np.zeros(0, int), *cells]), dtype=int)
         packed.lists = pack_lists([g.lists for g in grids])
-        splines = [g.coefficient.ravel() for g in grids if g.coefficient is not None]
+        splines = [np.zeros(0) if g.coefficient is None else g.coefficient.ravel() for g in grids]
         packed.coefficient = wp.array(np.concatenate([np.zeros(0), *splines]), dtype=wp.float32)
+        begins = np.cumsum([0, *map(len, splines)])
+        packed.spline = wp.array([n if len(s) else -1 for n, s in zip(begins, splines)], dtype=int)
         packed.error = wp.array([g.error for g in grids], dtype=real)
     return packed, meshes
 
@@ -335,7 +334,7 @@ def spline_field(grids: Grids, k: int, p: vec3):
     dx = _spline_slopes(t[0])
     dy = _spline_slopes(t[1])
     dz = _spline_slopes(t[2])
-    first = grids.first[k] + ((i[0] - 1) * n[1] + i[1] - 1) * n[2] + i[2] - 1
+    first = grids.spline[k] + ((i[0] - 1) * n[1] + i[1] - 1) * n[2] + i[2] - 1
     gradient = vec3()
     value = real(0.0)
     for a in range(3):
@@ -370,7 +369,7 @@ def smooth_distance(grids: Grids, k: int, p: vec3):
 def mesh_field(grids: Grids, k: int, p: vec3, d: real):
     """Normal and distance where the grid's value is d: from the nearest triangle close to the surface; of a
     smooth mesh from its spline, whose gradient may differ slightly from length 1."""
-    if grids.coefficient.shape[0] > 0:
+    if grids.spline[k] >= 0:
         return spline_field(grids, k, p)
     h = grids.spacing[k]
     if wp.abs(d) <= h:

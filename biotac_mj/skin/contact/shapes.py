@@ -171,7 +171,7 @@ def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: in
     bound = rough_bound(kind, size, rounding, grids, grid, p)
     if kind == 7 and bound > -(real(1.0) + TRILINEAR) * grids.spacing[grid]:
         h = grids.spacing[grid]
-        if grids.coefficient.shape[0] > 0:
+        if grids.spline[grid] >= 0:
             if bound < (NEAR_SURFACE - TRILINEAR) * h:
                 bound = wp.max(bound, spline_field(grids, grid, p)[3] - real(2.0) * grids.error[grid])
         elif h > _COARSE and bound < _NEAR:
