@@ -15,6 +15,7 @@ from biotac_mj.skin import GeomSet, bake_distance_grid
 from biotac_mj.skin.contact.meshes import Grids, pack_grids
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance, distance_bound
+from biotac_mj.skin.contact.touch import SKINS
 
 SIZES = {
     "sphere": (0.8, 0, 0),
@@ -526,6 +527,15 @@ def test_a_smooth_mesh_has_a_normal_without_jumps():
         turned[smooth] = np.linalg.norm(np.diff(normal, axis=0), axis=1).max()
     step = np.pi / 1999
     assert turned[False] > 20 * step and turned[True] < 4 * step
+
+
+def test_a_skin_whose_grid_has_edges_is_refused():
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=1.0)
+    smooth, sharp = (bake_distance_grid(ball.vertices, ball.faces, cells=8, smooth=s) for s in (True, False))
+    assert GeomSet(["skin"], [()], grids=[smooth], own=smooth).shapes == SKINS
+    for grid, own in ((sharp, smooth), (smooth, sharp), (smooth, None)):
+        with pytest.raises(ValueError, match="smooth=True"):
+            GeomSet(["skin"], [()], grids=[grid], own=own)
 
 
 def test_smooth_and_sharp_meshes_are_one_set():

@@ -40,7 +40,8 @@ class GeomSet:
       groups: (ngeom,) body of each geom, 0..ngroup-1; None: one group.
       rounding: fillet radius of boxes and cylinders (ngeom,) [m].
       grids: one DistanceGrid for each mesh and each skin, in the order of `types`.
-      own: DistanceGrid of the undeformed skin that they touch; needed if `types` has a skin.
+      own: DistanceGrid of the undeformed skin that they touch; needed if `types` has a skin. Those of skins
+        are smooth.
       nworld: number of worlds.
       device: Warp device.
 
@@ -75,8 +76,14 @@ class GeomSet:
             raise ValueError(
                 "every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)"
             )
-        if "skin" in types and not isinstance(own, DistanceGrid):
-            raise ValueError("a geom is a skin: pass own=, the DistanceGrid of the skin that it touches")
+        of_geoms = iter(grids)
+        kinds = [(kind, next(of_geoms)) for kind, has_grid in zip(types, gridded) if has_grid]
+        skins = [grid for kind, grid in kinds if kind == "skin"]
+        if skins and any(getattr(grid, "coefficient", None) is None for grid in (*skins, own)):
+            raise ValueError(
+                "a geom is a skin: pass own=, the DistanceGrid of the skin that it touches; both need "
+                "bake_distance_grid(vert, face, smooth=True)"
+            )
         size = np.zeros((count, 3))
         for row, given in zip(size, sizes, strict=True):
             row[: len(given)] = given

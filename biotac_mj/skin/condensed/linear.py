@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ...cache import cached
 from ...geometry.tet_mesh import enclosed_volume
 from ...kernels import kernel_module
-from ..contact.meshes import grid_value, mesh_distance, mesh_field
+from ..contact.meshes import smooth_distance, spline_field
 from ..contact.posed import Geoms
 from ..liquid import volume_gradient
 from ..types import real, vec3
@@ -50,9 +50,9 @@ def _core_gaps(
     p = b[0] * vert[t[0]] + b[1] * vert[t[1]] + b[2] * vert[t[2]] + shift
     k = core.grid[0]
     if everywhere == 1:
-        gap_out[f, i] = mesh_field(core.grids, k, p, grid_value(core.grids, k, p))[3]
+        gap_out[f, i] = spline_field(core.grids, k, p)[3]
     else:
-        gap_out[f, i] = mesh_distance(core.grids, k, p)[3]
+        gap_out[f, i] = smooth_distance(core.grids, k, p)[3]
 
 
 def _meet_core(model, free, rest):

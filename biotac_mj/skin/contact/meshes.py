@@ -349,29 +349,14 @@ def spline_field(grids: Grids, k: int, p: vec3):
 @wp.func
 def mesh_distance(grids: Grids, k: int, p: vec3):
     """Normal and distance: from the grid far from the surface; close to it from the nearest triangle, so that
-    edges stay sharp, or from the spline of a smooth mesh."""
+    edges stay sharp, or from the spline of a smooth mesh, whose gradient may differ slightly from length
+    1."""
     d = grid_value(grids, k, p)
-    if d > TRILINEAR * grids.spacing[k]:  # surely outside: no contact here
+    h = grids.spacing[k]
+    if d > TRILINEAR * h:  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    return mesh_field(grids, k, p, d)
-
-
-@wp.func
-def smooth_distance(grids: Grids, k: int, p: vec3):
-    """`mesh_distance` from a smooth mesh, without the code for triangles, which takes registers on CUDA."""
-    d = grid_value(grids, k, p)
-    if d > TRILINEAR * grids.spacing[k]:
-        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    return spline_field(grids, k, p)
-
-
-@wp.func
-def mesh_field(grids: Grids, k: int, p: vec3, d: real):
-    """Normal and distance where the grid's value is d: from the nearest triangle close to the surface; of a
-    smooth mesh from its spline, whose gradient may differ slightly from length 1."""
     if grids.spline[k] >= 0:
         return spline_field(grids, k, p)
-    h = grids.spacing[k]
     if wp.abs(d) <= h:
         return to_triangles(grids, k, p, wp.abs(d) + h)
     n = vec3(
@@ -384,6 +369,15 @@ def mesh_field(grids: Grids, k: int, p: vec3, d: real):
     )
     n = wp.normalize(n)
     return wp.vec4d(n[0], n[1], n[2], d)
+
+
+@wp.func
+def smooth_distance(grids: Grids, k: int, p: vec3):
+    """`mesh_distance` from a smooth mesh, without the code for triangles, which takes registers on CUDA."""
+    d = grid_value(grids, k, p)
+    if d > TRILINEAR * grids.spacing[k]:
+        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
+    return spline_field(grids, k, p)
 
 
 @wp.func

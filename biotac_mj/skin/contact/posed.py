@@ -8,7 +8,7 @@ skins meet there by symmetry (`docs/design.md`, "Skin on skin").
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .meshes import TRILINEAR, Grids, grid_value, mesh_field, to_triangles
+from .meshes import TRILINEAR, Grids, grid_value, spline_field, to_triangles
 from .shapes import (
     GEOM_TYPES,
     distance,
@@ -84,11 +84,8 @@ def _between_skins(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
     d = real(0.5) * (theirs - mine)
     if least_to(geoms, g, d) > real(0.0):  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    other = mesh_field(geoms.grids, geoms.grid[g], y, theirs)
-    d = real(0.5) * (other[3] - mine)
-    if d > real(0.5) * TRILINEAR * geoms.grids.spacing[geoms.own]:  # as surely, by one grid's error alone
-        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    own = mesh_field(geoms.grids, geoms.own, p, mine)
+    other = spline_field(geoms.grids, geoms.grid[g], y)
+    own = spline_field(geoms.grids, geoms.own, p)
     n = vec3(other[0], other[1], other[2]) - wp.transpose(R) * vec3(own[0], own[1], own[2])
     n = wp.normalize(n)
     return wp.vec4d(n[0], n[1], n[2], real(0.5) * (other[3] - own[3]))
