@@ -432,7 +432,7 @@ def find_nodes(w: int, t: int, threads: int, nface: int, ncore: int, c: Constant
         for k in range(t, nin, threads):
             s.coordinate[w, 3 * nnode + k] = 3 * c.node.shape[0] + s.core_node[w, k]
         if threads == 1:
-            keep_rows(w, 3 * nnode + nin, s.coordinate, s.last, s.ready)
+            keep_rows(w, 3 * nnode + nin, s.coordinate, s.last, 3 * nnode + nin, 0, s.ready)
     sync()
     return nnode, nin
 

@@ -9,24 +9,28 @@ import warp as wp
 # columns of a matrix. So a processor's vectors do many columns at a time.
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
+    const int* __restrict at = listed.data + (long long)world * listed.shape[1];
     int* __restrict old = last.data + (long long)world * last.shape[1];
     int* __restrict there = ready.data + (long long)world * ready.shape[1];
-    bool same = old[0] == m;
-    for (int j = 0; j < m && same; ++j) same = old[1 + j] == at[j];
+    bool same = old[0] == n;
+    for (int j = 0; j < n && same; ++j) same = old[1 + j] == at[j];
     if (same) return;
-    old[0] = m;
-    for (int j = 0; j < m; ++j) old[1 + j] = at[j], there[j] = 0;
+    old[0] = n;
+    for (int j = 0; j < n; ++j) old[1 + j] = at[j];
+    for (int i = 0; i < m; ++i) there[i] = there[i] < most ? there[i] : most;
 #endif
 """)
 def keep_rows(
     world: int,
-    m: int,
-    coordinate: wp.array2d(dtype=int),
+    n: int,
+    listed: wp.array2d(dtype=int),
     last: wp.array2d(dtype=int),
+    m: int,
+    most: int,
     ready: wp.array2d(dtype=int),
 ):
-    """Forgets the rows of B where the candidates are others than the last ones."""
+    """Leaves the first m of `ready` at `most` at most, unless the first n listed are the last ones: of other
+    candidates nothing is known (0), of other columns the rows of B (1)."""
     ...
 
 

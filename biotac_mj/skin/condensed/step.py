@@ -208,6 +208,7 @@ def _scratch(model, linear, data, ngeom, room, groups):
     s.between = wp.empty((nworld, cached * cached), dtype=float)
     s.columns = wp.empty((nworld, cached * min(cached, 3 * touched)), dtype=float)
     s.ready, s.last = wp.zeros((nworld, cached), dtype=int), wp.zeros((nworld, cached + 1), dtype=int)
+    s.last_column = wp.zeros((nworld, min(cached, 3 * touched) + 1), dtype=int)
     s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
     s.stiff = wp.zeros((nworld, ninner), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))

@@ -133,11 +133,12 @@ class Scratch:
     column_place: wp.array2d(dtype=int)  # and their places among the candidates'
     # by one thread, see `lanes.gather_rows`: compliance between candidates, and in the columns of the
     # equations; which rows are ready (1: of the first, 2: of both); the number of the candidates'
-    # coordinates and these; sums of rows
+    # coordinates and these, and of the columns; sums of rows
     between: wp.array2d(dtype=float)
     columns: wp.array2d(dtype=float)
     ready: wp.array2d(dtype=int)
     last: wp.array2d(dtype=int)
+    last_column: wp.array2d(dtype=int)
     sum: wp.array2d(dtype=float)
     held: wp.array2d(dtype=float)  # of the equations, how they are held against the liquid's pressure
     solve: Solve

@@ -7,7 +7,7 @@ from ..block import block_rank, block_sum, sync
 from ..types import mat33, narrow, real, vec3, vec6
 from .bodies import move_nodes, number_bodies
 from .elimination import eliminate
-from .lanes import add_row, add_rows, begin_row, dot_column, gather_rows, sum_rows
+from .lanes import add_row, add_rows, begin_row, dot_column, gather_rows, keep_rows, sum_rows
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
@@ -195,8 +195,7 @@ def _fill_by_rows(
     wide = size.wide
     n = 3 * outer + inner
     m = 3 * nnode + nin
-    for j in range(m):
-        s.ready[w, j] = wp.min(s.ready[w, j], 1)  # the columns are others now
+    keep_rows(w, n, s.column_place, s.last_column, m, 1, s.ready)
     for i in range(n):
         begin_row(s.matrix, w, n, wide, i, soft * s.held[w, i], s.push)
     for k in range(outer):
