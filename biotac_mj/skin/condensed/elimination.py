@@ -227,8 +227,13 @@ MOST_EQUATIONS = 1024  # that `eliminate` has room for
                 #pragma unroll
                 for (int l = 0; l < 8; ++l) {{
                     const eight c = *(const eight*)(b + (long long)l * width + k);
+    #if defined(__FMA__)  // of vectors the compiler makes none of its own
+                    u = __builtin_elementwise_fma(-f[l], c, u);
+                    v = __builtin_elementwise_fma(-g[l], c, v);
+    #else
                     u -= f[l] * c;
                     v -= g[l] * c;
+    #endif
                 }}
                 *(eight*)(other + k) = v;
                 *(eight*)(one + k) = u;
