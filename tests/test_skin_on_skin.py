@@ -81,6 +81,20 @@ def test_two_pads_meet_as_one_meets_a_plate_halfway(tier):
         assert finger.read(data, "electrodes") == pytest.approx(alone.read(half, "electrodes"), abs=3)
 
 
+def test_a_pad_slides_over_another_without_jumps():
+    """Without friction, over facets of both meshes: in steps of 10 um the force changes by equal amounts."""
+    spec = spec_of()
+    fingers = pads(spec, friction=0.0, readings=False)
+    model = spec.compile()
+    data, found = press(model, [0, 0, -1e-3], steps=6), []
+    for x in np.linspace(0, 3e-4, 31):
+        data.mocap_pos[0, 0] = x
+        mujoco.mj_step(model, data)
+        found.append(pushes(data, fingers)[0, :3])
+    assert abs(found[0][2]) > 0.3
+    assert abs(np.diff(found, 2, axis=0)).max() < 2e-4 * abs(found[0][2])
+
+
 def test_what_one_feels_the_other_feels_turned_round():
     turn = np.zeros(4)
     mujoco.mju_euler2Quat(turn, [0.2, 0.1, 0.7], "xyz")
