@@ -155,16 +155,17 @@ class PlateDiagnosis(Verdict):
         )
 
     def pictures(self) -> list[Picture]:
-        """What each model takes away, what each electrode's change lacks, and its error."""
+        """What each model takes away of the squared error of the worst electrodes, with dots for those that
+        are named; what each electrode's change lacks; and its error."""
         names, models = [s.name for s in self.sensors], self.models
         closed = [[100 * f.tested[i].closed(s.worst) for i, s in enumerate(self.sensors)] for f in models]
+        tried = [f.name for f in models]
         dots = [(models.index(f), i) for f in self.named for i in range(len(names))]
-        taken = "squared error of the worst electrodes that each takes away [%]; dots: named"
         lacks = np.array([100 * s.slope for s in self.sensors])
         electrodes = electrode_names(range(lacks.shape[1]))
         own = [
-            Picture("models", "tried", plots.matrix(closed, [f.name for f in models], names, dots, taken)),
-            Picture("lacking", "where", plots.matrix(lacks, names, electrodes, [], "change that lacks [%]")),
+            Picture("models", "tried", plots.matrix(closed, tried, names, dots, "gained [%]")),
+            Picture("lacking", "where", plots.matrix(lacks, names, electrodes, [], "lacks [%]")),
             Picture(
                 "simulated",
                 "gap",
