@@ -4,13 +4,17 @@ import numpy as np
 import pytest
 from grids import first
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from biotac_mj import cli
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
+from biotac_mj.discrepancy.recordings.detectors.memory import remembered
+from biotac_mj.discrepancy.recordings.segments import free_rows
+from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.quality.check import sample_faults
 from biotac_mj.quality.log import Log
 from biotac_mj.quality.noise import sound_noise
-from biotac_mj.quality.still import at_rest
+from biotac_mj.quality.still import at_rest, between_rests
 from biotac_mj.recordings import Recording, read, write
 from biotac_mj.recordings.protocol import SCHEMA, STEPS, Protocol, Segment, read_protocol, write_protocol
 
@@ -105,6 +109,100 @@ def test_at_rest_what_is_more_than_noise_is_found(change, name, channels):
 @pytest.mark.parametrize("seed", range(4))
 def test_at_rest_noise_alone_has_no_fault(seed):
     assert at_rest(Log(resting(seed=seed))) == []
+
+
+RESTS = (slice(0, 2000), slice(2000, 4000))
+
+
+def coupled(x, noise, rng):
+    x[:, 5] += 0.4 * (x[:, 6] - x[:, 5])
+    return x
+
+
+def shared(x, noise, rng):
+    return x + 0.6 * noise * rng.standard_normal((len(x), 1))
+
+
+def turned_down(x, noise, rng):
+    x[2000:, 3] += 0.5 * (x[2000:, 3].mean() - x[2000:, 3])
+    return x
+
+
+@pytest.mark.parametrize(
+    "change, name, channels",
+    [
+        (coupled, "crosstalk", (5, 6)),
+        (shared, "noise", range(19)),
+        (turned_down, "gain", (3,)),
+    ],
+)
+def test_noise_tells_what_electrodes_share_and_their_gain(change, name, channels):
+    assert [(f.id, f.channels) for f in between_rests(Log(resting(change)), RESTS)] == [
+        (name, tuple(channels))
+    ]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_independent_noise_of_two_rests_tells_nothing(seed):
+    assert between_rests(Log(resting(seed=seed)), RESTS) == []
+
+
+def remembering(memory, force=True):
+    """What a sensor is found to remember that is touched twice for 20 s between rests; memory: (what touches
+    do to the electrodes (n, 19)) -> what is added."""
+    n, rng = int(RATE * 100), np.random.default_rng(2)
+    t = np.arange(n) / RATE
+    load = np.maximum(-np.sin(2 * np.pi * t / 5), 0)[:, None] * (t // 20 % 2)[:, None]
+    change = load * rng.normal(0, 150, 19)
+    level = np.linspace(2400, 3400, 19) + 0.3 * t[:, None]
+    x = level + change + memory(change)
+    counts = np.rint(x + sound_noise(np.broadcast_to(level[:1], (1, 19))) * rng.standard_normal(x.shape))
+    plate = load * [0.1, 0.2, -4.0] + rng.normal(0, 0.005, (n, 3)) if force else None
+    kinds = ("rest", "loops", "release", "loops", "release")
+    protocol = Protocol(tuple(Segment(kind, 20 * k, 20 * k + 20) for k, kind in enumerate(kinds)))
+    recording = PlainRecording(counts, plate, rate=RATE)
+    return remembered(Session(recording, np.ones(n, bool)), free_rows(recording, protocol, 0.0))
+
+
+def relaxing(change):
+    slow = lfilter([0.005], [1, -0.995], change, axis=0)  # 2 s
+    return -0.2 * slow
+
+
+def sticking(change):
+    follows = np.zeros_like(change)
+    width = 0.1 * np.abs(change).max(0)
+    for i in range(1, len(change)):
+        follows[i] = np.clip(follows[i - 1], change[i] - width, change[i] + width)
+    return follows - change
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_what_decays_after_touches_is_relaxation(force):
+    found = remembering(relaxing, force)
+    assert found.id == "relax" and found.parameters["tau"][0] == 2.0
+    assert found.parameters["g"][0] == pytest.approx(0.2, abs=0.08) and found.of_all
+
+
+def test_what_stays_after_touches_is_hysteresis():
+    found = remembering(sticking)
+    assert found.id == "hyster_load" and found.parameters["fraction"][0] == pytest.approx(0.1, abs=0.03)
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_a_sensor_without_memory_has_none_found(force):
+    assert remembering(np.zeros_like, force) is None
+
+
+@pytest.mark.slow
+def test_rests_together_tell_a_jump_under_touches():
+    """By less than the electrodes tell of each other while they are touched."""
+    protocol = Protocol((*PROTOCOL.segments, Segment("release", REST + TOUCHED, 2 * REST + TOUCHED)))
+    counts = np.concatenate([session(), session()[: int(RATE * REST)]])
+    step = 6 / (1 + np.exp(-(np.arange(len(counts)) / RATE - REST - 20) / 3))
+    counts[:, 4] += np.rint(step)
+    assert ("drift", (4,)) not in found(counts, None)
+    assert ("drift", (4,)) in found(counts, protocol)
 
 
 def test_a_checkup_finds_spikes_while_nothing_touches():

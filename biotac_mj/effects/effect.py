@@ -193,7 +193,8 @@ class Effect(abc.ABC):
         running sensor can have}.
       requires: data that a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of
         the counts; "time" to separate touches from drift; "load"; "change", that it begins or ends in the
-        recording; "poses", where nothing else suffices; "search", where no detector searches it.
+        recording; "protocol" of a checkup; "poses", where nothing else suffices; "search", where no detector
+        searches it.
       detector: class of evidence in logs, which sets a name's confidence
         (`discrepancy.recordings.confidence`).
     """

@@ -38,6 +38,7 @@ SPOT = "at_"  # begins the name of a modulus at a place
 class Relaxation(Effect):
     id, name, stage = "relax", "stress relaxation (Prony)", "C"
     physics = "G(t) = G (1 + g exp(-t / tau)): stress follows strain at once and relaxes"
+    requires = frozenset({"protocol"})
     params = {
         "g": Param("1", 0.0, 0.8, "0.02-0.3 (Kunzemann 2024; Liao 2020)", 0.1),
         "film": _FILM,
@@ -75,6 +76,7 @@ class Relaxation(Effect):
 class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
+    requires = frozenset({"protocol"})
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
     rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04), "more": _MORE}
     equivalents, remembers = ("relax",), True
@@ -111,6 +113,7 @@ class Hysteresis(Effect):
     physics = (
         "Prandtl-Ishlinskii elements in depth: loading and unloading differ at equal depth, at any speed"
     )
+    requires = frozenset({"protocol"})
     params = {
         "fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1),
         "film": _FILM,
@@ -149,6 +152,7 @@ class LoadHysteresis(Effect):
         "a Prandtl-Ishlinskii element in load: unloading is lower by a fraction of the press's peak, "
         "at any speed; the film follows with the same play"
     )
+    requires = frozenset({"protocol"})
     params = {
         "fraction": Param("1", 0.0, 0.4, "loops of 13-24 % of full scale (Sensors 2023)", 0.08),
         "film": _FILM,

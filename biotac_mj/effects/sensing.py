@@ -171,6 +171,7 @@ class Gain(Linear):
     id, name, stage = "gain", "gain of single electrodes", "A"
     physics = "an electrode's change from rest has its own factor (manufacturing)"
     each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
+    requires = frozenset({"protocol"})
     params = dict.fromkeys(BIOTAC.electrodes, each)
     equivalents, per_channel = ("inhomog",), True
     # Electrodes are 0.1 to 0.2 mm from their drawn positions, which looks like such gains. Gains found for
@@ -237,6 +238,7 @@ class CrossTalk(Linear):
         "V = (I + kappa K + scan S + common M + pairs) U: "
         "K decreases with distance, S is the channel sampled before, M the mean of all"
     )
+    requires = frozenset({"protocol"})
     params = {
         "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
         "scan": Param("1", -0.4, 0.4, "charge held by a multiplexer: CHOSEN, like kappa", 0.05),

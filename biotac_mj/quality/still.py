@@ -16,6 +16,12 @@ from .noise import ROUNDING, noise_level, sound_noise
 _ROW, _SAMPLE = 8.0, 5.5  # times the noise: of a row over all channels, of a sample
 _FEW, _NEAR = 4, 3  # of either; rows around one of all channels that belong to it
 _SLOW = (4, 8)  # rows of means, whose noise is compared with that of rows
+_CALM = 4.0  # times the noise, of a sample that counts as noise
+# correlation of the noise of channels: of the mean pair, 0.001 at most in a real sensor, of any pair 0.10
+_COMMON, _COUPLED = 0.1, 0.1
+_RARE = 1e-3  # chance of a pair that exceeds this
+_OWN = 9  # channels of 19: faults of fewer are of these
+_CHANGED = 0.2  # logarithm of the noise of a channel in a later rest over that in the first
 _COLOURED = 0.25  # logarithm by which it is more than the other channels': 0.15 at most in sound ones
 
 
@@ -50,6 +56,86 @@ def at_rest(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
             found.append(_spikes(log, rows, mask, own, [k], text))
             sound[k] = False
     return found + _coloured(log, x, sound)
+
+
+def between_rests(log: Log, rests: Sequence[slice], faults: Sequence[Fault] = ()) -> list[Fault]:
+    """What the noise says of several rests, in which nothing touches the sensor, together: noise of channels
+    is independent, and as much in the last rest as in the first."""
+    sound = np.ones(log.channels, bool)
+    told = (
+        f for f in faults if len(f.channels) <= log.some(_OWN) or f.step or f.correct or f.mask is not None
+    )
+    sound[[k for f in told for k in f.channels]] = False
+    fresh = ~log.repeated & ~log.masked[:, sound].any(1)
+    off = []
+    for rows in rests:
+        x = log.counts[rows][fresh[rows]]
+        if len(x) < 20 * BLOCKS:
+            continue
+        off.append((x[1:-1] - 0.5 * (x[2:] + x[:-2])) / sound_noise(np.median(x, axis=0)) / np.sqrt(1.5))
+    if not off or sound.sum() < 7:
+        return []
+    spread = np.median(np.abs(np.concatenate(off)), axis=0) / norm.ppf(0.75) + ROUNDING
+    off = [np.clip(one, -_CALM * spread, _CALM * spread) for one in off]
+    return _in_common(log, np.concatenate(off), sound) + _louder(log, off, sound)
+
+
+def _in_common(log, off, sound):
+    """What the noise off (n, c) of sound channels has in common: of all a disturbance, of some cross-talk."""
+    channels = np.flatnonzero(sound)
+    blocks = np.array([np.corrcoef(part.T) for part in np.array_split(off[:, channels], BLOCKS)])
+    i, j = np.triu_indices(len(channels), 1)
+    pairs, rows = blocks[:, i, j], len(off) / BLOCKS
+    common = np.median(pairs, axis=1)
+    found = []
+    if common.mean() > _COMMON:
+        text = f"{common.mean():.0%} of the noise is common to all electrodes while nothing touches"
+        size = float(np.median(noise_level(log.counts)[channels]) * np.sqrt(common.mean()))
+        every = range(log.channels)
+        found.append(_of_noise(log, "noise", every, text, {"size": size}, rows * (common - _COMMON)))
+    own = pairs - common[:, None]
+    # error of a correlation of differences that overlap, and the largest of so many by chance
+    chance = norm.isf(_RARE / len(i)) / np.sqrt(0.6 * len(off))
+    over = np.flatnonzero(np.abs(own.mean(0)) > _COUPLED + chance)
+    if len(over):
+        worst = over[np.argmax(np.abs(own[:, over].mean(0)))]
+        share = float(own[:, worst].mean())
+        a, b = (log.name([channels[k[worst]]]) for k in (i, j))
+        text = f"the noise of {a} and {b} correlates by {share:+.2f} while nothing touches"
+        which = sorted({int(channels[k]) for n in over for k in (i[n], j[n])})
+        strength = rows * (np.sign(share) * own[:, worst] - _COUPLED)
+        found.append(_of_noise(log, "crosstalk", which, text, {"kappa": share}, strength))
+    return found
+
+
+def _louder(log, off, sound):
+    """Channels whose noise is another one in a later rest than in the first, as their gain is."""
+    first, *others = (
+        np.log([np.sqrt((part**2).mean(0)) + ROUNDING for part in np.array_split(one, BLOCKS)]) for one in off
+    )
+    found = {}
+    first -= np.median(first[:, sound], axis=1, keepdims=True)
+    for later in others:
+        later -= np.median(later[:, sound], axis=1, keepdims=True)
+        change = later - first.mean(0)
+        for k in np.flatnonzero(sound & (np.abs(change.mean(0)) > _CHANGED)):
+            size = float(change[:, k].mean())
+            text = f"the noise of {log.name([k])} is {np.exp(size):.2f} times that of the first rest"
+            strength = 20 * (np.sign(size) * change[:, k] - _CHANGED)
+            ends = first[:, k].mean(), later[:, k].mean()
+            if sum(ends) < 0:  # less than the others have, noise and all
+                found[k] = _of_noise(log, "gain", [k], text, {f"e{k + 1}": float(np.expm1(size))}, strength)
+            else:
+                louder = float(np.exp(max(ends)) * noise_level(log.counts)[k])
+                found[k] = _of_noise(log, "noise", [k], text, {"size": louder}, strength)
+                found[k].ties = ("gain",)
+    return list(found.values()) if len(found) <= log.some(_FEW) else []
+
+
+def _of_noise(log, id_, channels, text, values, strength):
+    parameters = {name: (value, NAN, NAN) for name, value in values.items()}
+    end, which = (len(log) - 1) / log.rate, tuple(int(k) for k in channels)
+    return Fault(id_, which, 0.0, end, text, parameters, detector="loud", **evidence(strength))
 
 
 def _peaks(some, size):

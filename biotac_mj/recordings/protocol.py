@@ -24,19 +24,22 @@ _REMEDY = "`biotac checkup --out protocol.yaml` writes one"
 
 class Step(typing.NamedTuple):
     """A step of the protocol. seconds: duration; line: instruction; tells: the effects that it isolates;
-    touched: whether there is contact."""
+    touched: whether there is contact; sharp: whether it begins and ends within a few rows."""
 
     seconds: float
     line: str
     tells: str
     touched: bool = True
+    sharp: bool = False
 
 
 STEPS = {
     "rest": Step(
         45, "Switch the sensor on cold and leave it in air.", "noise, hum, drift, warm-up, lost rows", False
     ),
-    "taps": Step(15, "Tap the pad twice a second with a hard, light thing.", "latency, filters, swaps"),
+    "taps": Step(
+        15, "Tap the pad twice a second with a hard, light thing.", "latency, filters, swaps", sharp=True
+    ),
     "hold": Step(
         30,
         "Press the pad slowly on a flat, hard thing, and hold for 20 s.",
@@ -44,7 +47,7 @@ STEPS = {
     ),
     "release": Step(15, "Let go, and leave it in air.", "relaxation, offsets", False),
     "loops": Step(20, "Press slowly and let go slowly, five times at one place.", "hysteresis, saturation"),
-    "fast": Step(15, "Press fast and let go at once, at many places.", "latency, filters, gain"),
+    "fast": Step(15, "Press fast and let go at once, at many places.", "latency, filters, gain", sharp=True),
     "slides": Step(25, "Press lightly and slide along and across.", "friction, cross-talk, gain, signs"),
     "warm": Step(
         30, "Warm it in a fist for 10 s, then leave it in air.", "temperature, noise after load", False

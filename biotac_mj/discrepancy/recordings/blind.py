@@ -60,6 +60,8 @@ def _lacking(session):
     elif not session.loaded:
         out["load"] = "not loaded"
     out["change"] = "told only where it begins or ends here, not where it holds throughout or comes slowly"
+    if session.protocol is None:
+        out["protocol"] = "no checkup, whose steps tell these, and no poses"
     out["poses"] = "no poses of what touched, with which `diagnose` searches these"
     out["search"] = "not searched in any data"
     return out

@@ -15,7 +15,7 @@ from ..report.verdict import Gap
 from .detectors.trends import Trend
 from .recording import PlainRecording
 
-KINDS = {effect.id: effect for effect in entries("log")}
+KINDS = {effect.id: effect for effect in (*entries("poses"), *entries("log"))}
 _MOST = 12  # electrodes: what more have is of the sensor
 
 

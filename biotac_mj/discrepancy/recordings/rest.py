@@ -12,6 +12,7 @@ from ...quality.clock import CLOCK_FAULT
 from ...quality.noise import noise_level, running_median
 from .candidates import as_log
 from .confidence import NAMED, USUAL, farthest
+from .segments import sharply_touched
 from .session import Session
 
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
@@ -128,6 +129,8 @@ def _of_rows(session):
     # from one row to the next, more than noise and than the rows around, where nothing touches
     least, log = 6 * noise_level(x) + 2, as_log(r)
     touch = log.touched[rows][1:] if r.force is not None else _together(np.diff(x, axis=0) / least, log)
+    if session.protocol is not None:
+        touch = touch | sharply_touched(r, session.protocol)[rows][1:]
     jumps = sharp(x, least) & ~touch[:, None]
     jumps[[one[0] - 1 for one in series[1:]]] = False
     # noise never comes again in all electrodes

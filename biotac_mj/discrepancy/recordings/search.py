@@ -8,7 +8,7 @@ import tqdm
 
 from ...quality.check import less, lost_rows, sample_faults
 from ...quality.confidence import clear
-from ...quality.still import at_rest
+from ...quality.still import at_rest, between_rests
 from ...recordings import Recording
 from ...recordings.protocol import Protocol
 from ..evidence import discoveries
@@ -18,11 +18,12 @@ from .detectors.jumps import jumped
 from .detectors.lagging import lagging
 from .detectors.latency import delayed
 from .detectors.levels import levels, settle
+from .detectors.memory import remembered
 from .detectors.order import slipped
 from .diagnosis import RecordingDiagnosis, concluded
 from .proof import prove
-from .recording import PlainRecording, as_plain
-from .segments import moved, stretches
+from .recording import PlainRecording, as_plain, enough
+from .segments import free_rows, moved, stretches
 from .session import Session
 
 _MOST = 8  # of trends over time
@@ -165,9 +166,9 @@ def _proved(session):
     for finding in session.findings:
         prove(session, finding)
     tested = [*session.findings, *session.weak]
-    enough = discoveries([f.p for f in tested])
+    sure = discoveries([f.p for f in tested])
     # faults of the log are reported whatever else was tested
-    chance = [f for f, yes in zip(session.findings, enough) if not (yes or f.of_log)]
+    chance = [f for f, yes in zip(session.findings, sure) if not (yes or f.of_log)]
     contradicted = [f for f in session.findings if f.verified is False or f in chance]
     if contradicted:
         session = session.without(*contradicted)
@@ -177,28 +178,51 @@ def _proved(session):
 
 def _checkup(session, protocol, named):
     """Findings of single stretches of a protocol that the whole log does not show."""
-    r, found = session.recording, []
+    r, found, rests = session.recording, [], []
+    session.protocol = protocol
+    coarse = {k for f in session.findings if f.step for k in f.channels}
     for touched, rows in stretches(r, protocol):
         some = diagnose_recording(r.part(rows), named=named).findings
-        if not touched:  # nothing but noise is there
+        if not touched:
+            rests.append(rows)
+        if not touched and not coarse:  # nothing but noise is there
             faults = [f for f in some if f.of_log]
-            more = at_rest(less(as_log(r.part(rows)), faults), faults)
-            for fault in more:
-                fault.confidence = confidence(fault)
-            some += as_candidates([f for f in more if clear(f, named)])[0]
+            some += _sure_of(at_rest(less(as_log(r.part(rows)), faults), faults), named)
         # at rest a filtered electrode is constant, too: only the whole log shows one that is always constant
-        found += [moved(f, rows, r) for f in some if not f.kind.silent]
-    enough = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
-    for finding, yes in zip(found, enough):
+        found += [moved(f, rows, r) for f in some if not (f.kind.silent or coarse.issuperset(f.channels))]
+    faults = [f for f in (*session.findings, *found) if f.trend is None]
+    found += _sure_of(between_rests(as_log(r, session.counts, session.masked), rests, faults), named)
+    free = free_rows(r, protocol, max((f.delay for f in session.findings), default=0.0))
+    if (finding := remembered(session, free)) is not None:
+        finding.confidence = confidence(finding)
+        found.append(finding)
+    elif rests and enough(free.sum(), r.design):  # all rests are one log of an unloaded sensor
+        rows = np.flatnonzero(free)
+        cut = dict.fromkeys(("force", "tdc", "missing", "since"), None)
+        counts = session.without(*(f for f in session.findings if f.trend is not None)).counts[rows]
+        still = dataclasses.replace(r, electrodes=counts, joints=(), **cut)
+        found += [moved(f, rows, r) for f in diagnose_recording(still, named=named).findings if f.kind.drifts]
+    sure = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
+    for finding, yes in zip(found, sure):
         if not yes or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
-        elif not any(f.id == finding.id and _alike(f, finding) for f in session.findings):
+        elif not any(_explains(f, finding) for f in session.findings):
             session.accept(finding)  # the first stretch with it
 
 
-def _alike(one, other):
-    """Whether two findings are of the same electrodes, or both of all."""
-    return one.of_all == other.of_all and bool(set(one.channels) & set(other.channels))
+def _sure_of(faults, named):
+    """Candidates of faults that are likely enough."""
+    for fault in faults:
+        fault.confidence = confidence(fault)
+    return as_candidates([f for f in faults if clear(f, named)])[0]
+
+
+def _explains(one, other):
+    """Whether a finding makes another one of a stretch needless: the same, or a fault of the same electrodes,
+    of which one cause is likelier than two."""
+    if one.of_all != other.of_all or not set(one.channels) & set(other.channels):
+        return False
+    return one.id == other.id or not one.of_all or one.of_log and other.of_log
 
 
 def _late(session, named):

@@ -3,10 +3,15 @@
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from ...recordings.protocol import STEPS, Protocol
 from .candidates import Candidate
 from .recording import PlainRecording, enough
+
+_BEGUN = 1.0  # [s] by which a person is late
+_TIMES = 6.0  # of the force's noise, where something touches
+_AFTER = 0.05  # [s]
 
 
 def stretches(recording: PlainRecording, protocol: Protocol) -> list[tuple[bool, slice]]:
@@ -30,25 +35,52 @@ def _clock(recording):
     return recording.time if recording.since is None else recording.since
 
 
-def moved(finding: Candidate, rows: slice, recording: PlainRecording) -> Candidate:
+def sharply_touched(recording: PlainRecording, protocol: Protocol) -> np.ndarray:
+    """(n,) bool, rows of steps that ask for sharp touches."""
+    some = protocol.rows(_clock(recording), *(kind for kind, step in STEPS.items() if step.sharp))
+    out = np.zeros(len(recording), bool)
+    out[np.concatenate([[], *some]).astype(int)] = True
+    return out
+
+
+def free_rows(recording: PlainRecording, protocol: Protocol, late: float) -> np.ndarray:
+    """(n,) bool, rows in which nothing touches the sensor: by the force, if there is one, from a moment after
+    it has ceased, which the electrodes follow `late` [s]; else by the protocol, from a second after a step's
+    begin."""
+    time, force = _clock(recording), recording.force
+    free = np.zeros(len(recording), bool)
+    for one in protocol.segments:
+        if not STEPS[one.kind].touched:
+            free |= (time >= one.start + _BEGUN) & (time < one.stop)
+    if force is None or not free.any():
+        return free
+    alone = force[free] - np.median(force[free], 0)
+    limit = _TIMES * 1.4826 * np.median(np.abs(alone), 0)
+    pressed = (np.abs(force - np.median(force[free], 0)) > limit).any(1)
+    rows = round((_AFTER + 2 * max(late, 0.0)) * recording.rate)
+    return ~(uniform_filter1d(pressed.astype(float), 2 * rows + 1) > 0.5 / (2 * rows + 1))
+
+
+def moved(finding: Candidate, rows: np.ndarray | slice, recording: PlainRecording) -> Candidate:
     """A finding in some rows as one of the whole recording, which acts in these rows alone."""
-    begin, shape = recording.time[rows.start], recording.electrodes.shape
-    mask, correct = finding.mask, finding.correct
+    time, shape = recording.time[rows], recording.electrodes.shape
+    mask, correct, own = finding.mask, finding.correct, np.arange(len(time)) / recording.rate
     if mask is not None:
         mask = np.zeros(shape, bool)
         mask[rows] = finding.mask
 
-    def without(counts, time):
+    def without(counts, at):
         counts = counts.copy()
-        counts[rows] = correct(counts[rows], time[rows] - begin)
+        counts[rows] = correct(counts[rows], own)
         return counts
 
+    start, end, *places = np.interp((finding.start, finding.end, *finding.places), own, time).tolist()
     return dataclasses.replace(
         finding,
-        start=finding.start + begin,
-        end=finding.end + begin,
+        start=start,
+        end=end,
         mask=mask,
         correct=None if correct is None else without,
-        places=tuple(place + begin for place in finding.places),
+        places=tuple(places),
         trend=None,
     )

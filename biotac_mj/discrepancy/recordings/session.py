@@ -13,13 +13,13 @@ class Session:
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, nelectrode); masked
       (n, nelectrode) bool; findings; weak: those that are too little to be named, or contradicted; unnamed:
-      sentences on what is there and has no name.
+      sentences on what is there and has no name; protocol: of a checkup, or None.
     """
 
     def __init__(self, recording: PlainRecording, fit: np.ndarray, findings: tuple | list = ()):
         self.recording, self.fit = recording, fit
         self.findings, self.weak, self.unnamed = list(findings), [], []  # the last a list of str
-        self.fresh = 1 - recording.repeated.mean()
+        self.fresh, self.protocol = 1 - recording.repeated.mean(), None
         self.replay()
 
     def replay(self) -> None:
