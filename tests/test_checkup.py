@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from grids import first
+from logs import tapped
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
@@ -203,6 +204,15 @@ def test_rests_together_tell_a_jump_under_touches():
     counts[:, 4] += np.rint(step)
     assert ("drift", (4,)) not in found(counts, None)
     assert ("drift", (4,)) in found(counts, protocol)
+
+
+def test_taps_are_sharper_than_a_plate_without_a_fault():
+    """A plate that shows the taps too late or not at all tells of no touch; the protocol does."""
+    counts, force, rng = tapped(12)
+    recording = PlainRecording(counts, 0.01 * rng.standard_normal(force.shape), rate=RATE)
+    taps, slow = (Protocol((Segment(kind, 0.0, 40.0),)) for kind in ("taps", "loops"))
+    assert diagnose_recording(recording, protocol=slow).significant
+    assert not diagnose_recording(recording, protocol=taps).significant
 
 
 def test_a_checkup_finds_spikes_while_nothing_touches():
