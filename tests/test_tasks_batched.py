@@ -365,15 +365,36 @@ def test_a_policy_comes_back_from_its_file(tmp_path):
         load_policy(tmp_path / "none.safetensors")
 
 
-@pytest.mark.parametrize("task, actions", [("roll_rod", 6), ("insert_peg", 3), ("follow_edge", 4)])
-def test_policies_that_ship_have_cards(task, actions):
+@pytest.mark.parametrize(
+    "task, name, observe, actions",
+    [
+        ("roll_rod", None, "electrodes+pac", 6),
+        ("roll_rod", "electrodes", "electrodes", 6),
+        ("insert_peg", None, "electrodes", 3),
+        ("follow_edge", None, "electrodes", 4),
+    ],
+)
+def test_policies_that_ship_have_cards(task, name, observe, actions):
     """What they saw and how they did, of data that are called synthetic."""
-    policy, card = load_policy(find_policy(task))
-    assert card["task"] == task and card["data"] == "synthetic"
-    assert card["observe"] == ("electrodes+pac" if task == "roll_rod" else "electrodes")
+    policy, card = load_policy(find_policy(task, name))
+    assert card["task"] == task and card["data"] == "synthetic" and card["observe"] == observe
     assert 0 < card["low"] < card["success"] <= card["high"] <= 1 and card["episodes"] >= 64
     seen = torch.zeros(2, len(policy.mean))
     assert policy(seen).shape == (2, actions) and torch.isfinite(policy(seen)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "task, name",
+    [("roll_rod", None), ("roll_rod", "electrodes"), ("insert_peg", None), ("follow_edge", None)],
+)
+def test_policies_that_ship_do_as_their_cards_say(task, name, capsys):
+    if task == "roll_rod" and not HAND.is_file():
+        pytest.skip("needs MuJoCo Menagerie (set MENAGERIE_ROOT)")
+    more = [*(["--policy", name] if name else []), *(["--hand", str(HAND)] if task == "roll_rod" else [])]
+    assert main(["play", task, "--episodes", "8", "--json", *more]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["agrees"] and score["card"] == read_card(find_policy(task, name))
 
 
 @pytest.mark.parametrize(

@@ -246,7 +246,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "--policy",
         metavar="FILE",
         help="in a task, what acts (default: the policy that comes with the package); script uses "
-        "the true state, random draws actions",
+        "the true state, random draws actions; electrodes of roll_rod carries over to other sensors",
     )
     verb.add_argument(
         "--episodes", type=whole(1, 100000), help="in a task, number of episodes to score without a picture"
@@ -262,7 +262,7 @@ def _play(args):
     of_task = ("policy", "episodes", "json", "render", "window")
     if len(args.recording) == 1 and args.recording[0] in TASKS:
         check_device(args.device)
-        if args.policy not in (None, "script", "random"):  # before seconds of imports
+        if args.policy not in (None, "script", "random", "electrodes"):  # before seconds of imports
             trained = "`python -m biotac_mj.tasks.batched.training TASK --out FOLDER`"
             with reading(args.policy, "policy", f"give script, random, or a file that {trained} wrote"):
                 pass

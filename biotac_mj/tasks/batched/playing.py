@@ -21,21 +21,23 @@ def seen_by(env: BatchTask, observe: str, worlds: slice = slice(None)) -> torch.
 
 
 def find_policy(task: str, policy: pathlib.Path | str | None = None) -> pathlib.Path:
-    """The file of a policy; None: the one of the task that comes with the package.
+    """The file of a policy: a path; None: the one of the task that comes with the package; a word: another
+    one of it that comes with it.
 
     Raises:
       FileNotFoundError: none came with it.
     """
+    name = task if policy is None else f"{task}-{policy}"
+    assets = pathlib.Path(str(importlib.resources.files("biotac_mj.assets")))
+    path = assets / "policies" / f"{name}.safetensors"
+    if path.is_file():
+        return path
     if policy is not None:
         return pathlib.Path(policy)
-    assets = pathlib.Path(str(importlib.resources.files("biotac_mj.assets")))
-    path = assets / "policies" / f"{task}.safetensors"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no policy of {task} comes with this version: give --policy script, or --policy FILE that "
-            f"`python -m biotac_mj.tasks.batched.training {task} --out FOLDER` wrote"
-        )
-    return path
+    raise FileNotFoundError(
+        f"no policy of {task} comes with this version: give --policy script, or --policy FILE that "
+        f"`python -m biotac_mj.tasks.batched.training {task} --out FOLDER` wrote"
+    )
 
 
 def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
@@ -57,7 +59,7 @@ def acting(task: str, policy: pathlib.Path | str | None, device: str) -> tuple[s
     """Observation of a policy, a function (env) -> actions (num_envs, num_actions), and its card.
 
     Args:
-      policy: a file, None (`find_policy`), "script", which uses the true state, or "random".
+      policy: a file, None or a word (`find_policy`), "script", which uses the true state, or "random".
     """
     if policy == "script":
         return "none", lambda env: env.script(), {"task": task}
