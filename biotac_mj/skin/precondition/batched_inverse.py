@@ -10,13 +10,17 @@ if typing.TYPE_CHECKING:
 
 THREADS = 512  # of a block: one for each row
 
-# By panels of eight columns: thread t has row t of the panel, and a warp updates a row by the panel.
+# By panels of eight columns, of which thread t has row t. At a pivot each warp proposes its largest entry, by
+# a key of bits that are ordered as the number is, with the row in the last ones. Then each warp updates rows
+# by the panel, a column for each lane, which keeps what the pivots' rows have there.
 _EXCHANGE = f"""
-    const int t = threadIdx.x, lane = t % 32, P = 8;
+    const int t = threadIdx.x, lane = t % 32, warp = t / 32, P = 8, W = {THREADS} / 32;
+    const int R = 8;  // rows that a warp reads at once
     __shared__ __align__(16) float panel[{THREADS}][P];
+    __shared__ __align__(16) float proposed[2][W][P];
     __shared__ float rows[P][{THREADS}];
-    __shared__ float values[{THREADS} / 32];
-    __shared__ int places[{THREADS} / 32], number[{THREADS}], chosen[P];
+    __shared__ unsigned keys[2][W];
+    __shared__ int number[{THREADS}];
     const int w = world;
     const int n = n_in;
     const long long stride = A.shape[1];
@@ -29,71 +33,69 @@ _EXCHANGE = f"""
         for (int o = t; o < n * P; o += {THREADS})
             panel[o / P][o % P] = o % P < width ? a[o / P * stride + k + o % P] : 0.0f;
         __syncthreads();
-        float own[P];
+        float own[P], pivot[P];
         #pragma unroll
-        for (int b = 0; b < P; ++b) own[b] = t < n ? panel[t][b] : 0.0f;
+        for (int b = 0; b < P; ++b) {{ own[b] = t < n ? panel[t][b] : 0.0f; pivot[b] = 0.0f; }}
+        bool open = t < n && number[t] < 0;
         #pragma unroll
         for (int s = 0; s < P; ++s) {{
             if (s >= width) break;
-            float best = t < n && number[t] < 0 ? fabsf(own[s]) : -1.0f;
-            int at = t;
-            for (int d = 16; d > 0; d >>= 1) {{
-                const float other = __shfl_xor_sync(0xffffffffu, best, d);
-                const int where = __shfl_xor_sync(0xffffffffu, at, d);
-                if (other > best || (other == best && where < at)) {{ best = other; at = where; }}
-            }}
-            if (lane == 0) {{ values[t / 32] = best; places[t / 32] = at; }}
-            __syncthreads();
-            best = values[0]; at = places[0];
-            for (int m = 1; m < {THREADS} / 32; ++m)
-                if (values[m] > best) {{ best = values[m]; at = places[m]; }}
-            if (t == at) {{
+            const unsigned size = __float_as_uint(fabsf(own[s])) & ~{THREADS - 1}u;
+            const unsigned key = open ? size | ({THREADS - 1} - t) : 0;
+            unsigned best = key;
+#if __CUDA_ARCH__ >= 800
+            best = __reduce_max_sync(0xffffffffu, best);
+#else
+            for (int d = 16; d > 0; d >>= 1) best = max(best, __shfl_xor_sync(0xffffffffu, best, d));
+#endif
+            if (lane == 0) keys[s % 2][warp] = best;
+            if (open && key == best)
                 #pragma unroll
-                for (int b = 0; b < P; ++b) panel[t][b] = own[b];
-                number[t] = k + s;
-                chosen[s] = t;
-            }}
-            __syncthreads();
+                for (int b = 0; b < P; ++b) proposed[s % 2][warp][b] = own[b];
+            __syncthreads();  // the next pivot but one writes there again
+            #pragma unroll
+            for (int m = 0; m < W; ++m) best = max(best, keys[s % 2][m]);
+            const int at = {THREADS - 1} - (best & {THREADS - 1});
+            if (t < n) pivot[s] = a[at * stride + t];
             float v[P];
             #pragma unroll
-            for (int b = 0; b < P; ++b) v[b] = panel[at][b];
+            for (int b = 0; b < P; ++b) v[b] = proposed[s % 2][at / 32][b];
             const float d = 1.0f / v[s], f = t == at ? -1.0f : own[s];
             #pragma unroll
             for (int b = 0; b < P; ++b) {{
                 const float share = b == s ? d : v[b] * d;
                 own[b] = (t == at || b == s ? 0.0f : own[b]) - f * share;
             }}
+            if (t == at) {{ number[t] = k + s; open = false; }}
         }}
-        __syncthreads();
         #pragma unroll
-        for (int b = 0; b < P; ++b) panel[t][b] = own[b];
-        for (int s = 0; s < P; ++s)
-            if (t < n) rows[s][t] = s < width ? a[chosen[s] * stride + t] : 0.0f;
+        for (int b = 0; b < P; ++b) {{ panel[t][b] = own[b]; rows[b][t] = pivot[b]; }}
         __syncthreads();
-        for (int i = t / 32; i < n; i += {THREADS} / 32) {{
-            const float4 left = *(const float4*)&panel[i][0], right = *(const float4*)&panel[i][4];
-            const bool was = number[i] >= k;
-            for (int j = lane; j < n; j += 128) {{
-                float sum[4];  // all are read before one is written, which a later read would wait for
+        for (int j = lane; j < n; j += 32) {{
+            float row[P];
+            #pragma unroll
+            for (int s = 0; s < P; ++s) row[s] = rows[s][j];
+            for (int i = warp; i < n; i += R * W) {{
+                float sum[R];  // all are read before one is written, which a later read would wait for
                 #pragma unroll
-                for (int m = 0; m < 4; ++m)
-                    sum[m] = was || j + 32 * m >= n ? 0.0f : a[i * stride + j + 32 * m];
+                for (int r = 0; r < R; ++r) {{
+                    const int l = i + r * W;
+                    sum[r] = l >= n || number[l] >= k ? 0.0f : a[l * stride + j];
+                }}
                 #pragma unroll
-                for (int m = 0; m < 4; ++m) {{
-                    const int h = j + 32 * m;
-                    if (h >= n) break;
-                    sum[m] += left.x * rows[0][h]; sum[m] += left.y * rows[1][h];
-                    sum[m] += left.z * rows[2][h]; sum[m] += left.w * rows[3][h];
-                    sum[m] += right.x * rows[4][h]; sum[m] += right.y * rows[5][h];
-                    sum[m] += right.z * rows[6][h]; sum[m] += right.w * rows[7][h];
-                    a[i * stride + h] = h >= k && h < k + width ? panel[i][h - k] : sum[m];
+                for (int r = 0; r < R; ++r) {{
+                    const int l = i + r * W;
+                    if (l >= n) break;
+                    #pragma unroll
+                    for (int s = 0; s < P; ++s) sum[r] += panel[l][s] * row[s];
+                    a[l * stride + j] = j >= k && j < k + width ? panel[l][j - k] : sum[r];
                 }}
             }}
         }}
     }}
     // column k of the exchanged matrix belongs to the right-hand side of the row whose pivot is k
     __syncthreads();
-    for (int i = t / 32; i < n; i += {THREADS} / 32)
+    for (int i = warp; i < n; i += W)
         for (int j = lane; j < n; j += 32) target[number[i] * stride + j] = a[i * stride + number[j]];
     __syncthreads();
 """
@@ -103,7 +105,7 @@ _EXCHANGE = f"""
 def exchange(world: int, n_in: int, A: wp.array3d(dtype=float), B: wp.array3d(dtype=float)): ...
 
 
-@wp.kernel(module="unique", enable_backward=False, launch_bounds=THREADS)
+@wp.kernel(module="unique", enable_backward=False, launch_bounds=(THREADS, 2))
 def invert_kernel(
     # In:
     extra: int,
