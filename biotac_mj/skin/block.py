@@ -1,6 +1,8 @@
 """Collective operations of the threads of a block: barriers, sums, maxima, ranks. On the CPU a block is one
 thread."""
 
+import functools
+
 import warp as wp
 
 from .types import real, vec3, vec6
@@ -75,21 +77,34 @@ def block_sum(own: vec6) -> vec6: ...  # noqa: F811
 _OF_LANES = """
 #if defined(__CUDA_ARCH__)
     const unsigned mask = 0xffffffffu >> (32 - lanes) << threadIdx.x % 32 / lanes * lanes;
-    for (int c = 0; c < 3; ++c)
-        for (int far = lanes / 2; far > 0; far /= 2) p[c] += __shfl_xor_sync(mask, p[c], far);
+    NUMBER* number = (NUMBER*)&p;
+    for (int far = lanes / 2; far > 0; far /= 2)
+        #pragma unroll
+        for (int c = 0; c < sizeof(p) / sizeof(NUMBER); ++c)
+            number[c] += __shfl_xor_sync(mask, number[c], far);
 #endif
     return p;
 """
 
 
-@wp.func_native(_OF_LANES)
+@functools.cache
+def lane_sum(dtype: type, scalar: type) -> wp.Function:
+    """As `sum_of_lanes`, of any type that consists of numbers `scalar`."""
+
+    @wp.func_native(_OF_LANES.replace("NUMBER", "double" if scalar is real else "float"))
+    def sum_of_lanes(p: dtype, lanes: int) -> dtype: ...
+
+    return sum_of_lanes
+
+
+@wp.func_native(_OF_LANES.replace("NUMBER", "double"))
 def sum_of_lanes(p: vec3, lanes: int) -> vec3:
     """Sum of a vector over `lanes` neighbouring lanes of a warp, a power of two, which take part together and
     get it. On the CPU there is one."""
     ...
 
 
-@wp.func_native(_OF_LANES)
+@wp.func_native(_OF_LANES.replace("NUMBER", "float"))
 def sum_of_lanes(p: wp.vec3, lanes: int) -> wp.vec3: ...  # noqa: F811
 
 

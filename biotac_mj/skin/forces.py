@@ -13,8 +13,7 @@ from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, worlds
-from .precondition.dense import FEW, LANES_FEW, THREADS_FEW
-from .program import Fork, Launcher
+from .program import FEW, LANES_FEW, THREADS_FEW, Fork, Launcher
 from .types import mat33, real, vec3
 
 _LISTED = 1 << 16  # most threads for listed faces: each takes several faces if there are more

@@ -17,6 +17,10 @@ from ..launches import in_a_row, recorded, repeated
 from ..quiet import headers
 from ..threads import cores
 
+FEW = 16  # up to this number of worlds do not fill the device: work is split more finely
+THREADS_FEW = 64  # block size with few worlds: small, so that more multiprocessors take part
+LANES_FEW = 8  # threads that sum one node with few worlds: a single thread would wait for each read
+
 
 class Launcher:
     """Launches kernels immediately, on one device."""

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..newton.nodes import SurfaceForces
 from ..newton.worlds import Worlds
-from ..program import Launcher
+from ..program import FEW, LANES_FEW, THREADS_FEW, Launcher
 from ..types import SINGLE
 from . import Preconditioner, Residual, body_tangent, right_hand_sides, touching_nodes, woodbury
 from .inverse import Inverse
@@ -23,10 +23,6 @@ if typing.TYPE_CHECKING:
     from ..bodies import Bodies
     from ..geoms import GeomSet
     from ..newton.bodies import BodyContact
-
-FEW = 16  # up to this number of worlds do not fill the device: work is split more finely
-THREADS_FEW = 64  # block size with few worlds: small, so that more multiprocessors take part
-LANES_FEW = 8  # threads that sum one node with few worlds: a single thread would wait for each read
 
 
 class DensePreconditioner(Preconditioner):

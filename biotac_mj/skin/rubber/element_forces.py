@@ -5,7 +5,7 @@ import typing
 import numpy as np
 import warp as wp
 
-from ..program import Launcher
+from ..program import FEW, Launcher
 from ..types import DOUBLE, SINGLE, Precision, mat33, real, vec3
 from .element_kernels import element_kernels
 from .element_points import BOUNDS
@@ -45,7 +45,9 @@ class ElementForces:
         self._kernels = element_kernels(elements.corners, elements.law == 0, precision, bool(options))
         # in double precision on CUDA they are for gradients of few worlds: small blocks use more
         # multiprocessors
-        self._block_dim = 64 if self.device.is_cuda and precision.name == "double" else BOUNDS[0]
+        single, on_cuda = precision.name == "single", self.device.is_cuda
+        self._block_dim = 64 if on_cuda and not single else BOUNDS[0]
+        self._lanes = elements.npoint if on_cuda and single and self._nworld <= FEW else 1
         corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
         with wp.ScopedDevice(self.device):
             shape = np.ascontiguousarray(elements.mesh.shape.numpy())
@@ -103,5 +105,6 @@ class ElementForces:
         return tuple(a.numpy().reshape(shape[: 2 if a.dtype is real else 4]) for a in out)
 
     def _launch(self, program, kernel, inputs, outputs):
-        inputs = [self._elements.cap, self._rubber, self._elements.mesh, *inputs]
-        program.launch(kernel, (self._count, self._nworld), inputs, outputs, self._block_dim)
+        inputs = [self._lanes, self._elements.cap, self._rubber, self._elements.mesh, *inputs]
+        dim = self._count, self._nworld, self._lanes
+        program.launch(kernel, dim, inputs, outputs, self._block_dim)

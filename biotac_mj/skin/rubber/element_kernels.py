@@ -3,7 +3,8 @@
 Positions and forces are in double precision: a filled skin under light contact balances forces far larger
 than its load, and their rounding errors would show. Tangents have the precision of directions. In double
 precision, deformation gradients and rotations are stored from force to product; in single, on CUDA, it is
-faster to compute them again than to read them. A thread has an element."""
+faster to compute them again than to read them. A thread has an element, or, for few worlds on CUDA, one of
+its integration points: `lanes` threads share an element, and all write the same."""
 
 import functools
 import types
@@ -11,6 +12,7 @@ import types
 import warp as wp
 
 from ...kernels import kernel_module
+from ..block import lane_sum
 from ..types import DOUBLE, Precision, mat33, real, vec3
 from .element_points import Kind, material_functions
 from .points import Mesh, Rubber, deformation_of
@@ -32,11 +34,12 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
     corners, averaged, is_single = kind.corners, kind.averaged, kind.is_single
     corotational, gradients = kind.corotational, kind.gradients(DOUBLE)
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
-    f = material_functions(kind)
+    f, sum_forces = material_functions(kind), lane_sum(positions, real)
 
     @wp.kernel(**kind.placement)
     def force(
         # In:
+        lanes: int,
         cap: real,
         rubber: Rubber,
         mesh: Mesh,
@@ -50,7 +53,7 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
         corner_out: wp.array2d(dtype=vec3),
         inverted_out: wp.array(dtype=int),
     ):
-        e, w = wp.tid()
+        e, w, lane = wp.tid()
         if on[w] == 0:
             return
         X = positions()
@@ -64,13 +67,16 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
         npoint = wp.static(kind.npoint)
         if wp.static(is_single):  # no constant: unrolled, a loop would need more registers than there are
             npoint = mesh.weight.shape[1]
+        else:
+            lane = 0
+            lanes = 1
         pressure = real(0.0)
         if wp.static(averaged):
             if lam > local:
-                pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
+                pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w, lane, lanes)
                 pressure_out[e, w] = pressure
         C = positions()
-        for q in range(npoint):
+        for q in range(lane, npoint, lanes):
             i = npoint * e + q
             F = X * shape[q] * mesh.inverse[e, q]
             bad = f.flaw(rubber, F)
@@ -85,6 +91,7 @@ def _force_kernel(kind: Kind) -> wp.Kernel:
             C -= (
                 f.weighted_volume(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])
             ) * wp.transpose(shape[q])
+        C = sum_forces(C, lanes)
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec3(C[0, a], C[1, a], C[2, a])
 
@@ -97,7 +104,11 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
     corotational, precision, gradients = kind.corotational, kind.precision, kind.gradients(kind.precision)
     scalar, vec, thin = precision.scalar, precision.vec, precision.narrow
     directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
-    f = material_functions(kind)
+    f, sum_number, sum_forces = (
+        material_functions(kind),
+        lane_sum(scalar, scalar),
+        lane_sum(directions, scalar),
+    )
 
     @wp.func
     def point_state(
@@ -121,6 +132,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
     @wp.kernel(**kind.placement)
     def product(
         # In:
+        lanes: int,
         cap: real,
         rubber: Rubber,
         mesh: Mesh,
@@ -134,7 +146,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         # Out:
         corner_out: wp.array2d(dtype=vec),
     ):
-        e, w = wp.tid()
+        e, w, lane = wp.tid()
         if on[w] == 0:
             return
         D = directions()
@@ -155,21 +167,24 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
         npoint = wp.static(kind.npoint)
         if wp.static(is_single):  # as in `force`
             npoint = mesh.weight.shape[1]
+        else:
+            lane = 0
+            lanes = 1
         mean_pressure = real(0.0)
         stiff = scalar(0.0)
         if wp.static(averaged):
             if lam > local:
                 mean_pressure = pressure[e, w]
                 mean = scalar(0.0)
-                for q in range(npoint):
+                for q in range(lane, npoint, lanes):
                     B = thin(mesh.inverse[e, q])
                     i = wp.static(kind.npoint) * e + q
                     F, R = point_state(i, w, X, shape[q], B, deformation_in, rotation_in)
                     dF = D * shape[q] * B
                     mean += scalar(mesh.weight[e, q]) * wp.ddot(f.direction_of(rubber.law, F, R), dF)
-                stiff = scalar((lam - local) / mesh.volume[e]) * mean
+                stiff = scalar((lam - local) / mesh.volume[e]) * sum_number(mean, lanes)
         C = directions()
-        for q in range(npoint):
+        for q in range(lane, npoint, lanes):
             i = npoint * e + q
             B = thin(mesh.inverse[e, q])
             F, R = point_state(i, w, X, shape[q], B, deformation_in, rotation_in)
@@ -181,6 +196,7 @@ def _product_kernel(kind: Kind) -> wp.Kernel:
             C += (scalar(f.weighted_volume(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(
                 shape[q]
             )
+        C = sum_forces(C, lanes)
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
 
@@ -209,7 +225,7 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = f.local_lame(mu, lam, cap)
-        pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
+        pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w, 0, 1)
         sigma = mat33()
         for q in range(wp.static(npoint)):
             F = deformation(mesh, e, q, x, w)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import warp as wp
 
 from ...kernels import kernel_module
+from ..block import lane_sum
 from ..types import Precision, mat33, real, vec3
 from .law import (
     Law,
@@ -77,7 +78,7 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
     polar_thin = polar_single if kind.is_single else polar
     # no step ends with an inverted element: on CUDA registers matter more than the digits of its rotation
     polar_full = polar_upright if kind.is_single else polar
-    deformation = deformation_of(kind.corners)
+    deformation, sum_number = deformation_of(kind.corners), lane_sum(real, real)
 
     @wp.func
     def rotation(F: mat33):
@@ -98,14 +99,16 @@ def material_functions(kind: Kind) -> types.SimpleNamespace:
         return dilatation(law, F, R)
 
     @wp.func
-    def averaged_pressure(excess: real, law: int, mesh: Mesh, x: wp.array2d(dtype=vec3), e: int, w: int):
+    def averaged_pressure(
+        excess: real, law: int, mesh: Mesh, x: wp.array2d(dtype=vec3), e: int, w: int, lane: int, lanes: int
+    ):
         """Pressure of an element's mean dilatation, for the part `excess` of lambda that is not local
-        [Pa]."""
+        [Pa]; summed by `lanes` threads."""
         mean = real(0.0)
-        for q in range(mesh.weight.shape[1]):
+        for q in range(lane, mesh.weight.shape[1], lanes):
             F = deformation(mesh, e, q, x, w)
             mean += mesh.weight[e, q] * theta(law, F, rotation(F))
-        return excess * mean / mesh.volume[e]
+        return excess * sum_number(mean, lanes) / mesh.volume[e]
 
     @wp.func
     def stress_of(
