@@ -137,7 +137,15 @@ class DissectedInverse:
     def matrices(self) -> list:
         """Matrices for products: blocks, G^T, and S, each column as often as a right-hand side is stored in
         `block_products.Product.side`. Torch tensors on CUDA, numpy arrays in single precision on the CPU."""
-        made = [np.stack(c, -1).reshape(*c[0].shape[:-1], -1) for c in zip(*self._columns)]
+        return self._matrices(self._columns)
+
+    @functools.cached_property
+    def single_matrices(self) -> list:
+        """The same with each column once."""
+        return self._matrices(self._columns[:1])
+
+    def _matrices(self, columns):
+        made = [np.stack(c, -1).reshape(*c[0].shape[:-1], -1) for c in zip(*columns)]
         if not self.device.is_cuda:
             return [m.astype(np.float32) for m in made]
         import torch

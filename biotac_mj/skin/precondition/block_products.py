@@ -11,33 +11,40 @@ from .block_inverse import DissectedInverse
 
 kernel_module(__name__)
 
-_COLUMNS = 8  # worlds are padded to tiles of the tensor cores
+_COLUMNS = 8  # right-hand sides are padded to tiles of the tensor cores
+_APART = 32  # right-hand sides up to which a product takes as long as reading the matrices
 
 
 class Product:
-    """The inverse times a right-hand side of each world.
+    """The inverse times right-hand sides, which are sums of `halves`. Few right-hand sides have a column for
+    each half, so that every entry of the matrices is read once; more of them have a row for each half, so
+    that there are no more results than right-hand sides.
 
     Args:
-      inverse: the blocks. nworld: number of worlds.
+      inverse: the blocks. nside: number of right-hand sides.
 
     Attributes:
       side: (rows, halves, columns) right-hand sides, as `right_hand_sides.write_node` stores them.
-      answer: (rows, columns); the first row of a node is `DissectedInverse.row`, a world has one column.
+      answer: (rows, 1 or halves, columns), to be summed over the halves; the first row of a node is
+        `DissectedInverse.row`, a right-hand side has one column.
     """
 
-    def __init__(self, inverse: DissectedInverse, nworld: int):
-        self._inverse, columns = inverse, -(-nworld // _COLUMNS) * _COLUMNS
+    def __init__(self, inverse: DissectedInverse, nside: int):
+        self._inverse, columns = inverse, -(-nside // _COLUMNS) * _COLUMNS
         k, s, q, first = inverse.npiece, inverse.size, inverse.width, inverse.first
+        apart = nside <= _APART and inverse.copies == 2  # a third one has other entries
+        halves, each = (inverse.copies, 1) if apart else (1, inverse.copies)
         with wp.ScopedDevice(inverse.device):
             self.side = wp.zeros((inverse.padded, inverse.copies, columns), dtype=wp.float16)
-            self.answer = wp.zeros((inverse.padded, columns), dtype=float)
-            self._separator_force = wp.zeros((k * q, columns), dtype=float)
+            self.answer = wp.zeros((inverse.padded, halves, columns), dtype=float)
+            self._separator_force = wp.zeros((k * q, halves, columns), dtype=float)
         side, answer, separator_force = (_view(a) for a in (self.side, self.answer, self._separator_force))
+        columns *= halves
         pieces, separators = side[:first].reshape(k, -1, columns), side[first:].reshape(-1, columns)
-        blocks, lift, separator = inverse.matrices
+        blocks, lift, separator = inverse.single_matrices if apart else inverse.matrices
         # matrix, right-hand sides, result
-        self._lift = lift, pieces[:, : s * inverse.copies], separator_force.reshape(k, q, columns)
-        self._joint = separator, separators, answer[first:]
+        self._lift = lift, pieces[:, : s * each], separator_force.reshape(k, q, columns)
+        self._joint = separator, separators, answer[first:].reshape(-1, columns)
         self._blocks = blocks, pieces, answer[:first].reshape(k, s + q, columns)[:, :s]
 
     def run(self, program: Launcher) -> None:
@@ -83,7 +90,7 @@ def _multiply(program, matrix, side, answer):
 _FOUR = """
     struct alignas(16) Four { float v[4]; };
     struct alignas(8) Halves { wp::half v[4]; };
-    const int copies = side.shape[1], columns = side.shape[2];
+    const int copies = side.shape[1], columns = side.shape[2], halves = answer.shape[1];
 """
 _WRITE = """
     Halves high, low;
@@ -104,8 +111,11 @@ _WRITE = """
     Four total;
     for (int k = 0; k < 4; ++k) total.v[k] = wp::half_to_float(a.v[k]) + wp::half_to_float(b.v[k]);
     for (int i = start.data[j]; i < start.data[j + 1]; ++i) {{
-        const Four f = *(const Four*)(separator_force.data + (long long)rows.data[i] * columns + 4 * c);
-        for (int k = 0; k < 4; ++k) total.v[k] -= motion_scale * f.v[k];
+        const float* from = answer.data + (long long)rows.data[i] * halves * columns + 4 * c;
+        for (int h = 0; h < halves; ++h, from += columns) {{
+            const Four f = *(const Four*)from;
+            for (int k = 0; k < 4; ++k) total.v[k] -= motion_scale * f.v[k];
+        }}
     }}
     for (int k = 0; k < 4; ++k) total.v[k] *= force_scale;
     {_WRITE}
@@ -116,7 +126,7 @@ def load_separator(
     first: int,
     start: wp.array(dtype=int),
     rows: wp.array(dtype=int),
-    separator_force: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     motion_scale: float,
     force_scale: float,
     side: wp.array3d(dtype=wp.float16),
@@ -125,7 +135,12 @@ def load_separator(
 
 @wp.func_native(f"""
     {_FOUR}
-    Four total = *(const Four*)(answer.data + (long long)separator * columns + 4 * c);
+    const float* from = answer.data + (long long)separator * halves * columns + 4 * c;
+    Four total = *(const Four*)from;
+    for (int h = 1; h < halves; ++h) {{
+        const Four f = *(const Four*)(from + h * columns);
+        for (int k = 0; k < 4; ++k) total.v[k] += f.v[k];
+    }}
     for (int k = 0; k < 4; ++k) total.v[k] *= factor;
     wp::half* at = side.data + (long long)row * copies * columns + 4 * c;
     {_WRITE}
@@ -134,7 +149,7 @@ def load_piece(
     separator: int,
     row: int,
     c: int,
-    answer: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     factor: float,
     side: wp.array3d(dtype=wp.float16),
 ): ...
@@ -146,7 +161,7 @@ def load_separators(
     first: int,
     start: wp.array(dtype=int),
     rows: wp.array(dtype=int),
-    separator_force: wp.array2d(dtype=float),
+    separator_force: wp.array3d(dtype=float),
     motion_scale: float,
     force_scale: float,
     # In and out:
@@ -164,7 +179,7 @@ def load_pieces(
     size: int,
     width: int,
     of_row: wp.array(dtype=int),
-    answer: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     factor: float,
     # Out:
     side_out: wp.array3d(dtype=wp.float16),

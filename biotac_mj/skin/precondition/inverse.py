@@ -58,6 +58,8 @@ class Inverse:
         self._undeformed = self._node_map(row, none, norm)
         self.node_map = self._node_map(row, self.pushed.matrix, norm) if self.pushed else self._undeformed
         self._product = Product(self.inverse, nworld)
+        # residual and volume's gradient of all worlds, in one product
+        self._pairs = Product(self.inverse, 2 * nworld) if self._liquid else self._product
 
     def _node_map(self, row, matrix, norm):
         out = right_hand_sides.NodeMap()
@@ -91,16 +93,16 @@ class Inverse:
         """
         product, nodes, liquid = self._product, [self.node_map, self._wet, gradient], self._liquid
         if liquid and first:
+            product = self._pairs
             self._launch(program, right_hand_sides.load_gradient, self._nodes, [*nodes, on], [product.side])
-            product.run(program)
-            inputs = [self._chunk, *nodes, product.answer, st, on]
-            out = [self.along, self._partial]
-            self._launch(program, right_hand_sides.read_along, self._chunks, inputs, out)
         inputs = [0, self.node_map, self._no_slot, r, *nodes[1:], u_out, self._nothing, st, on]
         self._launch(program, right_hand_sides.load_difference, self._nodes, inputs, [product.side])
         product.run(program)
         if liquid:
             inputs = [self._chunk, *nodes, product.answer, st, on]
+            if first:
+                out = [self.along, self._partial]
+                self._launch(program, right_hand_sides.read_along, self._chunks, inputs, out)
             kernel = right_hand_sides.measure_volume_change
             self._launch(program, kernel, self._chunks, inputs, [self._partial])
             inputs = [self._partial, on, int(first)]

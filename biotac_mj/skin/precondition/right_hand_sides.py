@@ -34,8 +34,11 @@ def write_node(b: wp.vec3, row: int, column: int, out: wp.array3d(dtype=wp.float
 
 
 @wp.func
-def read_node(x: wp.array2d(dtype=float), row: int, column: int):
-    return wp.vec3(x[row, column], x[row + 1, column], x[row + 2, column]) / RAISE
+def read_node(x: wp.array3d(dtype=float), row: int, column: int):
+    total = wp.vec3()
+    for h in range(x.shape[1]):
+        total += wp.vec3(x[row, h, column], x[row + 1, h, column], x[row + 2, h, column])
+    return total / RAISE
 
 
 @wp.struct
@@ -98,14 +101,15 @@ def load_gradient(
     on: wp.array(dtype=int),
     side_out: wp.array3d(dtype=wp.float16),
 ):
-    """Stores the volume's gradient at node i, over its norm, as a right-hand side."""
+    """Stores the volume's gradient at node i, over its norm, as a right-hand side after those of all
+    residuals."""
     i, w = wp.tid()
     j = node_map.row[i]
     if on[w] == 1 and j >= 0:
         g = wp.vec3()
         if wet[i] == 1:
             g = single(gradient[i, w]) / node_map.norm[1, w]
-        write_node(pull_back(node_map, i, w, g), j, w, side_out)
+        write_node(pull_back(node_map, i, w, g), j, node_map.norm.shape[1] + w, side_out)
 
 
 @wp.kernel
@@ -126,17 +130,19 @@ def read_along(
     node_map: NodeMap,
     wet: wp.array(dtype=int),
     gradient: wp.array2d(dtype=vec3),
-    answer: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     st: Worlds,
     on: wp.array(dtype=int),
     # Out:
     along_out: wp.array2d(dtype=wp.vec3),
     partial_out: wp.array3d(dtype=real),
 ):
-    """Displacements of a chunk of nodes by the scaled gradient, and their product with it."""
+    """Displacements of a chunk of nodes by the scaled gradient, see `load_gradient`, and their product with
+    it."""
     c, w = wp.tid()
     if on[w] == 0:
         return
+    column = node_map.norm.shape[1] + w
     pull = liquid_scale(st, w)
     factor = node_map.norm[1, w] * pull * node_map.scale * float(st.softness[w])
     gg = real(0.0)
@@ -144,7 +150,7 @@ def read_along(
         j = node_map.row[i]
         along = wp.vec3()
         if j >= 0:
-            along = push_forward(node_map, i, w, read_node(answer, j, w) * factor)
+            along = push_forward(node_map, i, w, read_node(answer, j, column) * factor)
             if wet[i] == 1:
                 gg += real(wp.dot(pull * single(gradient[i, w]), along))
         along_out[i, w] = along
@@ -158,7 +164,7 @@ def measure_volume_change(
     node_map: NodeMap,
     wet: wp.array(dtype=int),
     gradient: wp.array2d(dtype=vec3),
-    answer: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     st: Worlds,
     on: wp.array(dtype=int),
     # Out:
@@ -184,7 +190,7 @@ def gather_displacements(
     node_map: NodeMap,
     node: wp.array2d(dtype=int),
     size: wp.array(dtype=int),
-    answer: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     st: Worlds,
     on: wp.array(dtype=int),
     # Out:
@@ -244,7 +250,7 @@ def read_answer(
     # In:
     chunk: int,
     node_map: NodeMap,
-    answer: wp.array2d(dtype=float),
+    answer: wp.array3d(dtype=float),
     largest: wp.array(dtype=float),
     r: wp.array2d(dtype=wp.vec3),
     wet: wp.array(dtype=int),
