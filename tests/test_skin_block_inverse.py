@@ -58,6 +58,16 @@ def test_a_product_is_the_inverse_and_its_own_entries(stiffness, thirds, close):
     rows = written(product, inverse, b)
     Program("cpu", product.run).run()
     z = product.answer.numpy().sum(1)[rows, :5] / float(RAISE) * inverse.back
+    many = Product(inverse, 40)  # halves are rows, with few sides columns
+    written(many, inverse, b)
+    Program("cpu", many.run).run()
+    assert many.answer.shape[1] == 1 and product.answer.shape[1] == (1 if thirds else 2)
+    np.testing.assert_allclose(
+        many.answer.numpy()[rows, 0, :5],
+        product.answer.numpy().sum(1)[rows, :5],
+        rtol=0,
+        atol=2e-5 * abs(many.answer.numpy()).max(),
+    )
     exact = scipy.sparse.linalg.spsolve(K, b)
     assert (np.linalg.norm(z - exact, axis=0) < close * np.linalg.norm(exact, axis=0)).all()
     half, rest = (a.numpy().astype(float) for a in (inverse.half, inverse.rest))
