@@ -6,11 +6,12 @@ import warp as wp
 # by its own limit), and end the search for SIMD operations early. By LLVM's own limits a press's kernels take
 # a fifth less time to compile, and all but the elements' run as fast
 _LIMITS = "-mllvm=-inline-", "-mllvm=-slp-"
+_WARP = wp.config.cpu_compiler_flags  # kernels that are made later have the same
 
 
 def kernel_module(name: str, inlined: bool = False) -> str:
     """Names the Warp module of kernels: without adjoints, compiled for the CPU by LLVM's own limits. Other
-    flags in `warp.config.cpu_compiler_flags` when this is called remain.
+    flags that `warp.config.cpu_compiler_flags` has when this file is imported remain.
 
     Args:
       name: of the Warp module; `__name__` for the kernels of a file that name no other.
@@ -19,7 +20,7 @@ def kernel_module(name: str, inlined: bool = False) -> str:
     Returns:
       The name, for `warp.kernel`.
     """
-    flags = wp.config.cpu_compiler_flags
+    flags = _WARP
     if flags is not None:
         limits = _LIMITS[1:] if inlined else _LIMITS
         flags = " ".join(flag for flag in flags.split() if not flag.startswith(limits))
