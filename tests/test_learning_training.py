@@ -1,6 +1,7 @@
 """Training on a small set whose rule is known, files of weights, use in MuJoCo, and everything that can be
 wrong with the input."""
 
+import copy
 import dataclasses
 import json
 import re
@@ -77,6 +78,14 @@ def test_local_head_recovers_the_rule_on_an_unseen_object(trained, evaluated):
     assert 0.8 <= rows["local_taught"]["interval_coverage"] <= 1
     text = table(result)
     assert "unseen object: ring_7mm" in text and f"{result['default']} against linear" in text
+    for p in (0.001, 0.2):  # a median alone does not recommend
+        changed = copy.deepcopy(result)
+        found = changed["splits"]["ring_7mm"]
+        for name in {"tare", "physics", "physics_gain", "linear"} & set(rows):
+            found["models"][name]["median"] = 100.0
+        for test in found["tests"].values():
+            test["p"] = p
+        assert ("not significantly better than linear" in table(changed)) == (p > 0.05)
     for picture in result["figures"]:
         assert (trained / picture.split("/")[-1]).stat().st_size > 10_000
     with TactileSet(result["set"]) as data:

@@ -17,6 +17,7 @@ PAPER = {
     "object": {"latent_projection": 0.015, "pointnet": 0.016},
 }
 UNIT = 2048.0
+_SURE = 0.05  # p of a paired test below which one model is better than another
 # rows to compare with, nothing that is served
 _REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae")
 
@@ -160,7 +161,7 @@ def table(result: dict) -> str:
 
 
 def _choice(result):
-    """Recommended model, its basis, and whether a simpler one is better."""
+    """Recommended model, its basis, and simpler ones that are better or not significantly worse."""
     judged = _judging(result["splits"])
     medians = {
         name: np.mean([result["splits"][split]["models"][name]["median"] for split in judged])
@@ -172,8 +173,15 @@ def _choice(result):
     seeds = min(len(result["splits"][split]["seeds"]) for split in judged)
     text = f"best of the networks on unseen {on} ({seeds} seed{'s' * (seeds > 1)}): {result['default']}"
     if better:
-        text += f"; {', '.join(better)} is better here, so attach no network of this set: train on more"
-    return text
+        return f"{text}; {', '.join(better)} is better here, so attach no network of this set: train on more"
+    tests = [result["splits"][split]["tests"] for split in judged]
+    unsure = [
+        name
+        for name in ("linear", "physics_gain")
+        if name in medians
+        and any(one.get(f"{result['default']} against {name}", {"p": 1.0})["p"] >= _SURE for one in tests)
+    ]
+    return text + (f"; not significantly better than {', '.join(unsure)}: train on more" if unsure else "")
 
 
 def _judging(splits):
