@@ -148,6 +148,17 @@ def test_independent_noise_of_two_rests_tells_nothing(seed):
     assert between_rests(Log(resting(seed=seed)), RESTS) == []
 
 
+def test_noise_is_compared_while_all_electrodes_warm_up():
+    """Of which each rest by itself has a trend of all electrodes, too."""
+
+    def warming(x, touched):
+        colder = 0.05 * np.exp(-np.arange(len(x)) / RATE / 15)
+        disturbed = 0.8 * np.random.default_rng(3).standard_normal((len(x), 1))
+        return x * (1 - colder[:, None]) + disturbed * sound_noise(x[:1])
+
+    assert ("noise", tuple(range(19))) in found(session(warming))
+
+
 def remembering(memory, force=True):
     """What a sensor is found to remember that is touched twice for 20 s between rests; memory: (what touches
     do to the electrodes (n, 19)) -> what is added."""

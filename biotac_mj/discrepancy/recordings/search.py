@@ -182,7 +182,8 @@ def _checkup(session, protocol, named):
     session.protocol = protocol
     coarse = {k for f in session.findings if f.step for k in f.channels}
     for touched, rows in stretches(r, protocol):
-        some = diagnose_recording(r.part(rows), named=named).findings
+        # levels are of the session's clock: the whole log tells them, and all rests as one
+        some = [f for f in diagnose_recording(r.part(rows), named=named).findings if f.trend is None]
         if not touched:
             rests.append(rows)
         if not touched and not coarse:  # nothing but noise is there
