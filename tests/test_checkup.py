@@ -148,6 +148,7 @@ def test_independent_noise_of_two_rests_tells_nothing(seed):
     assert between_rests(Log(resting(seed=seed)), RESTS) == []
 
 
+@pytest.mark.slow  # quick: the noise of two rests above
 def test_noise_is_compared_while_all_electrodes_warm_up():
     """Of which each rest by itself has a trend of all electrodes, too."""
 
