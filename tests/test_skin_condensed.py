@@ -818,6 +818,16 @@ def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch)
     assert 0 < squeezed(out) and out.load_factor < 1 and len(out.memory.contacts) <= 10
 
 
+def test_geoms_without_an_earlier_pose_come_from_outside(coarse):
+    """Friction that began at the pose left 29 % less force than that of a sphere that came in."""
+    skin = CondensedSkin(coarse, sphere())
+    start, direction = touch(coarse.geometry)
+    deep = (start + 2e-3 * direction)[None]
+    pressed = skin.solve(Memory.rest(1), deep, EYE)
+    came = skin.solve(skin.at_rest(start[None], EYE).memory, deep, EYE)
+    assert squeezed(pressed) == pytest.approx(squeezed(came), rel=0.02)
+
+
 def test_a_pressed_skin_keeps_its_force_without_a_load_path(coarse):
     """Neither its own way nor one from outside; how wrong that is, nobody knows."""
     skin = CondensedSkin(coarse, sphere())

@@ -64,11 +64,6 @@ class CondensedStepper(FemStepper):
         """
         bound = PATIENT if patient else 1
         memory = self._read(state)
-        if not memory.started:
-            released = geom_pos, geom_mat
-            if bodies is not None:  # where the bodies go without the skin
-                released = bodies.without(np.array([g.group for g in self._geoms], int), *released)
-            memory = self._skin.outside(*released)  # as those of the full tier do
         begin = self._read(near.state) if near is not None and bodies is not None else None
         out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies, begin)
         return SkinResult(

@@ -84,7 +84,7 @@ class CondensedSkin:
         of_items = {"x": d.x, "x_last": d.x_last, "node_force": d.outer.node_force, "wrench": wrench}
         of_items["slack"] = self._step.slack
         of_items |= {"sample_force": d.outer.sample_force, "touched_by": touched_by}
-        of_items |= {name: getattr(g, name) for name in ("pos", "mat", "pos_last")}
+        of_items |= {name: getattr(g, name) for name in ("pos", "mat")}
         out = {name: array.numpy()[:, 0] for name, array in of_items.items()}
         scalars = {"most": self._step.most, "spent": self._step.spent}
         scalars |= {"tier": self._step.tier, "load_factor": d.worlds.load_factor}
@@ -107,10 +107,10 @@ class CondensedSkin:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a pure function of its
         arguments.
 
-        If that fails, the geoms are followed in load increments. The outcome is valid for the poses in its
-        memory, which are the given ones if `load_factor` is 1. Geoms that are so deep inside the core that no
-        skin fits are followed until it does not; `load_factor` is then the fraction of their path into the
-        skin.
+        If that fails, the geoms are followed in load increments. Geoms without an earlier pose come from
+        `outside`. The outcome is valid for the poses in its memory, which are the given ones if `load_factor`
+        is 1. Geoms that are so deep inside the core that no skin fits are followed until it does not;
+        `load_factor` is then the fraction of their path into the skin.
 
         Args:
           allowed: fraction of the limit by `patience`.
@@ -133,23 +133,25 @@ class CondensedSkin:
             v["compliance"][:, :, 0], v["predicted"][:, 0] = bodies.compliance, bodies.wrench
             v["origin"][:, 0], v["arm"][:, 0], v["spin"][:, 0] = bodies.pos, bodies.arm, bodies.spin
         self.proximity.pose(pos, mat)
-        if bodies is not None or not self.proximity.deep(pos, mat):
-            return self._follow(memory, pos, mat, most, bodies, near)
-        shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
-        fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
-        known = memory if memory.started else self.outside(shallow, mat)
-        out = self._follow(known, shallow, mat, most)
-        return dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
-
-    def _follow(self, memory, pos, mat, most, bodies=None, near=None):
-        """Solves for poses that are not too deep. most: limit of the cost, in evaluations."""
-        far, let_go = np.inf, (pos, mat)
+        let_go = pos, mat
         if bodies is not None:  # where the bodies go without the skin
             self._uncouple()
             let_go = tuple(view.copy() for view in self._uncoupled)
-        if memory.started:
-            motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
-            far = np.abs(motion).max(initial=0.0) + _LEVER * turned
+        if not memory.started:  # as in the full tier: friction acts from the first touch on
+            memory = self.outside(*let_go)
+            self.proximity.pose(pos, mat)
+        if bodies is not None or not self.proximity.deep(pos, mat):
+            return self._follow(memory, pos, mat, let_go, most, near)
+        shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
+        fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
+        out = self._follow(memory, shallow, mat, (shallow, mat), most)
+        return dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
+
+    def _follow(self, memory, pos, mat, let_go, most, near=None):
+        """Solves for poses that are not too deep. let_go: poses without the skin. most: limit of the cost, in
+        evaluations."""
+        motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
+        far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
             if self.proximity.clear(*let_go, 0.0):  # the geoms do not touch the skin, or leave it
                 return self.at_rest(*let_go)
@@ -198,8 +200,6 @@ class CondensedSkin:
             v["x"][:] = nodes
         self._held = None
         v["x_last"][:] = v["x"]
-        if not memory.started:
-            v["pos_last"][:] = np.nan
         # what no candidate writes
         v["node_force"][:] = 0.0
 
