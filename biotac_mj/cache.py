@@ -1,9 +1,9 @@
 """Cache on disk: arrays, found by a digest of all inputs.
 
-A file is written to a temporary name and then renamed, so that no incomplete file is seen. A damaged file is
-made again. Without a writable folder the arrays are computed each time. The size of the folder is limited,
-since every material has its own files, up to 200 MB, and a data set has thousands of materials; the least
-recently used files are deleted."""
+A file is written to a temporary name and then renamed, so that no incomplete file is seen. It ends with a
+digest of its key and all its bytes: a file that is damaged, or another one, is made again. Without a writable
+folder the arrays are computed each time. The size of the folder is limited, since every material has its own
+files, up to 200 MB, and a data set has thousands of materials; the least recently used files are deleted."""
 
 import contextlib
 import dataclasses
@@ -14,8 +14,6 @@ import os
 import pathlib
 import sys
 import threading
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import BinaryIO
 
@@ -25,6 +23,7 @@ import platformdirs
 from .files import replacing
 
 _FORMAT = "2"  # of keys and files
+_LETTERS = 24  # letters of a digest
 _SKIN = ("geometry", "skin")  # folders whose code makes most arrays
 _LARGEST = 4  # default limit of the folder, see BIOTAC_CACHE_GB [GB]
 _PACKAGE = pathlib.Path(__file__).parent
@@ -57,7 +56,7 @@ def digest(*content: object) -> str:
     """
     found = hashlib.sha256(_FORMAT.encode())
     _add(found, content)
-    return found.hexdigest()[:24]
+    return found.hexdigest()[:_LETTERS]
 
 
 def _add(found, item):
@@ -133,11 +132,12 @@ class Entry:
     def load(self) -> dict[str, np.ndarray] | None:
         """The arrays, or None if the file is missing or damaged."""
         try:
-            with np.load(self.path, allow_pickle=False) as file:  # the archive has a checksum of each array
-                found = dict(file)
-            if str(found.pop("key")) != self._key:
+            whole = self.path.read_bytes()
+            if self._seal(np.frombuffer(whole, np.uint8)[:-_LETTERS]) != whole[-_LETTERS:]:
                 return None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+            with np.load(io.BytesIO(whole), allow_pickle=False) as file:
+                found = dict(file)
+        except Exception:  # whatever it is: the arrays can be made again
             return None
         touch(self.path)
         return found
@@ -145,8 +145,13 @@ class Entry:
     def save(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes the arrays, if the folder is writable."""
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, key=np.array(self._key), **arrays)
+        np.savez(buffer, allow_pickle=False, **arrays)
+        buffer.write(self._seal(np.frombuffer(buffer.getvalue(), np.uint8)))
         replace_file(self.path, lambda file: file.write(buffer.getbuffer()), self._bounded)
+
+    def _seal(self, content):
+        """The end of a file. The archive's own checksums do not cover which arrays it has."""
+        return digest(self._key, content).encode()
 
 
 def cached(

@@ -4,12 +4,14 @@ harm."""
 import ast
 import dataclasses
 import importlib.util
+import io
 import os
 import pathlib
 import re
 import sys
 import time
 import types
+import zipfile
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from biotac_mj import cache
 from biotac_mj.cache import Entry, cache_folder, cached, digest
 from biotac_mj.calibration.forward import simulate
 from biotac_mj.calibration.indentation import Indentation
+from biotac_mj.data.objects import make_object
 from biotac_mj.discrepancy import Trajectory
 from biotac_mj.discrepancy.plates import tables
 from biotac_mj.discrepancy.trajectories.model import simulator
@@ -33,6 +36,7 @@ from biotac_mj.skin.condensed.linear import LinearSkin
 from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.fill import rest_state, rest_worlds
 from biotac_mj.skin.modes import skin_modes
+from biotac_mj.triangles import trimesh
 
 SCRIPT = pathlib.Path(__file__).parents[1] / "scripts" / "fit_estimators.py"
 GEOMETRY = four_nodes("coarse")
@@ -265,7 +269,42 @@ def test_contents_that_differ_have_other_digests():
         digest(lambda: 0)
 
 
+def test_a_mesh_file_that_changed_is_another_object(tmp_path):
+    path, found = tmp_path / "ball.stl", []
+    for radius in (5e-3, 1e-3):
+        trimesh.creation.icosphere(2, radius).export(path)
+        found.append(make_object(f"mesh:{path}"))
+        assert np.ptp(found[-1].vert, axis=0).max() == pytest.approx(2 * radius, rel=1e-6)
+    assert digest(found[0]) != digest(found[1])
+
+
 # --- files
+
+
+def damaged(whole, key):
+    """What a file of the cache may become, by name."""
+    for at in range(len(whole)):
+        yield f"bit {at}", whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :]
+    for length in range(0, len(whole), 7):
+        yield f"cut at {length}", whole[:length]
+    yield "longer", whole + b"\0"
+    np.save(array := io.BytesIO(), np.zeros(3))
+    yield "an array", array.getvalue()
+    for arrays in ({}, {"vert": np.zeros(2), "pressure": np.array(1.0)}):
+        np.savez(archive := io.BytesIO(), key=np.array(key), **arrays)
+        yield f"an archive of {list(arrays)}", archive.getvalue()
+
+
+def test_a_file_that_is_not_as_it_was_written_is_not_read():
+    entry = Entry("thing", [1.0])
+    entry.save({"vert": np.arange(30.0).reshape(10, 3), "pressure": np.array(2.0)})
+    whole, read = entry.path.read_bytes(), []
+    for name, content in damaged(whole, entry.path.stem.split("-")[1]):
+        entry.path.write_bytes(content)
+        if entry.load() is not None:
+            read.append(name)
+    entry.path.write_bytes(whole)
+    assert not read and entry.load()["vert"].shape == (10, 3)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK nonsense", "a bit", "another"])
@@ -299,12 +338,17 @@ def test_a_bad_file_is_made_again_without_a_word(content, capsys):
     assert len(made) == 2 and not capsys.readouterr().err
 
 
-@pytest.mark.parametrize("content", [b"", b"PK nonsense", "another"])
+@pytest.mark.parametrize("content", [b"", b"PK nonsense", "another", "design", "encrypted"])
 def test_a_bad_file_of_a_skin_does_not_reach_who_comes_next(content):
     path, _ = skin_reference(GEOMETRY)
     if content == "another":
         other = dataclasses.replace(GEOMETRY, electrode_pos=GEOMETRY.electrode_pos[::-1])
         content = pathlib.Path(skin_reference(other)[0]).read_bytes()
+    elif isinstance(content, str):
+        name, content = content, bytearray(pathlib.Path(path).read_bytes())
+        with zipfile.ZipFile(path) as file:
+            within = file.getinfo("design.npy").header_offset + 200
+        content[content.rfind(b"PK\1\2") + 8 if name == "encrypted" else within] ^= 1
     pathlib.Path(path).write_bytes(content)
     assert skin_reference(GEOMETRY)[0] == path
     assert np.array_equal(load_skin(path).electrode_pos, GEOMETRY.electrode_pos)

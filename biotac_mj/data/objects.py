@@ -55,14 +55,18 @@ def _prism(name, corners, width):
     )
 
 
-@functools.lru_cache(maxsize=32)
 def make_object(name: str) -> Indenter:
     """One of OBJECTS, or any name for `press.indenter.make_indenter`.
 
     Raises:
       ValueError: unknown name; the text lists the names.
     """
-    if name in INDENTERS or name.startswith(("geom:", "mesh:")):
+    return make_indenter(name) if name.startswith("mesh:") else _made(name)  # a file may change
+
+
+@functools.lru_cache(maxsize=32)
+def _made(name):
+    if name in INDENTERS or name.startswith("geom:"):
         return make_indenter(name)
     if name not in OBJECTS:
         raise ValueError(
