@@ -37,13 +37,13 @@ FEATURES = {
     "late": {"gain": 1, "size": 1},
     "lag": {"share": 1},
 }
-_ROWS = ("rhythm", "sharp", "sharp1", "again")
+_ROWS = ("rhythm", "sharp", "sharp1")
 # of what is left: each may be what no name fits. Under a load levels are in recordings without an effect what
 # they are in others
 LEFT = {
     "loaded": _ROWS,
     "short": _ROWS,
-    "moving": ("rhythm", "sharp1", "low6", "again"),
+    "moving": ("rhythm", "sharp1", "low6"),
     "still": ("level3", *_ROWS, "low1", "low6"),
 }
 UNKNOWN = 0.1  # of recordings without an effect, that are as unusual as is called unknown

@@ -4,17 +4,19 @@ import dataclasses
 import json
 import pathlib
 import sys
+import types
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from biotac_mj.discrepancy import Trajectory
+from biotac_mj.discrepancy.report.verdict import Gap, Verdict
 from biotac_mj.discrepancy.trajectories.recorded import trajectories_of
 from biotac_mj.discrepancy.trajectories.trajectory import read_trajectories, write_trajectories
 from biotac_mj.geometry import load_skin
 from biotac_mj.press.approach import surface_point
-from biotac_mj.recordings import Recording, load
+from biotac_mj.recordings import Recording, faults, load
 from biotac_mj.sensor.channels import REST_COUNTS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
@@ -123,19 +125,24 @@ def test_what_cannot_be_used_is_refused(change, message):
         trajectories_of([dataclasses.replace(presses(), **change)])
 
 
+def as_csv(path, one):
+    """Writes a recording with poses and returns its path."""
+    columns = {"time": one.time, **{f"e{k + 1}": one.electrodes[:, k] for k in range(19)}, "pdc": one.pdc}
+    columns |= {f"F{a}": one.force[:, k] for k, a in enumerate("xyz")}
+    columns |= {f"object_pos_{a}": one.object_pos[:, k] for k, a in enumerate("xyz")}
+    columns |= {f"object_q{a}": one.object_quat[:, k] for k, a in enumerate("wxyz")}
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    return path
+
+
 def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch):
     """From the file to what is diagnosed, with the skin, object and repeatability of the command line."""
     from biotac_mj.cli import main
     from biotac_mj.discrepancy.trajectories import workflow
 
     one = presses()
-    columns = {"time": one.time, **{f"e{k + 1}": one.electrodes[:, k] for k in range(19)}, "pdc": one.pdc}
-    columns |= {f"F{a}": one.force[:, k] for k, a in enumerate("xyz")}
-    columns |= {f"object_pos_{a}": one.object_pos[:, k] for k, a in enumerate("xyz")}
-    columns |= {f"object_q{a}": one.object_quat[:, k] for k, a in enumerate("wxyz")}
-    path = tmp_path / "three.csv"
-    table = np.column_stack(list(columns.values()))
-    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    path = as_csv(tmp_path / "three.csv", one)
     assert load(path)[0].object_pos is not None
     seen = {}
 
@@ -155,6 +162,33 @@ def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch)
     for a, b in zip(seen["data"], expected):
         np.testing.assert_allclose(a.pos, b.pos, atol=1e-8)
         np.testing.assert_allclose(a.electrodes, b.electrodes)
+
+
+def test_a_verdict_on_poses_warns_of_all_that_import_names(tmp_path, monkeypatch):
+    """An electrode that stands still for a second. No effect is searched."""
+    from biotac_mj.cli import main
+    from biotac_mj.discrepancy.trajectories import workflow
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Found(Verdict):
+        beliefs: object
+
+    def diagnose(sim, data, **settings):
+        beliefs = types.SimpleNamespace(save=lambda *_: None)
+        words = dict.fromkeys(("kind", "name", "data", "verdict", "aside"), "none")
+        return Found(
+            **words, significant=False, effects=[], gap={"force": Gap("N", 1.0, 1.0, 1.0)}, beliefs=beliefs
+        )
+
+    monkeypatch.setattr(workflow, "diagnose", diagnose)
+    one, out = presses(), tmp_path / "report"
+    one.electrodes[100:200, 4] = one.electrodes[100, 4]
+    path = as_csv(tmp_path / "three.csv", one)
+    assert main(["diagnose", str(path), "--object", "sphere_7mm", "--out", str(out), "--quiet"]) == 0
+    said = faults(load(path)[0])
+    assert any("e5" in fault.message for fault in said)
+    verdict = json.loads((out / "verdict.json").read_text())
+    assert verdict["warnings"] == [f"three: {fault.message}" for fault in said]
 
 
 def test_plans_of_the_generator_are_trajectories():

@@ -11,6 +11,7 @@ from scipy import ndimage, signal
 
 from biotac_mj import cli
 from biotac_mj.discrepancy import read_recording
+from biotac_mj.quality.again import logged_twice
 from biotac_mj.quality.check import check
 from biotac_mj.quality.clock import clock_faults, guessed_rate, missing_rows
 from biotac_mj.quality.codes import put_back
@@ -444,6 +445,30 @@ def test_halves_that_are_exchanged_are_no_lost_rows():
     assert named(np.r_[counts[third:], counts[:third]]) == [("order", ())]
 
 
+def test_rows_that_are_logged_twice_are_one_fault():
+    """A block and scattered rows, late; also of a quiet sensor, whose rows may be equal by chance."""
+    e, _, rng = pressed(3, 50)
+    for size in (0.6, 4.0):
+        counts = noisy(e, rng, size)
+        (fault,) = faults(np.r_[counts[:3000], counts[2000:2500], counts[3000:]])
+        assert fault.id == "again" and (fault.start, fault.end) == (30.0, 34.99)
+        assert fault.message.startswith(
+            "500 rows come again, in all electrodes: rows 3001 to 3500 are as from"
+        )
+        assert fault.mask[3000:3500].all() and fault.mask.sum() == 500 * 19
+    late = counts.copy()
+    late[1000:1200:20] = counts[990:1190:20]
+    assert [f.id for f in logged_twice(Log(late))] == ["again"] and logged_twice(Log(late))[0].p < 1e-6
+
+
+def test_rows_that_are_equal_by_chance_are_not_logged_twice():
+    """Of a sensor with so little noise that half of the rows come again."""
+    e, rng = unloaded(6, 20)
+    counts = noisy(e, rng, 0.25)
+    (fault,) = logged_twice(Log(counts))
+    assert fault.mask.all(1).mean() > 0.3 and fault.p > 0.5 and not faults(counts)
+
+
 # --- clocks ---
 
 
@@ -518,6 +543,7 @@ def spoiled():
         "held": [held],
         "hum": [lambda x: x + np.rint(6 * np.sin(2 * np.pi * 31.7 * np.arange(len(x)) / RATE))[:, None]],
         "gap": [lambda x: x],
+        "twice": [lambda x: np.r_[x[:1200], x[500:1200], x[1200:]]],
         "overflow": [lambda x: overflowing(1, 3, 1024, 900)[1]],
     }
 

@@ -147,6 +147,7 @@ def _of_poses(args: argparse.Namespace, recordings: "Sequence[Recording]") -> No
     """recordings: with poses, in place of a file of trajectories."""
     from ..geometry.design import BIOTAC
     from ..geometry.skins import shipped_skin
+    from ..recordings.inspection import warnings
     from ..recordings.recording import designed
     from ..skin.settings import read_dict
     from .trajectories import workflow
@@ -194,7 +195,8 @@ def _of_poses(args: argparse.Namespace, recordings: "Sequence[Recording]") -> No
         progress=not args.quiet,
     )
     report.beliefs.save(out / "round", sim, data)
-    _reported(dataclasses.replace(report, notes=[*notes, *report.notes]), out)
+    doubts = [f"{one.name}: {line}" for one in recordings for line in warnings(one)]
+    _reported(dataclasses.replace(report, notes=[*notes, *report.notes], warnings=doubts), out)
 
 
 def next_verb(args: argparse.Namespace) -> None:

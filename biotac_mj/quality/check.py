@@ -3,6 +3,7 @@
 import typing
 from collections.abc import Sequence
 
+from .again import logged_twice
 from .codes import coarse, put_back
 from .confidence import NAMED, clear, confidence
 from .fault import Fault
@@ -40,8 +41,8 @@ def check(log: Log, named: float = NAMED) -> Checked:
 
 
 def sample_faults(log: Log, named: float = NAMED) -> Checked:
-    """Finds faults of samples: dead, coarse, repeated, stuck, clipped and spiked ones, words that overflow,
-    hum, noise.
+    """Finds faults of samples: dead, coarse, repeated, stuck, clipped and spiked ones, rows logged twice,
+    words that overflow, hum, noise.
 
     Each detector ignores the samples that the detectors before it rejected.
     """
@@ -50,7 +51,8 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
         return Checked(log, dead(log), [])
     log, faults = put_back(log)
     weak = []
-    for find in (off_rows, unmeasured, coarse, dead, sample_and_hold, hum, stuck_or_clipped, spikes, noisy):
+    of_rows = (off_rows, unmeasured, coarse, dead, sample_and_hold, logged_twice)
+    for find in (*of_rows, hum, stuck_or_clipped, spikes, noisy):
         for fault in find(less(log, faults), faults):
             fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)

@@ -11,8 +11,8 @@ class Fault:
     """A fault of a log of n rows and c channels.
 
     Attributes:
-      id: "clock", "contact", "freeze", "hum", "jump", "lost_rows", "noise", "order", "overflow",
-        "quantise", "saturate", "spikes" or "stuck".
+      id: "again", "clock", "contact", "freeze", "hum", "jump", "lost_rows", "noise", "order",
+        "overflow", "quantise", "saturate", "spikes" or "stuck".
       channels: from 0. start, end: [s] from the first row. message: one line.
       parameters: name -> (value, low, high), nan if no interval is known.
       mask: (n, c) bool, samples without a measurement, or None.

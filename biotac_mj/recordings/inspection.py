@@ -6,7 +6,6 @@ from ..quality.check import check
 from ..quality.clock import CLOCK_FAULT, clock_faults
 from ..quality.fault import Fault
 from ..quality.log import Log
-from ..quality.stuck import dead
 from ..sensor.channels import FULL_SCALE
 from .recording import CHANNELS, CLOCKED, REST_LIKE, Recording, check_recording, with_baseline
 
@@ -56,14 +55,12 @@ def faults(recording: Recording) -> list[Fault]:
 
 
 def warnings(recording: Recording) -> list[str]:
-    """Reasons to doubt a recording, one line each: electrodes that never change, and `remarks`.
+    """Reasons to doubt a recording, one line each: its `faults` and `remarks`.
 
     Raises:
       TypeError: not a Recording.
     """
-    check_recording(recording)
-    log, _ = _log(recording)
-    return [*(fault.message for fault in (dead(log) if log is not None else [])), *remarks(recording)]
+    return [*(fault.message for fault in faults(recording)), *remarks(recording)]
 
 
 def remarks(recording: Recording) -> list[str]:

@@ -88,7 +88,7 @@ def as_log(
     )
 
 
-def as_candidates(faults: Sequence[Fault]) -> tuple[list[Candidate], list[str]]:
-    """Faults as candidates, and in words those that no effect of the catalogue is."""
+def as_candidates(faults: Sequence[Fault]) -> tuple[list[Candidate], list[Fault]]:
+    """Faults as candidates, and those that no effect of the catalogue is."""
     found = [Candidate(**vars(f), of_log=True) for f in faults if f.id in KINDS]
-    return found, [f.message for f in faults if f.id not in KINDS]
+    return found, [f for f in faults if f.id not in KINDS]

@@ -59,7 +59,8 @@ def rest(session: Session) -> Rest:
         {"channel": f"e{m.used[i] + 1}"} | _where(counts[:, i], time)
         for i in np.argsort(-np.maximum(level, aside))[:3]
     ]
-    faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
+    faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)]
+    faults += [f.message for f in session.unnamed]
     faults += _contradicted(session)
     far, name = farthest(features, USUAL[kind]["features"])
     compared = len(session.recording) * session.fresh >= _COMPARED
@@ -105,7 +106,7 @@ def _contradicted(session):
 
 def _of_rows(session):
     """Features of the recording without the named effects that need no model of the load: rhythms, sharp
-    changes, repeated rows, and more than noise where only noise is expected. And their description."""
+    changes, and more than noise where only noise is expected. And their description."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh
@@ -133,9 +134,6 @@ def _of_rows(session):
         touch = touch | sharply_touched(r, session.protocol)[rows][1:]
     jumps = sharp(x, least) & ~touch[:, None]
     jumps[[one[0] - 1 for one in series[1:]]] = False
-    # noise never comes again in all electrodes
-    same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
-    live = np.median(noise_level(x)) > 1.0
     number = int(jumps.sum())
     most = np.argsort(-jumps.sum(0))[:2]
     rhythm = f"a rhythm of {f[band][most_over]:.1f} Hz and up to {beats[most_over].max():.0f} counts"
@@ -145,12 +143,10 @@ def _of_rows(session):
         f"of {' and '.join(f'e{k + 1}' for k in most)}",
     )
     said |= dict.fromkeys(("low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most")
-    said["again"] = "rows come again, in all electrodes"
     return {
         "rhythm": float(over.mean(1).max()) if swing >= _RESOLVED else 0.0,
         "sharp": float(np.log(jumps.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
         "sharp1": float(np.log(np.sort(jumps.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
-        "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
         "low": float(np.median(low)),
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),

@@ -81,7 +81,9 @@ def diagnose_recording(
 def _adopt(session, faults, weak):
     """Takes over what is wrong with the log, whatever the sensor did."""
     found, unnamed = as_candidates(faults)
-    session.unnamed += unnamed
+    if unnamed:
+        session.unnamed += unnamed
+        session.replay()
     for finding in found:
         session.accept(finding)
     session.weak += as_candidates(weak)[0]
@@ -231,7 +233,7 @@ def _late(session, named):
     less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
-    whole = Session(r, np.ones(len(r), bool), session.findings)
+    whole = Session(r, np.ones(len(r), bool), session.findings, session.unnamed)
     found, refused = [], set()
     for _ in range(4):
         finding = levels(whole, refused)

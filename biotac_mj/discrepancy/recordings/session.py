@@ -13,12 +13,18 @@ class Session:
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, nelectrode); masked
       (n, nelectrode) bool; findings; weak: those that are too little to be named, or contradicted; unnamed:
-      sentences on what is there and has no name; protocol: of a checkup, or None.
+      faults of the log that no effect of the catalogue is; protocol: of a checkup, or None.
     """
 
-    def __init__(self, recording: PlainRecording, fit: np.ndarray, findings: tuple | list = ()):
+    def __init__(
+        self,
+        recording: PlainRecording,
+        fit: np.ndarray,
+        findings: tuple | list = (),
+        unnamed: tuple | list = (),
+    ):
         self.recording, self.fit = recording, fit
-        self.findings, self.weak, self.unnamed = list(findings), [], []  # the last a list of str
+        self.findings, self.weak, self.unnamed = list(findings), [], list(unnamed)
         self.fresh, self.protocol = 1 - recording.repeated.mean(), None
         self.replay()
 
@@ -26,7 +32,7 @@ class Session:
         """Counts and mask from the recording and the findings."""
         r = self.recording
         self.counts, self.masked = r.electrodes.copy(), np.zeros(r.electrodes.shape, bool)
-        for finding in self.findings:
+        for finding in (*self.unnamed, *self.findings):
             self._take_out(finding)
         self._model = None
 
@@ -50,8 +56,8 @@ class Session:
 
     def without(self, *left_out: Candidate) -> "Session":
         """A session in which some findings are not taken out."""
-        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out])
-        out.weak, out.unnamed = list(self.weak), list(self.unnamed)
+        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unnamed)
+        out.weak = list(self.weak)
         return out
 
     def model(self) -> Model:

@@ -6,7 +6,6 @@ import numpy as np
 
 from ...data.generation.clearance import Placed, surface_samples
 from ...geometry.skins import load_skin
-from ...recordings.inspection import warnings
 from ...recordings.recording import Recording
 from .trajectory import Trajectory
 
@@ -51,7 +50,7 @@ def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[
                 f"{recording.name}: {recording.object} never meets the skin, the smallest gap is "
                 f"{1e3 * gap.min():.2f} mm: give poses of its tip in the BioTac's frame, or the sensor's too"
             )
-        notes += [f"{recording.name}: {note}" for note in (*assumed, *warnings(recording))]
+        notes += [f"{recording.name}: {note}" for note in assumed]
         out += found
         clock += float(recording.time[-1] - recording.time[0]) + 1.0
     turned = [np.sum((t.force @ t.heading)[t.depth > 0]) > 0 for t in out if t.force is not None]
