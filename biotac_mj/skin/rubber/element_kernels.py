@@ -255,7 +255,7 @@ def _reading_kernels(kind: Kind) -> dict[str, wp.Kernel]:
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = f.local_lame(mu, lam, cap)
-        pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
+        pressure = f.averaged_pressure(lam - local, rubber.law, mesh, x, e, w, 0, 1)
         for q in range(wp.static(npoint)):
             i = wp.static(npoint) * e + q
             F = deformation(mesh, e, q, x, w)
