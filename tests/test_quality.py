@@ -561,6 +561,7 @@ def test_show_import_and_diagnose_say_the_same(tmp_path, capsys, name):
     np.savetxt(log, np.column_stack([time, counts])[keep], "%.9g", ",", header=header, comments="")
     found = [f.message for f in faults(counts[keep], clocked=True, missing=missing_rows(time[keep]))]
     assert len(found) == len(changes)
+    assert name != "twice" or found[0].endswith("logged twice")
     for words in (
         ["recording", "import", log, "--out", rec],
         ["recording", "show", rec, "--out", str(tmp_path / "show.png")],
