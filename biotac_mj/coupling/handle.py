@@ -156,7 +156,7 @@ class Handle:
         """
         setup, (_, models, *_) = self._parts(model, data)
         return {
-            int(body): (one[:6].copy(), one[6:42].reshape(6, 6).copy())
+            int(body): (one["wrench0"].copy(), one["tangent0"].copy())
             for body, one in zip(setup.touching.body, models)
         }
 

@@ -20,16 +20,13 @@ from .implicit.metric import assign_slots
 from .implicit.rules import EULER, PATIENCE, stayed
 from .setup import (
     CONVERGED,
-    ENERGY,
     FAILED,
-    FREQUENCY,
+    LINEAR,
     OUT_OF_REACH,
     REACHED,
-    SLACK,
     STARTED,
     STAYED,
     Setup,
-    models_of,
 )
 from .solid import solid_wrench
 from .stepper import SkinResult
@@ -119,7 +116,7 @@ class Instance:
             )
         self.state = data.plugin_state[start : start + setup.nstate]
         self.parts, self.state_address = setup.parts(self.state), self.state.ctypes.data
-        self._pose, self._geom_pose, self._solved = None, None, {}
+        self._geom_pose, self._solved = None, {}
         self._forget()
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
@@ -144,11 +141,11 @@ class Instance:
         bad = not math.isfinite(self.state.sum())
         if bad:
             state = self.state.copy()
-            energy = self.setup.parts(state)[1][:, ENERGY]
+            energy = self.setup.parts(state)[1]["left"]
             energy[energy == np.inf] = 0.0
             bad = not np.isfinite(state).all()
         if cause is not None and not bad:
-            turned = self.parts[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
+            turned = np.concatenate([self.parts[1][name] for name in ("mat0", "end_mat")])
             bad = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) > 1e-6
         if bad:
             raise ValueError(
@@ -218,7 +215,8 @@ class Instance:
         with self.setup.skin.lock:
             stays = stepper.is_out_of_reach(skin, *self._geom_pose)
             if stays:
-                self._result, self._pose, self._reading = self.setup.skin.untouched, (pos, mat), None
+                self._result = dataclasses.replace(self.setup.skin.untouched, pose=(pos, mat))
+                self._reading = None
         return stays
 
     def stay(self) -> SkinResult | None:
@@ -230,13 +228,17 @@ class Instance:
         pressure = skin.stepper.pressure(state) if known else None
         if pressure is None:
             return None
-        wrench, tangent, *pose, slack = (part.copy() for part in models_of(self.parts[1]))
+        wrench, tangent, *pose, slack = self._last_model()
         with skin.lock:
             vert = skin.stepper.vert_xpos(state)
         known = {"measured": reach > 0, "pose": tuple(pose), "slack": slack}
         result = SkinResult(state, wrench, tangent, vert, pressure, **known)
-        self._result, self._reading, self._pose, self.stays = result, None, result.pose, True
+        self._result, self._reading, self.stays = result, None, True
         return result
+
+    def _last_model(self):
+        """Copies of the `LINEAR` model of the last step."""
+        return (self.parts[1][name].copy() for name in LINEAR)
 
     def solve_for_pose(
         self,
@@ -255,7 +257,7 @@ class Instance:
         An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
           end of the step.
         """
-        self._pose, self.stays = (pos, mat), False
+        self.stays = False
         dt, stepper, before = self.model.opt.timestep, self.setup.skin.stepper, self._skin
         near = near if near is not None and near.converged else None
         more = {"near": near, "patient": self._may_wait, "spent": spent}
@@ -289,7 +291,7 @@ class Instance:
             if len(self._solved) > 8:
                 self._solved.clear()
             self._solved[key] = result
-        self._result, self._reading, self._pose = result, None, result.pose
+        self._result, self._reading = result, None
         return result
 
     @property
@@ -304,7 +306,7 @@ class Instance:
         if not len(self.dofs):
             return head[CONVERGED] == -1.0
         skins = self.touching.skins
-        return bool(skins) and head[CONVERGED] <= 0.0 and bool(models[skins, :6].any())
+        return bool(skins) and head[CONVERGED] <= 0.0 and bool(models["wrench0"][skins].any())
 
     def _came_to(self, state):
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies for which a skin's state holds; None where the skin
@@ -319,7 +321,7 @@ class Instance:
             return dataclasses.replace(result, pose=pose)
         if not self.parts[0][STARTED]:  # the first step
             return result
-        wrench, tangent, *last, _ = models_of(self.parts[1])
+        wrench, tangent, *last, _ = self._last_model()
         state = before.copy()
         if self.parts[0][CONVERGED] <= -PATIENCE:
             stepper.reset(state)
@@ -328,9 +330,9 @@ class Instance:
         return dataclasses.replace(
             result,
             state=state,
-            wrench=wrench.copy(),
-            tangent=tangent.copy(),
-            pose=tuple(p.copy() for p in last),
+            wrench=wrench,
+            tangent=tangent,
+            pose=tuple(last),
             vert_xpos=stepper.vert_xpos(state),
         )
 
@@ -501,17 +503,12 @@ class Instance:
         if good and self.stays:
             reach = STAYED if result.measured else -STAYED
         head[:] = head[FAILED] + (not good), good - steps, reach
-        n, ends = self.setup.ngroup, self.ends or self._pose
-        models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
-        models[:, SLACK] = result.slack
-        models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
-        models[:, 54:57], models[:, 57:66], models[:, ENERGY] = (
-            ends[0],
-            ends[1].reshape(n, 9),
-            self.outcome.energy,
-        )
+        for name, value in zip(LINEAR, result.model):
+            models[name] = value
+        models["end_pos"], models["end_mat"] = self.ends or result.pose
+        models["left"] = self.outcome.energy
         if self.outcome.frequency is not None:
-            models[:, FREQUENCY] = self.outcome.frequency
+            models["frequency"] = self.outcome.frequency
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

@@ -23,18 +23,11 @@ _HEAD = 3
 FAILED, CONVERGED, STARTED = range(_HEAD)
 # STAYED: the last solve left the skin as it was; negative where its error is not measured
 REACHED, OUT_OF_REACH, STAYED = 1.0, 2.0, 3.0
-# of a touching body: wrench, tangent, the pose they belong to, the pose at the end of the step, the energy
-# that it has in the skin at most [J], infinite where that is not known, the angular frequency [rad/s] at
-# which it bounces, and how far from that pose it cannot touch (`rounds.Model`)
-_MODEL = 6 + 36 + 3 + 9 + 3 + 9 + 1 + 1 + 1
-ENERGY, FREQUENCY, SLACK = (_MODEL - k for k in (3, 2, 1))
-
-
-def models_of(table: np.ndarray) -> tuple:
-    """Linear models of bodies in rows (n, 69) of a plugin state, as views: wrench (n, 6), tangent (n, 6, 6),
-    pose (n, 3), (n, 3, 3), slack (n,)."""
-    tangent, mat = table[:, 6:42].reshape(-1, 6, 6), table[:, 45:54].reshape(-1, 3, 3)
-    return table[:, :6], tangent, table[:, 42:45], mat, table[:, SLACK]
+# of a touching body, by the names of `rounds`: its linear model; the pose at the end of the step; the energy
+# that it has in the skin at most [J], infinite where that is not known; the frequency at which it bounces
+_FIELDS = {"wrench0": 6, "tangent0": (6, 6), "pos0": 3, "mat0": (3, 3), "end_pos": 3, "end_mat": (3, 3)}
+MODEL = np.dtype([(name, float, _FIELDS.get(name, ())) for name in (*_FIELDS, "left", "frequency", "slack")])
+LINEAR = "wrench0", "tangent0", "pos0", "mat0", "slack"
 
 
 class _Skin:
@@ -108,20 +101,22 @@ class Setup:
 
     @property
     def nstate(self) -> int:
-        return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
+        return (
+            _HEAD + MODEL.itemsize // 8 * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
+        )
 
     def parts(self, state: np.ndarray) -> tuple:
-        """Head, linear models of the last step (ngroup, 69), the skin's and the readings' parts of a plugin
+        """Head, models of the last step (ngroup,) of `MODEL`, the skin's and the readings' parts of a plugin
         state, as views."""
-        a = _HEAD + _MODEL * self.ngroup
+        a = _HEAD + MODEL.itemsize // 8 * self.ngroup
         b = a + self.skin.stepper.nstate
         c = b + self.skin.readings.nstate
-        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, _MODEL), state[a:b], state[b:c]
+        return state[:_HEAD], state[_HEAD:a].view(MODEL), state[a:b], state[b:c]
 
     def reset(self, state: np.ndarray) -> None:
         head, models, skin, readings = self.parts(state)
         head[:], models[:] = 0.0, 0.0
-        models[:, [45, 49, 53, 57, 61, 65]] = 1.0  # rotations, though nothing touches
+        models["mat0"] = models["end_mat"] = np.eye(3)  # though nothing touches
         head[CONVERGED] = 1.0
         with self.skin.lock:
             self.skin.stepper.reset(skin)

@@ -75,6 +75,11 @@ class SkinResult:
     cost: float = 0.0
     slack: np.ndarray | float = 0.0
 
+    @property
+    def model(self) -> tuple:
+        """Linear models of the touching bodies, as `setup.LINEAR` names their parts."""
+        return self.wrench, self.tangent, *self.pose, self.slack
+
 
 class SkinStepper:
     """Base class of skins. A skin has `nstate`, `reset`, `solve_skin` and `vert_xpos`; the other methods are

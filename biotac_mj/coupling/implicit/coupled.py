@@ -4,6 +4,7 @@ import numpy as np
 
 from ...skin.bodies import BodyMotion
 from ..instance import Instance, Outcome
+from ..setup import LINEAR
 from ..structs import DataView
 from .rules import FORETOLD, STILL, TOLERANCE
 from .step_arrays import StepArrays
@@ -70,8 +71,7 @@ class Coupled:
             wrong, wrench = np.abs(result.wrench - self.part("acting")), np.abs(result.wrench)
             self.instance.stays = bool(wrong.max() < FORETOLD * wrench.max())
         self.result, self.may_act = result, result.converged and self._cost < _MOST
-        names = "wrench0", "tangent0", "pos0", "mat0", "slack"
-        for name, value in zip(names, (result.wrench, result.tangent, *result.pose, result.slack)):
+        for name, value in zip(LINEAR, result.model):
             self.part(name)[:] = value
 
     def _core_motion(self):

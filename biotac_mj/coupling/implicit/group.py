@@ -8,7 +8,7 @@ import numpy as np
 
 from ...geometry.rigid_warp import LEVER
 from ..instance import Instance
-from ..setup import ENERGY, FREQUENCY, STARTED, models_of
+from ..setup import LINEAR, MODEL, STARTED
 from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
 from .coupled import Coupled
@@ -55,8 +55,7 @@ class SkinGroup:
         first, arrays, step = self._instances[0], self.arrays, self._model.opt.timestep
         heads, tables, *_ = zip(*(t.parts for t in self._instances))
         models = np.concatenate(tables)
-        last = models_of(models)
-        resting = [not last[1][skin.bodies].any() for skin in self._all]
+        resting = [not models["tangent0"][skin.bodies].any() for skin in self._all]
         if any(resting):  # maybe nothing is near
             pos, mat = self._kinematics.predict(step - first.lead)
         self.skins = []
@@ -73,13 +72,13 @@ class SkinGroup:
         self.correction, self.amiss, self.excess = np.zeros((3, len(models), 6))
         self.forced, self.withdrawn, self.written = None, False, False
         arrays.record(step, 0.5 * first.by_stages)
-        for (before, now), part in zip(arrays.models, last):
-            before[:] = now[:] = part
+        for name in MODEL.names:
+            getattr(arrays, name)[:] = models[name]
+        for name in LINEAR:
+            arrays.last[name][:] = models[name]
         for skin in self._all:
             if skin not in self.skins:
                 skin.part("wrench0")[:] = 0.0
-        arrays.end_pos[:], arrays.end_mat[:] = models[:, 54:57], models[:, 57:66].reshape(-1, 3, 3)
-        arrays.left[:], arrays.frequency[:] = models[:, ENERGY], models[:, FREQUENCY]
         arrays.began[:] = [head[STARTED] != 0.0 for head in heads]
         arrays.begin()
         self._kinematics.check(arrays.start_pos, arrays.start_mat)

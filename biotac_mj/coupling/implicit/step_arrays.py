@@ -53,7 +53,7 @@ class StepArrays:
       off: (nskin, 2) [m] of `evaluate`, see `find_off`. left_out: (nbody,) of `conclude` [J].
       find_energy, restrain, gains: functions that do the energy balance. They return whether a skin is
         greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
-      models: views of wrench0, tangent0, pos0, mat0 and slack, in the last step and in this one.
+      last: {name: view} of the last step's `Model`.
     """
 
     def __init__(self, kinematics: Kinematics, setups: Sequence[Setup], springs: Springs):
@@ -91,7 +91,7 @@ class StepArrays:
             for name in kind.vars:
                 if _is_of_bodies(array := getattr(struct, name)):
                     setattr(self, name, _seen(array))
-        self.models = [(_seen(getattr(last, name)), getattr(self, name)) for name in Model.vars]
+        self.last = {name: _seen(getattr(last, name)) for name in Model.vars}
         self.stiffness = whole.square, kinematics.jacobian, model.tangent0
         self._respond(springs, (kinematics.jacobian, model))
 

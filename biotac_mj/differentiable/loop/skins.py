@@ -152,7 +152,7 @@ class LoopSkin:
             whole = begun is not None and all(np.array_equal(a, b) for a, b in zip(begun, last))
             begun = begun and tuple(a.copy() for a in begun)
         idle = head[STARTED] == OUT_OF_REACH
-        wrench, gamma = models[:, :6].copy(), np.full(len(models), self.instance.outcome.gamma)
+        wrench, gamma = models["wrench0"].copy(), np.full(len(models), self.instance.outcome.gamma)
         return SavedStep(self.stepper.used(now), wrench, bool(idle), resting, gamma, begun, whole)
 
     def nodes(self, state: SavedState) -> np.ndarray:
