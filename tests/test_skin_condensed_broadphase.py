@@ -98,7 +98,7 @@ def ask(
     o = Increment()
     o.reach = real(1.0)
     o.fraction = share
-    may_out[w] = may_be_touched(w, 0, 1, o, geoms, c, s)
+    may_out[w] = may_be_touched(w, 0, o, geoms, c, s)
 
 
 def test_faces_that_come_to_the_core_unsought_were_candidates():

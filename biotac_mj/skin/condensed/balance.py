@@ -31,10 +31,10 @@ _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
 
 @wp.func
-def _swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
+def _swap_poses(w: int, t: int, geoms: Geoms, s: Scratch):
     """Swaps the poses of the geoms with those of the last equilibrium."""
     sync()
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         pos = geoms.pos[g, w]
         mat = geoms.mat[g, w]
         geoms.pos[g, w] = s.held_pos[g, w]
@@ -45,11 +45,11 @@ def _swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
 
 
 @wp.func
-def _find_motion(w: int, t: int, threads: int, nnode: int, nin: int, geoms: Geoms, c: Constants, s: Scratch):
+def _find_motion(w: int, t: int, nnode: int, nin: int, geoms: Geoms, c: Constants, s: Scratch):
     """Replaces displacements vector[TRY] by the motion from vector[U], for touching nodes relative to the
     geoms, which have moved since the last equilibrium."""
     nsample = c.sample.shape[0]
-    for k in range(t, nnode, threads):
+    for k in range(t, nnode, wp.block_dim()):
         i = c.node[s.node[w, k]]
         u = vec3(s.vector[w, U, 3 * k], s.vector[w, U, 3 * k + 1], s.vector[w, U, 3 * k + 2])
         p = c.rest[i, 0] + u
@@ -64,7 +64,7 @@ def _find_motion(w: int, t: int, threads: int, nnode: int, nin: int, geoms: Geom
             u += geoms.pos[g, w] + turn * (p - s.held_pos[g, w]) - p
         for a in range(3):
             s.vector[w, TRY, 3 * k + a] = s.vector[w, TRY, 3 * k + a] - u[a]
-    for j in range(3 * nnode + t, 3 * nnode + nin, threads):
+    for j in range(3 * nnode + t, 3 * nnode + nin, wp.block_dim()):
         s.vector[w, TRY, j] = s.vector[w, TRY, j] - s.vector[w, U, j]
     sync()
 
@@ -94,12 +94,12 @@ def newton_from(predictor: int, before: Linear, l: Linear, most: real, tolerance
 
 
 @wp.func
-def _search_length(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
+def _search_length(w: int, t: int, n: int, d: Newton, s: Scratch):
     """Line search after an evaluation of contact at the end of a step: accepts the step, or chooses another
     length. Returns whether it was accepted."""
     d.tried += 1
     mine = real(0.0)
-    for j in range(t, n, threads):
+    for j in range(t, n, wp.block_dim()):
         f = s.vector[w, F, j] + d.alpha * s.vector[w, DF, j]
         mine += (s.vector[w, G, j] - f) * s.vector[w, DU, j]
     now = wp.sign(d.slope) * block_sum(mine) - d.alpha * d.viscosity * d.work
@@ -109,7 +109,7 @@ def _search_length(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
         d.caught = real(1.0)
         if good == 0 and d.high >= real(0.0):
             d.caught = d.high - d.low
-        for j in range(t, n, threads):
+        for j in range(t, n, wp.block_dim()):
             s.vector[w, F, j] = s.vector[w, F, j] + d.alpha * s.vector[w, DF, j]
             s.vector[w, U, j] = s.vector[w, TRY, j]
         sync()
@@ -141,15 +141,15 @@ def _search_length(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
 
 
 @wp.func
-def _take_step(w: int, t: int, threads: int, d: Newton, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
+def _take_step(w: int, t: int, d: Newton, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """After an evaluation of contact, tests a step, computes the next one, or ends."""
     n = 3 * o.nnode + o.nin
     if d.predictor == Predictor.EVALUATED:
-        multiply(w, t, threads, o.nnode, n, F, d.fresh, 1, d.linear, c, s)
+        multiply(w, t, o.nnode, n, F, d.fresh, 1, d.linear, c, s)
         d.fresh = -1
-        _find_motion(w, t, threads, o.nnode, o.nin, geoms, c, s)
+        _find_motion(w, t, o.nnode, o.nin, geoms, c, s)
     elif d.searching == 1:
-        d = _search_length(w, t, threads, n, d, s)
+        d = _search_length(w, t, n, d, s)
     steps = 1 - d.searching  # whether a step is to be found
     while steps > 0:
         steps = 0
@@ -159,20 +159,20 @@ def _take_step(w: int, t: int, threads: int, d: Newton, o: Increment, geoms: Geo
             d.found = CUT
         elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.viscosity <= _FIXED:
             moved = wp.where(d.predictor != Predictor.NONE, 1, 0)
-            good, equations = solve_system(w, t, threads, o.nnode, o.nin, d.viscosity, moved, d.linear, c, s)
+            good, equations = solve_system(w, t, o.nnode, o.nin, d.viscosity, moved, d.linear, c, s)
             dear = real(equations) / _DEAR
             d.spent += dear * dear
         if d.predictor != Predictor.NONE:
-            for j in range(t, wp.where(good == 1, n, 0), threads):
+            for j in range(t, wp.where(good == 1, n, 0), wp.block_dim()):
                 s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
             sync()
-            pose_by_load(w, t, threads, s.solve.stepping[w].to, o.nnode, geoms, c, s)
+            pose_by_load(w, t, s.solve.stepping[w].to, o.nnode, geoms, c, s)
             d.fresh = U
             good = 3
             d.predictor = int(Predictor.NONE)
         if good == 1:
             own = vec3()
-            for j in range(t, n, threads):
+            for j in range(t, n, wp.block_dim()):
                 f = s.vector[w, F, j]
                 df = s.vector[w, DF, j]
                 du = s.vector[w, DU, j]
@@ -191,7 +191,7 @@ def _take_step(w: int, t: int, threads: int, d: Newton, o: Increment, geoms: Geo
             elif d.error < d.tolerance and d.viscosity == real(0.0):
                 d.found = 1
                 good = 0
-                for j in range(t, n, threads):
+                for j in range(t, n, wp.block_dim()):
                     s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
                     s.vector[w, U, j] = s.vector[w, U, j] + s.vector[w, DU, j]
                 sync()
@@ -214,7 +214,7 @@ def _take_step(w: int, t: int, threads: int, d: Newton, o: Increment, geoms: Geo
             d.at = U
     if d.searching == 1:
         d.at = TRY
-        for j in range(t, n, threads):
+        for j in range(t, n, wp.block_dim()):
             s.vector[w, TRY, j] = s.vector[w, U, j] + d.alpha * s.vector[w, DU, j]
     return d
 
@@ -225,16 +225,7 @@ def newton_method(shapes: str) -> wp.Function:
     touch_faces = contact_kernels(False, False, shapes).touch_faces
 
     @wp.func
-    def evaluate_contact(
-        w: int,
-        t: int,
-        threads: int,
-        d: Newton,
-        o: Increment,
-        geoms: Geoms,
-        c: Constants,
-        s: Scratch,
-    ):
+    def evaluate_contact(w: int, t: int, d: Newton, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
         """Finds the displacements that the forces bring about, where they are not known, and there the forces
         vector[G] of the contact law, and flags of the candidates that touch: in the end with a symmetric
         tangent, and for a pending predictor with the geoms at `held_pos`. Unless geoms have moved,
@@ -245,19 +236,19 @@ def newton_method(shapes: str) -> wp.Function:
             skin = d.linear
             if d.predictor == Predictor.PENDING:
                 skin = d.before
-            multiply(w, t, threads, nnode, 3 * nnode + o.nin, F, d.fresh, 1, skin, c, s)
+            multiply(w, t, nnode, 3 * nnode + o.nin, F, d.fresh, 1, skin, c, s)
         if d.predictor == Predictor.PENDING:
-            _swap_poses(w, t, threads, geoms, s)
+            _swap_poses(w, t, geoms, s)
         sync()
         most = real(0.0)
-        for k in range(t, nnode, threads):
+        for k in range(t, nnode, wp.block_dim()):
             i = c.node[s.node[w, k]]
             u = vec3(s.vector[w, d.at, 3 * k], s.vector[w, d.at, 3 * k + 1], s.vector[w, d.at, 3 * k + 2])
             most = wp.max(most, wp.length_sq(c.rest[i, 0] + u - s.x[i, w]))
             s.x[i, w] = c.rest[i, 0] + u
         d.travel = wp.where(anew == 1, real(0.0), d.travel + ROOT3 * wp.sqrt(block_max(most)))
         count = int(0)
-        for begin in range(0, o.nface, threads):
+        for begin in range(0, o.nface, wp.block_dim()):
             f = int(0)
             left = int(0)
             if begin + t < o.nface:
@@ -270,10 +261,10 @@ def newton_method(shapes: str) -> wp.Function:
         sync()
         several = s.bodies.compliance.shape[0] > 1
         touch_faces(
-            w, t, threads, count, s.look, s.close_to, geoms, s.x, s.touch, 1 - d.ends, d.travel, s.free
+            w, t, wp.block_dim(), count, s.look, s.close_to, geoms, s.x, s.touch, 1 - d.ends, d.travel, s.free
         )
         sync()
-        for k in range(t, nnode, threads):
+        for k in range(t, nnode, wp.block_dim()):
             i = c.node[s.node[w, k]]
             total = vec3()
             on = int(0)
@@ -288,7 +279,7 @@ def newton_method(shapes: str) -> wp.Function:
             for a in range(3):
                 s.vector[w, G, 3 * k + a] = total[a]
         nsample = c.sample.shape[0]
-        for k in range(t, o.ncore * nsample, threads):
+        for k in range(t, o.ncore * nsample, wp.block_dim()):
             place = k / nsample
             face = c.inner_face[s.core_face[w, place]]
             moved = vec3()
@@ -300,7 +291,7 @@ def newton_method(shapes: str) -> wp.Function:
             n = k % nsample
             s.now[w, place, n] = s.gap[w, place, n] + wp.dot(c.sample[n], moved)
         sync()
-        for k in range(t, o.nin, threads):
+        for k in range(t, o.nin, wp.block_dim()):
             push = real(0.0)
             stiff = real(0.0)
             v = c.inner[s.core_node[w, k]]
@@ -322,20 +313,13 @@ def newton_method(shapes: str) -> wp.Function:
         d.fresh = -1
         d.spent += real(1.0)
         if d.predictor == Predictor.PENDING:
-            _swap_poses(w, t, threads, geoms, s)
+            _swap_poses(w, t, geoms, s)
             d.predictor = int(Predictor.EVALUATED)
             d.fresh = TRY
         return d
 
     @wp.func
-    def balance(
-        w: int,
-        t: int,
-        threads: int,
-        geoms: Geoms,
-        c: Constants,
-        s: Scratch,
-    ):
+    def balance(w: int, t: int, geoms: Geoms, c: Constants, s: Scratch):
         """Newton's method from `newton_from` to its end."""
         d = s.solve.newton[w]
         o = s.solve.increment[w]
@@ -344,10 +328,10 @@ def newton_method(shapes: str) -> wp.Function:
         while going == 1:
             sync()
             if evaluated == 1:
-                d = _take_step(w, t, threads, d, o, geoms, c, s)
+                d = _take_step(w, t, d, o, geoms, c, s)
             sync()
             going = 1 - d.ends
-            d = evaluate_contact(w, t, threads, d, o, geoms, c, s)
+            d = evaluate_contact(w, t, d, o, geoms, c, s)
             evaluated = 1
         if t == 0:
             s.solve.newton[w] = d

@@ -35,11 +35,11 @@ def _group_of(w: int, i: int, geoms: Geoms, touch: Contact, c: Constants):
 
 
 @wp.func
-def find_groups(w: int, t: int, threads: int, nnode: int, geoms: Geoms, c: Constants, s: Scratch):
+def find_groups(w: int, t: int, nnode: int, geoms: Geoms, c: Constants, s: Scratch):
     """Finds the position of each candidate node, and its group of geoms, kept until another one touches
     it."""
     groups = s.bodies.compliance.shape[0]
-    for k in range(t, wp.where(groups > 0, nnode, 0), threads):
+    for k in range(t, wp.where(groups > 0, nnode, 0), wp.block_dim()):
         s.arm[w, k] = s.x[c.node[s.node[w, k]], w]
         s.group[w, k] = 0
         if groups > 1:
@@ -58,14 +58,14 @@ def touching_group(f: int, w: int, geoms: Geoms, touch: Contact, nsample: int, g
 
 
 @wp.func
-def number_bodies(w: int, t: int, threads: int, outer: int, s: Scratch):
+def number_bodies(w: int, t: int, outer: int, s: Scratch):
     """Gives the bodies that touched nodes answer to, and that give way, their equations."""
     b = s.bodies
     groups = b.compliance.shape[0]
-    for h in range(t, groups, threads):
+    for h in range(t, groups, wp.block_dim()):
         b.column[h, w] = -1
     sync()
-    for m in range(t, wp.where(groups > 0, outer, 0), threads):
+    for m in range(t, wp.where(groups > 0, outer, 0), wp.block_dim()):
         h = s.group[w, s.touched[w, m]]
         gives = b.compliance[h, h, w]
         if wp.ddot(gives, gives) > real(0.0):
@@ -82,10 +82,10 @@ def number_bodies(w: int, t: int, threads: int, outer: int, s: Scratch):
 
 
 @wp.func
-def _set_motions(w: int, t: int, threads: int, b: Bodies):
+def _set_motions(w: int, t: int, b: Bodies):
     """Computes the motions of all bodies by the listed wrenches."""
     sync()
-    for h in range(t, b.motion.shape[0], threads):
+    for h in range(t, b.motion.shape[0], wp.block_dim()):
         m = vec6()
         for g in range(b.motion.shape[0]):
             load = b.wrench[g, w]
@@ -96,12 +96,12 @@ def _set_motions(w: int, t: int, threads: int, b: Bodies):
 
 
 @wp.func
-def _list_loads(w: int, t: int, threads: int, p: int, nnode: int, s: Scratch):
+def _list_loads(w: int, t: int, p: int, nnode: int, s: Scratch):
     """Makes the wrench of each body that on the nodes of its group that vector[p] of the candidates is: by
     eight threads for each, on the CPU by the one."""
     b = s.bodies
-    lanes = wp.min(threads, 8)
-    for h in range(t / lanes, b.wrench.shape[0], threads / lanes):
+    lanes = wp.min(wp.block_dim(), 8)
+    for h in range(t / lanes, b.wrench.shape[0], wp.block_dim() / lanes):
         force = vec3()
         torque = vec3()
         for k in range(t % lanes, nnode, lanes):
@@ -117,16 +117,16 @@ def _list_loads(w: int, t: int, threads: int, p: int, nnode: int, s: Scratch):
 
 
 @wp.func
-def move_nodes(w: int, t: int, threads: int, nnode: int, p: int, out: int, shifted: int, s: Scratch):
+def move_nodes(w: int, t: int, nnode: int, p: int, out: int, shifted: int, s: Scratch):
     """Adds to vector[out] how the nodes move relative to their bodies by forces vector[p]; with `shifted`
     from where the geoms are."""
     b = s.bodies
     if b.compliance.shape[0] > 0:
-        _list_loads(w, t, threads, p, nnode, s)
-        for h in range(t, wp.where(shifted == 1, b.wrench.shape[0], 0), threads):
+        _list_loads(w, t, p, nnode, s)
+        for h in range(t, wp.where(shifted == 1, b.wrench.shape[0], 0), wp.block_dim()):
             b.wrench[h, w] = b.wrench[h, w] + b.posed[h, w]
-        _set_motions(w, t, threads, b)
-        for k in range(t, nnode, threads):
+        _set_motions(w, t, b)
+        for k in range(t, nnode, wp.block_dim()):
             m = b.motion[s.group[w, k], w]
             u = vec3(m[0], m[1], m[2]) + wp.cross(vec3(m[3], m[4], m[5]), s.arm[w, k])
             for a in range(3):
@@ -135,15 +135,15 @@ def move_nodes(w: int, t: int, threads: int, nnode: int, p: int, out: int, shift
 
 
 @wp.func
-def place_bodies(w: int, t: int, threads: int, load_factor: real, geoms: Geoms, s: Scratch):
+def place_bodies(w: int, t: int, load_factor: real, geoms: Geoms, s: Scratch):
     """Puts the geoms to a fraction of their path, where the wrenches `posed` then bring their bodies."""
     b = s.bodies
-    for h in range(t, b.motion.shape[0], threads):
+    for h in range(t, b.motion.shape[0], wp.block_dim()):
         b.wrench[h, w] = (
             b.posed[h, w] - (real(1.0) - load_factor) * b.begun[h, w] - load_factor * b.predicted[h, w]
         )
-    _set_motions(w, t, threads, b)
-    for g in range(t, geoms.count, threads):
+    _set_motions(w, t, b)
+    for g in range(t, geoms.count, wp.block_dim()):
         pos = s.pos[g, w]
         mat = s.mat[g, w]
         if load_factor < real(1.0):
@@ -158,46 +158,37 @@ def place_bodies(w: int, t: int, threads: int, load_factor: real, geoms: Geoms, 
 
 
 @wp.func
-def pose_by_load(
-    w: int,
-    t: int,
-    threads: int,
-    load_factor: real,
-    nnode: int,
-    geoms: Geoms,
-    c: Constants,
-    s: Scratch,
-):
+def pose_by_load(w: int, t: int, load_factor: real, nnode: int, geoms: Geoms, c: Constants, s: Scratch):
     """Puts the geoms where the forces vector[F] of the candidates bring their bodies; by how much a point of
     theirs moves so at most [m]."""
     b = s.bodies
     groups = b.compliance.shape[0]
     if groups == 0:
         return real(0.0)
-    for k in range(t, nnode, threads):
+    for k in range(t, nnode, wp.block_dim()):
         s.arm[w, k] = s.x[c.node[s.node[w, k]], w]
     sync()
-    _list_loads(w, t, threads, F, nnode, s)
-    for h in range(t, groups, threads):
+    _list_loads(w, t, F, nnode, s)
+    for h in range(t, groups, wp.block_dim()):
         load = b.wrench[h, w]
         b.wrench[h, w] = -load - b.posed[h, w]
         b.posed[h, w] = -load
-    _set_motions(w, t, threads, b)
+    _set_motions(w, t, b)
     far = real(0.0)
     for h in range(groups):
         m = b.motion[h, w]
         far = wp.max(far, wp.length(vec3(m[0], m[1], m[2])) + _LEVER * wp.length(vec3(m[3], m[4], m[5])))
     sync()
-    place_bodies(w, t, threads, load_factor, geoms, s)
+    place_bodies(w, t, load_factor, geoms, s)
     return far
 
 
 @wp.func
-def sum_forces(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
+def sum_forces(w: int, t: int, geoms: Geoms, c: Constants, s: Scratch):
     """Makes the wrenches `posed` those of the forces on all outer nodes that a solve begins with."""
     b = s.bodies
     groups = b.compliance.shape[0]
-    for i in range(t, wp.where(groups > 0, c.node.shape[0], 0), threads):
+    for i in range(t, wp.where(groups > 0, c.node.shape[0], 0), wp.block_dim()):
         mine = int(-1)
         if wp.length_sq(s.force[w, i]) > real(0.0):
             mine = wp.where(groups > 1, _group_of(w, i, geoms, s.touch, c), 0)
@@ -205,7 +196,7 @@ def sum_forces(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scra
     for h in range(groups):
         force = vec3()
         torque = vec3()
-        for i in range(t, c.node.shape[0], threads):  # as above: each thread reads what it wrote
+        for i in range(t, c.node.shape[0], wp.block_dim()):  # as above: each thread reads what it wrote
             if s.look[w, i] == h:
                 force += s.force[w, i]
                 torque += wp.cross(s.x[c.node[i], w], s.force[w, i])

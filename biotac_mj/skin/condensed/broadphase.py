@@ -56,7 +56,7 @@ def _is_clear(w: int, view: int, travel: real, near: wp.int64, geoms: Geoms, c: 
 
 
 @wp.func
-def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
+def choose_view(w: int, t: int, geoms: Geoms, c: Constants, s: Scratch):
     """Chooses the view of the undeformed skin; returns it, the motion of the geoms there since it was taken
     [m], and the geoms near the skin. A view that is too old is renewed. A skin that serves several BioTacs in
     turn has several views."""
@@ -72,15 +72,15 @@ def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
         return view, least, near
     view = s.turn[w]
     sync()
-    for f in range(t, c.face.shape[0], threads):
+    for f in range(t, c.face.shape[0], wp.block_dim()):
         face = c.face[f]
         clearance, _beyond, _count, within = face_clearance(
             c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms, near, _SEEN
         )
         s.far[w, view, f] = clearance
         s.seen[w, view, f] = within
-    depth = -geoms_core_clearance(w, t, threads, geoms, near, c.core, c.core_vert)
-    for g in range(t, geoms.count, threads):
+    depth = -geoms_core_clearance(w, t, wp.block_dim(), geoms, near, c.core, c.core_vert)
+    for g in range(t, geoms.count, wp.block_dim()):
         s.seen_pos[view, g, w] = geoms.pos[g, w]
         s.seen_mat[view, g, w] = geoms.mat[g, w]
     if t == 0:
@@ -91,27 +91,27 @@ def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
 
 
 @wp.func
-def largest_displacement(w: int, t: int, threads: int, x: wp.array2d(dtype=vec3), c: Constants):
+def largest_displacement(w: int, t: int, x: wp.array2d(dtype=vec3), c: Constants):
     """Largest displacement of a node [m]."""
     largest = real(0.0)
-    for i in range(t, c.free.shape[0], threads):
+    for i in range(t, c.free.shape[0], wp.block_dim()):
         largest = wp.max(largest, wp.length_sq(x[c.free[i], w] - c.rest[c.free[i], 0]))
     return wp.sqrt(block_max(largest))
 
 
 @wp.func
-def forget_faces(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
+def forget_faces(w: int, t: int, geoms: Geoms, c: Constants, s: Scratch):
     """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
-    for i in range(t, s.x.shape[0], threads):
+    for i in range(t, s.x.shape[0], wp.block_dim()):
         s.sought_x[i, w] = s.x[i, w]
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         s.sought_pos[g, w] = geoms.pos[g, w]
         s.sought_mat[g, w] = geoms.mat[g, w]
-    for f in range(t, c.face.shape[0], threads):
+    for f in range(t, c.face.shape[0], wp.block_dim()):
         s.near[w, f] = s.touch.kept[f, w]
         s.close_to[w, f] = wp.int64(0)
         s.touch.touching[f, w] = 0
-    for f in range(t, c.inner_face.shape[0], threads):
+    for f in range(t, c.inner_face.shape[0], wp.block_dim()):
         loaded = int(0)
         for k in range(3):
             i = c.inner_number[c.inner_face[f][k]]
@@ -186,13 +186,11 @@ def _meets_core(f: int, i: int, w: int, fraction: real, x: wp.array2d(dtype=vec3
 
 
 @wp.func
-def _list_marked(
-    w: int, t: int, threads: int, none: int, mark: wp.array2d(dtype=int), list_out: wp.array2d(dtype=int)
-):
+def _list_marked(w: int, t: int, none: int, mark: wp.array2d(dtype=int), list_out: wp.array2d(dtype=int)):
     """Lists the items whose mark is above none, in their order, as far as there is room, and makes their
     marks none + 1, none + 2, ...; how many there are."""
     n = mark.shape[1]
-    each = (n + threads - 1) / threads
+    each = (n + wp.block_dim() - 1) / wp.block_dim()
     first = t * each
     last = wp.min(first + each, n)
     count = int(0)
@@ -215,7 +213,6 @@ def _list_marked(
 def find_faces(
     w: int,
     t: int,
-    threads: int,
     reach: real,
     view: int,
     travel: real,
@@ -236,7 +233,7 @@ def find_faces(
         near = ALL
     # what is left is listed after each test, so that each thread has a part of it, and in the end a sample
     count = int(0)
-    for begin in range(0, c.face.shape[0], threads):
+    for begin in range(0, c.face.shape[0], wp.block_dim()):
         f = begin + t
         left = int(0)
         if f < c.face.shape[0]:
@@ -252,7 +249,7 @@ def find_faces(
     sync()
     close = int(0)
     new = int(0)
-    for begin in range(0, count, threads):
+    for begin in range(0, count, wp.block_dim()):
         f = int(0)
         left = int(0)
         within = wp.int64(0)
@@ -275,7 +272,7 @@ def find_faces(
         close += rank[1]
     sync()
     nsample = c.sample.shape[0]
-    for m in range(t, close * nsample, threads):
+    for m in range(t, close * nsample, wp.block_dim()):
         f = s.look[w, m / nsample]
         if s.near[w, f] == 0:
             face = c.face[f]
@@ -287,28 +284,28 @@ def find_faces(
             if sample_within(p, reach, face_radius(x1 - x0, x2 - x0), w, geoms, s.close_to[w, f]):
                 s.near[w, f] = 1
     sync()
-    for k in range(t, close, threads):
+    for k in range(t, close, wp.block_dim()):
         new += s.near[w, s.look[w, k]]
     sync()
-    nface = _list_marked(w, t, threads, 0, s.near, s.face)
+    nface = _list_marked(w, t, 0, s.near, s.face)
     return nface, block_rank(new)[1]
 
 
 @wp.func
-def find_slack(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
+def find_slack(w: int, t: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """Finds how far each group of geoms can go without touching the skin [m], its turns times LEVER."""
-    for group in range(t, s.slack.shape[0], threads):
+    for group in range(t, s.slack.shape[0], wp.block_dim()):
         s.slack[group, w] = wp.where(o.ok == 1, _REGION, real(0.0))
     sync()
     close = wp.int64(0)
-    for k in range(t, o.nface, threads):
+    for k in range(t, o.nface, wp.block_dim()):
         close = close | s.close_to[w, s.face[w, k]]
     for g in range(geoms.count):
         if has(close, g):
             wp.atomic_min(s.slack, geoms.group[g], w, real(0.0))
     others = o.near & ~close
     moved = _REGION + ROOT3 * _moved_since(w, o.view, o.near, geoms, c, s)
-    for f in range(t, c.face.shape[0], threads):
+    for f in range(t, c.face.shape[0], wp.block_dim()):
         within = wp.int64(0)
         if ROOT3 * o.largest + moved >= s.far[w, o.view, f]:
             moves = ROOT3 * wp.sqrt(_moved(f, w, c.face, s.x, c)) + moved
@@ -326,16 +323,16 @@ def find_slack(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Cons
                     wp.atomic_min(s.slack, geoms.group[g], w, wp.max(bound, real(0.0)))
     sync()
     lever = wp.max(real(1.0), (wp.length(c.center) + c.radius) / real(LEVER))
-    for group in range(t, s.slack.shape[0], threads):
+    for group in range(t, s.slack.shape[0], wp.block_dim()):
         s.slack[group, w] = s.slack[group, w] / (ROOT3 * lever)
 
 
 @wp.func
-def may_be_touched(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
+def may_be_touched(w: int, t: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """Whether a face that was no candidate when they were sought may have come to a geom since, or an inner
     one to the core, by how far nodes and near geoms have moved at most."""
     nodes = real(0.0)
-    for k in range(t, c.node.shape[0], threads):
+    for k in range(t, c.node.shape[0], wp.block_dim()):
         i = c.node[k]
         nodes = wp.max(nodes, wp.length_sq(s.x[i, w] - s.sought_x[i, w]))
     posed = real(0.0)
@@ -348,7 +345,7 @@ def may_be_touched(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: 
     if ROOT3 * (wp.sqrt(block_max(nodes)) + posed) >= o.reach:
         return True
     over = real(0.0)
-    for k in range(t, c.inner.shape[0], threads):
+    for k in range(t, c.inner.shape[0], wp.block_dim()):
         i = c.inner[k]
         went = wp.length_sq(s.x[i, w] - s.sought_x[i, w])
         before = wp.length_sq(s.sought_x[i, w] - c.rest[i, 0])
@@ -357,28 +354,28 @@ def may_be_touched(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: 
 
 
 @wp.func
-def is_known(w: int, t: int, threads: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
+def is_known(w: int, t: int, o: Increment, geoms: Geoms, c: Constants, s: Scratch):
     """Whether the candidates that were found last are all that can touch."""
     other = real(0.0)
-    for f in range(t, c.face.shape[0], threads):
+    for f in range(t, c.face.shape[0], wp.block_dim()):
         if s.touch.kept[f, w] == 1 and s.near[w, f] == 0:
             other = real(1.0)
-    for k in range(t, c.inner.shape[0], threads):
+    for k in range(t, c.inner.shape[0], wp.block_dim()):
         if s.core_force[w, k] != real(0.0) and s.core_place[w, k] < 0:
             other = real(1.0)
     if block_max(other) > real(0.0):
         return 0
-    return wp.where(may_be_touched(w, t, threads, o, geoms, c, s), 0, 1)
+    return wp.where(may_be_touched(w, t, o, geoms, c, s), 0, 1)
 
 
 @wp.func
-def find_inner_faces(w: int, t: int, threads: int, fraction: real, c: Constants, s: Scratch):
+def find_inner_faces(w: int, t: int, fraction: real, c: Constants, s: Scratch):
     """Adds the inner faces that are nearer to the core than a fraction of their displacement; how many there
     are, and how many are new. Beyond capacity none is listed."""
     nsample = c.sample.shape[0]
     new = int(0)
     inside = int(0)
-    for begin in range(0, c.inner_face.shape[0], threads):
+    for begin in range(0, c.inner_face.shape[0], wp.block_dim()):
         f = begin + t
         left = int(0)
         if f < c.inner_face.shape[0]:
@@ -389,64 +386,64 @@ def find_inner_faces(w: int, t: int, threads: int, fraction: real, c: Constants,
             s.look[w, inside + rank[0]] = f
         inside += rank[1]
     sync()
-    for m in range(t, inside * nsample, threads):
+    for m in range(t, inside * nsample, wp.block_dim()):
         f = s.look[w, m / nsample]
         if s.near_core[w, f] == 0 and _meets_core(f, m % nsample, w, fraction, s.x, c):
             s.near_core[w, f] = 1
     sync()
-    for k in range(t, inside, threads):
+    for k in range(t, inside, wp.block_dim()):
         new += s.near_core[w, s.look[w, k]]
     sync()
-    ncore = _list_marked(w, t, threads, 0, s.near_core, s.core_face)
+    ncore = _list_marked(w, t, 0, s.near_core, s.core_face)
     return ncore, block_rank(new)[1]
 
 
 @wp.func
-def find_nodes(w: int, t: int, threads: int, nface: int, ncore: int, c: Constants, s: Scratch):
+def find_nodes(w: int, t: int, nface: int, ncore: int, c: Constants, s: Scratch):
     """Numbers the free nodes of the candidate faces and their coordinates; how many outer and inner nodes
     there are, which are not listed where there is no room."""
-    for i in range(t, c.node.shape[0], threads):
+    for i in range(t, c.node.shape[0], wp.block_dim()):
         s.place[w, i] = -1
-    for i in range(t, c.inner.shape[0], threads):
+    for i in range(t, c.inner.shape[0], wp.block_dim()):
         s.core_place[w, i] = -1
     sync()
-    for k in range(t, nface, threads):
+    for k in range(t, nface, wp.block_dim()):
         face = c.face[s.face[w, k]]
         for a in range(3):
             i = c.number[face[a]]
             if i >= 0:
                 s.place[w, i] = 0
-    for k in range(t, wp.min(ncore, s.core_face.shape[1]), threads):
+    for k in range(t, wp.min(ncore, s.core_face.shape[1]), wp.block_dim()):
         face = c.inner_face[s.core_face[w, k]]
         for a in range(3):
             i = c.inner_number[face[a]]
             if i >= 0:
                 s.core_place[w, i] = 0
     sync()
-    nnode = _list_marked(w, t, threads, -1, s.place, s.node)
-    nin = _list_marked(w, t, threads, -1, s.core_place, s.core_node)
+    nnode = _list_marked(w, t, -1, s.place, s.node)
+    nin = _list_marked(w, t, -1, s.core_place, s.core_node)
     if 3 * nnode + nin <= s.coordinate.shape[1]:
-        for k in range(t, nnode, threads):
+        for k in range(t, nnode, wp.block_dim()):
             for a in range(3):
                 s.coordinate[w, 3 * k + a] = 3 * s.node[w, k] + a
-        for k in range(t, nin, threads):
+        for k in range(t, nin, wp.block_dim()):
             s.coordinate[w, 3 * nnode + k] = 3 * c.node.shape[0] + s.core_node[w, k]
-        if threads == 1:
+        if wp.block_dim() == 1:
             keep_rows(w, 3 * nnode + nin, s.coordinate, s.last, 3 * nnode + nin, 0, s.ready)
     sync()
     return nnode, nin
 
 
 @wp.func
-def measure_core(w: int, t: int, threads: int, nnode: int, nin: int, ncore: int, c: Constants, s: Scratch):
+def measure_core(w: int, t: int, nnode: int, nin: int, ncore: int, c: Constants, s: Scratch):
     """Gaps of the candidates' samples from the core, where the skin is now."""
     k = int(0)
     if ncore > 0:  # else there may be no core
         k = c.core.grid[0]
-    for j in range(t, nin, threads):
+    for j in range(t, nin, wp.block_dim()):
         i = c.inner[s.core_node[w, j]]
         s.vector[w, BACK, 3 * nnode + j] = wp.dot(s.x[i, w] - c.rest[i, 0], c.away[s.core_node[w, j]])
-    for j in range(t, ncore * c.sample.shape[0], threads):
+    for j in range(t, ncore * c.sample.shape[0], wp.block_dim()):
         at = j / c.sample.shape[0]
         i = j % c.sample.shape[0]
         f = s.core_face[w, at]
@@ -458,19 +455,9 @@ def measure_core(w: int, t: int, threads: int, nnode: int, nin: int, ncore: int,
 
 
 @wp.func
-def is_deep(
-    w: int,
-    t: int,
-    threads: int,
-    view: int,
-    travel: real,
-    near: wp.int64,
-    geoms: Geoms,
-    c: Constants,
-    s: Scratch,
-):
+def is_deep(w: int, t: int, view: int, travel: real, near: wp.int64, geoms: Geoms, c: Constants, s: Scratch):
     """Whether a geom is deeper in the core than a skin has room for. view, travel, near: those of
     `choose_view`."""
     if _is_clear(w, view, travel, near, geoms, c, s):
         return False
-    return geoms_core_clearance(w, t, threads, geoms, near, c.core, c.core_vert) < -c.core_depth
+    return geoms_core_clearance(w, t, wp.block_dim(), geoms, near, c.core, c.core_vert) < -c.core_depth

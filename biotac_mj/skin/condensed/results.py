@@ -23,26 +23,17 @@ mat66 = wp.spatial_matrixd
 
 
 @wp.func
-def place_nodes(
-    w: int,
-    t: int,
-    threads: int,
-    count: int,
-    pressure: real,
-    l: Linear,
-    c: Constants,
-    s: Scratch,
-):
+def place_nodes(w: int, t: int, count: int, pressure: real, l: Linear, c: Constants, s: Scratch):
     """Puts all nodes where count listed loads and a pressure above that at rest [Pa] bring them; what that
     adds to the cavity's volume, and its linear part [m^3]; the largest displacement [m]."""
     linear = real(0.0)
     largest = real(0.0)
     swollen = l.swell * pressure
-    if threads == 1:
+    if wp.block_dim() == 1:
         sum_rows(c.row, c.largest, w, 3 * c.free.shape[0], count, s.loaded, s.load, s.sum)
-    for i in range(t, c.free.shape[0], threads):
+    for i in range(t, c.free.shape[0], wp.block_dim()):
         u = wp.vec3()
-        if threads == 1:
+        if wp.block_dim() == 1:
             u = wp.vec3(s.sum[w, 3 * i], s.sum[w, 3 * i + 1], s.sum[w, 3 * i + 2])
         else:
             u = dot_columns(c.row, c.largest, 3 * i, w, count, s.loaded, s.load)
@@ -53,28 +44,19 @@ def place_nodes(
         linear += wp.dot(c.gradient[i], d)
     linear = block_sum(linear)
     volume = real(0.0)
-    for f in range(t, c.wet.shape[0], threads):
+    for f in range(t, c.wet.shape[0], wp.block_dim()):
         face = c.wet[f]
         volume -= wp.dot(s.x[face[0], w], wp.cross(s.x[face[1], w], s.x[face[2], w])) / real(6.0)
     return block_sum(volume) - c.cavity, linear, wp.sqrt(block_max(largest))
 
 
 @wp.func
-def correct(
-    w: int,
-    t: int,
-    threads: int,
-    nnode: int,
-    pressure: real,
-    modulus: real,
-    c: Constants,
-    s: Scratch,
-):
+def correct(w: int, t: int, nnode: int, pressure: real, modulus: real, c: Constants, s: Scratch):
     """Softening and swelling (`correction.Correction`) of the skin as it is; and by which fraction it is
     squeezed, how far its forces are spread [m^2]."""
     own = real(0.0)
     mean = vec3()
-    for k in range(t, nnode, threads):
+    for k in range(t, nnode, wp.block_dim()):
         weight = real(0.0)
         for a in range(3):
             f = s.vector[w, F, 3 * k + a]
@@ -89,7 +71,7 @@ def correct(
     if total > real(0.0):
         mean = mean / total
         sums = vec3()
-        for k in range(t, nnode, threads):
+        for k in range(t, nnode, wp.block_dim()):
             weight = real(0.0)
             for a in range(3):
                 f = s.vector[w, F, 3 * k + a]
@@ -122,7 +104,6 @@ def _touches(w: int, group: int, geoms: Geoms, touched_by: wp.array2d(dtype=int)
 def find_wrenches(
     w: int,
     t: int,
-    threads: int,
     nface: int,
     nnode: int,
     geoms: Geoms,
@@ -133,11 +114,11 @@ def find_wrenches(
 ):
     """Wrenches of the skin ON each group of geoms: those of the samples and, to first order, the change by
     Newton's last step, by their fractions of each node."""
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         touched_by[g, w] = 0
     sync()
     nsample = c.sample.shape[0]
-    for k in range(t, nface, threads):
+    for k in range(t, nface, wp.block_dim()):
         f = s.face[w, k]
         for i in range(wp.where(s.touch.touching[f, w] == 1, nsample, 0)):
             g = s.touch.trial_geom[f * nsample + i, w]
@@ -146,12 +127,12 @@ def find_wrenches(
     sync()
     for group in range(wrench.shape[0]):
         if _touches(w, group, geoms, touched_by) == 0:
-            for a in range(t, 6, threads):
+            for a in range(t, 6, wp.block_dim()):
                 wrench[group, w, a] = real(0.0)
             continue
         force = vec3()
         torque = vec3()
-        for k in range(t, nface, threads):
+        for k in range(t, nface, wp.block_dim()):
             f = s.face[w, k]
             if s.touch.touching[f, w] == 1:
                 face = c.face[f]
@@ -173,7 +154,7 @@ def find_wrenches(
                             torque += moment
                 if mine == group:
                     torque += other
-        for k in range(t, nnode, threads):
+        for k in range(t, nnode, wp.block_dim()):
             fraction = fraction_of(w, k, group, geoms, c, s)
             if fraction > real(0.0):
                 rest = vec3()
@@ -215,7 +196,6 @@ def fraction_of(w: int, k: int, group: int, geoms: Geoms, c: Constants, s: Scrat
 def find_tangents(
     w: int,
     t: int,
-    threads: int,
     nnode: int,
     nin: int,
     l: Linear,
@@ -228,8 +208,8 @@ def find_tangents(
     """Stiffness against rigid motions of each group of geoms about the origin, with springs D lumped at the
     nodes: (1 + D W)^-1 D, which is symmetric and positive semi-definite. Springs have no stiffness along
     which their nodes slip, and their inverse would drown W in its rounding."""
-    outer, inner = gather_blocks(w, t, threads, nnode, nin, c, s)
-    for k in range(t, wp.min(outer, s.touched.shape[1]), threads):
+    outer, inner = gather_blocks(w, t, nnode, nin, c, s)
+    for k in range(t, wp.min(outer, s.touched.shape[1]), wp.block_dim()):
         p = s.node[w, s.touched[w, k]]
         lumped = wp.mat33()
         for e in range(c.ring_start[p + 1] - c.ring_start[p]):
@@ -242,15 +222,15 @@ def find_tangents(
     for group in range(tangent.shape[0]):
         most = real(0.0)
         if room == 1 and _touches(w, group, geoms, touched_by) == 1:
-            for k in range(t, outer, threads):
+            for k in range(t, outer, wp.block_dim()):
                 fraction = fraction_of(w, s.touched[w, k], group, geoms, c, s)
                 s.vector[w, DU, k] = fraction  # no longer needed
                 most = wp.max(most, fraction)
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
-            fill_contact(w, t, threads, equations_of(outer, inner, wide), nnode, nin, 1.0, 1, l, c, s)
-            for k in range(t, outer, threads):
+            fill_contact(w, t, equations_of(outer, inner, wide), nnode, nin, 1.0, 1, l, c, s)
+            for k in range(t, outer, wp.block_dim()):
                 D = s.vector[w, DU, k] * widen(s.block[w, k, 0])
                 turned = -D * wp.skew(s.x[c.node[s.node[w, s.touched[w, k]]], w])
                 for a in range(3):
@@ -258,7 +238,7 @@ def find_tangents(
                     for b in range(3):
                         s.matrix[w, begin + b] = float(D[a, b])
                         s.matrix[w, begin + 3 + b] = float(turned[a, b])
-            for m in range(t, 6 * inner, threads):
+            for m in range(t, 6 * inner, wp.block_dim()):
                 s.matrix[w, (3 * outer + m / 6) * wide + equations + m % 6] = 0.0
             sync()
             solved = eliminate(s.matrix, w, equations, 6)
@@ -269,7 +249,7 @@ def find_tangents(
             for a in range(6):
                 left = vec3()
                 right = vec3()
-                for k in range(t, outer, threads):
+                for k in range(t, outer, wp.block_dim()):
                     fraction = s.vector[w, DU, k]
                     at = s.x[c.node[s.node[w, s.touched[w, k]]], w]
                     v = vec3()
@@ -306,11 +286,10 @@ def conclude(
     w, t = wp.tid()
     if wanted[w] == 0:
         return
-    threads = wp.block_dim()
     o = s.solve.increment[w]
-    find_wrenches(w, t, threads, o.nface, o.nnode, geoms, c, s, touched_by_out, wrench_out)
+    find_wrenches(w, t, o.nface, o.nnode, geoms, c, s, touched_by_out, wrench_out)
     if tangent_out.shape[0] > 0:
-        find_tangents(w, t, threads, o.nnode, o.nin, o.linear, geoms, c, s, touched_by_out, tangent_out)
+        find_tangents(w, t, o.nnode, o.nin, o.linear, geoms, c, s, touched_by_out, tangent_out)
 
 
 @wp.kernel
@@ -343,4 +322,4 @@ def recall(
     l = Linear()
     l.scale = r.solved[w][0] / modulus
     l.swell = r.solved[w][1] / modulus
-    place_nodes(w, 0, 1, count, r.pressure[w], l, c, s)
+    place_nodes(w, 0, count, r.pressure[w], l, c, s)

@@ -47,14 +47,14 @@ def whole_step() -> wp.Kernel:
         tier_out: wp.array(dtype=int),
     ):
         w = wp.tid()
-        begin_step(w, 0, 1, law, geoms, s, st)
+        begin_step(w, 0, law, geoms, s, st)
         while s.solve.phase[w] != DONE:
             if s.solve.phase[w] == SEARCH:
-                search(w, 0, 1, geoms, c, s, r, st)
+                search(w, 0, geoms, c, s, r, st)
             if s.solve.phase[w] == NEWTON:
-                balance(w, 0, 1, geoms, c, s)
+                balance(w, 0, geoms, c, s)
             if s.solve.phase[w] == BALANCED:
-                conclude_balance(w, 0, 1, geoms, rest_pressure, c, s, r, st, node_force_out, tier_out)
+                conclude_balance(w, 0, geoms, rest_pressure, c, s, r, st, node_force_out, tier_out)
 
     return step
 
@@ -69,7 +69,7 @@ def _begin(
     s: Scratch,
 ):
     w, t = wp.tid()
-    begin_step(w, t, wp.block_dim(), law, geoms, s, st)
+    begin_step(w, t, law, geoms, s, st)
 
 
 @wp.kernel(module=kernel_module(f"{__name__}.search"), launch_bounds=(LARGEST_BLOCK, 2))
@@ -84,7 +84,7 @@ def _search(
 ):
     w, t = wp.tid()
     if s.solve.phase[w] == SEARCH:
-        search(w, t, wp.block_dim(), geoms, c, s, r, st)
+        search(w, t, geoms, c, s, r, st)
 
 
 @functools.cache
@@ -101,7 +101,7 @@ def _balance(shapes):
     ):
         w, t = wp.tid()
         if s.solve.phase[w] == NEWTON:
-            balance(w, t, wp.block_dim(), geoms, c, s)
+            balance(w, t, geoms, c, s)
 
     return _balance
 
@@ -124,7 +124,7 @@ def _conclude(
     """Sets going[0] if a world has not finished."""
     w, t = wp.tid()
     if s.solve.phase[w] == BALANCED:
-        conclude_balance(w, t, wp.block_dim(), geoms, rest_pressure, c, s, r, st, node_force_out, tier_out)
+        conclude_balance(w, t, geoms, rest_pressure, c, s, r, st, node_force_out, tier_out)
     if t == 0 and s.solve.phase[w] != DONE:
         going_out[0] = 1
 

@@ -63,27 +63,27 @@ def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constant
 
 
 @wp.func
-def _load(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+def _load(w: int, t: int, nnode: int, nin: int, s: Scratch):
     """Sets vector[F] of the candidates to the initial forces of a solve."""
-    for k in range(t, nnode, threads):
+    for k in range(t, nnode, wp.block_dim()):
         f = s.force[w, s.node[w, k]]
         for a in range(3):
             s.vector[w, F, 3 * k + a] = f[a]
-    for k in range(t, nin, threads):
+    for k in range(t, nin, wp.block_dim()):
         s.vector[w, F, 3 * nnode + k] = s.core_force[w, s.core_node[w, k]]
     sync()
 
 
 @wp.func
-def _store(w: int, t: int, threads: int, nnode: int, c: Constants, s: Scratch):
+def _store(w: int, t: int, nnode: int, c: Constants, s: Scratch):
     """Stores vector[F] as forces of the nodes; nodes that are no candidates have none."""
-    for i in range(t, c.node.shape[0], threads):
+    for i in range(t, c.node.shape[0], wp.block_dim()):
         f = vec3()
         k = s.place[w, i]
         if k >= 0:
             f = vec3(s.vector[w, F, 3 * k], s.vector[w, F, 3 * k + 1], s.vector[w, F, 3 * k + 2])
         s.force[w, i] = f
-    for i in range(t, c.inner.shape[0], threads):
+    for i in range(t, c.inner.shape[0], wp.block_dim()):
         push = real(0.0)
         if s.core_place[w, i] >= 0:
             push = s.vector[w, F, 3 * nnode + s.core_place[w, i]]
@@ -92,16 +92,16 @@ def _store(w: int, t: int, threads: int, nnode: int, c: Constants, s: Scratch):
 
 
 @wp.func
-def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+def _bound(w: int, t: int, nnode: int, nin: int, s: Scratch):
     """Limits forces that are not in equilibrium: those of the contact law at each node, which push and lie in
     the friction cone, but at most the forces that the skin balances at its displacements."""
-    for k in range(t, nnode, threads):
+    for k in range(t, nnode, wp.block_dim()):
         push = vec3(s.vector[w, G, 3 * k], s.vector[w, G, 3 * k + 1], s.vector[w, G, 3 * k + 2])
         balanced = vec3(s.vector[w, F, 3 * k], s.vector[w, F, 3 * k + 1], s.vector[w, F, 3 * k + 2])
         fraction = balanced_fraction(push, balanced)
         for a in range(3):
             s.vector[w, F, 3 * k + a] = fraction * push[a]
-    for k in range(t, nin, threads):
+    for k in range(t, nin, wp.block_dim()):
         j = 3 * nnode + k
         s.vector[w, F, j] = wp.clamp(s.vector[w, F, j], real(0.0), s.vector[w, G, j])
     sync()
@@ -145,7 +145,7 @@ def _next_increment(last: Increment):
 
 
 @wp.func
-def begin_step(w: int, t: int, threads: int, law: int, geoms: Geoms, s: Scratch, st: Worlds):
+def begin_step(w: int, t: int, law: int, geoms: Geoms, s: Scratch, st: Worlds):
     """Starts a step: previous and new poses of the geoms."""
     if st.wanted[w] == 0:
         if t == 0:
@@ -170,7 +170,7 @@ def begin_step(w: int, t: int, threads: int, law: int, geoms: Geoms, s: Scratch,
             st.nonconverged[w] = st.nonconverged[w] + 1
             s.solve.phase[w] = DONE
         return
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         s.pos[g, w] = geoms.pos[g, w]
         s.mat[g, w] = geoms.mat[g, w]
         last = geoms.pos_last[g, w]
@@ -199,7 +199,6 @@ def begin_step(w: int, t: int, threads: int, law: int, geoms: Geoms, s: Scratch,
 def _begin_at(
     w: int,
     t: int,
-    threads: int,
     o: Increment,
     r: Remembered,
     pos: wp.array2d(dtype=vec3),
@@ -211,11 +210,11 @@ def _begin_at(
 ):
     """Begins an increment at an equilibrium with geoms at these poses: its forces, pressure and linear skin,
     the softening after it, and where geoms are held."""
-    for i in range(t, c.node.shape[0], threads):
+    for i in range(t, c.node.shape[0], wp.block_dim()):
         s.force[w, i] = r.force[i, w]
-    for i in range(t, c.inner.shape[0], threads):
+    for i in range(t, c.inner.shape[0], wp.block_dim()):
         s.core_force[w, i] = r.core_force[i, w]
-    for g in range(t, pos.shape[0], threads):
+    for g in range(t, pos.shape[0], wp.block_dim()):
         s.held_pos[g, w] = pos[g, w]
         s.held_mat[g, w] = mat[g, w]
     sync()
@@ -227,7 +226,7 @@ def _begin_at(
 
 
 @wp.func
-def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch, r: Remembered, st: Worlds):
+def search(w: int, t: int, geoms: Geoms, c: Constants, s: Scratch, r: Remembered, st: Worlds):
     """The phase SEARCH: finds the candidates, first at the start of an increment, then at its displacements
     while there are new ones. Where those of a long motion find no room it begins anew with nearer ones:
     the searches that follow find which of the others are touched."""
@@ -241,35 +240,35 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
     if first == 1:
         if p.again == 1:
             at = s.previous
-            o = _begin_at(w, t, threads, o, at.balance, at.pos, at.mat, p.modulus, c, s, st)
+            o = _begin_at(w, t, o, at.balance, at.pos, at.mat, p.modulus, c, s, st)
         else:
-            o = _begin_at(w, t, threads, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
-        sum_forces(w, t, threads, geoms, c, s)
+            o = _begin_at(w, t, o, r, geoms.pos_last, geoms.mat_last, p.modulus, c, s, st)
+        sum_forces(w, t, geoms, c, s)
         if p.at == real(0.0):  # where the step begins
-            for h in range(t, s.bodies.begun.shape[0], threads):
+            for h in range(t, s.bodies.begun.shape[0], wp.block_dim()):
                 s.bodies.begun[h, w] = s.bodies.posed[h, w]
             sync()
-        place_bodies(w, t, threads, p.to, geoms, s)
+        place_bodies(w, t, p.to, geoms, s)
         moved = wp.pow(real(0.5), real(o.cutbacks - 1)) * _largest_motion(w, geoms)
-        view, travel, near = choose_view(w, t, threads, geoms, c, s)
+        view, travel, near = choose_view(w, t, geoms, c, s)
         if p.holds == 1:
             o.solved = r.solved[w]
-        elif is_deep(w, t, threads, view, travel, near, geoms, c, s):
+        elif is_deep(w, t, view, travel, near, geoms, c, s):
             o.deep = 1
             looking = 0
         elif near & o.near == near:
-            known = is_known(w, t, threads, o, geoms, c, s)
+            known = is_known(w, t, o, geoms, c, s)
         o.view = view
         o.travel = travel
         o.near = near
         if known == 0:
-            forget_faces(w, t, threads, geoms, c, s)
+            forget_faces(w, t, geoms, c, s)
             o.reach = _REACH + moved
             if p.holds == 1 or looking == 0:  # what touched
                 o.reach = real(-1.0)
             o.nface = 0
     if looking == 1 and known == 0:
-        largest = largest_displacement(w, t, threads, s.x, c)
+        largest = largest_displacement(w, t, s.x, c)
         reach = real(0.0)
         fraction = real(0.0)
         if first == 1:
@@ -280,8 +279,8 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
             fraction = o.fraction
         else:
             o.reach = real(-1.0)  # which nodes have left
-        nface, new = find_faces(w, t, threads, reach, o.view, o.travel, largest, o.near, geoms, c, s)
-        ncore, inner = find_inner_faces(w, t, threads, fraction, c, s)
+        nface, new = find_faces(w, t, reach, o.view, o.travel, largest, o.near, geoms, c, s)
+        ncore, inner = find_inner_faces(w, t, fraction, c, s)
         new += inner
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
@@ -289,7 +288,7 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
             o.nface = nface
             o.ncore = ncore
     if looking == 1 and known == 0:
-        nnode, nin = find_nodes(w, t, threads, o.nface, o.ncore, c, s)
+        nnode, nin = find_nodes(w, t, o.nface, o.ncore, c, s)
         o.nnode = nnode
         o.nin = nin
         if o.ncore > s.core_face.shape[1] or 3 * nnode + nin > s.coordinate.shape[1]:
@@ -302,12 +301,12 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
             looking = 0
             o.ok = 0
     if looking == 1:
-        measure_core(w, t, threads, o.nnode, o.nin, o.ncore, c, s)
-        find_groups(w, t, threads, o.nnode, geoms, c, s)
-        _load(w, t, threads, o.nnode, o.nin, s)
+        measure_core(w, t, o.nnode, o.nin, o.ncore, c, s)
+        find_groups(w, t, o.nnode, geoms, c, s)
+        _load(w, t, o.nnode, o.nin, s)
         predictor = int(Predictor.NONE)
         before = o.linear
-        count, own = gather_load(w, t, threads, 3 * o.nnode + o.nin, F, c, s)
+        count, own = gather_load(w, t, 3 * o.nnode + o.nin, F, c, s)
         l = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
         if first == 1 and count > 0 and p.holds == 0:
             predictor = int(Predictor.PENDING)
@@ -330,7 +329,6 @@ def search(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch,
 def _remember(
     w: int,
     t: int,
-    threads: int,
     found: Increment,
     geoms: Geoms,
     c: Constants,
@@ -339,11 +337,11 @@ def _remember(
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
 ):
-    for i in range(t, c.node.shape[0], threads):
+    for i in range(t, c.node.shape[0], wp.block_dim()):
         r.force[i, w] = s.force[w, i]
-    for i in range(t, c.inner.shape[0], threads):
+    for i in range(t, c.inner.shape[0], wp.block_dim()):
         r.core_force[i, w] = s.core_force[w, i]
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         pos[g, w] = geoms.pos[g, w]
         mat[g, w] = geoms.mat[g, w]
     if t == 0:
@@ -357,7 +355,6 @@ def _remember(
 def _commit(
     w: int,
     t: int,
-    threads: int,
     found: Increment,
     geoms: Geoms,
     c: Constants,
@@ -367,12 +364,12 @@ def _commit(
     rest_pressure: real,
 ):
     """Stores the state at the end of an increment, with the friction anchors."""
-    _remember(w, t, threads, found, geoms, c, s, r, geoms.pos_last, geoms.mat_last)
+    _remember(w, t, found, geoms, c, s, r, geoms.pos_last, geoms.mat_last)
     if s.previous.pos.shape[0] > 0:
-        _remember(w, t, threads, found, geoms, c, s, s.previous.balance, s.previous.pos, s.previous.mat)
-    for k in range(t, found.nface, threads):  # those that had anchors are candidates
+        _remember(w, t, found, geoms, c, s, s.previous.balance, s.previous.pos, s.previous.mat)
+    for k in range(t, found.nface, wp.block_dim()):  # those that had anchors are candidates
         commit_face(s.face[w, k], w, s.touch)
-    for i in range(t, s.x.shape[0], threads):
+    for i in range(t, s.x.shape[0], wp.block_dim()):
         s.touch.x_last[i, w] = s.x[i, w]
     if t == 0:
         st.pressure[w] = found.pressure + rest_pressure
@@ -382,15 +379,7 @@ def _commit(
 
 @wp.func
 def _conclude_pass(
-    w: int,
-    t: int,
-    threads: int,
-    p: LoadStepping,
-    o: Increment,
-    geoms: Geoms,
-    c: Constants,
-    s: Scratch,
-    st: Worlds,
+    w: int, t: int, p: LoadStepping, o: Increment, geoms: Geoms, c: Constants, s: Scratch, st: Worlds
 ):
     """Ends a pass of Newton's method; returns the increment and the next phase, BALANCED if the increment has
     ended, SEARCH if what was no candidate may be touched now."""
@@ -407,30 +396,30 @@ def _conclude_pass(
     n = 3 * o.nnode + o.nin
     if o.ok == CUT:
         if o.error < real(1.0) - p.at:
-            _bound(w, t, threads, o.nnode, o.nin, s)
+            _bound(w, t, o.nnode, o.nin, s)
         else:  # further from an equilibrium than where the path began
             o.ok = 0
-    if count_contacts(w, t, threads, o.nface, c, s) > s.most_contacts:
+    if count_contacts(w, t, o.nface, c, s) > s.most_contacts:
         o.ok = 0
     if o.ok == 0:
         return o, BALANCED
-    count, own = gather_load(w, t, threads, n, F, c, s)
+    count, own = gather_load(w, t, n, F, c, s)
     if count == 0:  # nothing touches any more
         o.bulge = real(0.0)
     o.pressure = -l.bulk_stiffness * (l.scale * own + o.bulge)
-    volume, part, largest = place_nodes(w, t, threads, count, o.pressure, l, c, s)
+    volume, part, largest = place_nodes(w, t, count, o.pressure, l, c, s)
     o.largest = largest
-    after, squeezed, spread = correct(w, t, threads, o.nnode, o.pressure, p.modulus, c, s)
+    after, squeezed, spread = correct(w, t, o.nnode, o.pressure, p.modulus, c, s)
     o.after = after
     o.measured = wp.where(_is_measured(squeezed, spread, c.squeezed, c.narrow), 1, -1)
     if count == 0:
         o.measured = 1
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         s.held_pos[g, w] = geoms.pos[g, w]
         s.held_mat[g, w] = geoms.mat[g, w]
     sync()
     done = int(1)
-    if pose_by_load(w, t, threads, p.to, o.nnode, geoms, c, s) >= _STANDS:
+    if pose_by_load(w, t, p.to, o.nnode, geoms, c, s) >= _STANDS:
         done = 0
     if wp.abs(after[0] - o.solved[0]) >= _SETTLED:
         done = 0
@@ -451,9 +440,9 @@ def _conclude_pass(
                 int(Predictor.EVALUATED), d.before, again, p.left - o.spent, d.tolerance
             )
         return o, NEWTON
-    _store(w, t, threads, o.nnode, c, s)
+    _store(w, t, o.nnode, c, s)
     if o.ok != CUT:
-        if may_be_touched(w, t, threads, o, geoms, c, s):
+        if may_be_touched(w, t, o, geoms, c, s):
             return o, SEARCH
     return o, BALANCED
 
@@ -494,7 +483,6 @@ def _go_on(most: real, p: LoadStepping, o: Increment):
 def conclude_balance(
     w: int,
     t: int,
-    threads: int,
     geoms: Geoms,
     rest_pressure: wp.array(dtype=real),
     c: Constants,
@@ -510,7 +498,7 @@ def conclude_balance(
     sync()
     phase = BALANCED
     if o.solving == 1:
-        o, phase = _conclude_pass(w, t, threads, p, o, geoms, c, s, st)
+        o, phase = _conclude_pass(w, t, p, o, geoms, c, s, st)
     if phase != BALANCED:
         if t == 0:
             s.solve.increment[w] = o
@@ -519,9 +507,9 @@ def conclude_balance(
     if p.holds == 0 and o.ok != 0:
         if t == 0:
             tier[w] = o.measured
-        _commit(w, t, threads, o, geoms, c, s, r, st, rest_pressure[w])
+        _commit(w, t, o, geoms, c, s, r, st, rest_pressure[w])
     else:
-        for i in range(t, s.x.shape[0], threads):
+        for i in range(t, s.x.shape[0], wp.block_dim()):
             s.x[i, w] = s.touch.x_last[i, w]
         sync()
     p, on = _go_on(s.most[w], p, o)
@@ -532,11 +520,11 @@ def conclude_balance(
             s.solve.phase[w] = SEARCH
         return
     if s.slack.shape[0] > 0:
-        find_slack(w, t, threads, o, geoms, c, s)
+        find_slack(w, t, o, geoms, c, s)
         sync()
-    for i in range(t, c.node.shape[0], threads):
+    for i in range(t, c.node.shape[0], wp.block_dim()):
         node_force[c.node[i], w] = r.force[i, w]
-    for g in range(t, geoms.count, threads):
+    for g in range(t, geoms.count, wp.block_dim()):
         geoms.pos[g, w] = s.pos[g, w]
         geoms.mat[g, w] = s.mat[g, w]
     if t == 0:

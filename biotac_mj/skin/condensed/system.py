@@ -13,10 +13,10 @@ from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
 
 @wp.func
-def gather_load(w: int, t: int, threads: int, n: int, p: int, c: Constants, s: Scratch):
+def gather_load(w: int, t: int, n: int, p: int, c: Constants, s: Scratch):
     """Lists what of vector[p] over n coordinates is not zero, since most of it is; how much that is, and its
     product with `give_at`."""
-    each = (n + threads - 1) / threads
+    each = (n + wp.block_dim() - 1) / wp.block_dim()
     first = t * each
     last = wp.min(first + each, n)
     own = real(0.0)
@@ -41,45 +41,35 @@ def gather_load(w: int, t: int, threads: int, n: int, p: int, c: Constants, s: S
 
 @wp.func
 def multiply(
-    w: int,
-    t: int,
-    threads: int,
-    nnode: int,
-    n: int,
-    p: int,
-    out: int,
-    shifted: int,
-    l: Linear,
-    c: Constants,
-    s: Scratch,
+    w: int, t: int, nnode: int, n: int, p: int, out: int, shifted: int, l: Linear, c: Constants, s: Scratch
 ):
     """vector[out] = W vector[p] over n coordinates, of outer nodes relative to their bodies, which give way;
     with `shifted` besides where the bulge alone puts them."""
-    count, swollen = gather_load(w, t, threads, n, p, c, s)
+    count, swollen = gather_load(w, t, n, p, c, s)
     push = l.bulk_stiffness * l.swell * l.scale * swollen
     if shifted == 1:
         push += l.bulk_stiffness * l.swell * l.bulge
-    if threads == 1:
+    if wp.block_dim() == 1:
         for a in range(count):
             gather_rows(c.compliance, w, n, s.coordinate, s.loaded_place[w, a], 1, s.ready, s.between)
         sum_rows(s.between, w, n, count, s.loaded_place, s.load, s.sum)
-    for j in range(t, n, threads):
+    for j in range(t, n, wp.block_dim()):
         cj = s.coordinate[w, j]
         total = float(0.0)
-        if threads == 1:
+        if wp.block_dim() == 1:
             total = s.sum[w, j]
         else:
             total = dot_column(c.compliance, cj, w, count, s.loaded, s.load)
         s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
     sync()
-    move_nodes(w, t, threads, nnode, p, out, shifted, s)
+    move_nodes(w, t, nnode, p, out, shifted, s)
 
 
 @wp.func
-def _find_touched(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+def _find_touched(w: int, t: int, nnode: int, nin: int, s: Scratch):
     """Lists what touches; how many outer and inner nodes."""
     n = nnode + nin
-    each = (n + threads - 1) / threads
+    each = (n + wp.block_dim() - 1) / wp.block_dim()
     first = t * each
     last = wp.min(first + each, n)
     outer = int(0)
@@ -102,13 +92,13 @@ def _find_touched(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch
 
 
 @wp.func
-def gather_blocks(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+def gather_blocks(w: int, t: int, nnode: int, nin: int, c: Constants, s: Scratch):
     """Lists what touches, and the stiffness of the pairs of outer nodes of which the first does; how many
     outer and inner nodes do, which are not listed where there is no room."""
-    outer, inner = _find_touched(w, t, threads, nnode, nin, s)
+    outer, inner = _find_touched(w, t, nnode, nin, s)
     room = wp.min(outer, s.touched.shape[1])
     most = s.block.shape[2]
-    for m in range(t, room * most, threads):
+    for m in range(t, room * most, wp.block_dim()):
         k = m / most
         p = s.node[w, s.touched[w, k]]
         e = c.ring_start[p] + m % most
@@ -125,7 +115,7 @@ def gather_blocks(w: int, t: int, threads: int, nnode: int, nin: int, c: Constan
     sync()
     nsample = c.sample.shape[0]
     most = s.core_block.shape[2]
-    for m in range(t, wp.min(inner, s.touched.shape[1] - room) * most, threads):
+    for m in range(t, wp.min(inner, s.touched.shape[1] - room) * most, wp.block_dim()):
         k = m / most
         p = s.core_node[w, s.touched[w, outer + k] - nnode]
         e = c.inner_ring_start[p] + m % most
@@ -147,11 +137,11 @@ def gather_blocks(w: int, t: int, threads: int, nnode: int, nin: int, c: Constan
 
 
 @wp.func
-def count_contacts(w: int, t: int, threads: int, nface: int, c: Constants, s: Scratch):
+def count_contacts(w: int, t: int, nface: int, c: Constants, s: Scratch):
     """Number of touching samples of the candidates."""
     nsample = c.sample.shape[0]
     own = int(0)
-    for k in range(t, nface * nsample, threads):
+    for k in range(t, nface * nsample, wp.block_dim()):
         f = s.face[w, k / nsample]
         if s.touch.touching[f, w] == 1 and s.touch.trial_geom[f * nsample + k % nsample, w] >= 0:
             own += 1
@@ -226,9 +216,17 @@ def _fill_by_rows(
 
 @wp.func
 def fill_contact(
-    w: int, t: int, threads: int, size: Equations, nnode: int, nin: int, soft: float, lumped: int,
-    l: Linear, c: Constants, s: Scratch,
-):  # fmt: skip
+    w: int,
+    t: int,
+    size: Equations,
+    nnode: int,
+    nin: int,
+    soft: float,
+    lumped: int,
+    l: Linear,
+    c: Constants,
+    s: Scratch,
+):
     """1 + D W over what touches, D being softer by a factor. lumped: whether D is diagonal, its blocks being
     the first of each node."""
     outer = size.outer
@@ -237,7 +235,7 @@ def fill_contact(
     n = 3 * outer + inner
     scale = soft * float(l.scale)
     pressed = float(l.bulk_stiffness * l.swell * l.scale)
-    for i in range(t, n, threads):
+    for i in range(t, n, wp.block_dim()):
         place = coordinate_at(w, i, outer, nnode, s)
         at = s.coordinate[w, place]
         s.column[w, i] = at
@@ -263,10 +261,10 @@ def fill_contact(
                 held += one * float(c.give_at[3 * c.node.shape[0] + c.inner_ring[e]])
         s.held[w, i] = held
     sync()
-    if threads == 1:
+    if wp.block_dim() == 1:
         _fill_by_rows(w, size, nnode, nin, soft, lumped, scale, c, s)
         return
-    for m in range(t, outer * n, threads):
+    for m in range(t, outer * n, wp.block_dim()):
         k = m / n
         j = m % n
         at = s.column[w, j]
@@ -284,7 +282,7 @@ def fill_contact(
             i = 3 * k + a
             value = scale * total[a] - soft * s.held[w, i] * s.push[w, j]
             s.matrix[w, i * wide + j] = value + wp.where(i == j, 1.0, 0.0)
-    for m in range(t, inner * n, threads):
+    for m in range(t, inner * n, wp.block_dim()):
         i = 3 * outer + m / n
         j = m % n
         at = s.column[w, j]
@@ -303,13 +301,13 @@ def fill_contact(
 
 @wp.func
 def _fill_bodies(
-    w: int, t: int, threads: int, outer: int, equations: int, wide: int, soft: float, c: Constants, s: Scratch
+    w: int, t: int, outer: int, equations: int, wide: int, soft: float, c: Constants, s: Scratch
 ):
     """What the bodies add to `solve_system`: columns for how contact resists their motions, and rows for how
     forces on the nodes move them."""
     b = s.bodies
     bodies = s.borders[w] / 6
-    for m in range(t, outer * bodies, threads):
+    for m in range(t, outer * bodies, wp.block_dim()):
         k = m / bodies
         column = 6 * (m % bodies)
         p = s.node[w, s.touched[w, k]]
@@ -330,7 +328,7 @@ def _fill_bodies(
     for h in range(wp.where(bodies > 0, b.compliance.shape[0], 0)):
         if b.column[h, w] >= 0:
             begin = equations + b.column[h, w]
-            for j in range(t, wide, threads):
+            for j in range(t, wide, wp.block_dim()):
                 moved = vec6()
                 if j < 3 * outer:
                     at = s.touched[w, j / 3]
@@ -348,45 +346,36 @@ def _fill_bodies(
 
 @wp.func
 def solve_system(
-    w: int,
-    t: int,
-    threads: int,
-    nnode: int,
-    nin: int,
-    viscosity: real,
-    moved: int,
-    l: Linear,
-    c: Constants,
-    s: Scratch,
+    w: int, t: int, nnode: int, nin: int, viscosity: real, moved: int, l: Linear, c: Constants, s: Scratch
 ):
     """(1 + D W) df = g - f, of skin and bodies that are stiffer by the viscosity, and W df; whether that can
     be, and how many equations it took. The motions of the bodies are unknowns of their own: df moves them,
     and D resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + viscosity)
-    outer, inner = gather_blocks(w, t, threads, nnode, nin, c, s)
+    outer, inner = gather_blocks(w, t, nnode, nin, c, s)
     equations = 3 * outer + inner
-    number_bodies(w, t, threads, wp.min(outer, s.touched.shape[1]), s)
+    number_bodies(w, t, wp.min(outer, s.touched.shape[1]), s)
     wide = equations + s.borders[w] + 1  # of a row, the right-hand side being its last entry
     if outer + inner > s.touched.shape[1] or wide * wide > s.matrix.shape[1]:
         return 0, 0
     # what touches no more goes at once
-    for k in range(t, nnode, threads):
+    for k in range(t, nnode, wp.block_dim()):
         for a in range(3):
             j = 3 * k + a
             s.vector[w, DF, j] = wp.where(s.on[w, k] == 1, real(0.0), -s.vector[w, F, j])
-    for k in range(t, nin, threads):
+    for k in range(t, nin, wp.block_dim()):
         j = 3 * nnode + k
         s.vector[w, DF, j] = wp.where(s.on[w, nnode + k] == 1, real(0.0), -s.vector[w, F, j])
     sync()
-    multiply(w, t, threads, nnode, n, DF, DU, 0, l, c, s)
-    for j in range(t, wp.where(moved == 1, n, 0), threads):
+    multiply(w, t, nnode, n, DF, DU, 0, l, c, s)
+    for j in range(t, wp.where(moved == 1, n, 0), wp.block_dim()):
         s.vector[w, DU, j] = s.vector[w, DU, j] + s.vector[w, TRY, j]
     sync()
     if equations > 0:
         soft = float(softer)
-        fill_contact(w, t, threads, equations_of(outer, inner, wide), nnode, nin, soft, 0, l, c, s)
-        for k in range(t, outer, threads):
+        fill_contact(w, t, equations_of(outer, inner, wide), nnode, nin, soft, 0, l, c, s)
+        for k in range(t, outer, wp.block_dim()):
             p = s.node[w, s.touched[w, k]]
             total = wp.vec3()
             for e in range(c.ring_start[p], c.ring_start[p + 1]):
@@ -400,7 +389,7 @@ def solve_system(
                 at = 3 * s.touched[w, k] + a
                 value = float(s.vector[w, G, at] - s.vector[w, F, at]) - soft * total[a]
                 s.matrix[w, (3 * k + a + 1) * wide - 1] = value
-        for k in range(t, inner, threads):
+        for k in range(t, inner, wp.block_dim()):
             at = coordinate_at(w, 3 * outer + k, outer, nnode, s)
             p = s.core_node[w, at - 3 * nnode]
             value = float(0.0)
@@ -413,16 +402,16 @@ def solve_system(
             s.matrix[w, (3 * outer + k + 1) * wide - 1] = value
             for j in range(equations, wide - 1):
                 s.matrix[w, (3 * outer + k) * wide + j] = 0.0
-        _fill_bodies(w, t, threads, outer, equations, wide, soft, c, s)
+        _fill_bodies(w, t, outer, equations, wide, soft, c, s)
         if eliminate(s.matrix, w, wide - 1, 1) == 0:
             return 0, equations
-        for k in range(t, equations, threads):
+        for k in range(t, equations, wp.block_dim()):
             at = coordinate_at(w, k, outer, nnode, s)
             s.vector[w, DF, at] = real(s.matrix[w, k * wide + wide - 1])
         sync()
     if viscosity > real(0.0):
-        for j in range(t, n, threads):
+        for j in range(t, n, wp.block_dim()):
             s.vector[w, DF, j] = softer * s.vector[w, DF, j]
         sync()
-    multiply(w, t, threads, nnode, n, DF, DU, 0, l, c, s)
+    multiply(w, t, nnode, n, DF, DU, 0, l, c, s)
     return 1, equations
