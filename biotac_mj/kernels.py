@@ -1,5 +1,8 @@
-"""How the package's kernels are compiled."""
+"""How the package's kernels are compiled, and their structs made."""
 
+import typing
+
+import numpy as np
 import warp as wp
 
 # Warp's flags repeat a function wherever it is called (LLVM inlines what has 40 times as many instructions as
@@ -26,3 +29,21 @@ def kernel_module(name: str, inlined: bool = False) -> str:
         flags = " ".join(flag for flag in flags.split() if not flag.startswith(limits))
     wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": flags}, name)
     return name
+
+
+def set_fields(struct: typing.Any, **fields: typing.Any) -> typing.Any:
+    """Sets fields of a Warp struct, and returns it. Arrays of numpy and lists become arrays of the declared
+    type on the current device; others are taken as they are."""
+    for name, value in fields.items():
+        if isinstance(value, np.ndarray | list):
+            declared = struct._cls.vars[name].type
+            value = wp.array(value, dtype=declared.dtype, ndim=declared.ndim)
+        setattr(struct, name, value)
+    return struct
+
+
+def add_zeros(struct: typing.Any, names: str, *shape: int) -> None:
+    """Makes fields of a Warp struct, of these names, arrays of zeros of a shape and the declared types on the
+    current device."""
+    for name in names.split():
+        setattr(struct, name, wp.zeros(shape, dtype=struct._cls.vars[name].type.dtype))

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..geometry import rigid_warp
 from ..geometry.rigid import cross, rotation
-from ..kernels import kernel_module
+from ..kernels import add_zeros, kernel_module
 from .types import mat33, vec3
 
 kernel_module(__name__)
@@ -38,10 +38,8 @@ class Bodies:
 def make_bodies(groups: int, nworld: int) -> Bodies:
     """Rigid bodies (zero compliance) for `groups` groups of geoms, on Warp's default device."""
     b = Bodies()
-    b.compliance = wp.zeros((groups, groups, nworld), dtype=wp.spatial_matrixd)
-    for name in ("predicted", "begun", "converged", "posed", "wrench", "motion"):
-        setattr(b, name, wp.zeros((groups, nworld), dtype=wp.spatial_vectord))
-    b.origin, b.arm, b.spin = (wp.zeros((groups, nworld), dtype=vec3) for _ in range(3))
+    add_zeros(b, "compliance", groups, groups, nworld)
+    add_zeros(b, "predicted begun converged posed wrench motion origin arm spin", groups, nworld)
     b.column = wp.full((groups, nworld), -1, dtype=int)
     return b
 

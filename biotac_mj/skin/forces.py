@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from ..kernels import set_fields
 from . import liquid
 from .contact import broadphase, faces, touch
 from .data import SkinData
@@ -82,9 +83,10 @@ class Forces:
         self.wrench_chunks = -(-len(model.outer.face) // self.wrench_chunk)
         with wp.ScopedDevice(model.device):
             self._partial_wrench = wp.zeros((2 * geoms.ngroup, self.wrench_chunks, data.nworld), dtype=vec3)
-        self._slots, self.node_forces = nodes.NodeSlots(), self._node_forces()
-        self._slots.lanes = self._lanes
-        self._slots.start, self._slots.slot = vectors.elements.start, vectors.elements.slot
+        elements, self.node_forces = vectors.elements, self._node_forces()
+        self._slots = set_fields(
+            nodes.NodeSlots(), lanes=self._lanes, start=elements.start, slot=elements.slot
+        )
         self._no_laws = faces.empty_laws(model.device)
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
@@ -258,7 +260,9 @@ class Forces:
         area, touched = m.inner.area, [None, None, None]
         if c:
             area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
-        inner = liquid.inner_faces(m.inner.face, m.core_slot, m.sample, area)
+        inner = set_fields(
+            liquid.InnerFaces(), face=m.inner.face, slot=m.core_slot, sample=m.sample, area=area
+        )
         self.launch(
             program, liquid.wet_faces, (k.face_chunks, d.nworld),
             [k.face_chunk, inner, *law, *touched, d.x, on],
@@ -276,12 +280,7 @@ class Forces:
         m, d, k = self.m, self.d, self.k
         liquid = nodes.LiquidForces()
         if m.has_liquid:
-            liquid.face, liquid.start, liquid.slot = m.inner.face, m.inner.start, m.inner.slot
-            liquid.wet, liquid.corner, liquid.node, liquid.gradient = (
-                k.wet,
-                k.wet_corner,
-                m.wet_node,
-                d.gradient,
-            )
+            set_fields(liquid, face=m.inner.face, start=m.inner.start, slot=m.inner.slot, node=m.wet_node)
+            set_fields(liquid, wet=k.wet, corner=k.wet_corner, gradient=d.gradient)
         core = d.core.forces if d.core else nodes.SurfaceForces()
         return d.outer.forces, core, liquid

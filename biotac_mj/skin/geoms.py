@@ -6,12 +6,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..kernels import add_zeros, set_fields
 from .contact.meshes import DistanceGrid, pack_grids
 from .contact.posed import TURN, WINDOW, Geoms
 from .contact.shapes import GEOM_TYPES
 from .contact.touch import CORE, MESHES, SKINS, SOLIDS
 from .state import allocate
-from .types import mat33, real, vec3
 
 # number of MuJoCo's three sizes that a geom type uses
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0, "skin": 0}
@@ -104,22 +104,13 @@ class GeomSet:
         self.ngroup = int(groups.max()) + 1 if count else 0
         self.groups, self._grids, self._rounding = groups, list(grids), rounding
         struct = Geoms()
-        struct.count = count
         with wp.ScopedDevice(self.device):
-            struct.kind = wp.array([GEOM_TYPES[k] for k in types], dtype=int)
-            struct.size = wp.array(size.reshape(-1, 3), dtype=vec3)
-            struct.rounding = wp.array(rounding, dtype=real)
-            struct.window = wp.zeros(count, dtype=real)
-            struct.turn = wp.zeros(count, dtype=wp.vec2d)
-            struct.grid = wp.array(np.maximum(number, 0).astype(np.int32), dtype=int)
-            struct.group = wp.array(groups.astype(np.int32), dtype=int)
-            struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
-            struct.pos = wp.zeros((count, nworld), dtype=vec3)
-            struct.mat = (
-                wp.array(np.tile(np.eye(3), (count, nworld, 1, 1)), dtype=mat33)
-                if count
-                else wp.zeros((0, nworld), dtype=mat33)
-            )
+            set_fields(struct, count=count, kind=[GEOM_TYPES[k] for k in types], size=size, group=groups)
+            set_fields(struct, rounding=rounding, grid=np.maximum(number, 0))
+            set_fields(struct, friction=np.repeat(friction[:, None], nworld, 1))
+            set_fields(struct, mat=np.tile(np.eye(3), (count, nworld, 1, 1)))
+            add_zeros(struct, "window turn", count)
+            add_zeros(struct, "pos", count, nworld)
             allocate("geoms", struct, {"geom": count, "world": nworld})
         struct.own = len(grids)
         struct.grids, self._meshes = pack_grids([*grids, own] if "skin" in types else grids, self.device)

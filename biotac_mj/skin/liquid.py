@@ -90,13 +90,6 @@ class InnerFaces:
     area: wp.array(dtype=real)
 
 
-def inner_faces(face: wp.array, slot: wp.array, sample: wp.array, area: wp.array) -> InnerFaces:
-    """The struct of these arrays."""
-    out = InnerFaces()
-    out.face, out.slot, out.sample, out.area = face, slot, sample, area
-    return out
-
-
 @wp.kernel
 def wet_faces(
     # In:

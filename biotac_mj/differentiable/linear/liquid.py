@@ -12,8 +12,8 @@ import torch
 import warp as wp
 
 from ...geometry.rigid import skew
-from ...kernels import kernel_module
-from ...skin.liquid import InnerFaces, inner_faces, wet_faces
+from ...kernels import kernel_module, set_fields
+from ...skin.liquid import InnerFaces, wet_faces
 from ...skin.types import real, vec3
 from ..record import Record
 from ..skin import Skin
@@ -237,7 +237,8 @@ class _Inputs:
                 outputs, (volume, None, corner)
             )]  # fmt: skip
             law = [self.stiffness, self.reference, self.touching, self.geom, self.force, self.x]
-            inputs = [1, inner_faces(face, slot, sample, area), *law, wp.ones(k, dtype=int)]
+            inner = set_fields(InnerFaces(), face=face, slot=slot, sample=sample, area=area)
+            inputs = [1, inner, *law, wp.ones(k, dtype=int)]
             given = [self.stiffness.grad, self.reference.grad, None, None, self.force.grad, self.x.grad]
             wp.launch(
                 _adjoint, (n, k), inputs, outputs, adjoint=True,

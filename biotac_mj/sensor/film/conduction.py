@@ -39,6 +39,7 @@ from biotac_mj.geometry.design import BIOTAC, Design, electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import connected_cells
+from biotac_mj.kernels import set_fields
 from biotac_mj.launches import recorded
 from biotac_mj.sensor.channels import impedance_from_counts
 from biotac_mj.sensor.film import kernels
@@ -396,24 +397,12 @@ class BatchFilm:
             self._node = wp.array(film.node, dtype=int)
             self._rest_thickness = wp.array(film._rest_thickness, dtype=real)
             self._face = wp.array(film.face, dtype=wp.vec3i)
-            self._pattern = Pattern()
-            for name, value in pattern.items():
-                if isinstance(value, np.ndarray):
-                    kind = Pattern.vars[name].type
-                    value = wp.array(value.astype(np.int32), dtype=kind.dtype, ndim=kind.ndim)
-                setattr(self._pattern, name, value)
-            self._discs = kernels.Discs()
-            self._discs.pos = wp.array(film._pos, dtype=vec3)
-            self._discs.tangent = wp.array(film._tangent, dtype=vec3, ndim=2)
+            self._pattern, footprint = set_fields(Pattern(), **pattern), film._footprint
             starts = np.searchsorted(disc, np.arange(len(film._pos) + 1))
-            self._discs.pair_start = wp.array(starts, dtype=int)
-            self._discs.pair_disc = wp.array(disc, dtype=int)
-            self._discs.pair_face = wp.array(face, dtype=int)
-            self._discs.sample = wp.array(film._disc, dtype=wp.vec2d)
-            self._discs.footprint = film._footprint
-            self._network = kernels.Network()
-            self._network.spreading, self._network.step = wp.array(table, dtype=real), table_step
-            self._network.radius, self._network.footprint = film.electrode_radius, film._footprint
+            self._discs = set_fields(kernels.Discs(), pos=film._pos, tangent=film._tangent, pair_start=starts)
+            set_fields(self._discs, pair_disc=disc, pair_face=face, sample=film._disc, footprint=footprint)
+            self._network = set_fields(kernels.Network(), spreading=table, step=table_step)
+            self._network.radius, self._network.footprint = film.electrode_radius, footprint
             self._cell_constant = wp.array(film.cell_constant[None], dtype=real)
             self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=real)
             self.valid = wp.ones(nworld, dtype=int)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from ...cache import cached
 from ...geometry.tet_mesh import enclosed_volume
-from ...kernels import kernel_module
+from ...kernels import kernel_module, set_fields
 from ..contact.meshes import smooth_distance, spline_field
 from ..contact.posed import Geoms
 from ..liquid import volume_gradient
@@ -180,49 +180,35 @@ class LinearSkin:
         return self._constants[device]
 
     def _make_constants(self, model):
-        c, g, made = Constants(), model.geometry, self.compliance
-        c.node, c.number, c.opposite = _ints(self.node), _ints(self.number), _ints(self.opposite)
-        c.free = _ints(model.free)
-        c.rest = wp.array(model.rest.vert[:, None].astype(float), dtype=vec3, ndim=2)
-        o = model.outer
-        c.face, c.sample, c.start, c.slot = o.face, model.sample, o.start, o.slot
-        rings = _rings(g.outer_face, self.number, len(self.node))
-        c.ring_start, c.ring, c.term_start, c.term = map(_ints, rings)
+        c, g, made, o = Constants(), model.geometry, self.compliance, model.outer
+        vert, number, mean = model.rest.vert, self._numbers(self.inner), self._slope.mean(1)
+        set_fields(c, node=self.node, number=self.number, opposite=self.opposite, free=model.free)
+        set_fields(c, rest=vert[:, None].astype(float), face=o.face, sample=model.sample)
+        set_fields(c, start=o.start, slot=o.slot, give=self.give, give_at=self.give_at)
+        set_fields(c, gradient=self.gradient, liquid_give=self.liquid_give, cavity=self.cavity)
+        set_fields(c, **_rings("", g.outer_face, self.number, len(self.node)))
         # on the CPU the mapped file itself
         c.compliance = wp.array(made.between, dtype=float, ndim=2, copy=False)
         c.row = wp.array(made.rows, dtype=wp.float16, ndim=2, copy=False)
         c.largest = wp.array(made.largest, dtype=float, copy=False)
-        c.give = wp.array(self.give, dtype=vec3)
-        c.give_at = wp.array(self.give_at, dtype=real)
-        c.liquid_give, c.cavity = self.liquid_give, self.cavity
-        c.gradient = wp.array(self.gradient, dtype=vec3)
-        c.wet = wp.zeros(0, dtype=wp.vec3i) if model.inner is None else model.inner.face
-        vert = model.rest.vert
+        none = np.zeros((0, 3), np.int32)
+        c.wet = wp.array(none, dtype=wp.vec3i) if model.inner is None else model.inner.face
         center = (vert.min(0) + vert.max(0)) / 2
         c.center, c.radius = vec3(*center), float(np.linalg.norm(vert - center, axis=1).max())
-        c.core_vert, c.core_depth = wp.zeros(0, dtype=vec3), model.options.max_core_depth
-        c.inner, c.inner_number = _ints(self.inner), _ints(self._numbers(self.inner))
-        c.away = wp.array(self.away, dtype=vec3)
-        c.inner_face, c.inner_area = wp.zeros(0, dtype=wp.vec3i), wp.zeros(0, dtype=real)
-        c.inner_start, c.inner_slot = _ints([]), _ints([])
-        rings = [[]] * 4
-        if model.has_core:
-            surface = model.core_surface
-            c.core, c.core_vert = model.core(1).struct, model.core_vert
-            c.inner_face, c.inner_area = surface.face, surface.area
-            c.inner_start, c.inner_slot = surface.start, surface.slot
-            rings = _rings(surface.face_np, self._numbers(self.inner), len(self.inner))
-        c.inner_ring_start, c.inner_ring, c.inner_term_start, c.inner_term = map(_ints, rings)
+        c.core_depth = model.options.max_core_depth
+        set_fields(c, inner=self.inner, inner_number=number, away=self.away)
+        surface = model.core_surface if model.has_core else None
+        if surface:
+            c.core, c.core_vert, c.inner_area = model.core(1).struct, model.core_vert, surface.area
+            c.inner_face, c.inner_start, c.inner_slot = surface.face, surface.start, surface.slot
+        else:
+            set_fields(c, core_vert=none, inner_area=[], inner_face=none, inner_start=[], inner_slot=[])
+        set_fields(c, **_rings("inner_", surface.face_np if surface else none, number, len(self.inner)))
         # the spline rounds edges of the core by micrometres: samples that are outside must not start inside
-        c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
-        c.inner_gap = wp.array(self._spline_gap, dtype=real, ndim=2)
-        c.inner_slope = wp.array(self._slope, dtype=vec3, ndim=2)
-        c.inner_bend = wp.array(self._bend, dtype=real)
-        mean = self._slope.mean(1)
-        c.inner_mean_slope = wp.array(mean, dtype=vec3)
-        spread = np.linalg.norm(self._slope - mean[:, None], axis=2).max(1)
-        c.inner_spread = wp.array(spread, dtype=real)
-        c.inner_far = wp.array(self._spline_gap.min(1), dtype=real)
+        set_fields(c, inner_rest=np.minimum(self.core_gap, 0.0), inner_gap=self._spline_gap)
+        set_fields(c, inner_slope=self._slope, inner_mean_slope=mean, inner_bend=self._bend)
+        set_fields(c, inner_spread=np.linalg.norm(self._slope - mean[:, None], axis=2).max(1))
+        set_fields(c, inner_far=self._spline_gap.min(1))
         k = self.correction
         c.depth, c.most, c.width, c.stretch, c.squeeze = k.depth, k.most, k.width, k.stretch, k.squeeze
         low, high = k.poissons_ratio
@@ -236,12 +222,9 @@ _made = (
 )  # by model; a LinearSkin must not refer to its model, which would keep both
 
 
-def _ints(values):
-    return wp.array(np.asarray(values, np.int32), dtype=int)
-
-
-def _rings(face, number, count):
-    """CSR lists of the neighbours of `count` numbered nodes, and of the blocks of faces for each pair."""
+def _rings(of, face, number, count):
+    """CSR lists of the neighbours of `count` numbered nodes, and of the blocks of faces for each pair, by the
+    names of `Constants` that begin with `of`."""
     f, a, b = (x.ravel() for x in np.meshgrid(np.arange(len(face)), range(3), range(3), indexing="ij"))
     one, other = number[face[f, a]], number[face[f, b]]
     here = (one >= 0) & (other >= 0)
@@ -249,4 +232,9 @@ def _rings(face, number, count):
     order = np.argsort(pair, kind="stable")
     pairs, begin = np.unique(pair[order], return_index=True)
     ring_start = np.searchsorted(pairs // count, np.arange(count + 1))
-    return ring_start, pairs % count, np.append(begin, len(term)), term[order]
+    return {
+        f"{of}ring_start": ring_start,
+        f"{of}ring": pairs % count,
+        f"{of}term_start": np.append(begin, len(term)),
+        f"{of}term": term[order],
+    }

@@ -5,19 +5,19 @@ import types
 
 import warp as wp
 
+from ...kernels import add_zeros
 from ..bodies import make_bodies
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..model import SkinModel, SkinOptions
 from ..program import Launcher
 from ..state import CONDENSED, allocate
-from ..types import mat33, real, vec3
+from ..types import real, vec3
 from . import results
 from .linear import LinearSkin
 from .refusals import refuse
 from .results import conclude, recall
 from .solve import block_of, phases, whole_step
-from .states import Increment, LoadStepping, Newton
 from .structs import NVECTOR, Previous, Remembered, Scratch
 
 
@@ -172,70 +172,49 @@ class CondensedStep:
 
 
 def _scratch(model, linear, data, ngeom, room, groups):
-    s, nworld = Scratch(), data.nworld
-    s.x = data.x
+    s, w = Scratch(), data.nworld
     nface, nouter, ninner = len(model.outer.face_np), len(linear.node), len(linear.inner)
     ncore = len(model.core_surface.face_np) if model.has_core else 0
     touched, core_faces = min(room.touched, nouter + ninner), min(room.core_faces, ncore)
-    n = min(room.coordinates, 3 * nouter + ninner)
-    nodes = min(n // 3, nouter)
-    for name, count in (
-        ("near", nface),
-        ("near_core", ncore),
-        ("look", max(nface, ncore)),
-        ("face", nface),
-        ("core_face", core_faces),
-        ("place", nouter),
-        ("core_place", ninner),
-        ("node", nouter),
-        ("core_node", ninner),
-        ("coordinate", n),
-        ("loaded", n),
-        ("loaded_place", n),
-        ("on", min(n, nouter + ninner)),
-        ("touched", touched),
+    n, ring = min(room.coordinates, 3 * nouter + ninner), model.ring.shape[1]
+    kept = 0 if model.device.is_cuda else n  # by one thread; rows that are never used take no memory
+    nodes, columns = min(n // 3, nouter), min(kept, 3 * touched)
+    for names, *shape in (
+        ("turn most spent deep borders", w),
+        ("near face free close_to", w, nface),
+        ("near_core", w, ncore),
+        ("look", w, max(nface, ncore)),
+        ("core_face", w, core_faces),
+        ("gap now", w, core_faces, len(model.sample)),
+        ("place node force", w, nouter),
+        ("core_place core_node core_force stiff", w, ninner),
+        ("arm group", w, nodes),
+        ("coordinate loaded loaded_place load", w, n),
+        ("vector", w, NVECTOR, n),
+        ("on", w, min(n, nouter + ninner)),
+        ("touched", w, touched),
+        ("block core_block", w, touched, ring),
+        ("held push column column_place", w, 3 * touched),
+        ("matrix", w, (3 * touched + 6 * max(groups, 1)) ** 2),
+        ("sum", w, 3 * max(kept, len(model.free))),
+        ("ready", w, kept),
+        ("last", w, kept + 1),
+        ("last_column", w, columns + 1),
+        ("seen", w, room.views, nface),
+        ("seen_depth", w, room.views),
+        ("seen_mat", room.views, ngeom, w),
+        ("slack", groups, w),
+        ("pos mat from_pos from_mat held_pos held_mat sought_pos sought_mat", ngeom, w),
+        ("sought_x", model.nvert, w),
     ):
-        setattr(s, name, wp.zeros((nworld, count), dtype=int))
-    s.free = wp.zeros((nworld, nface), dtype=real)
-    s.slack = wp.zeros((groups, nworld), dtype=real)
-    s.close_to = wp.zeros((nworld, nface), dtype=wp.int64)
-    s.force = wp.zeros((nworld, nouter), dtype=vec3)
-    s.core_force = wp.zeros((nworld, ninner), dtype=real)
-    s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)
-    s.load = wp.zeros((nworld, n), dtype=float)
-    cached = 0 if model.device.is_cuda else n  # by one thread; rows that are never used take no memory
-    s.sum = wp.zeros((nworld, 3 * max(cached, len(model.free))), dtype=float)
-    s.between = wp.empty((nworld, cached * cached), dtype=float)
-    s.columns = wp.empty((nworld, cached * min(cached, 3 * touched)), dtype=float)
-    s.ready, s.last = wp.zeros((nworld, cached), dtype=int), wp.zeros((nworld, cached + 1), dtype=int)
-    s.last_column = wp.zeros((nworld, min(cached, 3 * touched) + 1), dtype=int)
-    s.held, s.push = (wp.zeros((nworld, 3 * touched), dtype=float) for _ in range(2))
-    s.stiff = wp.zeros((nworld, ninner), dtype=real)
-    s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))
-    ring = model.ring.shape[1]
-    s.block = wp.zeros((nworld, touched, ring), dtype=wp.mat33)
-    s.core_block = wp.zeros((nworld, touched, ring), dtype=float)
-    s.column, s.column_place = (wp.zeros((nworld, 3 * touched), dtype=int) for _ in range(2))
-    s.matrix = wp.zeros((nworld, (3 * touched + 6 * max(groups, 1)) ** 2), dtype=float)
-    s.bodies, s.borders = make_bodies(groups, nworld), wp.zeros(nworld, dtype=int)
-    s.arm, s.group = wp.zeros((nworld, nodes), dtype=vec3), wp.zeros((nworld, nodes), dtype=int)
-    s.solve.phase = wp.zeros(nworld, dtype=int)
-    for name, of in (("stepping", LoadStepping), ("increment", Increment), ("newton", Newton)):
-        setattr(s.solve, name, wp.zeros(nworld, dtype=of))
-    s.previous = Previous()
-    sizes = {"outer_node": nouter, "inner_node": ninner, "world": nworld}
+        add_zeros(s, names, *shape)
+    s.between, s.columns = (wp.empty((w, kept * many), dtype=float) for many in (kept, columns))
+    s.far = wp.ones((w, room.views, nface), dtype=real)  # until a geom comes near
+    s.seen_pos = wp.full((room.views, ngeom, w), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
+    s.x, s.most_contacts, s.bodies = data.x, room.contacts, make_bodies(groups, w)
+    add_zeros(s.solve, "phase stepping increment newton", w)
+    s.previous, sizes = Previous(), {"outer_node": nouter, "inner_node": ninner, "world": w}
     allocate("condensed", s.previous.balance, sizes, tier=CONDENSED)
-    s.previous.pos = wp.zeros((ngeom if groups else 0, nworld), dtype=vec3)
-    s.previous.mat = wp.zeros((ngeom if groups else 0, nworld), dtype=mat33)
-    s.previous.begins = wp.zeros(nworld, dtype=int)
-    s.pos, s.from_pos, s.held_pos, s.sought_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(4))
-    s.mat, s.from_mat, s.held_mat, s.sought_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(4))
-    s.sought_x = wp.zeros((model.nvert, nworld), dtype=vec3)
-    s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
-    s.seen_mat = wp.zeros((room.views, ngeom, nworld), dtype=mat33)
-    s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near
-    s.seen = wp.zeros((nworld, room.views, nface), dtype=wp.int64)
-    s.seen_depth, s.turn = wp.zeros((nworld, room.views), dtype=real), wp.zeros(nworld, dtype=int)
-    s.most, s.spent = (wp.zeros(nworld, dtype=real) for _ in range(2))
-    s.deep, s.most_contacts = wp.zeros(nworld, dtype=int), room.contacts
+    add_zeros(s.previous, "pos mat", ngeom if groups else 0, w)
+    add_zeros(s.previous, "begins", w)
     return s

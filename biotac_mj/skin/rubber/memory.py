@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ...kernels import kernel_module
+from ...kernels import kernel_module, set_fields
 from ..program import Launcher
 from ..state import allocate
 from ..types import mat33, real, vec3
@@ -201,30 +201,21 @@ def rubber_of_worlds(model: Any, materials: list[Material], modulus: np.ndarray 
     Args:
       modulus: (nelem, nworld) factors on Young's modulus, or None.
     """
-    n = len(materials)
+    none = np.zeros((0, len(materials)))
+    branch = _by_world([m.hysteresis for m in materials]) * [1, 1.5**0.5]
     second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
-    rubber = Rubber()
-    rubber.law = model.law
+    mullins = [m.mullins or (0.0, 0.0, 0.0) for m in materials]
     with wp.ScopedDevice(model.device):
-        rubber.mu = wp.array([m.mu for m in materials], dtype=real)
-        rubber.lam = wp.array(second, dtype=real)
-        none = np.zeros((0, n))
-        rubber.modulus = wp.array(none if modulus is None else modulus, dtype=real, ndim=2)
-        prony = np.array([m.prony for m in materials], float).reshape(n, -1, 2)
-        branch = np.array([m.hysteresis for m in materials], float).reshape(n, -1, 2) * [1, 1.5**0.5]
-        rubber.prony = _by_world(prony, wp.vec2d)
-        rubber.branch = _by_world(branch, wp.vec2d)
-        mullins = [m.mullins or (0.0, 0.0, 0.0) for m in materials]
-        rubber.mullins = wp.array(mullins, dtype=vec3)
-        rubber.stiffening = wp.array([m.stiffening for m in materials], dtype=real)
-    return rubber
+        rubber = set_fields(Rubber(), law=model.law, mu=[m.mu for m in materials], lam=second)
+        set_fields(rubber, modulus=none if modulus is None else modulus, branch=branch, mullins=mullins)
+        set_fields(rubber, prony=_by_world([m.prony for m in materials]))
+        return set_fields(rubber, stiffening=[m.stiffening for m in materials])
 
 
-def _by_world(table, dtype):
-    """Converts (nworld, k, 2) to vectors [k, world]."""
-    if not table.shape[1]:
-        return wp.zeros((0, len(table)), dtype=dtype)
-    return wp.array(np.ascontiguousarray(np.swapaxes(table, 0, 1)), dtype=dtype, ndim=2)
+def _by_world(tables):
+    """Tables (k, 2) of each world as (k, nworld, 2)."""
+    table = np.array(tables, float).reshape(len(tables), -1, 2)
+    return np.ascontiguousarray(np.swapaxes(table, 0, 1))
 
 
 class RubberMemory:

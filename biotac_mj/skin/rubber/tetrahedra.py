@@ -24,7 +24,7 @@ import warp as wp
 
 from ...geometry.edge_nodes import shape_gradients
 from ...geometry.tet_mesh import check_volumes
-from ..types import mat33, real, vec3
+from ...kernels import set_fields
 from .law import LAWS
 from .points import Mesh
 
@@ -96,13 +96,9 @@ class Tetrahedra:
         self._shape, self._whole, self._volume_fraction = shape, whole, volume_fraction
         inverse, weight = self._measure(vert)
         start, slot = incidence(self.nvert, elem)
-        self.mesh = Mesh()
         with wp.ScopedDevice(device):
-            self.mesh.elem = wp.array(np.ascontiguousarray(elem.T), dtype=int, ndim=2)
-            self.mesh.shape = wp.array(shape, dtype=vec3, ndim=2)
-            self.mesh.inverse = wp.array(inverse, dtype=mat33, ndim=2)
-            self.mesh.weight = wp.array(weight, dtype=real, ndim=2)
-            self.mesh.volume = wp.array(weight.sum(1), dtype=real)
+            self.mesh = set_fields(Mesh(), elem=np.ascontiguousarray(elem.T), shape=shape, inverse=inverse)
+            set_fields(self.mesh, weight=weight, volume=weight.sum(1))
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
 
     def _measure(self, vert):
