@@ -148,7 +148,7 @@ class SkinWorlds:
         )
         # inputs of the steps' preconditioner: `touching` and `block` of the surfaces; k.r; its output k.z
         self.precondition = _Replayed(self.device, steps.put_preconditioner)
-        self.invert = _Replayed(self.device, lambda program: steps.put_inverse(program, steps.k.r))
+        self.invert = _Replayed(self.device, steps.put_inverse)
 
     # --- tensors ---
 

@@ -8,6 +8,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..fields import check_choice
+from ..kernels import add_zeros, set_fields
 from ..threads import single_thread
 from .bodies import make_bodies
 from .contact.broadphase import ClearanceCache
@@ -25,7 +26,7 @@ from .rubber.element_forces import ElementForces
 from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
 from .state import FULL, allocate, clear, options_of, zeros
-from .types import Precision, mat33, real, vec3, vec6
+from .types import Precision, mat33, real, vec3
 
 if typing.TYPE_CHECKING:
     from .geoms import GeomSet
@@ -56,16 +57,14 @@ class ContactState:
         self.sample_force = zeros(self.anchor.shape, vec3, tier)  # of samples that touch [N]
         self.corner = zeros((3 * nface, nworld), vec3, tier)
         self.block = zeros((6 * nface, nworld), mat33, tier)
-        self.forces = forces = SurfaceForces()
-        forces.face, forces.start, forces.slot = surface.face, surface.start, surface.slot
-        forces.touching, forces.corner, forces.block = self.touching, self.corner, self.block
-        forces.node_force = self.node_force
+        self.forces = self._shared(SurfaceForces())
         cache = self.clearances
-        cache.mark, cache.travel = wp.full(nworld, -1, dtype=int), wp.zeros(nworld, dtype=real)
-        cache.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
-        cache.since = wp.zeros((nface, nworld), dtype=real)
-        cache.count = wp.zeros(2, dtype=int)
-        cache.unknown, cache.near = (wp.zeros(nface * nworld, dtype=int) for _ in range(2))
+        cache.mark = wp.full(nworld, -1, dtype=int)
+        add_zeros(cache, "travel", nworld)
+        add_zeros(cache, "seen", 3 * nface, nworld)
+        add_zeros(cache, "since", nface, nworld)
+        add_zeros(cache, "count", 2)
+        add_zeros(cache, "unknown near", nface * nworld)
         self._host = None
 
     def contact(
@@ -78,15 +77,15 @@ class ContactState:
         bound: wp.array,
     ) -> Contact:
         """`Contact` of this surface for kernels: its arrays, and the given fields."""
-        out, surface = Contact(), self.surface
-        out.face, out.area, out.sample, out.stick_ratio = surface.face, surface.area, sample, stick_ratio
-        out.bonded = surface.bonded
-        out.stiffness, out.laws, out.x_last, out.bound = stiffness, laws, x_last, bound
-        out.anchor_geom, out.anchor, out.kept = self.anchor_geom, self.anchor, self.kept
-        out.corner, out.block, out.touching = self.corner, self.block, self.touching
-        out.trial_geom, out.bond, out.trial_anchor = self.trial_geom, self.bond, self.trial_anchor
-        out.sample_force = self.sample_force
+        out = self._shared(Contact())
+        out.sample, out.stick_ratio, out.stiffness, out.laws = sample, stick_ratio, stiffness, laws
+        out.x_last, out.bound = x_last, bound
         return out
+
+    def _shared(self, struct):
+        """A struct with those of its fields that the state or its surface has by the same name."""
+        known = vars(self.surface) | vars(self)
+        return set_fields(struct, **{name: known[name] for name in struct._cls.vars if name in known})
 
     def active(self, w: int) -> tuple[np.ndarray, np.ndarray]:
         """Touching faces (n,) of world w, and their tangents (n, 6, 3, 3), on the host."""
@@ -183,8 +182,7 @@ class SkinData:
             self.frame_mat = wp.array(np.tile(np.eye(3), (nworld, 1, 1)), dtype=mat33)
             wp.copy(self.frame_mat_last, self.frame_mat)
             self.worlds = Worlds()
-            for name, variable in Worlds.vars.items():
-                setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
+            add_zeros(self.worlds, " ".join(Worlds.vars), nworld)
         self.rests, self.rests_alike = None, False  # the latter: all worlds must keep the model's rest
         self.worlds.wanted.fill_(1)
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
@@ -215,21 +213,7 @@ class SkinData:
     def preconditioner(self) -> "Preconditioner":
         """A `precondition.Preconditioner`."""
         if self._preconditioner is None:
-            surfaces, m = (self.outer, self.core), self.model
-            if self._chosen is SparsePreconditioner:
-                self._preconditioner = SparsePreconditioner(
-                    m, surfaces, self.worlds, self.chunk, self.bodies, self.body_contact
-                )
-            else:
-                self._preconditioner = DensePreconditioner(
-                    m,
-                    surfaces,
-                    self.worlds,
-                    self.chunk,
-                    self.contact_capacity,
-                    self.bodies,
-                    self.body_contact,
-                )
+            self._preconditioner = self._chosen(self)
         return self._preconditioner
 
     @property
@@ -295,15 +279,11 @@ class SkinData:
         self._preconditioner, w, n = None, self.nworld, 6 * ngroup
         with wp.ScopedDevice(self.model.device):
             self.bodies, self.body_contact = make_bodies(ngroup, w), BodyContact()
-            self.body_contact.group = wp.zeros((len(self.model.outer.face), w), dtype=int)
-            for name in ("skin_wrench", "residual", "step", "displacement", "pending"):
-                setattr(self.body_contact, name, wp.zeros((ngroup, w), dtype=vec6))
-            self.body_contact.inverse = wp.zeros((w, n, n), dtype=real)
-            self.body_contact.pivot = wp.zeros((w, n), dtype=int)
-            self.body_contact.wrench_known, self.body_contact.has_pending = (
-                wp.zeros(w, dtype=int),
-                wp.zeros(w, dtype=int),
-            )
+            add_zeros(self.body_contact, "group", len(self.model.outer.face), w)
+            add_zeros(self.body_contact, "skin_wrench residual step displacement pending", ngroup, w)
+            add_zeros(self.body_contact, "inverse", w, n, n)
+            add_zeros(self.body_contact, "pivot", w, n)
+            add_zeros(self.body_contact, "wrench_known has_pending", w)
 
     def _forget_steps(self):
         for one in self.steps.values():

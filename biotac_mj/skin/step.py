@@ -291,13 +291,13 @@ class SkinStep:
         k = self.k
         self.M.begin_step(program, self.d.x)
         residual = Residual(k.norms, k.r, self._forces.gradient)
-        self.M.update(program, self.st, residual, k.z, k.partial, self._forces.in_parallel)
+        self.M.update(program, residual, k.z, k.partial, self._forces.in_parallel)
 
-    def put_inverse(self, program: Launcher, r: wp.array) -> None:
-        """k.z = approximate inverse of the tangent times r, zero at fixed nodes; k.partial must hold the
-        square of r by chunks."""
+    def put_inverse(self, program: Launcher) -> None:
+        """k.z = approximate inverse of the tangent times k.r, zero at fixed nodes, and k.partial r . z and
+        gradient . z; k.partial must hold the square of r by chunks."""
         k = self.k
-        self.M.apply(program, self.st, k.partial, r, self._forces.gradient, k.z, k.partial)
+        self.M.apply(program, Residual(k.partial, k.r, self._forces.gradient), k.z, k.partial)
 
     # --- the step ---
 
@@ -473,7 +473,7 @@ class SkinStep:
         if self._compliant:
             self._compliant.begin_iteration(self._launcher)
         residual = Residual(k.norms, k.r, self._forces.gradient)
-        self.M.update(self._launcher, st, residual, k.p, k.partial, self._forces.in_parallel)
+        self.M.update(self._launcher, residual, k.p, k.partial, self._forces.in_parallel)
 
     def _solve(self):
         self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
@@ -481,7 +481,7 @@ class SkinStep:
 
     def _continue_solve(self):
         k, st = self.k, self.st
-        self.M.apply(self._launcher, st, k.partial, k.r, self._forces.gradient, k.z, k.partial)
+        self.put_inverse(self._launcher)
         self._decide(krylov.choose_beta, [k.partial, st])
         self._launch(self._krylov_kernels.next_direction, self.d.x.shape, [k.z, st, k.p])
         self._advance_solve(0)

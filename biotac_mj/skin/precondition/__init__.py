@@ -11,7 +11,6 @@ from ..types import Precision
 
 if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
-    from ..newton.worlds import Worlds
 
 __all__ = ["Preconditioner", "Residual"]
 
@@ -20,7 +19,8 @@ class Residual(NamedTuple):
     """The residual to which a preconditioner is applied.
 
     Attributes:
-      norms: (4, nchunk, nworld); the first is the square of r, the third that of the gradient.
+      norms: (k, nchunk, nworld); the first is the square of r and, for an update, the third that of the
+        gradient.
       r: [nvert, nworld] residual, zero at fixed nodes.
       gradient: of the liquid's volume [nvert, nworld]; None without a liquid.
     """
@@ -31,8 +31,8 @@ class Residual(NamedTuple):
 
 
 class Preconditioner(Protocol):
-    """The approximate inverse of the tangent, for all worlds of one SkinData: the inverse of the undeformed
-    stiffness, corrected for contact and liquid. Methods put launches into a program.
+    """The approximate inverse of the tangent, for all worlds of one SkinData, its argument: the inverse of
+    the undeformed stiffness, corrected for contact and liquid. Methods put launches into a program.
 
     Attributes:
       precision: of directions.
@@ -46,33 +46,21 @@ class Preconditioner(Protocol):
     def update(
         self,
         program: Launcher,
-        st: "Worlds",
         residual: Residual,
         z_out: wp.array,
         partial_out: wp.array,
         in_parallel: Callable[..., None],
     ) -> None:
-        """Takes the tangents of contact and liquid from the last evaluation in the active worlds, sets
-        `st.touched`, and computes z = approximate inverse of the new tangent times r.
+        """Takes the tangents of contact and liquid from the last evaluation in the active worlds, marks those
+        that touch, and computes z = approximate inverse of the new tangent times r.
 
         Args:
-          st: Worlds.
-          residual: r and the gradient of the liquid's volume, see `Residual`.
           z_out: [nvert, nworld]. partial_out: (2, nchunk, nworld) r . z and gradient . z.
           in_parallel: launches functions that do not need each other's results.
         """
 
-    def apply(
-        self,
-        program: Launcher,
-        st: "Worlds",
-        partial: wp.array,
-        r: wp.array,
-        gradient: wp.array,
-        z_out: wp.array,
-        partial_out: wp.array,
-    ) -> None:
-        """Computes z for another r in the running worlds. partial: square of r by chunks."""
+    def apply(self, program: Launcher, residual: Residual, z_out: wp.array, partial_out: wp.array) -> None:
+        """Computes z for another r in the running worlds."""
 
     def renew_if_due(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve at x [nvert, nworld]: takes the factor of this shape if solves were long; by

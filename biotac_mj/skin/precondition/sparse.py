@@ -21,24 +21,23 @@ import warp as wp
 from scipy.linalg.lapack import dgetrf, dgetrs
 
 from ...geometry.rigid import rigid_motions
-from ..newton.worlds import NEGLIGIBLE_RESIDUAL, Worlds
+from ..newton.worlds import NEGLIGIBLE_RESIDUAL
 from ..program import Launcher
 from ..types import DOUBLE
-from . import Residual
+from . import Preconditioner, Residual
 from .body_tangent import assemble, body_tangent
 from .pushed_forward import PushForward, pushes_forward
 
 if typing.TYPE_CHECKING:
-    from ..bodies import Bodies
+    from ..data import SkinData
     from ..geoms import GeomSet
-    from ..newton.bodies import BodyContact
 
 _DENSE = 300  # coordinates below which a dense matrix of springs is faster than a sparse one
 _FACTOR = 60  # cost of a factor in products of the tangent
 _SYSTEM = 110_000  # entries of a Woodbury system that cost as much as a product
 
 
-class SparsePreconditioner:
+class SparsePreconditioner(Preconditioner):
     """Preconditioner of all worlds of one SkinData in double precision, see `precondition.Preconditioner`.
 
     For nearly incompressible rubber the inverse is pushed forward into the deformed shape (`pushed_forward`).
@@ -50,17 +49,10 @@ class SparsePreconditioner:
 
     precision = DOUBLE
 
-    def __init__(
-        self,
-        model: typing.Any,
-        surfaces: tuple,
-        st: Worlds,
-        chunk: int,
-        bodies: "Bodies | None" = None,
-        body_contact: "BodyContact | None" = None,
-    ):
-        self._bodies, self._body_contact = bodies, body_contact
-        self._model, self._surfaces = model, [s for s in surfaces if s]
+    def __init__(self, data: "SkinData"):
+        model, st = data.model, data.worlds
+        self._bodies, self._body_contact = data.bodies, data.body_contact
+        self._model, self._surfaces = model, [s for s in (data.outer, data.core) if s]
         self._rest = self.factor = model.factor
         # change of the free nodes, and a zero behind them for the fixed nodes
         self._change = np.zeros(3 * len(model.free) + 3, np.float32)
@@ -68,16 +60,15 @@ class SparsePreconditioner:
         self._change_at[model.free] = np.arange(len(model.free))
         self._is_free = np.zeros(model.nvert, bool)
         self._is_free[model.free] = True
-        nworld = st.softness.shape[0]
         self._softness, self._kappa = st.softness.numpy(), st.kappa.numpy()
         self._viscosity = st.viscosity.numpy()
         self._work = st.work.numpy()
         self._products, self._iterations = 0, st.iterations_cg.numpy()
         self._rows = self._undeformed_rows = {}
-        self._woodbury = [None] * nworld
+        self._woodbury = [None] * data.nworld
         self._push_forward, self._pushed = None, False  # for nearly incompressible rubber
         self._gradient = self._along = None
-        self.any_touch = st.touched
+        self._active, self._running, self._touched = (a.numpy() for a in (st.active, st.running, st.touched))
 
     # --- the factor of a step ---
 
@@ -126,7 +117,6 @@ class SparsePreconditioner:
     def update(
         self,
         program: Launcher,
-        st: Worlds,
         residual: Residual,
         z_out: wp.array,
         partial_out: wp.array,
@@ -134,12 +124,12 @@ class SparsePreconditioner:
     ) -> None:
         """See `precondition.Preconditioner`."""
         norms, r, gradient = residual
-        on, square, r, z, partial = (a.numpy() for a in (st.active, norms, r, z_out, partial_out))
+        square, r, z, partial = (a.numpy() for a in (norms, r, z_out, partial_out))
         gradient = None if gradient is None else gradient.numpy()
-        touched, touching = self.any_touch.numpy(), [s.touching.numpy() for s in self._surfaces]
+        touched, touching = self._touched, [s.touching.numpy() for s in self._surfaces]
 
         def update():
-            worlds = np.flatnonzero(on)
+            worlds = np.flatnonzero(self._active)
             z[:, self._of(worlds)], partial[:, :, self._of(worlds)] = 0, 0
             for w in worlds:
                 touched[w] = any(t[:, w].any() for t in touching)
@@ -168,21 +158,12 @@ class SparsePreconditioner:
 
         program.call(update)
 
-    def apply(
-        self,
-        program: Launcher,
-        st: Worlds,
-        partial: wp.array,
-        r: wp.array,
-        gradient: wp.array,
-        z_out: wp.array,
-        partial_out: wp.array,
-    ) -> None:
+    def apply(self, program: Launcher, residual: Residual, z_out: wp.array, partial_out: wp.array) -> None:
         """See `precondition.Preconditioner`."""
-        on, r, z, out = (a.numpy() for a in (st.running, r, z_out, partial_out))
+        r, z, out = (a.numpy() for a in (residual.r, z_out, partial_out))
 
         def apply():
-            worlds = np.flatnonzero(on)
+            worlds = np.flatnonzero(self._running)
             if len(worlds):
                 self._correct(worlds, self._solve(r[:, self._of(worlds)], worlds), r, z, out)
 
