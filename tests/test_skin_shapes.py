@@ -532,10 +532,11 @@ def test_a_smooth_mesh_has_a_normal_without_jumps():
 def test_a_skin_whose_grid_has_edges_is_refused():
     ball = trimesh.creation.icosphere(subdivisions=1, radius=1.0)
     smooth, sharp = (bake_distance_grid(ball.vertices, ball.faces, cells=8, smooth=s) for s in (True, False))
-    assert GeomSet(["skin"], [()], grids=[smooth], own=smooth).shapes == SKINS
-    for grid, own in ((sharp, smooth), (smooth, sharp), (smooth, None)):
+    both = smooth, smooth
+    assert GeomSet(["skin"], [()], grids=both, own=both).shapes == SKINS
+    for grids, own in (((smooth, sharp), both), (both, (sharp, smooth)), (both, ())):
         with pytest.raises(ValueError, match="smooth=True"):
-            GeomSet(["skin"], [()], grids=[grid], own=own)
+            GeomSet(["skin"], [()], grids=grids, own=own)
 
 
 def test_smooth_and_sharp_meshes_are_one_set():

@@ -339,13 +339,13 @@ class Batch(Skins):
 
     def meet(self, others: list["Batch"]) -> None:
         """Shares what skins do to each other between two that both move bodies."""
-        both = [other for other in others if self._two_way]
-        self.skins_met = [
-            (other, k) for other in both for k in other._skins if other._body.numpy()[k] == self._core
-        ]
-        bodies, cores = self._body.numpy(), {other._core for other, _ in self.skins_met}
-        fraction = np.ones(len(bodies))
-        fraction[[k for k in self._skins if bodies[k] in cores]] = 0.5
+        self.skins_met = []
+        bodies, fraction = self._body.numpy(), np.ones(self._body.size)
+        for other in others if self._two_way else ():
+            mine = np.flatnonzero(other._body.numpy() == self._core).tolist()
+            self.skins_met += [(other, k) for k in mine]
+            if set(mine) & set(other._skins):
+                fraction[[k for k in self._skins if bodies[k] == other._core]] = 0.5
         self.skin.fraction.assign(fraction)
 
     def pass_by(self, taking_part: Marks) -> None:

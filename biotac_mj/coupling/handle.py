@@ -155,9 +155,10 @@ class Handle:
           ValueError, TypeError: see `draw`.
         """
         setup, (_, models, *_) = self._parts(model, data)
+        bodies = setup.touching.body
         return {
-            int(body): (one["wrench0"].copy(), one["tangent0"].copy())
-            for body, one in zip(setup.touching.body, models)
+            int(body): tuple(models[bodies == body][name].sum(axis=0) for name in ("wrench0", "tangent0"))
+            for body in bodies
         }
 
     def contact_pressure(

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..fields import as_real
 from ..geometry.rigid import unit
-from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skin_geometry import RIGID, SkinGeometry
 from ..short_repr import short_repr
 from .config import Config, collides
 from .touching import deformable
@@ -116,7 +116,7 @@ def _model(geometry):
     """mjcf/biotac.xml with the meshes, electrodes and outer surface of a skin."""
     with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
         spec = mujoco.MjSpec.from_file(str(folder / "biotac.xml"))
-    for part in ("core", "nail", "clamp"):
+    for part in RIGID:
         mesh, vert, face = (
             spec.mesh(part),
             getattr(geometry, f"{part}_vert"),

@@ -24,6 +24,7 @@ class Geom:
       group: index of the touching body it belongs to, 0..ngroup-1.
       rounding: radius of its rounded edges [m].
       vert, face: (n, 3) [m], (m, 3) of a mesh or a skin in the geom's frame; None for the others.
+      rigid: such a mesh of the core, nail and clamp under a skin; None for the others.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Geom:
     rounding: float = 0.0
     vert: np.ndarray | None = None
     face: np.ndarray | None = None
+    rigid: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclasses.dataclass

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from ..geometry.rigid import matrix
-from ..geometry.solid import bounds_solid, close_rim, convex_hull, face_outwards, ground
+from ..geometry.solid import bounds_solid, close_rim, convex_hull, face_outwards, ground, joined
 from .config import OWN, Config
 from .stepper import Geom
 from .structs import ModelView
@@ -37,7 +37,8 @@ class Touching:
     Attributes:
       core: id of the BioTac's body.
       geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
-      body: (ngroup,) ids of the touching bodies. group: (ngeom,) which of them each geom is on.
+      body: (ngroup,) ids of the touching bodies, a BioTac's twice: as its skin, and as nail and clamp. group:
+        (ngeom,) which of them each geom is on.
       fraction: (ngroup,) of what the skin is pushed by each with that this BioTac answers for: half of it
         where another one's skin is pushed as well and answers for the other half.
       path: (ngroup,) of a body's way that what the skin meets goes along: half, where that is another skin.
@@ -65,9 +66,12 @@ class Touching:
         if not compiling:  # nor are meshes
             meshes, self.notes = _meshes(model, core, ids)
             ids = np.array([i for i in ids if meshes.get(int(i), True) is not None], dtype=np.int64)
-        bodies = model.geom_bodyid[ids]
+        # a body's skin and its rigid parts are groups of their own
+        is_skin = np.array([_has_skin(model, core, g) for g in ids], dtype=np.int64)
+        parts = 2 * model.geom_bodyid[ids] + is_skin
         self.geom = ids
-        self.body, self._first, group = np.unique(bodies, return_index=True, return_inverse=True)
+        parts, self._first, group = np.unique(parts, return_index=True, return_inverse=True)
+        self.body = parts // 2
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
         for i in rounding:
             if model.geom_bodyid[i] == core:
@@ -104,8 +108,8 @@ class Touching:
         parts = []
         for g in self.geoms:
             parts.append(repr((g.type, g.size.tolist(), g.friction, g.group, g.rounding)).encode())
-            if g.vert is not None:
-                parts.append(g.vert.tobytes() + g.face.tobytes())
+            meshes = ((g.vert, g.face), g.rigid)
+            parts += [a.tobytes() for mesh in meshes for a in mesh or () if a is not None]
         return b"|".join(parts)
 
     def geom_pose(self, pos: np.ndarray, mat: np.ndarray) -> tuple:
@@ -172,14 +176,10 @@ def _select(model, core, names):
     pairs = np.stack([model.pair_geom1, model.pair_geom2])  # that MuJoCo collides whatever the masks are
     of_core = model.geom_bodyid[pairs] == core
     meets[pairs[of_core[::-1]]] = True
-    biotacs = {model.geom_bodyid[i] for i in np.flatnonzero(model.geom_contype & OWN) if _is_core(model, i)}
     out = []
     for i in np.flatnonzero(meets):
         body = model.geom_bodyid[i]
         if weld[body] == own:
-            continue
-        # solid parts of another BioTac meet those of this one; its core stands for the skin around it
-        if model.geom_contype[i] & OWN and body in biotacs and not _has_skin(model, core, i):
             continue
         if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own):
             continue
@@ -309,6 +309,16 @@ def _skin_of(model, geom):
     return (vert, face) if bounds_solid(vert, face) else None
 
 
+def _rigid_of(model, geom):
+    """Mesh (n, 3) [m], (m, 3) of all rigid parts of a BioTac, in the frame of its core's geom."""
+    parts, frame = [], matrix(model.geom_quat[geom])
+    for g in np.flatnonzero((model.geom_bodyid == model.geom_bodyid[geom]) & (model.geom_dataid >= 0)):
+        vert, face = mesh_of(model, int(model.geom_dataid[g]))
+        vert = vert @ matrix(model.geom_quat[g]).T + model.geom_pos[g]
+        parts.append(((vert - model.geom_pos[geom]) @ frame, face))
+    return joined(parts)
+
+
 def _meshes(model, core, ids):
     """{geom: (vert, face), or None where it is no solid} of the meshes and skins among the geoms, and
     notes."""
@@ -393,5 +403,8 @@ def _describe(model, core, index, group, rounding, config, mesh):
         else (other if priority > config.priority else config.friction)
     )
     vert, face = mesh or (None, None)
-    shape = "skin" if _has_skin(model, core, index) else _TYPES[kind]
-    return Geom(name, shape, np.array(model.geom_size[index]), friction, group, rounding, vert, face)
+    shape, rigid = _TYPES[kind], None
+    if _has_skin(model, core, index):
+        shape, rigid = "skin", mesh and _rigid_of(model, index)
+    size = np.array(model.geom_size[index])
+    return Geom(name, shape, size, friction, group, rounding, vert, face, rigid)

@@ -9,7 +9,7 @@ from ..files import write_npz
 from ..reading import Array, read_npz
 from ..short_repr import short_repr
 from .design import BIOTAC, Design, read_design
-from .solid import check_place, check_size, no_solid
+from .solid import check_place, check_size, joined, no_solid
 from .tet_mesh import TetMesh, check_closed, check_volumes, enclosed_volume, indices, triangle_numbers
 
 # the eight four-node tetrahedra of a ten-node one: four at the corners, four around the octahedron's diagonal
@@ -26,6 +26,7 @@ PARTS = np.array(
         [4, 9, 6, 7],
     ]
 )
+RIGID = "core", "nail", "clamp"
 _SOLID = 1e-12  # least volume of core, nail and clamp [m^3], for which MuJoCo computes an inertia
 _OFF = 1e-3  # largest distance of an electrode outside the core's box [m]
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
@@ -37,14 +38,12 @@ STORED = {
     "outer_face": Array((None, 3), "index"),
     "inner_face": Array((None, 3), "index"),
     "fixed": Array((None,), "index"),
-    **{f"{part}_vert": Array((None, 3)) for part in ("core", "nail", "clamp")},
-    **{f"{part}_face": Array((None, 3), "index") for part in ("core", "nail", "clamp")},
+    **{f"{part}_vert": Array((None, 3)) for part in RIGID},
+    **{f"{part}_face": Array((None, 3), "index") for part in RIGID},
     "electrode_pos": Array(("nelectrode", 3)),
     "electrode_normal": Array(("nelectrode", 3)),
 }
-_INTO = {
-    name: f"{name[:-5]}_vert" if name[:-5] in ("core", "nail", "clamp") else "vert" for name in _INT_FIELDS
-}
+_INTO = {name: f"{name[:-5]}_vert" if name[:-5] in RIGID else "vert" for name in _INT_FIELDS}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +156,7 @@ class SkinGeometry:
                 f"the electrodes of skin {name} are not on its core, or their normals are not of length one: "
                 "import the mesh again"
             )
-        for part in ("core", "nail", "clamp"):
+        for part in RIGID:
             vert, face = getattr(self, f"{part}_vert"), getattr(self, f"{part}_face")
             if not len(face):
                 continue
@@ -196,6 +195,11 @@ class SkinGeometry:
                 f"outer_face and inner_face of skin {name} are not the surface of its tetrahedra: "
                 f"{more} triangles too many, {missing} missing; import the mesh again"
             )
+
+    @property
+    def rigid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mesh (n, 3) [m], (m, 3) of core, nail and clamp."""
+        return joined([(getattr(self, f"{p}_vert"), getattr(self, f"{p}_face")) for p in RIGID])
 
     def save(self, path: pathlib.Path | str) -> pathlib.Path:
         """Writes an .npz file with positions in float64, so that a reload is equal to the bit."""

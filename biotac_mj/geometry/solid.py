@@ -1,6 +1,8 @@
 """Triangle meshes as solids: tests whether a mesh bounds a solid, has the size of a part of a fingertip and
 lies at its frame's origin, convex hulls, solids of height fields."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
@@ -125,6 +127,13 @@ def close_rim(face: np.ndarray) -> np.ndarray:
     rim = rim[(rim != first).all(axis=1)]
     fan = np.column_stack([rim[:, ::-1], np.full(len(rim), first)])
     return np.concatenate([face, fan.astype(face.dtype)])
+
+
+def joined(meshes: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Several meshes (n, 3) [m], (m, 3) as one."""
+    vert, face = zip(*meshes)
+    first = np.cumsum([0, *map(len, vert[:-1])])
+    return np.concatenate(vert), np.concatenate([f + n for f, n in zip(face, first)]).astype(np.int32)
 
 
 def convex_hull(vert: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

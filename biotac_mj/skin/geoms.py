@@ -13,6 +13,8 @@ from .contact.shapes import GEOM_TYPES
 from .contact.touch import CORE, MESHES, SKINS, SOLIDS
 from .state import allocate
 
+# grids of a geom type that has some
+_GRIDS = {"mesh": 1, "skin": 2}
 # number of MuJoCo's three sizes that a geom type uses
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0, "skin": 0}
 
@@ -39,9 +41,9 @@ class GeomSet:
       friction: Coulomb coefficients (ngeom,).
       groups: (ngeom,) body of each geom, 0..ngroup-1; None: one group.
       rounding: fillet radius of boxes and cylinders (ngeom,) [m].
-      grids: one DistanceGrid for each mesh and each skin, in the order of `types`.
-      own: DistanceGrid of the undeformed skin that they touch; needed if `types` has a skin. Those of skins
-        are smooth.
+      grids: one DistanceGrid for each mesh, and two for each skin, of its undeformed shape and of its rigid
+        parts, both smooth; in the order of `types`.
+      own: these two of the skin that they touch; needed if `types` has a skin.
       nworld: number of worlds.
       device: Warp device.
 
@@ -61,7 +63,7 @@ class GeomSet:
         groups: ArrayLike | None = None,
         rounding: ArrayLike | None = None,
         grids: Sequence[DistanceGrid] = (),
-        own: DistanceGrid | None = None,
+        own: Sequence[DistanceGrid] = (),
         nworld: int = 1,
         device: wp.DeviceLike = "cpu",
     ):
@@ -71,17 +73,16 @@ class GeomSet:
                 raise ValueError(
                     f"geom type {kind!r} cannot touch the skin: use one of {', '.join(GEOM_TYPES)}"
                 )
-        gridded = [kind in ("mesh", "skin") for kind in types]
-        if sum(gridded) != len(grids) or not all(isinstance(g, DistanceGrid) for g in grids):
+        need = np.array([_GRIDS.get(kind, 0) for kind in types], np.int32)
+        number = np.where(need, np.cumsum(need) - need, 0)
+        if need.sum() != len(grids) or not all(isinstance(g, DistanceGrid) for g in grids):
             raise ValueError(
                 "every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)"
             )
-        of_geoms = iter(grids)
-        kinds = [(kind, next(of_geoms)) for kind, has_grid in zip(types, gridded) if has_grid]
-        skins = [grid for kind, grid in kinds if kind == "skin"]
-        if skins and any(getattr(grid, "coefficient", None) is None for grid in (*skins, own)):
+        skins = [grid for k, kind in zip(number, types) if kind == "skin" for grid in grids[k : k + 2]]
+        if skins and (len(own) != 2 or any(grid.coefficient is None for grid in (*skins, *own))):
             raise ValueError(
-                "a geom is a skin: pass own=, the DistanceGrid of the skin that it touches; both need "
+                "a geom is a skin: pass own=, two DistanceGrids of the skin that it touches; all need "
                 "bake_distance_grid(vert, face, smooth=True)"
             )
         size = np.zeros((count, 3))
@@ -99,21 +100,20 @@ class GeomSet:
         groups = np.zeros(count, int) if groups is None else np.asarray(groups, int)
         if not (np.isfinite(friction).all() and (friction >= 0).all()):
             raise ValueError(f"friction {friction.tolist()} must be finite and not negative")
-        number = np.cumsum(gridded) - 1 if count else np.zeros(0)
         self.types, self.count, self.nworld, self.device = list(types), count, nworld, wp.get_device(device)
         self.ngroup = int(groups.max()) + 1 if count else 0
         self.groups, self._grids, self._rounding = groups, list(grids), rounding
         struct = Geoms()
         with wp.ScopedDevice(self.device):
             set_fields(struct, count=count, kind=[GEOM_TYPES[k] for k in types], size=size, group=groups)
-            set_fields(struct, rounding=rounding, grid=np.maximum(number, 0))
+            set_fields(struct, rounding=rounding, grid=number)
             set_fields(struct, friction=np.repeat(friction[:, None], nworld, 1))
             set_fields(struct, mat=np.tile(np.eye(3), (count, nworld, 1, 1)))
             add_zeros(struct, "window turn", count)
             add_zeros(struct, "pos", count, nworld)
             allocate("geoms", struct, {"geom": count, "world": nworld})
         struct.own = len(grids)
-        struct.grids, self._meshes = pack_grids([*grids, own] if "skin" in types else grids, self.device)
+        struct.grids, self._meshes = pack_grids([*grids, *own], self.device)
         self.struct = struct
         self.posed = False
         self.advance()
@@ -136,8 +136,8 @@ class GeomSet:
         radius = np.where(curved, size.min(1) ** 2 / np.maximum(size.max(1), 1e-12), self._rounding)
         edged = curved | np.isin(self.types, ("box", "cylinder", "mesh"))
         self.struct.window.assign(np.where(edged & (radius < spacing), WINDOW / samples, 0.0))
-        widths = iter([grid.facet_width for grid in self._grids])
-        width = np.array([next(widths) if kind in ("mesh", "skin") else 0.0 for kind in self.types])
+        meshes = zip(self.struct.grid.numpy().tolist(), self.types)
+        width = np.array([self._grids[k].facet_width if kind == "mesh" else 0.0 for k, kind in meshes])
         width = np.clip(width, spacing, 2 / 3**0.25 * samples * spacing)  # at most an edge of the skin's
         turn = np.outer(spacing / width, TURN)
         self.struct.turn.assign(np.cos(np.radians(turn)))

@@ -55,8 +55,7 @@ class World:
             t.skins_met = [
                 (other, k)
                 for other in self.coupled
-                for k in other.touching.skins
-                if other.touching.body[k] == t.touching.core
+                for k in np.flatnonzero(other.touching.body == t.touching.core).tolist()
             ]
         self.first = self.coupled[0].index if self.coupled else -1
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step

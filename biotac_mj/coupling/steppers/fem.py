@@ -438,8 +438,10 @@ def geom_set(
     Args:
       geometry: of that skin. nworld: number of worlds. device: Warp device.
     """
-    node, face = np.unique(close_rim(geometry.outer_face), return_inverse=True)
-    own = geometry.vert[node], face.reshape(-1, 3).astype(np.int32)
+    own = ()
+    if any(g.type == "skin" for g in geoms):
+        node, face = np.unique(close_rim(geometry.outer_face), return_inverse=True)
+        own = _grids_of_skin(geometry.vert[node], face.reshape(-1, 3).astype(np.int32), geometry.rigid)
     return GeomSet(
         [g.type for g in geoms],
         [g.size for g in geoms],
@@ -447,7 +449,7 @@ def geom_set(
         [g.group for g in geoms],
         [g.rounding for g in geoms],
         _grids_of(geoms),
-        _grid(*(a.tobytes() for a in own), True) if any(g.type == "skin" for g in geoms) else None,
+        own,
         nworld=nworld,
         device=device,
     )
@@ -459,19 +461,28 @@ def grid_of(vert: np.ndarray, face: np.ndarray) -> DistanceGrid:
 
 
 def _grids_of(geoms):
-    """Grids of the meshes and skins. A skin is smooth: between facets of its mesh the force would jump."""
-    return [
-        _grid(g.vert.tobytes(), g.face.tobytes(), g.type == "skin")
-        for g in geoms
-        if g.type in ("mesh", "skin")
-    ]
+    """Grids of the meshes and skins."""
+    out = []
+    for g in geoms:
+        if g.type == "mesh":
+            out.append(grid_of(g.vert, g.face))
+        elif g.type == "skin":
+            out += _grids_of_skin(g.vert, g.face, g.rigid)
+    return out
+
+
+def _grids_of_skin(vert, face, rigid):
+    """Grids of a skin and of its rigid parts, which reach as far. Both are smooth: between facets of the
+    meshes the force would jump."""
+    beyond = np.maximum(rigid[0].min(0) - vert.min(0), vert.max(0) - rigid[0].max(0)).max()
+    meshes = ((vert, face), 2e-3), (rigid, beyond + 2e-3)
+    return [_grid(*(a.tobytes() for a in mesh), True, float(margin)) for mesh, margin in meshes]
 
 
 @functools.lru_cache(maxsize=16)
-def _grid(vert, face, smooth=False):
-    return bake_distance_grid(
-        np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3), smooth=smooth
-    )
+def _grid(vert, face, smooth=False, margin=2e-3):
+    vert, face = np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3)
+    return bake_distance_grid(vert, face, margin=margin, smooth=smooth)
 
 
 _models = Shared(keep=2)

@@ -1,8 +1,7 @@
 """Geoms posed in the BioTac frame, and distances of points from them, in Warp.
 
 The skin of another BioTac deforms as this one does. Two skins in contact are each solved against the surface
-where the signed distances d1, d2 from both undeformed shapes are equal, the zeros of (d2 - d1) / 2; equal
-skins meet there by symmetry (`docs/design.md`, "Skin on skin").
+that parts their overlap as their thicknesses above core, nail and clamp (`docs/design.md`, "Skin on skin").
 """
 
 import warp as wp
@@ -49,7 +48,9 @@ class Geoms:
     pos_last: wp.array2d(dtype=vec3)
     mat_last: wp.array2d(dtype=mat33)
     grids: Grids
-    own: int  # grid of the undeformed skin that they touch, if the skin of another BioTac is among them
+    # grid of the undeformed skin that they touch, if the skin of another BioTac is among them; the grid after
+    # that of a skin is of its rigid parts
+    own: int
 
 
 @wp.struct
@@ -78,17 +79,49 @@ def least_to(geoms: Geoms, g: int, d: real):
 
 
 @wp.func
+def _thickness(grids: Grids, k: int, p: vec3, outside: wp.vec4d):
+    """Gradient and value of the thickness of skin k at a point that is `outside` off its undeformed shape."""
+    through = spline_field(grids, k + 1, p) - outside
+    if through[3] < real(0.0):
+        return wp.vec4d()
+    return through
+
+
+@wp.func
+def _turned(R: mat33, field: wp.vec4d):
+    """A gradient and value in a frame in which the present one has the rotation R."""
+    n = R * vec3(field[0], field[1], field[2])
+    return wp.vec4d(n[0], n[1], n[2], field[3])
+
+
+@wp.func
 def _between_skins(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
+    """Gradient and value of (d2 - d1) / 2 with the distances d1 from the own skin and d2 from the other,
+    where these overlap of a d2 - (1 - a) d1 with the own share a of their thicknesses, and that share."""
+    k = geoms.grid[g]
+    other = spline_field(geoms.grids, k, y)
+    straight = spline_field(geoms.grids, geoms.own, p)
+    own = _turned(wp.transpose(R), straight)
+    half = real(0.5) * (other - own)
+    overlap = other + own
+    if overlap[3] >= real(0.0):
+        return half, real(0.5)
+    theirs = _thickness(geoms.grids, k, y, other)
+    mine = _turned(wp.transpose(R), _thickness(geoms.grids, geoms.own, p, straight))
+    both = mine[3] + theirs[3]
+    if both == real(0.0):
+        return half, real(0.5)
+    share = mine[3] / both
+    turning = (theirs[3] * mine - mine[3] * theirs) / (both * both)  # its gradient
+    turning[3] = real(0.0)
+    return half + (share - real(0.5)) * overlap + overlap[3] * turning, share
+
+
+@wp.func
+def _apart(geoms: Geoms, g: int, p: vec3, y: vec3):
+    """Lower bound of the value of `_between_skins`, but for errors of the grids."""
     theirs = grid_value(geoms.grids, geoms.grid[g], y)
-    mine = grid_value(geoms.grids, geoms.own, p)
-    d = real(0.5) * (theirs - mine)
-    if least_to(geoms, g, d) > real(0.0):  # surely outside: no contact here
-        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    other = spline_field(geoms.grids, geoms.grid[g], y)
-    own = spline_field(geoms.grids, geoms.own, p)
-    n = vec3(other[0], other[1], other[2]) - wp.transpose(R) * vec3(own[0], own[1], own[2])
-    n = wp.normalize(n)
-    return wp.vec4d(n[0], n[1], n[2], real(0.5) * (other[3] - own[3]))
+    return wp.min(theirs, real(0.5) * (theirs - grid_value(geoms.grids, geoms.own, p)))
 
 
 # a call copies all that Geoms hold: 1.6 kB, more work on the CPU than the distance from a sphere
@@ -97,21 +130,20 @@ def distance_from(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
     """Outward unit normal (x, y, z), in the geom's frame, and signed distance (w) [m] of point p of the
     BioTac frame from geom g with rotation R, in whose frame p is y."""
     if geoms.kind[g] == SKIN:
-        return _between_skins(geoms, g, p, y, R)
+        least = _apart(geoms, g, p, y)
+        if least_to(geoms, g, least) > real(0.0):  # surely outside: no contact here
+            return wp.vec4d(real(1.0), real(0.0), real(0.0), least)
+        field, _share = _between_skins(geoms, g, p, y, R)
+        n = wp.normalize(vec3(field[0], field[1], field[2]))
+        return wp.vec4d(n[0], n[1], n[2], field[3])
     return distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-
-
-@wp.func
-def _bound_between(geoms: Geoms, g: int, p: vec3, y: vec3):
-    difference = grid_value(geoms.grids, geoms.grid[g], y) - grid_value(geoms.grids, geoms.own, p)
-    return least_to(geoms, g, real(0.5) * difference)
 
 
 @wp.func
 def bound_to(geoms: Geoms, g: int, p: vec3, y: vec3):
     """Lower bound of the distance of point p, y in the frame of geom g [m]; cheap far from the geom."""
     if geoms.kind[g] == SKIN:
-        return _bound_between(geoms, g, p, y)
+        return least_to(geoms, g, _apart(geoms, g, p, y))
     return distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
 
 
@@ -242,10 +274,12 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
 
 
 @wp.func
-def convected_anchor(geoms: Geoms, g: int, w: int, stick: vec3):
-    """Anchor of the last step in the present frame of geom g. On another skin it moves half as far, as the
-    surface between both does."""
+def convected_anchor(geoms: Geoms, g: int, w: int, stick: vec3, y: vec3):
+    """Anchor of the last step in the present frame of geom g, of a point at y there. On another skin it moves
+    by the own share of the body's way, as the surface between both does."""
     if geoms.kind[g] == SKIN:
+        p = geoms.mat[g, w] * y + geoms.pos[g, w]
+        _field, share = _between_skins(geoms, g, p, y, geoms.mat[g, w])
         there = place_on(geoms, g, w, geoms.mat_last[g, w] * stick + geoms.pos_last[g, w])
-        return real(0.5) * (stick + there)
+        return there + share * (stick - there)
     return stick

@@ -357,7 +357,7 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                         last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
                         stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
                     if wp.static(shapes == SKINS):
-                        stick = convected_anchor(geoms, touched, w, stick)
+                        stick = convected_anchor(geoms, touched, w, stick, local)
                     most = mu * fn
                     if friction_mode == LAGGED:
                         most = c.bound[i, w]
