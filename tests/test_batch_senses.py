@@ -66,7 +66,7 @@ def test_what_the_device_feels_is_what_one_sensor_feels():
         touched.begin()
         result = stepper.solve_skin(state, place(i)[None], np.eye(3)[None], DT)
         expected = shaking.of_step(state, result, DT)
-        area, state = stepper.touched_area(result.state), result.state
+        area, state = stepper.contact_area(result), result.state
         stepper._data.dt.fill_(DT)
         wrench = wp.array(result.wrench[:, None], dtype=wp.spatial_vectord, device=device)
         touched.end(wrench, wp.array(result.tangent[:, None], dtype=wp.spatial_matrixd, device=device))

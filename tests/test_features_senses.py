@@ -146,7 +146,7 @@ def by_generate(settings, file, tier="full"):
     sense, _ = draw_sense(options, [SEED, 0, 3], maker.few)
     film = FilmConduction(maker.geometry, **read_film((options.options or {}).get("film")))
     x = fields.vert_xpos(maker.geometry.vert, 0)
-    read = read_motion(film, x, maker.time, fields.pressure[0], 1, sense, fields.touch(0))
+    read = read_motion(film, x, maker.time, fields.pressure[0], 1, sense, fields.touch(maker.model, 0))
     return _by_channel(read.counts, read.pac)
 
 

@@ -120,7 +120,7 @@ def test_a_height_presses_as_much_as_the_plate_that_goes_as_deep():
         found, state = shaking.of_step(state, result, 2e-3), result.state
         pressure.append(result.pressure)
     _, gain, slip, area = found
-    assert area[0] == pytest.approx(stepper.touched_area(state)[0], rel=1e-6) and area[0] > 0
+    assert area[0] == pytest.approx(stepper.contact_area(result)[0], rel=1e-6) and area[0] > 0
     assert slip[0] < 0.01 and gain[0, -1] > 0
     assert gain[0, -1] == pytest.approx((pressure[-1] - pressure[-3]) / 4e-5, rel=0.35)
 

@@ -330,6 +330,7 @@ class Instance:
         return dataclasses.replace(
             result,
             state=state,
+            load=np.ones(len(stepper.contact_rows(state))),  # not known: even
             wrench=wrench,
             tangent=tangent,
             pose=tuple(last),
@@ -344,7 +345,7 @@ class Instance:
                 felt = result.wrench / self.touching.fraction[:, None]  # by the skin itself
                 if config.thermal is not None:
                     after = result.state is not None
-                    area = skin.stepper.touched_area(result.state) if after else np.zeros(self.setup.ngroup)
+                    area = skin.stepper.contact_area(result) if after else np.zeros(self.setup.ngroup)
                     touch = {"area": area, "force": np.linalg.norm(felt[:, :3], axis=1)}
                 if config.textures is not None:
                     whole = dataclasses.replace(result, wrench=felt)

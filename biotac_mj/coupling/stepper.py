@@ -170,8 +170,14 @@ class SkinStepper:
         None: the skin changes while nothing moves."""
         return None
 
-    def touched_area(self, state: np.ndarray) -> np.ndarray:
-        """(ngroup,) area of the skin that each body touches in a state [m^2]; used by sensors with heat."""
+    def contact_rows(self, state: np.ndarray) -> np.ndarray:
+        """Contacts (k, 5) in a state, with forces `SkinResult.load`: sample of the outer surface, geom, and
+        anchor in its frame [m]."""
+        return np.zeros((0, 5))
+
+    def contact_area(self, result: SkinResult) -> np.ndarray:
+        """(ngroup,) area of the skin on which each body presses at the end of a solve [m^2], see
+        `geometry.surface.pressure_area`; used by sensors with heat."""
         raise NotImplementedError
 
     def touched_faces(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

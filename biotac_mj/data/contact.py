@@ -3,21 +3,8 @@
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.surface import face_areas, node_areas, node_normals
+from ..geometry.surface import FORCE_TOUCHES, face_areas, node_areas, node_normals, pressure_area
 from .schema import nodes_of
-
-_TOUCH = 1e-6  # [N]: less is no contact
-
-
-def pressure_area(force: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """(n,) area [m^2] on which forces (n, nnode) [N] press nodes with areas (nnode,) [m^2]; 0 without force.
-
-    9/8 (int p dA)^2 / int p^2 dA, which is the area of a contact whose pressure p falls to 0 at its edge as
-    Hertz's does. An even pressure has 9/8 of its area. The pressure is a node's force over its area, so that
-    the area follows the forces without steps; it is at least 9/8 of a node's."""
-    square = (force**2 / area).sum(1)
-    total = force.sum(1)
-    return 9 / 8 * np.divide(total**2, square, out=np.zeros(len(force)), where=total > _TOUCH)
 
 
 def contact_labels(
@@ -35,7 +22,7 @@ def contact_labels(
     """
     outer, size = nodes_of(geometry), np.linalg.norm(np.asarray(force, float), axis=2)
     total = size.sum(1)
-    touches = total > _TOUCH
+    touches = total > FORCE_TOUCHES
     weight = size / np.where(touches, total, 1.0)[:, None]
     at_rest = geometry.vert if rest is None else geometry.vert + rest
     facing = node_normals(at_rest, geometry.outer_face)[outer]

@@ -61,7 +61,7 @@ class Interaction:
       contact_pos: (n, 3) centre of the contact forces on the deformed skin, weighted by their norm [m];
         contact_normal: (n, 3) unit outward normal of the deformed skin there. Both NaN without contact.
       contact_depth: (n,) largest inward displacement of the nodes in contact, along the normals of the
-        untouched skin [m]; contact_area: (n,) on which it presses [m^2], `data.contact.pressure_area`. Both 0
+        untouched skin [m]; contact_area: (n,) on which it presses [m^2], `surface.pressure_area`. Both 0
         without contact.
       pressure: (n,) of the liquid above rest [Pa].
       impedance: (n, nelectrode) e1, e2, ... of the simulated film [ohm].

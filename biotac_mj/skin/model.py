@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ..fields import as_real, check_choice, check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.surface import face_areas
+from ..geometry.surface import face_areas, node_areas
 from ..geometry.tet_mesh import enclosed_volume
 from ..quiet import announce_compilation
 from ..threads import single_thread
@@ -195,6 +195,10 @@ class Surface:
     def rest_at(self, vert: np.ndarray) -> None:
         """Sets other reference positions (nvert, 3) [m]."""
         self.area.assign(np.linalg.norm(face_areas(vert, self.face_np), axis=1))
+
+    def node_areas(self) -> np.ndarray:
+        """(n,) areas of `node` [m^2]."""
+        return node_areas(self.face_np, self.area.numpy(), len(self.start) - 1)[self.node.numpy()]
 
 
 _STIFF_IN_VOLUME = 0.45  # Poisson's ratio above which half precision loses the compliance to volume change

@@ -8,6 +8,7 @@ friction anchors over the body."""
 import numpy as np
 import warp as wp
 
+from ..geometry.surface import FORCE_TOUCHES, OF_HERTZ
 from ..kernels import kernel_module
 from .data import SkinData
 from .modes import SkinModes
@@ -18,17 +19,12 @@ kernel_module(__name__)
 vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
-_CHUNK = 96  # faces that one thread sums
-# sums of a chunk: force on samples, area, force on samples that touched before, its product with their
-# anchors' motion
-_LOAD, _AREA, _LASTING, _PATH = range(4)
+_TOUCHES, _OF_HERTZ = wp.constant(real(FORCE_TOUCHES)), wp.constant(real(OF_HERTZ))
 
-
-def sample_areas(face: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """(k,) area of each of k samples in contact, on faces number `face` (k,) of this area (nface,) [m^2]. A
-    stiff contact touches a flat face at a few samples, but its pressure acts on the whole face: these share
-    it."""
-    return area[face] / np.bincount(face, minlength=len(area))[face]
+_CHUNK = 96  # faces, or nodes, that one thread sums
+# sums of a chunk: force on samples, force on samples that touched before, its product with their anchors'
+# motion
+_LOAD, _LASTING, _PATH = range(3)
 
 
 def faces_of(modes: SkinModes, face: np.ndarray, nvert: int) -> np.ndarray:
@@ -44,7 +40,6 @@ def faces_of(modes: SkinModes, face: np.ndarray, nvert: int) -> np.ndarray:
 def sum_chunks(
     # In:
     nsample: int,
-    area: wp.array(dtype=real),
     group: wp.array(dtype=int),
     response: wp.array2d(dtype=vec3),
     kept: wp.array2d(dtype=int),
@@ -67,10 +62,6 @@ def sum_chunks(
             sum_out[g, c, w] = vec6()
     for f in range(c * _CHUNK, wp.min((c + 1) * _CHUNK, kept.shape[0])):
         if kept[f, w] == 1:
-            touching = int(0)
-            for s in range(nsample):
-                if geom[f * nsample + s, w] >= 0:
-                    touching += 1
             for s in range(nsample):
                 i = f * nsample + s
                 k = geom[i, w]
@@ -82,13 +73,46 @@ def sum_chunks(
                     if m == 0:
                         one = vec6()
                         one[_LOAD] = load
-                        one[_AREA] = area[f] / real(touching)  # see sample_areas
                         if geom_last[i, w] == k:
                             one[_LASTING] = load
                             path = load * (anchor[i, w] - anchor_last[i, w])
                             for a in range(3):
                                 one[_PATH + a] = path[a]
                         sum_out[g, c, w] = sum_out[g, c, w] + one
+
+
+@wp.kernel
+def sum_pressure(
+    # In:
+    sample: wp.array(dtype=vec3),
+    group: wp.array(dtype=int),
+    node: wp.array(dtype=int),
+    area: wp.array(dtype=real),
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    kept: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # Out:
+    sum_out: wp.array3d(dtype=wp.vec2d),
+):
+    """Force of each body on the nodes of a chunk, and its square over their areas [group, chunk, world]."""
+    c, w = wp.tid()
+    nsample = sample.shape[0]
+    for g in range(sum_out.shape[0]):
+        total = wp.vec2d()
+        for n in range(c * _CHUNK, wp.min((c + 1) * _CHUNK, node.shape[0])):
+            load = real(0.0)
+            for k in range(start[node[n]], start[node[n] + 1]):
+                f = slot[k] // 3
+                if kept[f, w] == 1:
+                    for s in range(nsample):
+                        i = f * nsample + s
+                        if geom[i, w] >= 0:
+                            if group[geom[i, w]] == g:
+                                load += sample[s][slot[k] % 3] * wp.length(force[i, w])
+            total += wp.vec2d(load, load * load / area[n])
+        sum_out[g, c, w] = total
 
 
 @wp.kernel
@@ -99,6 +123,7 @@ def write_bodies(
     tangent: wp.array2d(dtype=mat66),
     sums: wp.array3d(dtype=vec6),
     response: wp.array4d(dtype=vec3),
+    pressure: wp.array3d(dtype=wp.vec2d),
     # Out:
     area_out: wp.array2d(dtype=real),
     force_out: wp.array2d(dtype=real),
@@ -122,7 +147,12 @@ def write_bodies(
             path = vec3(total[_PATH], total[_PATH + 1], total[_PATH + 2])
             if total[_LASTING] > real(0.0):
                 path = path / total[_LASTING]
-            area_out[w, g] = total[_AREA]
+            pressed = wp.vec2d()
+            for c in range(pressure.shape[1]):
+                pressed += pressure[g, c, w]
+            area_out[w, g] = real(0.0)
+            if pressed[0] > _TOUCHES:
+                area_out[w, g] = _OF_HERTZ * pressed[0] * pressed[0] / pressed[1]
             force_out[w, g] = size
             slip_out[w, g] = real(0.0)
             if dt[w] > real(0.0):
@@ -151,7 +181,8 @@ class Touched:
       modes: of the skin; None: without `drive` and `gain`.
 
     Attributes (wp.arrays float64, written by `end`):
-      area, force, slip: (nworld, ngroup) contact area of each body [m^2], force [N] and speed of slip [m/s].
+      area, force, slip: (nworld, ngroup) contact area of each body [m^2], see `pressure_area`, force [N] and
+        speed of slip [m/s].
       drive: (nworld, nmode) modal force of all contacts [N kg^-1/2].
       gain: (nworld, ngroup, nmode + 1) modal forces by a height under each body [N kg^-1/2 / m] and, last,
         its steady pressure [Pa/m].
@@ -165,12 +196,14 @@ class Touched:
         response = np.zeros((0, nface, 3))
         if modes is not None:
             response = np.ascontiguousarray(faces_of(modes, model.outer.face_np, model.nvert).swapaxes(0, 1))
-        chunks = -(-nface // _CHUNK)
+        chunks, nodes = (-(-n // _CHUNK) for n in (nface, len(model.outer.node)))
         with wp.ScopedDevice(self.device):
             self._group = wp.array(np.asarray(group, np.int32), dtype=int)
             self._response = wp.array(response, dtype=vec3, ndim=2)
             self._geom, self._anchor = wp.empty_like(data.outer.anchor_geom), wp.empty_like(data.outer.anchor)
             self._geom.fill_(-1)
+            self._node_area = wp.array(model.outer.node_areas(), dtype=real)
+            self._pressure = wp.zeros((ngroup, nodes, nworld), dtype=wp.vec2d)
             self._sums = wp.zeros((ngroup, chunks, nworld), dtype=vec6)
             self._response_sums = wp.zeros((self._rows, ngroup, chunks, nworld), dtype=vec3)
             self.area, self.force, self.slip = (wp.zeros((nworld, ngroup), dtype=real) for _ in range(3))
@@ -192,9 +225,13 @@ class Touched:
         """
         d, nworld = self._data, self._data.nworld
         outer, shape = d.outer, (self._rows, self._sums.shape[1], nworld)
-        inputs = [len(d.model.sample), d.model.outer.area, self._group, self._response, outer.kept]
+        surface, sample = d.model.outer, d.model.sample
+        inputs = [sample, self._group, surface.node, self._node_area, surface.start, surface.slot]
+        inputs += [outer.kept, outer.anchor_geom, outer.sample_force]
+        wp.launch(sum_pressure, self._pressure.shape[1:], inputs, [self._pressure], device=self.device)
+        inputs = [len(sample), self._group, self._response, outer.kept]
         inputs += [outer.anchor_geom, outer.anchor, self._geom, self._anchor, outer.sample_force]
         wp.launch(sum_chunks, shape, inputs, [self._sums, self._response_sums], device=self.device)
-        inputs = [d.dt, wrench, tangent, self._sums, self._response_sums]
+        inputs = [d.dt, wrench, tangent, self._sums, self._response_sums, self._pressure]
         outputs = [self.area, self.force, self.slip, self.drive, self.gain]
         wp.launch(write_bodies, (self._rows, nworld), inputs, outputs, device=self.device)

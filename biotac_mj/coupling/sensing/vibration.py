@@ -58,7 +58,7 @@ class Shaking:
         if not len(rows):
             return None
         drive, gain = np.zeros(NMODE), np.zeros((self._ngroup, NMODE + 1))
-        slip, area = np.zeros(self._ngroup), self._stepper.touched_area(result.state)
+        slip, area = np.zeros(self._ngroup), self._stepper.contact_area(result)
         sample, geom = rows[:, :2].T.astype(int)
         group, face = self._group[geom], sample // len(self._stepper.model.sample)
         moved, known = self._moved(self._stepper.contact_rows(before), rows, sample)

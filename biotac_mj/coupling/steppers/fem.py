@@ -11,6 +11,7 @@ import warp as wp
 from ...cache import digest
 from ...geometry.skin_geometry import SkinGeometry
 from ...geometry.solid import close_rim
+from ...geometry.surface import pressure_area
 from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ...skin.bodies import BodyMotion
 from ...skin.contact.meshes import DistanceGrid
@@ -19,7 +20,6 @@ from ...skin.model import solved_geometry
 from ...skin.settings import Settings, read_settings
 from ...skin.state import FULL, SavedState, StateLayout, options_of
 from ...skin.state_arrays import StateArrays
-from ...skin.touched import sample_areas
 from ..config import Config
 from ..shared import Shared
 from ..stepper import Geom, SkinResult, SkinStepper
@@ -166,18 +166,26 @@ class FemStepper(SkinStepper):
         return self._model
 
     def contact_rows(self, state: np.ndarray) -> np.ndarray:
-        """Contacts (k, 5) in a state: sample of the outer surface, geom, and anchor in its frame [m]."""
         return self._layout.rows(state, "contacts")
 
     def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3)
 
-    def touched_area(self, state: np.ndarray) -> np.ndarray:
+    def contact_area(self, result: SkinResult) -> np.ndarray:
         """Of the shape at rest."""
         group = np.array([g.group for g in self._geoms], int)
-        geom = self.contact_rows(state)[:, 1].astype(int)
-        area = sample_areas(self._touched_faces(state), self._model.outer.area.numpy())
-        return np.bincount(group[geom], area, minlength=1 + max(group, default=-1))
+        sample, geom = self.contact_rows(result.state)[:, :2].T.astype(int)
+        force = np.zeros((1 + max(group, default=-1), self._model.nvert))
+        if not len(sample):
+            return force.sum(1)
+        face, part = np.divmod(sample, len(self._model.sample))
+        load = self._model.sample.numpy()[part] * result.load[:, None]
+        np.add.at(force, (group[geom][:, None], self._model.outer.face_np[face]), load)
+        return pressure_area(force[:, self._model.outer.node.numpy()], self._node_areas)
+
+    @functools.cached_property
+    def _node_areas(self):
+        return self._model.outer.node_areas()
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
         self._unpack(state)

@@ -243,7 +243,7 @@ class Maker:
                 fields.pressure[k],
                 noise[k],
                 senses[k],
-                fields.touch(k),
+                fields.touch(self.model, k),
                 None if fields.rest is None else fields.rest[k],
             )
             for k in range(len(motions))

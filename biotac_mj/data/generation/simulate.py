@@ -8,11 +8,12 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from ...geometry.surface import pressure_area
 from ...kernels import kernel_module
 from ...skin import GeomSet, SkinModel, step
 from ...skin.modes import SkinModes
 from ...skin.per_world import make_worlds
-from ...skin.touched import Touched, sample_areas
+from ...skin.touched import Touched
 from ...skin.types import real, vec3
 from ..contact import contact_labels
 from ..objects import make_object
@@ -36,7 +37,6 @@ class Fields:
         unstressed skin.
       contact_force: (k, n, nouter, 3) float32 [N].
       wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
-      area: (k, n) contact area [m^2].
       slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; empty
         without modes.
       rest: (k, nvert, 3) displacements of the skins at rest [m], if they differ; else None.
@@ -47,16 +47,16 @@ class Fields:
     wrench: np.ndarray
     pressure: np.ndarray
     converged: np.ndarray
-    area: np.ndarray
     slip: np.ndarray
     drive: np.ndarray
     gain: np.ndarray
     rest: np.ndarray | None = None
 
-    def touch(self, i: int) -> Touch:
+    def touch(self, model: SkinModel, i: int) -> Touch:
         """The object's contact in interaction i."""
+        area = pressure_area(np.linalg.norm(self.contact_force[i], axis=2), model.outer.node_areas())
         force = np.linalg.norm(self.wrench[i, :, :3], axis=1)
-        return Touch(self.area[i], force, self.slip[i], self.drive[i], self.gain[i])
+        return Touch(area, force, self.slip[i], self.drive[i], self.gain[i])
 
     def vert_xpos(self, vert: np.ndarray, i: int) -> np.ndarray:
         """(n, nvert, 3) stored node positions of interaction i [m]; vert: the skin at rest."""
@@ -162,7 +162,7 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
     fields = _empty(nworld, nstep, model.nvert, len(outer), 0 if modes is None else len(modes.rate))
     if data.rests is not None:
         fields.rest = (data.rests.vert - model.geometry.vert).astype(np.float32)
-    touched = Touched(data, np.zeros(scene.geoms.count, int), 1, modes)
+    touched = None if modes is None else Touched(data, np.zeros(scene.geoms.count, int), 1, modes)
     reader = _Reader(model, outer)
     walks = [_walk(m.pos, m.mat) for m in motions]
     clocks = None
@@ -173,7 +173,8 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         at = [min(k, len(w[0]) - 1) for w in walks]  # finished motions stay at their end
         scene.place([w[0][i] for w, i in zip(walks, at)], [w[1][i] for w, i in zip(walks, at)])
         dt = None if clocks is None else np.array([c[i] for c, i in zip(clocks, at)])
-        touched.begin()
+        if touched:
+            touched.begin()
         step(model, data, scene.geoms, dt)
         there = np.array([[i, w[2][k]] for i, w in enumerate(walks) if k < len(w[0]) and w[2][k] >= 0])
         if not len(there):
@@ -185,25 +186,24 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         fields.wrench[world, row], fields.pressure[world, row] = data.wrench[world, 0], data.pressure[world]
         if dt is not None:
             data.dt.assign(dt)
-        _evaluate_touch(touched, data, scene.geoms, modes is not None)
-        for name in ("area", "slip", "drive", "gain"):
-            array = getattr(touched, name).numpy()
-            getattr(fields, name)[world, row] = array[world] if name == "drive" else array[world, 0]
+        if touched:
+            _evaluate_touch(touched, data, scene.geoms)
+            for name in ("slip", "drive", "gain"):
+                array = getattr(touched, name).numpy()
+                getattr(fields, name)[world, row] = array[world] if name == "drive" else array[world, 0]
         if progress:
             progress(len(there))
     return fields
 
 
-def _evaluate_touch(touched, data, geoms, shaken):
+def _evaluate_touch(touched, data, geoms):
     """Evaluates `touched` for the step's result; the tangent costs a solve."""
-    device = data.model.device
-    wrench = np.ascontiguousarray(np.swapaxes(data.wrench, 0, 1))
-    shape = (geoms.ngroup, data.nworld, 6, 6)
-    tangent = np.swapaxes(data.tangent(geoms), 0, 1) if shaken else np.zeros(shape)
-    touched.end(
-        wp.array(wrench, dtype=wp.spatial_vectord, ndim=2, device=device),
-        wp.array(np.ascontiguousarray(tangent), dtype=wp.spatial_matrixd, ndim=2, device=device),
-    )
+    wrench, tangent = (np.ascontiguousarray(a.swapaxes(0, 1)) for a in (data.wrench, data.tangent(geoms)))
+    with wp.ScopedDevice(data.model.device):
+        touched.end(
+            wp.array(wrench, dtype=wp.spatial_vectord, ndim=2),
+            wp.array(tangent, dtype=wp.spatial_matrixd, ndim=2),
+        )
 
 
 def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, np.ndarray]:
@@ -226,7 +226,6 @@ def _simulate_condensed(model, names, motions, progress):
     nstep = len(motions[0].pos)
     outer = nodes_of(model.geometry)
     fields = _empty(len(motions), nstep, model.nvert, len(outer), 0)
-    area = model.outer.area.numpy()
     skins = {}
     for k, (name, motion) in enumerate(zip(names, motions)):
         if name not in skins:
@@ -246,8 +245,6 @@ def _simulate_condensed(model, names, motions, progress):
                 )
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
                 fields.contact_force[k, row] = skin.contact_force(memory)[outer]
-                face = memory.contacts[:, 0].astype(int) // len(model.sample)
-                fields.area[k, row] = sample_areas(face, area).sum()
         if progress:
             progress(nstep)
     return fields
@@ -342,7 +339,6 @@ def _empty(nworld, nstep, nvert, nouter, nmode):
         np.zeros((nworld, nstep, 6)),
         np.zeros((nworld, nstep)),
         np.ones((nworld, nstep), bool),
-        np.zeros((nworld, nstep)),
         np.zeros((nworld, nstep)),
         np.zeros((nworld, nstep, nmode)),
         np.zeros((nworld, nstep, nmode + 1 if nmode else 0)),
