@@ -56,12 +56,11 @@ def play(env: object, world: int, start: np.ndarray, controls: np.ndarray) -> np
 
     Args:
       env: the RollRod of the batch. start: (nq,) positions. controls: (step, nu)."""
-    from biotac_mj.tasks.batched.hand import Rod, build
+    from biotac_mj.tasks.batched.hand import build
 
     s, friction = env.cfg, next(iter(env.batches.values())).skin.geoms.struct.friction.numpy()[0]
     spec, _ = build(
         env._hand,
-        Rod(),
         s.timestep,
         False,
         skin="coarse",

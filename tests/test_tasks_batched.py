@@ -449,8 +449,8 @@ def test_what_only_a_task_has_is_refused_elsewhere(capsys):
 def test_a_misspelt_keyword_is_answered_with_those_of_the_task():
     with pytest.raises(TypeError, match=r"has 'observes': did you mean 'observe'\? .*history.*sensor"):
         make("follow_edge", num_envs=2, observes="force")
-    with pytest.raises(TypeError, match="has 'rodd': did you mean 'rod'"):
-        make("roll_rod", rodd=None)
+    with pytest.raises(TypeError, match="has 'hands': did you mean 'hand'"):
+        make("roll_rod", hands=None)
     assert tuple(TASKS) == NAMES
 
 

@@ -44,9 +44,9 @@ def assign(count: int, seed: int = 0, fractions: tuple = FRACTIONS) -> np.ndarra
     return np.array(SPLITS)[np.random.default_rng(seed).permutation(subset)]
 
 
-def least_count(train: int = 1, validation: int = 1, test: int = 1) -> int:
+def least_count(train: int = 1, validation: int = 1) -> int:
     """Smallest number of interactions of which `assign` gives each part so many."""
-    needed = dict(zip(SPLITS, (train, validation, test)))
+    needed = dict(zip(SPLITS, (train, validation, 1)))
     for count in itertools.count(1):
         subset = assign(count)
         if all((subset == name).sum() >= least for name, least in needed.items()):

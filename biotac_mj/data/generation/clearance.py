@@ -15,6 +15,7 @@ from ..objects import make_object
 kernel_module(__name__)
 
 _FAR = 2e-3  # [m] range of a mesh's distance grid
+_REACH = 0.12  # [m] longest travel to the first touch
 
 
 @wp.kernel
@@ -80,26 +81,21 @@ def surface_samples(vert: np.ndarray, face: np.ndarray, device: str, order: int 
 
 
 def first_touch(
-    placed: Placed,
-    points: wp.array,
-    start: np.ndarray,
-    mat: np.ndarray,
-    direction: np.ndarray,
-    reach: float = 0.12,
+    placed: Placed, points: wp.array, start: np.ndarray, mat: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
     """Travel (nworld,) [m] from start (nworld, 3) along direction (nworld, 3) until the object touches one of
     the points.
 
     Each step is as long as the smallest distance, so it cannot pass a point. NaN if none is met within
-    `reach`, or if the object starts in contact."""
+    `_REACH`, or if the object starts in contact."""
     travel = np.zeros(len(start))
     for _ in range(400):
         placed.place(start + travel[:, None] * direction, mat)
         gap = placed.nearest(points)
         if not travel.any():
             begun = gap > 0
-        moving = begun & (gap > 1e-7) & (travel < reach)
+        moving = begun & (gap > 1e-7) & (travel < _REACH)
         if not moving.any():
             break
         travel += np.where(moving, gap, 0)
-    return np.where(begun & (travel < reach) & (gap < 1e-5), travel, np.nan)
+    return np.where(begun & (travel < _REACH) & (gap < 1e-5), travel, np.nan)

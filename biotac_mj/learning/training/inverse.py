@@ -25,19 +25,17 @@ class InverseHead(nn.Module):
 
     Args:
       pod: Pod of the displacements. force_modes: components of the force. nouter: outer nodes.
-      nelectrode: electrodes. width, dropout: of the network.
+      nelectrode: electrodes.
     """
 
-    def __init__(
-        self, pod: Pod, force_modes: int, nouter: int, nelectrode: int, width: int = 256, dropout: float = 0.2
-    ):
+    def __init__(self, pod: Pod, force_modes: int, nouter: int, nelectrode: int):
         super().__init__()
         self.pod = pod
         self.modes = pod.basis.shape[1]
         self.register_buffer("force_basis", torch.zeros(nouter, force_modes))
         self.register_buffer("force_scale", torch.ones(force_modes))
         self.register_buffer("scale", torch.ones(nelectrode))
-        self.net = mlp([nelectrode, width, width, self.modes + force_modes], dropout)
+        self.net = mlp([nelectrode, 256, 256, self.modes + force_modes], 0.2)
 
     def codes(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Components of displacement (n, modes), relative to the root mean square of the first, and of force,

@@ -15,24 +15,14 @@ JOINTS = tuple(f"{f}J{i}" for f in ("FF", "MF") for i in (4, 3, 2, 1)) + tuple(
 )
 _ACTUATORS = ("FFJ4", "FFJ3", "FFJ0", "MFJ4", "MFJ3", "MFJ0", "THJ5", "THJ4", "THJ3", "THJ2", "THJ1")
 _PAD = np.array([-12e-3, -8.0e-3, 0.0])  # where a pad meets the rod, in the BioTac frame [m]
+_RADIUS, _HALF_LENGTH, _MASS = 10e-3, 30e-3, 15e-3  # of the rod, a capsule [m], [kg]
 _GAP = 1e-3  # between pads and rod before they close [m]
 _MARGIN = 0.1  # that joints stay away from their ends [rad]
 # a precision grip to begin the search with [rad]: knuckles bent, thumb opposed
 _GUESS = np.array([0, 0.9, 0.5, 0.5, 0, 0.9, 0.5, 0.5, 0.3, 1.0, 0, 0.2, 0.4])
 _STARTS = 20
-
-
-@dataclasses.dataclass(frozen=True)
-class Rod:
-    """The rod, a capsule.
-
-    Attributes:
-      radius, half_length [m]: of its cylinder; mass [kg].
-    """
-
-    radius: float = 10e-3
-    half_length: float = 30e-3
-    mass: float = 15e-3
+_SQUEEZE = np.array([12e-3, 12e-3, -6e-3])  # of the pads along the normal [m]
+_DAMPING = 5e-3  # [m/rad], below which a joint is no lever
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +51,7 @@ class Pinch:
 
 
 def build(
-    hand: pathlib.Path | str, rod: Rod, timestep: float, batch: bool, **settings: object
+    hand: pathlib.Path | str, timestep: float, batch: bool, **settings: object
 ) -> tuple[mujoco.MjSpec, dict]:
     """The model's spec, and what `attach_to_hand` returns.
 
@@ -107,18 +97,18 @@ def build(
     body.add_geom(
         name="rod",
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=[rod.radius, rod.half_length, 0],
-        mass=rod.mass,
+        size=[_RADIUS, _HALF_LENGTH, 0],
+        mass=_MASS,
         material="rod",
         rgba=[0.85, 0.45, 0.15, 1],
     )
     return spec, attach_to_hand(spec, "shadow_hand", fingers=FINGERS, batch=batch, **settings)
 
 
-def find_pinch(model: mujoco.MjModel, rod: Rod, squeeze: tuple = (12e-3, 6e-3)) -> Pinch:
+def find_pinch(model: mujoco.MjModel) -> Pinch:
     """A precision grip: two pads on one side of the rod, the thumb's on the other.
 
-    The servos are soft: pads press by wanting to be `squeeze` [m] (fingers, thumb) deep in the rod.
+    The servos are soft: pads press by wanting to be `_SQUEEZE` deep in the rod.
     """
     data = mujoco.MjData(model)
     joints = [model.joint(f"rh_{name}") for name in JOINTS]
@@ -145,7 +135,7 @@ def find_pinch(model: mujoco.MjModel, rod: Rod, squeeze: tuple = (12e-3, 6e-3)) 
         width = np.linalg.norm(normal)
         return np.concatenate(
             [
-                [400 * (width - 2 * (rod.radius + _GAP)), 200 * slant],
+                [400 * (width - 2 * (_RADIUS + _GAP)), 200 * slant],
                 (out - normal / width * np.array([-1, -1, 1])[:, None]).ravel(),
                 0.5 * (angle - _GUESS),
                 coupled(angle),
@@ -170,7 +160,7 @@ def find_pinch(model: mujoco.MjModel, rod: Rod, squeeze: tuple = (12e-3, 6e-3)) 
     axis, normal, _ = frame(pad)
     normal /= np.linalg.norm(normal)
     centre = 0.5 * (pad[:2].mean(0) + pad[2])
-    goal = pad - np.array([squeeze[0], squeeze[0], -squeeze[1]])[:, None] * normal
+    goal = pad - _SQUEEZE[:, None] * normal
 
     def press(angle):
         there, facing = pads(angle)
@@ -195,9 +185,8 @@ def find_pinch(model: mujoco.MjModel, rod: Rod, squeeze: tuple = (12e-3, 6e-3)) 
     return Pinch(qpos, address, actuators, *controls, axis, normal, centre, moves)
 
 
-def _pad_moves(pads, angle, across, normal, axis, damping=5e-3):
-    """(11, 6) controls by metre, see `Pinch`. pads: function (13,) -> (3, 3), (3, 3). damping: [m/rad], below
-    which a joint is no lever."""
+def _pad_moves(pads, angle, across, normal, axis):
+    """(11, 6) controls by metre, see `Pinch`. pads: function (13,) -> (3, 3), (3, 3)."""
     h = 1e-5
     columns = [(pads(angle + h * e)[0] - pads(angle - h * e)[0]) / (2 * h) for e in np.eye(len(angle))]
     out, own = np.zeros((13, 6)), (slice(0, 4), slice(4, 8), slice(8, 13))
@@ -205,7 +194,7 @@ def _pad_moves(pads, angle, across, normal, axis, damping=5e-3):
         # the last two joints of a finger bend together
         bend = np.eye(5) if k == 2 else np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]])
         lever = np.stack([across, normal, axis]) @ np.array([c[k] for c in columns[joints]]).T @ bend
-        inverse = lever.T @ np.linalg.inv(lever @ lever.T + damping**2 * np.eye(3))
+        inverse = lever.T @ np.linalg.inv(lever @ lever.T + _DAMPING**2 * np.eye(3))
         towards = 1 if k == 2 else -1  # the normal points from the thumb to the fingers
         out[joints, k], out[joints, 3 + k] = bend @ inverse[:, 0], towards * (bend @ inverse[:, 1])
     return np.stack([_controls(column) for column in out.T], axis=1)

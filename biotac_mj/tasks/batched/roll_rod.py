@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from .fixture import HeldSettings, HeldTask
-from .hand import _PAD, Rod, build, find_pinch
+from .hand import _PAD, build, find_pinch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class RollRod(HeldTask):
     Args:
       hand: Menagerie's shadow_hand/right_hand.xml; None looks for it in the folder that the variable
         MENAGERIE_ROOT names.
-      rod: its shape and mass. The others: see `BatchTask`.
+      The others: see `BatchTask`.
 
     Raises:
       FileNotFoundError: no such hand. ValueError: another hand, or a number that cannot be.
@@ -76,23 +76,17 @@ class RollRod(HeldTask):
     settings = Settings()
 
     def __init__(
-        self,
-        hand: pathlib.Path | str | None = None,
-        num_envs: int = 256,
-        *args: object,
-        rod: Rod = Rod(),  # noqa: B008 - frozen
-        **keywords: object,
+        self, hand: pathlib.Path | str | None = None, num_envs: int = 256, *args: object, **keywords: object
     ):
         menagerie = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
         self._hand = hand or menagerie / "shadow_hand" / "right_hand.xml"
-        self._rod_made = rod
         super().__init__(num_envs, *args, **keywords)
 
     def _scene(self, skin):
-        return *build(self._hand, self._rod_made, self.cfg.timestep, True, skin=skin), {}
+        return *build(self._hand, self.cfg.timestep, True, skin=skin), {}
 
     def _find_start(self, mjm):
-        self.pinch = find_pinch(mjm, self._rod_made)
+        self.pinch = find_pinch(mjm)
         x, y, _ = self.pinch.axis  # along the rod: its roll between the pads is seen best
         self.camera = self.pinch.centre, 0.1, math.degrees(math.atan2(y, x)) + 20.0, -15.0
         return self.pinch.qpos
