@@ -218,6 +218,24 @@ def test_a_lesson_is_sensed_anew():
     )
 
 
+@needs_hand
+def test_a_lesson_has_another_goal_and_what_is_done_for_it():
+    """As the script would do in the same state, had the goal been that; in all its decisions."""
+    settings = dataclasses.replace(Settings(), substeps=1, prepare=0)
+    env = make("roll_rod", 2, hand=HAND, device="cpu", settings=settings, history=3)
+    env.step(torch.ones(2, 6))
+    first, before = env.script(), env._place_before.clone()
+    sensed, wish = env.aim_anew(env.sensed(), first)
+    env._target = 1e-3 * sensed["body"][:, 0, -2]
+    assert (env.target - env.cfg.target[0] >= 0).all() and (env.target <= env.cfg.target[1]).all()
+    env._place_before[:] = torch.nan
+    np.testing.assert_allclose(wish, env.script(), atol=1e-5)
+    assert not torch.isclose(wish, first)[:, :3].any() and torch.equal(env._place_before, before)
+    body = torch.cat(env._sense_body(0.0, 0.0), dim=1)
+    np.testing.assert_allclose(sensed["body"][:, 0], body, atol=1e-6)
+    assert torch.equal(sensed["body"][..., -2], sensed["body"][:, :1, -2].expand(2, 3))
+
+
 def test_lessons_lack_electrodes_in_all_their_decisions():
     """As many of each finger, others in each lesson; PDC and PAC are there. Without a number all are."""
     touch = Touch.__new__(Touch)

@@ -49,6 +49,7 @@ class Settings(HeldSettings):
 
 
 _LATE = 2.0  # delay of a rod behind the goals of the pads [decisions]
+_TARGET = -2  # in what is sensed of the body
 
 
 class RollRod(HeldTask):
@@ -138,8 +139,17 @@ class RollRod(HeldTask):
         place = self.place
         coming = place + _LATE * torch.nan_to_num(place - self._place_before)
         self._place_before[:] = place
-        move = ((self._target - coming) / self.cfg.rate).clamp(-1, 1)[:, None]
-        return move * torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0], device=self.device)
+        return self._roll(self._target - coming)
+
+    def aim_anew(self, sensed: dict, wish: torch.Tensor) -> tuple[dict, torch.Tensor]:
+        body, target = sensed["body"].clone(), self._uniform(*self.cfg.target, len(wish))
+        off = target - 1e-3 * body[:, 0, _TARGET]
+        body[..., _TARGET] = 1e3 * target[:, None]
+        return {**sensed, "body": body}, wish + self._roll(off)
+
+    def _roll(self, distance):
+        """Actions that move the fingers' pads by distances (n,) [m] against the thumb."""
+        return torch.outer(distance / self.cfg.rate, torch.tensor([1.0, 1, -1, 0, 0, 0], device=self.device))
 
     def _judge(self):
         s, error = self.cfg, self.error

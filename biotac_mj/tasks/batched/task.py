@@ -219,7 +219,13 @@ class BatchTask(abc.ABC):
 
     @abc.abstractmethod
     def script(self) -> torch.Tensor:
-        """Actions (num_envs, num_actions) of a controller that uses the true state and solves the task."""
+        """Actions (num_envs, num_actions), of which -1 to 1 counts, of a controller that uses the true state
+        and solves the task."""
+
+    def aim_anew(self, sensed: dict, wish: torch.Tensor) -> tuple[dict, torch.Tensor]:
+        """What was `sensed` in n worlds, and what the script wished to do there (n, num_actions), with other
+        goals, where the task has observed ones."""
+        return sensed, wish
 
     # what they share
 

@@ -11,6 +11,7 @@ extras `batch` and `learning`; takes minutes on a GPU, a day on a CPU."""
 
 import argparse
 import dataclasses
+import functools
 import pathlib
 import sys
 import time
@@ -174,8 +175,9 @@ def train(
         for _ in range(numbers.steps):
             actions = torch.cat([run.learner.act(run.seen(), run.known()) for run in learners])
             if learns:
-                right = env.script().clamp(-1, 1)
-                lessons.add(env.sensed(), right)
+                wish = env.script()
+                lessons.add(env.sensed(), wish)
+                right = wish.clamp(-1, 1)
                 for run in learners:
                     run.compare(right)
             if first > 0:
@@ -227,14 +229,15 @@ def _study(learners, lessons, acted, progress):
     """Trains by imitation for `Numbers.study` times the time spent on acting, `acted` [s]; progress: elapsed
     fraction of the phase with a teacher. Each lesson draws new errors of encoders and model, because a policy
     would recognise the few states by these errors, and leaves electrodes out, because it would rely on few of
-    them, whose errors would then mislead it."""
-    numbers, begin = learners[0].learner.numbers, time.perf_counter()
+    them, whose errors would then mislead it; and another goal, because what was done towards the goal that
+    there was tells where the object was believed to be."""
+    numbers, env, begin = learners[0].learner.numbers, learners[0].env, time.perf_counter()
     for _ in range(numbers.lessons):
+        sensed, right = env.aim_anew(*lessons.draw(numbers.several))
+        draw = functools.cache(functools.partial(env.sense_anew, **sensed, missing=_MISSING))
         for run in learners:
-            sensed, right = lessons.draw(numbers.several)
-            seen = run.env.sense_anew(run.observe, **sensed, missing=_MISSING)
-            run.learner.imitate(seen, right, progress)
-        if _now(run.env) - begin > numbers.study * acted:
+            run.learner.imitate(draw(run.observe), right.clamp(-1, 1), progress)
+        if _now(env) - begin > numbers.study * acted:
             break
 
 
