@@ -440,14 +440,15 @@ def files_of_csv():
     yield Row(RUPPEL, "ruppel.csv is no recording", "ruppel.csv", lambda path: path.write_bytes(b"\xff\0\0"))
     for name in ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N"):
         yield Row(CSV, f"has no column '{name}'", "way.csv", replaced(name, "other"))
-        yield Row(CSV, f"{name} is 'x', not a number", "way.csv", cell(3, _column(name), "x", ","))
-        yield Row(CSV, "indentation 'way'", "way.csv", cell(3, _column(name), "nan", ","))
+        for given in ("x", "nan"):
+            said = f"line 4: {name} is {given!r}, not a finite number"
+            yield Row(CSV, said, "way.csv", cell(3, _column(name), given, ","))
     yield Row(CSV, "column 'tip_x_mm' of way.csv has unit mm", "way.csv", replaced("tip_x_m", "tip_x_mm"))
     yield Row(CSV, "these look like mN", "way.csv", cell(5, 5, "-900", ","))
     yield Row(CSV, "positions must be in metres", "way.csv", cell(5, 1, "-12", ","))
     yield Row(CSV, "way.csv is empty", "way.csv", text(""))
     yield Row(CSV, "has a header and no rows", "way.csv", lambda path: path.write_text(_lines(path)[0]))
-    yield Row(CSV, "way.csv is no CSV file", "way.csv", lambda path: path.write_bytes(b"\xff\xfe\0"))
+    yield Row(CSV, "it holds bytes, not text", "way.csv", lambda path: path.write_bytes(b"\1\2\0"))
     yield Row("lab calibrate way.csv --quiet", "does not say what pressed")
     yield Row("lab calibrate --quiet", "give either a file")
     yield Row("lab calibrate way.csv --synthetic", "give either a file")

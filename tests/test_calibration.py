@@ -232,7 +232,7 @@ def test_csv_round_trip_and_errors(way, tmp_path):
     refused(text, "what pressed", indenter=None)
     refused(text.replace("tip_x_m", "tip_x_mm"), "'tip_x_mm' .* has unit mm: it must be 'tip_x_m', in m")
     refused(text.replace("force_y_N,", "push,"), "no column 'force_y_N'")
-    refused(text.replace("\n0.02,", "\nsoon,"), "line 3 .* time_s is 'soon', not a number")
+    refused(text.replace("\n0.02,", "\nsoon,"), "line 3: time_s is 'soon', not a finite number")
     refused("\n".join(text.splitlines()[:3]), "at least 4")
     refused(text, "no direction", direction=(0, 0, 0))
     rows = [line.split(",") for line in text.splitlines()]

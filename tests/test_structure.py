@@ -41,7 +41,8 @@ LAYERS = {
     "versions view.offscreen",
     "differentiable": "kernels cache short_repr fields coupling plugin geometry skin sensor threads "
     "calibration recordings files press.indenter data.generation.clearance",
-    "calibration": "cache geometry skin sensor.channels fields files reading press.indenter press.path",
+    "calibration": "cache geometry skin sensor.channels fields files reading press.indenter press.path "
+    "recordings.formats.columns",
     "quality": "sensor.channels",
     "recordings": "short_repr lazy arguments quality sensor geometry fields files reading",
     "data": "kernels lazy recordings geometry skin sensor effects fields files reading shards triangles "

@@ -266,7 +266,7 @@ def calibrate(
     for _ in range(starts - 1):
         at = problem.draw_start(found.x, draw)
         if problem.promised(at) < (1 - _GAIN) * found.cost:
-            found = min(found, finish(at), key=_cost)
+            found = min(found, finish(at), key=lambda fit: fit.cost)
     modulus = configuration.modulus
     if finer is not None and modulus is not None and not callable(modulus):  # repeat per child, see `refined`
         modulus = np.repeat(modulus, len(finer.elem) // len(modulus))
@@ -418,10 +418,6 @@ class _Problem:
         """Predicted least cost for forces that are linear from there, so on that side of a jump."""
         residual, slopes = self._residual(at), self._slopes(at)
         return ((residual - slopes @ np.linalg.lstsq(slopes, residual)[0]) ** 2).sum() / 2
-
-
-def _cost(found):
-    return found.cost
 
 
 def _result(

@@ -11,6 +11,7 @@ from ..fields import check_entries
 from ..files import replacing
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import Array, read_hdf5, reading
+from ..recordings.formats.columns import open_bytes, parse_table
 from ..sensor.channels import check_force
 
 COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
@@ -195,53 +196,33 @@ def _read_csv(path, indenter, direction):
         raise ValueError(
             f"{path} does not say what pressed: name it with --indenter, as in --indenter sphere_7mm"
         )
-    with reading(path, "CSV file", f"it needs columns {', '.join(COLUMNS)}"):
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    if not rows:
-        raise ValueError(f"{path} is empty: it needs a header with columns {', '.join(COLUMNS)}")
-    if not rows[1:]:
-        raise ValueError(f"{path} has a header and no rows: one for each sample is needed")
-    header = [name.strip() for name in rows[0]]
-    columns = {name: _column(path, header, rows[1:], name) for name in COLUMNS}
-    value = np.array([columns[name] for name in COLUMNS]).T
-    return Indentation(
-        path.stem,
-        indenter,
-        value[:, 0],
-        value[:, 1:4],
-        _orientation(path, header, rows[1:], direction),
-        value[:, 4:],
-    )
+    table = parse_table(path, open_bytes(path), f"columns {', '.join(COLUMNS)}")
+    value, quat = _columns(table, COLUMNS), _orientation(table, direction)
+    return Indentation(path.stem, indenter, value[:, 0], value[:, 1:4], quat, value[:, 4:])
 
 
-def _column(path, header, rows, name):
-    if name not in header:
+def _columns(table, names):
+    """(n, len(names)) numbers of the columns of these names."""
+    header = table.names or []
+    for name in names:
+        if name in header:
+            continue
         stem, _, unit = name.rpartition("_")
         other = next((h for h in header if h.rpartition("_")[0] == stem or h == stem), None)
         if other:
             given = other[len(stem) :].lstrip("_") or "none"
             raise ValueError(
-                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; "
+                f"column {other!r} of {table.path} has unit {given}: it must be {name!r}, in {unit}; "
                 "convert the numbers and rename it"
             )
         raise ValueError(
-            f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; "
+            f"{table.path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; "
             f"it has {', '.join(header)}"
         )
-    index, values = header.index(name), []
-    for number, row in enumerate(rows, start=2):
-        try:
-            values.append(float(row[index]))
-        except (ValueError, IndexError):
-            cell = row[index] if index < len(row) else ""
-            raise ValueError(
-                f"line {number} of {path}: {name} is {cell!r}, not a number; correct or remove the line"
-            ) from None
-    return values
+    return table.numbers([header.index(name) for name in names], list(names))
 
 
-def _orientation(path, header, rows, direction):
+def _orientation(table, direction):
     from ..geometry.rigid import quaternion_from_y
 
     if direction is not None:
@@ -252,12 +233,12 @@ def _orientation(path, header, rows, direction):
                 "give three numbers that are not all zero"
             )
         return quaternion_from_y(direction / np.linalg.norm(direction))
-    if "quat_w" not in header:
+    if "quat_w" not in (table.names or []):
         return np.array([1.0, 0, 0, 0])
-    quat = np.array([_column(path, header, rows, name) for name in _ORIENTATION]).T
+    quat = _columns(table, _ORIENTATION)
     if np.abs(quat - quat[0]).max() > 1e-3 or abs(np.linalg.norm(quat[0]) - 1) > 1e-3:
         raise ValueError(
-            f"the quaternions of {path} turn or are not of length one: the indenter must only translate"
+            f"the quaternions of {table.path} turn or are not of length one: the indenter must only translate"
         )
     return quat[0] / np.linalg.norm(quat[0])
 

@@ -1,9 +1,8 @@
 """Reports of fits and comparisons: tables, JSON and a picture."""
 
 import dataclasses
+import json
 import pathlib
-
-import numpy as np
 
 from .. import files
 from .fit import Calibration
@@ -47,27 +46,15 @@ def calibration_table(result: Calibration) -> str:
     return "\n".join(lines)
 
 
-def plain(value: object) -> object:
-    """The value as JSON types."""
-    if dataclasses.is_dataclass(value):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None  # JSON has no NaN and no infinity
-    return value
-
-
 def write_json(content: dict, path: pathlib.Path | str) -> None:
     """Writes a dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite
     become null."""
-    files.write_json(path, plain(content))
+
+    def default(value):
+        return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value.tolist()
+
+    text = json.dumps(content, default=default)
+    files.write_json(path, json.loads(text, parse_constant=lambda _: None))
 
 
 def write_picture(result: Calibration, path: pathlib.Path | str) -> None:
