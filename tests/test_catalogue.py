@@ -12,7 +12,6 @@ from biotac_mj.discrepancy.recordings.recording import PlainRecording
 from biotac_mj.discrepancy.recordings.search import diagnose_recording
 from biotac_mj.effects.catalogue import CATALOGUE, entries
 from biotac_mj.effects.effect import STAGES, Effect, Param, Run
-from biotac_mj.effects.logged import LOGGED
 from biotac_mj.sensor.channels import counts_from_log_impedance
 
 # --- decisions by an effect's id
@@ -198,7 +197,7 @@ def test_effects_confused_with_each_other_are_known():
         assert {*effect.confusable, *effect.equivalents, *effect.refit_with} <= ids, effect.id
 
 
-# --- faults of a log, put into counts
+# --- faults of a log
 
 
 def at_rest(seconds=60, seed=0):
@@ -208,66 +207,18 @@ def at_rest(seconds=60, seed=0):
     return np.tile(counts_from_log_impedance(log_z - np.log(1e4)), (n, 1)), log_z, rng
 
 
-FAULTS = {
-    "count_offset": {"change": 40.0},
-    "count_gain": {"change": 0.02},
-    "drift": {"change": 60.0},
-    "flip": {"factor": -1.0},
-    "swap": {"onset": 30.0},
-    "stuck": {"value": 900.0},
-    "freeze": {"seconds": 5.0},
-    "saturate": {"level": 2500.0},
-    "quantise": {"step": 32.0},
-    "spikes": {"rate": 120.0},
-    "hum": {"amplitude": 8.0, "frequency": 12.5},
-    "noise": {"size": 12.0},
-    "common_noise": {"correlation": 0.5},
-}
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_of_its_electrodes_and_its_time(name):
-    """Electrodes 3, 8 and 12 from 20 to 40 s, under a load; what drifts keeps its level."""
-    counts, log_z, rng = at_rest()
-    load = 600 * np.sin(0.6 * np.arange(len(counts)) / 100)
-    counts = counts + load[:, None] + 3 * rng.standard_normal(counts.shape)
-    kind = type(next(e for e in LOGGED if e.id == name))
-    run = Run.of_counts(counts, log_z, np.arange(len(counts)) / 100)
-    kind([3, 8, 12], 20.0, 40.0).apply(run, FAULTS[name])
-    changed = np.abs(run.counts - counts) > 1e-9
-    rows = changed.any(1).nonzero()[0]
-    assert changed.any() and not np.delete(changed, [3, 8, 12], axis=1).any()
-    assert rows[0] >= 2000 and (rows[-1] <= 4000 or name == "drift")
-
-
-def test_exchanged_channels_show_each_the_next():
-    counts, log_z, _ = at_rest()
-    run = Run.of_counts(counts, log_z, np.arange(len(counts)) / 100)
-    kind = type(next(e for e in LOGGED if e.id == "swap"))
-    kind([3, 8, 12], 20.0, 40.0).apply(run, {"onset": 30.0})
-    assert (run.counts[2900] == counts[2900]).all()
-    assert (run.counts[3500, [3, 8, 12]] == counts[3500, [8, 12, 3]]).all()
-
-
-def test_lost_rows_leave_no_gap_in_the_clock():
-    counts, log_z, _ = at_rest()
-    time = np.arange(len(counts)) / 100
-    run = Run.of_counts(counts + time[:, None], log_z, time)
-    kind = type(next(e for e in LOGGED if e.id == "lost_rows"))
-    kind(start=20.0).apply(run, {"seconds": 3.0})
-    assert len(run.time) == len(run.counts) == len(time) - 300 and np.allclose(np.diff(run.time), 0.01)
-    assert np.isclose(np.diff(run.counts[:, 0]).max(), 3.01)
-
-
 @pytest.mark.parametrize("name", ["stuck", "hum", "noise"])
 def test_a_fault_of_the_catalogue_is_diagnosed_as_itself(name):
-    counts, log_z, rng = at_rest()
+    counts, _, rng = at_rest()
+    time, channels = np.arange(len(counts)) / 100, range(19) if name == "hum" else [5]
     counts = counts + 4 * rng.standard_normal(counts.shape)
-    run = Run.of_counts(counts, log_z, np.arange(len(counts)) / 100)
-    kind = type(next(e for e in LOGGED if e.id == name))
-    channels = range(19) if name == "hum" else [5]
-    kind(channels).apply(run, FAULTS[name])
-    found = diagnose_recording(PlainRecording(np.clip(np.rint(run.counts), 0, 4095), rate=100.0))
+    if name == "stuck":
+        counts[:, 5] = 900.0
+    elif name == "hum":
+        counts += 8.0 * np.sin(2 * np.pi * 12.5 * time)[:, None]
+    else:
+        counts[:, 5] += 12.0 * rng.standard_normal(len(counts))
+    found = diagnose_recording(PlainRecording(np.clip(np.rint(counts), 0, 4095), rate=100.0))
     assert [f.id for f in found.findings] == [name] and list(found.findings[0].channels) == list(channels)
 
 
@@ -282,7 +233,8 @@ def test_an_effect_is_one_class():
             run.counts[:, ::2] += theta["rate"] * run.clock[:, None]
 
     effect, (counts, log_z, _) = Half(), at_rest(1)
-    run = Run.of_counts(counts.copy(), log_z, np.arange(len(counts)) / 100)
+    time = np.arange(len(counts)) / 100
+    run = Run.of_counts(counts.copy(), log_z, time=time, clock=time)
     effect.apply(run, {"rate": 2.0})
     assert np.allclose((run.counts - counts)[-1], np.where(np.arange(19) % 2, 0, 2 * run.time[-1]))
     assert not (effect.before_skin or effect.per_channel or effect.undoes({}, 1.0))

@@ -2,7 +2,7 @@
 acquisition, the set-up and the log."""
 
 from .contact import Adhesion, Friction, FrictionLoad
-from .effect import Effect
+from .effect import Effect, Entry
 from .electrodes import ElectrodeDrift, Exchange, Noise, Offset
 from .logged import LOGGED
 from .rubber import (
@@ -77,7 +77,7 @@ _SENSOR = (
 _NOT_SEARCHED = (Noise(), DeadTaxels(), Modulus())
 
 
-def entries(fits: str | None = None) -> tuple[Effect, ...]:
+def entries(fits: str | None = None) -> tuple[Entry, ...]:
     """The effects that are searched in "poses", in a "log" or on a "plate"; None: all."""
     plate = ()
     if fits in (None, "plate"):

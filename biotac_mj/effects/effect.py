@@ -98,19 +98,16 @@ class Run:
     turn: float | np.ndarray = 0.0
 
     @classmethod
-    def of_counts(
-        cls, counts: np.ndarray, rest_log_z: np.ndarray, time: np.ndarray | None = None, **more: np.ndarray
-    ) -> "Run":
-        """A Run of counts (n, nelectrode) without contact.
+    def of_counts(cls, counts: np.ndarray, rest_log_z: np.ndarray, **more: np.ndarray) -> "Run":
+        """A Run of counts (n, nelectrode) without contact, all rows at one time.
 
         Args:
-          rest_log_z: (nelectrode,) ln of the impedances at rest [ohm]. time: (n,) [s]; None: all rows at one
-            time.
-          more: other fields, such as force (n, 3) [N]."""
+          rest_log_z: (nelectrode,) ln of the impedances at rest [ohm]. more: other fields, such as time (n,)
+            [s] or force (n, 3) [N]."""
         n = len(counts)
-        time = np.zeros(n) if time is None else time
         plain = {
-            "clock": time,
+            "time": np.zeros(n),
+            "clock": np.zeros(n),
             "tool": "",
             "heading": np.zeros(3),
             "depth": np.zeros(n),
@@ -123,7 +120,7 @@ class Run:
             "temperature": None,
             "session": {},
         }
-        return cls(time=time, counts=counts, rest_log_z=rest_log_z, **plain | more)
+        return cls(counts=counts, rest_log_z=rest_log_z, **plain | more)
 
     @property
     def rest(self) -> np.ndarray:
@@ -165,32 +162,22 @@ class Whole:
     lost: float = 0.0
 
 
-class Effect(abc.ABC):
-    """Subclasses override these attributes and implement `apply`.
+class Entry:
+    """What the catalogue says of an effect. Subclasses override these attributes.
 
     Attributes:
       id, name: of the effect. stage: key of STAGES. physics: description.
       fits: data in which the effect is searched, a set of "poses" (trajectories with the object's poses),
         "log" (recordings without) and "plate" (presses of a flat plate). An id may have a form for each.
-      params: {name: Param}. each: the parameter that every electrode has, in `params` by its name. design: of
-        the electrodes.
-      grid: values of the shape parameters that are tried.
-      rare: further parameters, added only if the data require them (`given`).
+      params: {name: Param}.
       confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
         appearance, separated only by much evidence. refit_with: ids of effects that are fitted with it.
-      per_channel: whether each free parameter belongs to one electrode, or one pair.
-      wiring: whether it assigns electrodes to channels, and has no other form.
-      of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
-      pose_offset: whether it moves all poses of the object equally, like their scatter between trials.
-      remembers: whether rubber or contact can model it inside the skin, with a delay of the films.
-      answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it uses.
-      instead_of: nuisance parameters of the base model that it replaces.
-      sound: root mean square of its parameters that a healthy sensor may have.
       drifts: whether it is a level that changes with the session's clock. in_noise: whether measured noise
         includes it. is_noise: whether it is noise, which a sensor's measured noise has. silent: whether an
         electrode has one value under any contact.
-      alike: whether a running sensor has it equally on all electrodes. most: {parameter: largest value that a
-        running sensor can have}.
+      runs: whether constants of a running sensor model it, without another skin. alike: whether a running
+        sensor has it equally on all electrodes. most: {parameter: largest value that a running sensor can
+        have}.
       requires: data that a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of
         the counts; "time" to separate touches from drift; "load"; "change", that it begins or ends in the
         recording; "protocol" of a checkup; "poses", where nothing else suffices; "search", where no detector
@@ -202,13 +189,40 @@ class Effect(abc.ABC):
     id = name = stage = physics = ""
     fits: frozenset = frozenset({"poses"})
     params: dict = {}
+    confusable: dict = {}
+    equivalents: tuple = ()
+    refit_with: tuple = ()
+    drifts = in_noise = is_noise = silent = alike = runs = False
+    most: dict = {}
+    requires: frozenset = frozenset({"poses"})
+    detector = ""
+
+    def possible(self, values: dict) -> bool:
+        """Whether found parameters, name -> (value, low, high), lie within their bounds."""
+        return all(self.params[n].low <= v[0] <= self.params[n].high for n, v in values.items())
+
+
+class Effect(Entry, abc.ABC):
+    """An entry that acts on a run. Subclasses override attributes and implement `apply`.
+
+    Attributes:
+      each: the parameter that every electrode has, in `params` by its name. design: of the electrodes.
+      grid: values of the shape parameters that are tried.
+      rare: further parameters, added only if the data require them (`given`).
+      per_channel: whether each free parameter belongs to one electrode, or one pair.
+      wiring: whether it assigns electrodes to channels, and has no other form.
+      of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
+      pose_offset: whether it moves all poses of the object equally, like their scatter between trials.
+      remembers: whether rubber or contact can model it inside the skin, with a delay of the films.
+      answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it uses.
+      instead_of: nuisance parameters of the base model that it replaces.
+      sound: root mean square of its parameters that a healthy sensor may have.
+    """
+
     each: Param | None = None
     design: Design = BIOTAC
     grid: tuple = ({},)
     rare: dict = {}
-    confusable: dict = {}
-    equivalents: tuple = ()
-    refit_with: tuple = ()
     per_channel = False
     wiring = False
     of_rest = False
@@ -217,10 +231,6 @@ class Effect(abc.ABC):
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0
-    drifts = in_noise = is_noise = silent = alike = False
-    most: dict = {}
-    requires: frozenset = frozenset({"poses"})
-    detector = ""
 
     @abc.abstractmethod
     def apply(self, run: Run, theta: dict) -> None:
@@ -246,7 +256,6 @@ class Effect(abc.ABC):
 
     @property
     def runs(self) -> bool:
-        """Whether constants of a running sensor model it, without another skin."""
         return self.stage in ("T", "A") and type(self).in_sensor is not Effect.in_sensor
 
     def applicable(self, trajectories: list) -> str | None:
@@ -299,10 +308,6 @@ class Effect(abc.ABC):
     def rejection_reason(self, theta: dict) -> str | None:
         """Reason why fitted parameters are implausible for this effect, or None."""
         return None
-
-    def possible(self, values: dict) -> bool:
-        """Whether found parameters, name -> (value, low, high), lie within their bounds."""
-        return all(self.params[n].low <= v[0] <= self.params[n].high for n, v in values.items())
 
     def alias(self, theta: dict) -> tuple:
         """Ids of other effects that are as likely with such parameters, whichever fits better."""

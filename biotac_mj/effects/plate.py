@@ -14,7 +14,7 @@ from ..geometry.surface import node_normals
 from ..sensor.film import excitation_places
 from ..skin import Material, SkinOptions
 from ..skin.rubber.material import CALIBRATED_FILL, PRESETS
-from .effect import Effect, Param, Run
+from .effect import Entry, Param
 
 RADIUS = PRESETS["calibrated"].electrode_radius  # [m] of the base model's electrodes
 _FADE = 2e-3  # [m] distance from fixed nodes over which a shift of the wall fades
@@ -60,11 +60,11 @@ def bonded(geometry: SkinGeometry, below: float) -> SkinGeometry:
 
 
 @dataclasses.dataclass(frozen=True)
-class PlateEffect(Effect):
+class PlateEffect(Entry):
     """An effect of one parameter.
 
     Attributes:
-      id, name, stage, physics: as of an Effect.
+      id, name, stage, physics: as of an Entry.
       parameter, unit: fitted quantity; base, other: its value in the base model and at the solved change
         (amount 1).
       film: settings of FilmConduction for a design. material, options, shape: of a skin that must be solved.
@@ -92,9 +92,6 @@ class PlateEffect(Effect):
         by = self.other - self.base
         low, high = sorted((self.base - _FAR * by, self.base + _FAR * by))
         return {self.parameter: Param(self.unit, low, high, "a straight line: CHOSEN", abs(by), self.base)}
-
-    def apply(self, run: Run, theta: dict) -> None:
-        raise NotImplementedError(f"{self.id} is a property of the skin: solve a skin that has it")
 
     @property
     def solved_anew(self) -> bool:

@@ -3,7 +3,7 @@
 import math
 
 from ...effects.catalogue import entries
-from ...effects.effect import Effect
+from ...effects.effect import Entry
 from ...effects.logged import LOGGED
 from .model import LEAST, WINDOW
 from .recording import FORCE_MOVED
@@ -19,7 +19,7 @@ def not_identifiable(session: Session) -> list[str]:
     ]
 
 
-def searched(session: Session) -> list[Effect]:
+def searched(session: Session) -> list[Entry]:
     """The effects that the recording has the data for."""
     return _by_need(session).get(None, [])
 

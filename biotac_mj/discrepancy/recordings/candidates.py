@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...effects.catalogue import entries
-from ...effects.effect import Effect
+from ...effects.effect import Entry
 from ...quality.fault import Fault
 from ...quality.log import Log
 from ...recordings.recording import CLOCKED
@@ -49,7 +49,7 @@ class Candidate(Fault):
     written: bool = True
 
     @property
-    def kind(self) -> Effect:
+    def kind(self) -> Entry:
         return KINDS[self.id]
 
     @property

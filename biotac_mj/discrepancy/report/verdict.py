@@ -18,7 +18,7 @@ from ...effects.catalogue import entries, name_of
 from ...effects.effect import STAGES
 
 if typing.TYPE_CHECKING:
-    from ...effects.effect import Effect, Param
+    from ...effects.effect import Entry, Param
     from ...effects.sensor_file import SensorFile
 
 SCHEMA, VERSION = "biotac_mj.verdict", 3
@@ -161,7 +161,7 @@ class Finding:
     end: float | None = None
 
     @classmethod
-    def of(cls, effect: "Effect", **said: object) -> "Finding":
+    def of(cls, effect: "Entry", **said: object) -> "Finding":
         """Finding of an effect, the catalogue's or a user's own; said: its other attributes."""
         own = {name: getattr(effect, name) for name in ("id", "name", "stage", "physics", "confusable")}
         return cls(**own, **said)

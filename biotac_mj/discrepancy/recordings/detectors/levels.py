@@ -10,9 +10,9 @@ import numpy as np
 from ....effects.logged import SHARED
 from ....effects.sensing import Thermal
 from ....geometry.design import Design, electrode_positions
+from ....quality.evidence import sign_flip
 from ....recordings.recording import designed
 from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
-from ...evidence import sign_flip
 from ..candidates import Candidate
 from ..model import Model
 from ..session import Session
@@ -304,7 +304,9 @@ def _name_shared(session, finding, trend, change):
     order = [e for e in sorted(SHARED, key=lambda e: e.drifts == sudden) if change > 0 or not e.rises]
     # what comes slowly is the session's whatever its pattern: electrodes have shares of their own of it
     alike = [e for e in order if e.drifts and not sudden or misfit[e.id] < 2 * min(misfit.values()) + 12]
-    found = {e.id: e.of_trend(trend, change, m.slope, middle) for e in alike}
+    time = np.linspace(trend.knots[0], trend.knots[-1], 200)
+    course = time, trend(time) - trend(time[:1])
+    found = {e.id: e.of_trend(*course, m.slope, middle) for e in alike}
     best, *ties = [e for e in alike if e.possible(found[e.id])] or alike
     finding.id, finding.parameters, ties = best.id, found[best.id], [e.id for e in ties]
     finding.detector = alike[0].detector  # by which way all go, whatever is possible
