@@ -12,7 +12,7 @@ from logs import RATE, noisy, overflowing, pressed, touched, unloaded
 from verdicts import check_verdict
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
-from biotac_mj.discrepancy.evidence import max_t, sign_flip
+from biotac_mj.discrepancy.evidence import max_t
 from biotac_mj.discrepancy.recordings.candidates import KINDS
 from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.detectors.latency import ForceView
@@ -28,6 +28,7 @@ from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.effects.catalogue import entries
 from biotac_mj.effects.effect import shifted
 from biotac_mj.effects.logged import LOGGED
+from biotac_mj.quality.evidence import sign_flip
 from biotac_mj.recordings import Recording, load_one
 from biotac_mj.recordings.recording import CLOCKED
 from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
@@ -621,7 +622,7 @@ def test_what_no_bound_allows_has_no_name():
 def test_a_straight_drift_is_no_long_warm_up():
     time = np.linspace(0.0, 200.0, 50)
     straight = Trend("smooth", np.nan, time, -0.1 * time / 200, 0.0, np.ones(16), 0.0)
-    found = KINDS["warmup"].of_trend(straight, -0.1, np.ones(19), np.ones(19))
+    found = KINDS["warmup"].of_trend(time, straight(time), np.ones(19), np.ones(19))
     (a, low, _), (tau, *_) = found["a"], found["tau"]
     assert low <= a < -0.1 and a > -1.0 and KINDS["warmup"].possible(found)
     assert a * (1 - np.exp(-200 / tau)) == pytest.approx(-0.1, rel=0.05)

@@ -7,6 +7,7 @@ from scipy.special import kl_div
 
 BLOCKS = 16  # of a log; each counts as independent evidence
 NAN = float("nan")
+_DRAWS = 4000  # of signs
 
 # scipy.stats.permutation_test draws new signs in each call and takes 40 to 350 times as long as `sign_flip`,
 # which the diagnosis of one log calls 267 times in 12 s
@@ -20,19 +21,19 @@ def evidence(strength: np.ndarray) -> dict:
     return {"nats": nats, "p": sign_flip(strength), "features": features}
 
 
-def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
+def sign_flip(gain: np.ndarray) -> float:
     """p of mean(gain) > 0 under random signs. gain: (n,), one per block or trajectory. Exact for n <= 12."""
     gain = np.asarray(gain, float)
     n = len(gain)
-    return float(np.mean(_signs(n, draws, seed) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
+    return float(np.mean(_signs(n) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
 
 
 @functools.lru_cache(maxsize=8)
-def _signs(n, draws, seed):
+def _signs(n):
     """(draws, n) of -1 and 1; all combinations for n <= 12."""
     if n <= 12:
         return 1.0 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
-    sign = np.random.default_rng(seed).choice([-1.0, 1.0], (draws, n))
+    sign = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, n))
     sign[0] = 1  # the data themselves, so that p > 0
     return sign
 

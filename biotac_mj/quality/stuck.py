@@ -88,7 +88,9 @@ def _quiet(log, rows):
     a constant channel has no hum either."""
     x, law, size = log.read[rows], *_noise(log.counts[rows])
     lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
-    usual, loud = (_middle(values, lively) for values in (size, law))
+    usual, loud = (  # NaN where none is lively
+        np.ma.median(np.ma.masked_array(values, ~lively), axis=0).filled(np.nan) for values in (size, law)
+    )
     law, size = _noise(x)
     noisy = usual[~np.isnan(usual)]
     others = np.median(noisy) if noisy.size else 0.0  # of a log in which nothing has noise
@@ -106,11 +108,6 @@ def _noise(x):
     bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
     law = sound_noise(uniform_filter1d(x, _WINDOW, axis=0)[1:-1])
     return law, np.sqrt(np.maximum(uniform_filter1d(bend, _WINDOW, axis=0), 0)) / law
-
-
-def _middle(values, on):
-    """Median of values (n, c) over the samples `on`, NaN if there is none."""
-    return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
 
 
 def _constant_faults(log, k, still, sure):

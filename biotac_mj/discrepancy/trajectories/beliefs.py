@@ -82,10 +82,10 @@ class Explanation:
             vectors = comparison.vectors(effects, nuisance)
             return [v * root for v, root in zip(vectors, rows)]
 
-        here = scaled(self.effects, self.nuisance)
+        here, unknown = scaled(self.effects, self.nuisance), 0 if known is None else known[0][1].shape[1]
         columns = [
             [(a - b) / step for a, b in zip(here, scaled(effects, nuisance))]
-            for step, effects, nuisance in itertools.islice(self.moves(), *_after(known))
+            for step, effects, nuisance in itertools.islice(self.moves(), unknown, None)
         ]
         own = [np.stack(parts, axis=1) for parts in zip(*columns)]
         if known is not None:
@@ -105,11 +105,6 @@ class Explanation:
         information = np.eye(len(parameters(out.effects)))
         information[:known, :known] = self.information
         return dataclasses.replace(out, information=information)
-
-
-def _after(known):
-    """Index of the first unknown parameter."""
-    return (0 if known is None else known[0][1].shape[1], None)
 
 
 def weights(scores: Sequence[float], effects: Sequence[int], contacts: float = _CONTACTS) -> np.ndarray:

@@ -171,7 +171,8 @@ def planned(
     spots = sorted(name for name in used if name.startswith(SPOT))
     fields = quick.fields(trajectories, progress, spots)
     able = [one for one in asked if _solved(one, fields)]
-    unseen = [one for one in beliefs.unseen if able[:1] == [first] and _shows(one, trajectories, fields)]
+    unseen = [one for one in beliefs.unseen if able[:1] == [first] and _solved(one, fields)]
+    unseen = [one for one in unseen if not one.effects[-1][0].applicable(trajectories)]
     runs = [
         quick.run(trajectories, fields, False, [*quick.effects, *one.effects], nuisance=one.nuisance)
         for one in able
@@ -181,7 +182,10 @@ def planned(
     if not len(within):
         raise ValueError(f"no contact stays below {bounds.force:g} N: give a larger --force")
     # what the model is off by grows with what a contact shows
-    expected = [_showing(trajectories[u], runs[0][u]) for u in within]
+    expected = [
+        dataclasses.replace(t, electrodes=np.clip(r.counts, 0, 4095), pdc=r.pdc, force=r.force)
+        for t, r in ((trajectories[u], runs[0][u]) for u in within)
+    ]
     comparison = Comparison(quick, expected, fields.part(within), beliefs.noise, beliefs.repeatability)
     separation = Separation(able, comparison, unseen)
     times, contacts, clock = np.zeros(len(within)), [], beliefs.end + _PAUSE
@@ -206,16 +210,6 @@ def _solved(one, fields):
         effect.joining(theta) is None and theta.keys() <= effect.solved(solved).params.keys()
         for effect, theta in one.effects
     )
-
-
-def _shows(one, trajectories, fields):
-    """Whether contacts may show the last effect of an explanation."""
-    return _solved(one, fields) and not one.effects[-1][0].applicable(trajectories)
-
-
-def _showing(t, run):
-    """A trajectory with the readings of a run."""
-    return dataclasses.replace(t, electrodes=np.clip(run.counts, 0, 4095), pdc=run.pdc, force=run.force)
 
 
 def _reason(explanations, weight, gain):

@@ -263,8 +263,9 @@ def screened(
     fit may start, and the evidence that one of a realistic size would make; best first."""
     signatures = Signatures(comparison, current, chosen)
     y = signatures.own(current.y.reshape(1, -1) / signatures.sd)[0]
-    best = {}
-    for effect, shape in [(e, s) for one in effects for e in _variants(one) for s in e.grid]:
+    # each as it is mostly, and with its rare parameters
+    every, best = ([e, e.given(list(e.rare))] if e.rare else [e] for e in effects), {}
+    for effect, shape in [(e, s) for one in every for e in one for s in e.grid]:
         prior = np.array([[SETTINGS.wide * effect.params[name].scale / size] for name, size in sizes(effect)])
         columns = signatures.columns(effect, shape) * prior
         precision = np.eye(len(columns)) + columns @ signatures.own(columns).T
@@ -304,11 +305,6 @@ def _few(precision, pull) -> list[int]:
             return sorted(some) if best > _gained(precision, pull) else []
         some, best = [*some, k], gain
     return []
-
-
-def _variants(effect):
-    """The effect as it is mostly, and with its rare parameters."""
-    return [effect, *([effect.given(list(effect.rare))] if effect.rare else [])]
 
 
 def _begin(effect, shape, weights):

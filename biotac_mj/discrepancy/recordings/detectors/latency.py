@@ -14,8 +14,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from ....effects.effect import shifted
+from ....quality.evidence import sign_flip
 from ....sensor.channels import log_impedance
-from ...evidence import sign_flip
 from ...trajectories.base.nuisance import ages
 from ..candidates import Candidate
 from ..conditional import Components

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from ....effects.effect import stop
 from ....quality.evidence import BLOCKS
 from ....quality.noise import ROUNDING
 from ....sensor.channels import log_impedance
@@ -103,7 +104,7 @@ def _laws(x, by, rate):
         yield _Law("lowpass", "", {"tau": tau}, text, by * _slow(x, tau, rate), 1.0, whole=True)
     swing = np.quantile(np.abs(x), 0.95, axis=0)
     for part in _PLAYS:
-        values = by * _play(x, part * swing)
+        values = by * (x - stop(x, part * swing))  # what an element with so much play follows
         yield _Law("hyster_load", "fraction", {"width": part}, "stays until the next one", values, part)
 
 
@@ -146,12 +147,4 @@ def _recovering(x, tau, rate):
     out = np.zeros_like(x)
     for i in range(1, len(x)):
         out[i] = out[i - 1] + np.where(np.abs(x[i]) > np.abs(out[i - 1]), up, down) * (x[i] - out[i - 1])
-    return out
-
-
-def _play(x, width):
-    """What an element with so much play (c,) on either side follows of x (n, c)."""
-    out = np.zeros_like(x)
-    for i in range(1, len(x)):
-        out[i] = np.clip(out[i - 1], x[i] - width, x[i] + width)
     return out

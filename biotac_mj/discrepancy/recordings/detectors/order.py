@@ -3,6 +3,7 @@ which needs no model of the load nor a long recording."""
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
 
 from ....quality.noise import noise_level
 from ..candidates import Candidate
@@ -85,20 +86,9 @@ def _goes_on(off):
     # what goes on where it was is not exchanged with others that happen to be there as well
     jumped = np.flatnonzero(np.diag(off) > _EACH)
     order[jumped] = jumped[linear_sum_assignment(np.minimum(off[np.ix_(jumped, jumped)], 50) ** 2)[1]]
-    for cycle in _cycles(order):
+    of = connected_components(np.eye(number)[order])[1]
+    for cycle in (np.flatnonzero(of == k) for k in np.unique(of[order != straight])):
         now, then = np.diag(off)[cycle], off[cycle, order[cycle]]
         if then.max() < _ON and np.median(now) > _JUMPS:
             out[cycle] = order[cycle]
     return out
-
-
-def _cycles(order):
-    """Lists of the channels of an order (c,) that go round in one another's places."""
-    left, cycles = set(np.flatnonzero(order != np.arange(len(order))).tolist()), []
-    while left:
-        cycle = [left.pop()]
-        while order[cycle[-1]] != cycle[0]:
-            cycle.append(int(order[cycle[-1]]))
-        left -= set(cycle)
-        cycles.append(cycle)
-    return cycles

@@ -6,7 +6,8 @@ import functools
 
 import numpy as np
 
-from ...evidence import log_ratio, sign_flip
+from ....quality.evidence import sign_flip
+from ...evidence import log_ratio
 
 BLOCKS = 16
 _KNOTS = (4, 7, 11)

@@ -5,6 +5,7 @@ import typing
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
 
 from ....effects.electrodes import Exchange
 from ...evidence import signed_root_t
@@ -29,22 +30,11 @@ def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Excha
     gain = fits[:, row, reads] - fits[:, row, row]
     # A contact that changes one electrode little is still evidence on the others in its ring.
     moved = []
-    for ring in _rings(reads):
+    of = connected_components(np.eye(len(reads))[reads])[1]
+    for ring in (np.flatnonzero(of == k) for k in np.unique(of[reads != row])):
         if gain[:, ring].mean(0).min() > _SWAPPED and signed_root_t(gain[:, ring].sum(1)) < _SWAP_CHANCE:
             moved += [(i, int(reads[i])) for i in ring]
     return Exchange(sorted(moved)).on(comparison.sim.design) if moved else None
-
-
-def _rings(reads):
-    """Lists of electrodes, each of which reads the next one: the cycles of a permutation."""
-    left, out = set(np.flatnonzero(reads != np.arange(len(reads))).tolist()), []
-    while left:
-        ring = [left.pop()]
-        while int(reads[ring[-1]]) in left:
-            ring.append(int(reads[ring[-1]]))
-            left.remove(ring[-1])
-        out.append(ring)
-    return out
 
 
 def _in_place_of(comparison, i, predicted):
@@ -54,9 +44,4 @@ def _in_place_of(comparison, i, predicted):
     measured = comparison.measured[i][:, :n]
     measured, predicted = measured - measured[:1], predicted[:, :n] - predicted[:1, :n]
     square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[:n, None] ** 2
-    return _evidence(square, len(measured))
-
-
-def _evidence(square: np.ndarray, rows: int) -> np.ndarray:
-    """-(rows / 2) log of mean squares, of what lies beyond noise [nats]."""
-    return -0.5 * rows * np.log(np.maximum(square, 1.0))
+    return -0.5 * len(measured) * np.log(np.maximum(square, 1.0))  # of what lies beyond noise
