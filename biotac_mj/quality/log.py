@@ -92,9 +92,9 @@ class Log:
 
     def name(self, channels) -> str:
         """Names of channels, in words."""
-        names, shown = [f"e{k + 1}" for k in channels], 4
+        names, most = [f"e{k + 1}" for k in channels], 4
         if len(names) == self.channels > 1:
             return "all electrodes"
-        if len(names) > shown + 1:
-            return f"{', '.join(names[:shown])} and {len(names) - shown} others"
+        if len(names) > most + 1:
+            return f"{', '.join(names[:most])} and {len(names) - most} others"
         return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -29,10 +29,10 @@ class Candidate(Fault):
       of_log: whether it is a fault of the log itself, detected in its own rows and their neighbours.
       sudden: whether it happens between two rows and is detected in them alone: several of one row are one
         event, and held-out rows have no further evidence.
-      beside_load: whether an electrode was compared with the others while a load moves them.
+      under_load: whether an electrode was compared with the others while a load moves them.
       delay: [s] by which the electrodes follow the force later.
-      trend: of levels over time, or None; share: (nelectrode,) of it that each electrode has, None of a
-        single one.
+      trend: of levels over time, or None; fraction: (nelectrode,) of it that each electrode has, None of
+        a single one.
       gap: on the held-out rows, None where nothing there measures it; verified: whether they confirm it,
         None where they cannot; written: whether it is in the amended sensor, with which the held-out rows are
         no further off.
@@ -40,10 +40,10 @@ class Candidate(Fault):
 
     of_log: bool = False
     sudden: bool = False
-    beside_load: bool = False
+    under_load: bool = False
     delay: float = 0.0
     trend: Trend | None = None
-    share: np.ndarray | None = None
+    fraction: np.ndarray | None = None
     gap: Gap | None = None
     verified: bool | None = None
     written: bool = True

@@ -71,7 +71,7 @@ class Model:
         self._fit()
         if not self.known.all():
             for _ in range(2):
-                self.value = np.where(self.known, self.value, self.value - self.alone())
+                self.value = np.where(self.known, self.value, self.value - self.residual())
                 self._fit()
 
     def _fit(self):
@@ -104,7 +104,7 @@ class Model:
         """Whether the fitted rows are long enough to separate load and drift."""
         return bool(self.inside.sum() * self.period >= LEAST)
 
-    def alone(self, value: np.ndarray | None = None) -> np.ndarray:
+    def residual(self, value: np.ndarray | None = None) -> np.ndarray:
         """(m, c) residual of every electrode given the others [ln Z]; unloaded: less the common change.
         value: (m, c) other levels than the model's own."""
         if not self.dimensions:

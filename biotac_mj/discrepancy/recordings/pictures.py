@@ -42,7 +42,7 @@ def _panels(d):
     """Panels of the worst channels; "simulated" is baseline and load as predicted from the other
     electrodes."""
     s, r, m = d.session, d.recording, d.session.model()
-    said = counts_from_log_impedance(m.value - (m.alone() if m.dimensions else m.value) + m.mean)
+    said = counts_from_log_impedance(m.value - (m.residual() if m.dimensions else m.value) + m.mean)
     measured, effect = (
         x[: len(m.time) * m.width].reshape(len(m.time), m.width, -1).mean(1)
         for x in (r.electrodes, r.electrodes - s.filled())

@@ -72,7 +72,7 @@ def _counts(session, without, finding):
         if finding.of_all:
             series = m.shared(np.ones(len(m.used)), value)[:, None] * m.slope.mean()
         else:
-            series = m.alone(value)[:, mine] * m.slope[mine]
+            series = m.residual(value)[:, mine] * m.slope[mine]
         out += [_rms(series[rows]) for rows in (aside, first)]
     if finding.of_all:
         what, floor = "the electrodes' common part about its level", _rms(noise) / np.sqrt(len(noise))
@@ -81,7 +81,7 @@ def _counts(session, without, finding):
     before, early_before, after, early_after = out
     better = after < before or early_after < early_before
     # beside a load the level against the others wanders by itself
-    if not better and (finding.beside_load or finding.features.get("turns", 0.0) > _TURNS):
+    if not better and (finding.under_load or finding.features.get("turns", 0.0) > _TURNS):
         return None
     if not finding.sudden:  # its evidence is in its own rows
         finding.verified = better
@@ -92,7 +92,7 @@ def _samples(session, finding):
     """RMS error of the finding's samples against their prediction from the other electrodes, as logged and
     without it: samples that are no measurement against those that are."""
     m, late = session.model(), ~session.fit
-    said = counts_from_log_impedance(m.value - m.alone() + m.mean)
+    said = counts_from_log_impedance(m.value - m.residual() + m.mean)
     time, number = session.recording.time[late], session.counts.shape[1]
     expected = np.full((len(time), number), np.nan)
     for i, k in enumerate(m.used):
@@ -188,7 +188,7 @@ def _errors(s, loaded):
     if loaded:
         m, aside = _aside(s)
         out = np.full((aside.sum(), s.counts.shape[1]), np.nan)
-        out[:, m.used] = m.alone()[aside] * m.slope
+        out[:, m.used] = m.residual()[aside] * m.slope
         return out
     level = counts_from_log_impedance(log_impedance(s.counts[s.fit]).mean(0))
     return np.where(s.masked, np.nan, s.counts - level)[~s.fit]

@@ -44,7 +44,7 @@ def rest(session: Session) -> Rest:
     """Compares every electrode with its prediction from the others, in the fitted and the held-out rows, in
     units of its change by the load; and the residual rows with those of recordings without an effect."""
     m = session.model()
-    cells, time = m.levels(m.alone(), every=True)
+    cells, time = m.levels(m.residual(), every=True)
     counts = np.abs(cells) * m.slope
     inside = time < m.time[m.inside][-1]
     level, aside = (
@@ -97,7 +97,7 @@ def _where(counts, time):
 
 def _contradicted(session):
     """Line on names that held-out rows contradict, except a warm-up, which every sensor has."""
-    weak = [f for f in session.weak if f.verified is False and f.confidence >= NAMED and f.share is None]
+    weak = [f for f in session.weak if f.verified is False and f.confidence >= NAMED and f.fraction is None]
     names = [f.kind.name + f.where for f in weak]
     if not names:
         return []

@@ -66,7 +66,7 @@ def diagnose_recording(
         bar.update()
         _levels(session, named)
         bar.update()
-        _beside(session, checked, named)
+        _later_faults(session, checked, named)
         bar.update()
         late = _late(session, named)
         bar.update()
@@ -95,19 +95,19 @@ def _levels(session, named):
         _take(session, finding, named)
     for finding in jumped(session):
         _take(session, finding, named)
-    refused = set()
+    rejected = set()
     for _ in range(_MOST + 4):
-        finding = levels(session, refused)
+        finding = levels(session, rejected)
         if finding is None:
             break
         same = [f for f in session.findings if f.channels == finding.channels]
         jumps = not finding.of_all and any(f.sudden for f in same)
         if jumps or _refined(session, finding, same) or not _take(session, finding, named):
-            refused.add((None,) if finding.of_all else finding.channels)
+            rejected.add((None,) if finding.of_all else finding.channels)
     settle(session)
 
 
-def _beside(session, checked, named):
+def _later_faults(session, checked, named):
     """Rows that are missing, and how late the electrodes follow the force; then all are judged together."""
     # an exchange or a jump is no lost row, nor what begins on all electrodes
     begun = [f.start for f in session.findings if f.of_all and f.trend is None and f.start > 0]
@@ -126,19 +126,19 @@ def _beside(session, checked, named):
 
 def _take(session, finding, named):
     """Takes a finding out of the counts if it is likely enough beside all others."""
-    alone = finding.trend is not None and finding.share is None
+    single = finding.trend is not None and finding.fraction is None
     if finding.p >= _P or not finding.possible:
         finding.confidence = _sure(session, finding)
         session.weak.append(finding)
         return False
     session.accept(finding)
-    if alone:  # judged as it is beside all others
+    if single:  # judged as it is beside all others
         settle(session)
     finding.confidence = _sure(session, finding)
     if finding.confidence >= named:
         return True
     session.take_back(finding)
-    if alone:
+    if single:
         settle(session)
     return False
 
@@ -234,13 +234,13 @@ def _late(session, named):
     r = session.recording
     begin = r.time[~session.fit][0]
     whole = Session(r, np.ones(len(r), bool), session.findings, session.unnamed)
-    found, refused = [], set()
+    found, rejected = [], set()
     for _ in range(4):
-        finding = levels(whole, refused)
+        finding = levels(whole, rejected)
         if finding is None:
             break
         finding.confidence = confidence(finding)
-        refused.add((None,) if finding.of_all else finding.channels)
+        rejected.add((None,) if finding.of_all else finding.channels)
         sudden = finding.trend.kind != "smooth" and finding.trend.onset > _LAST * begin
         if sudden and finding.confidence >= max(named, _LATE):
             finding.verified, finding.start = None, float(finding.trend.onset)

@@ -54,8 +54,8 @@ def free_rows(recording: PlainRecording, protocol: Protocol, late: float) -> np.
             free |= (time >= one.start + _BEGUN) & (time < one.stop)
     if force is None or not free.any():
         return free
-    alone = force[free] - np.median(force[free], 0)
-    limit = _TIMES * 1.4826 * np.median(np.abs(alone), 0)
+    unloaded = force[free] - np.median(force[free], 0)
+    limit = _TIMES * 1.4826 * np.median(np.abs(unloaded), 0)
     pressed = (np.abs(force - np.median(force[free], 0)) > limit).any(1)
     rows = round((_AFTER + 2 * max(late, 0.0)) * recording.rate)
     return ~(uniform_filter1d(pressed.astype(float), 2 * rows + 1) > 0.5 / (2 * rows + 1))

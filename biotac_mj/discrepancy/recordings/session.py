@@ -83,7 +83,7 @@ class Session:
         if not self.masked.any():
             return self.counts
         m, out = self.model(), self.counts.copy()
-        said = m.value + m.mean - np.where(m.known, 0, m.alone() if m.dimensions else 0)
+        said = m.value + m.mean - np.where(m.known, 0, m.residual() if m.dimensions else 0)
         time, rows = self.recording.time, np.arange(len(self.counts))
         for k in np.flatnonzero(self.masked.any(0)):
             hole = self.masked[:, k]

@@ -97,7 +97,7 @@ class Likelihood:
     Attributes:
       groups: slices of channels whose errors have something in common. noise: (width,) its standard deviation
         [counts, N]. courses: (k, n) of errors of laws. size: (width,) by how much the base model is expected
-        to be off [counts, N] under the deepest press; expected: (n,) fraction of it in each row.
+        to be off [counts, N] under the deepest press.
     """
 
     def __init__(
@@ -112,7 +112,6 @@ class Likelihood:
         each channel."""
         values, vectors = np.linalg.eigh(covariance)
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
-        self.expected = np.sqrt(vectors**2 @ self._scale)
         self.courses, self.noise, self.groups = courses, noise, groups
         self.size = np.concatenate(
             [np.full(s.stop - s.start, SETTINGS.resolution * _upper(largest[s])) for s in groups]

@@ -84,7 +84,6 @@ def diagnose(
     effects: Sequence = CATALOGUE,
     repeatability: float = REPEATABILITY,
     locked: float = 0.25,
-    seed: int = 0,
     progress: bool = True,
     fields: "Fields | None" = None,
 ) -> TrajectoryDiagnosis:
@@ -94,7 +93,7 @@ def diagnose(
       sim: Simulator. data: list of Trajectory. effects: the catalogue to choose from.
       repeatability: standard deviation of a pose from trial to trial [m]. locked: fraction of
         trajectories opened once, at the end.
-      seed: of the split. fields: what `sim.fields(data)` gave, to use again.
+      fields: what `sim.fields(data)` gave, to use again.
 
     Raises:
       ValueError: too few trajectories, or a fraction that leaves none.
@@ -109,7 +108,7 @@ def diagnose(
         )
     if not 0 < locked < 0.6:
         raise ValueError(f"locked is {locked}: hold out a fraction between 0 and 0.6 of the trajectories")
-    order = np.random.default_rng(seed).permutation(n)
+    order = np.random.default_rng(0).permutation(n)
     aside = np.sort(order[: max(2, round(locked * n))])
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields

@@ -21,7 +21,7 @@ _CLEAR = 6.0  # of the noise, at least
 # times what happens on the electrode's own rows around, what any other electrode does there, and both
 # together: at most 4.1, 3.0 and 8.4 in real recordings, of what stays and is there from one row to the next
 _TIMES = 3.0
-_ALONE = 2.0
+_ISOLATED = 2.0
 _BOTH = 9.0
 # of the step, from one row to the next: a touch takes several rows, of a bus slower than the logger two
 _AT_ONCE = (0.75, 1.3)
@@ -40,12 +40,12 @@ _SURE, _UNSURE = 0.2, 0.5
 
 class Edge(typing.NamedTuple):
     """A jump: time [s], step [counts], how many times what is around it (times) and what is on others
-    (alone)."""
+    (isolation)."""
 
     time: float
     step: float
     times: float
-    alone: float
+    isolation: float
 
 
 def edges(session: Session) -> dict[int, list[Edge]]:
@@ -65,13 +65,13 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     times = np.zeros_like(size)  # not used elsewhere
     times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
     second = np.sort(maximum_filter1d(size, 3, axis=0), axis=1)[:, [-2]]
-    alone = size / np.maximum(second, 1.0)
-    clear = peak & (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
+    isolation = size / np.maximum(second, 1.0)
+    clear = peak & (times > _TIMES) & (isolation > _ISOLATED) & (times * isolation > _BOTH)
     if not clear.any():
         return {}
     stays = _stays(x)
     found: dict[int, list[tuple]] = {}  # electrode: place and height of what stays
-    passing = np.zeros(x.shape[1])  # times and alone of the plainest step that does not
+    passing = np.zeros(x.shape[1])  # times and isolation of the plainest step that does not
     for i, k in zip(*np.nonzero(clear)):
         at = i + h
         # it came back from where it measured nothing, or rows were held or missing meanwhile
@@ -89,13 +89,13 @@ def edges(session: Session) -> dict[int, list[Edge]]:
             within = abs(height - step[i, k]) < rough  # the error: nothing moves
             found.setdefault(int(k), []).append((i, height if within else step[i, k]))
         else:
-            passing[k] = max(passing[k], times[i, k] * alone[i, k])
+            passing[k] = max(passing[k], times[i, k] * isolation[i, k])
     out = {
         k: [
-            Edge(rows[i + h] / r.rate, float(height), float(times[i, k]), float(alone[i, k]))
+            Edge(rows[i + h] / r.rate, float(height), float(times[i, k]), float(isolation[i, k]))
             for i, height in mine
             # where touches make such steps that pass, one of these stays now and then
-            if times[i, k] * alone[i, k] > _PASSING * passing[k]
+            if times[i, k] * isolation[i, k] > _PASSING * passing[k]
         ]
         for k, mine in found.items()
     }
@@ -143,15 +143,15 @@ def _kept(session, k, at, total, jumping):
     z = np.delete(x, [k, *jumping], axis=1)
     z = (z - z.mean(0)) / np.maximum(z.std(0), 1.0)
     level = total[np.searchsorted(at, time[clear], "right")]
-    apart = level[:, None] - level
+    difference = level[:, None] - level
     square = (z**2).sum(1)
-    away = np.where(apart != 0, square[:, None] + square - 2 * z @ z.T, np.inf)
+    away = np.where(difference != 0, square[:, None] + square - 2 * z @ z.T, np.inf)
     nearest = away.argmin(1)
     rows = np.argsort(away.min(1))[: max(5, len(z) // 5)]
     rows = rows[np.isfinite(away.min(1)[rows])]
     if not len(rows):
         return 1.0
-    return float(np.quantile((x[:, k] - x[nearest, k])[rows] / apart[rows, nearest[rows]], 0.75))
+    return float(np.quantile((x[:, k] - x[nearest, k])[rows] / difference[rows, nearest[rows]], 0.75))
 
 
 def jumped(session: Session) -> list[Candidate]:
@@ -188,7 +188,7 @@ def jumped(session: Session) -> list[Candidate]:
                 sudden=True,
                 features={
                     "edge": float(np.log(max(e.times for e in mine))),
-                    "alone": float(np.log(max(e.alone for e in mine))),
+                    "alone": float(np.log(max(e.isolation for e in mine))),
                 },
                 ties=_gains(session, k, at[0]),
                 correct=correct,

@@ -28,10 +28,10 @@ def lagging(session: Session) -> Candidate | None:
     if len(used) < 7 or fitted is None:
         return None
     product, square, total = fitted
-    tau, share = _lag(product.sum(0), square.sum(0), total)
-    share = np.where(tau > 0, share, 0.0)
-    i = int(np.argmax(share))
-    if share[i] < _LEAST:
+    tau, fraction = _lag(product.sum(0), square.sum(0), total)
+    fraction = np.where(tau > 0, fraction, 0.0)
+    i = int(np.argmax(fraction))
+    if fraction[i] < _LEAST:
         return None
     each = product[:, i] / np.maximum(square[:, i], 1e-30)
     error = float(each.std(ddof=1) / np.sqrt(len(each)))
@@ -40,17 +40,18 @@ def lagging(session: Session) -> Candidate | None:
         (int(used[i]),),
         0.0,
         float(r.time[-1]),
-        f"it is {1e3 * tau[i]:.0f} ms later than the others, which explains {share[i]:.0%} of what it lacks",
+        f"it is {1e3 * tau[i]:.0f} ms later than the others, which explains {fraction[i]:.0%} of what it "
+        "lacks",
         {"tau": (float(tau[i]), float(tau[i] - 2 * error), float(tau[i] + 2 * error))},
-        nats=float(-0.5 * BLOCKS * np.log1p(-share[i])),
+        nats=float(-0.5 * BLOCKS * np.log1p(-fraction[i])),
         p=sign_flip(product[:, i] * tau[i] - 0.5 * square[:, i] * tau[i] ** 2),
         detector="lag",
         ties=("latency",),
-        features={"share": float(np.log(share[i]))},
+        features={"share": float(np.log(fraction[i]))},
     )
     if aside is not None:
         later, explained = _lag(aside[0].sum(0), aside[1].sum(0), aside[2])
-        found.verified = bool(later[i] > 0 and explained[i] > 0.5 * share[i])
+        found.verified = bool(later[i] > 0 and explained[i] > 0.5 * fraction[i])
     return found
 
 

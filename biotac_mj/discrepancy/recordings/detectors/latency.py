@@ -42,7 +42,7 @@ class ForceView:
     def __init__(
         self, counts: np.ndarray, force: np.ndarray, rows: np.ndarray, usable: np.ndarray, rate: float
     ):
-        rows, self.rate, self.usable = np.flatnonzero(rows), rate, usable
+        rows, self.rate = np.flatnonzero(rows), rate
         z = log_impedance(counts[np.ix_(rows, usable)])
         z = z - z.mean(0)
         x = np.concatenate([z, Components(z, _AXES).products(z)], axis=1)

@@ -22,9 +22,9 @@ from .trends import BLOCKS, SHARP, Trend, compare, sharp, trends
 
 _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 # of a shared drift's shares about their mean: 8-15 % seen in a real unloaded sensor
-_SHARES = 0.12
+_SCATTER = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
-_ALONE = 0.7
+_OFF_MEDIAN = 0.7
 _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _WARMER = 0.05  # [K] by which the thermistor has to change
 _ALIKE = 0.9  # correlation of a trend with the thermistor's
@@ -35,7 +35,7 @@ _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _MOSTLY = 0.6  # least fraction of a trend that a multiple of the common one explains
 
 
-def levels(session: Session, refused: set) -> Candidate | None:
+def levels(session: Session, rejected: set) -> Candidate | None:
     """The strongest trend over time that one electrode or all have, none of those refused. Series that were
     put together have none: their levels differ by what is touched."""
     if session.recording.joints:
@@ -45,18 +45,18 @@ def levels(session: Session, refused: set) -> Candidate | None:
     everyone = np.ones(number)
     common, time = m.levels(m.shared(everyone))
     best = trends(common, time)[0]
-    finding = _beside(session, refused, best)
+    finding = _under_load(session, rejected, best)
     if finding is not None:
         return finding
     weight = everyone @ m.given.precision[:number, :number] @ everyone
     tried = [(_energy(best, time) * weight, None, best, common)]
-    alone, _ = m.levels(m.alone())
+    residual, _ = m.levels(m.residual())
     for i, k in enumerate(m.used):
-        best = trends(alone[:, i], time)[0]
-        tried.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), best, alone[:, i]))
+        best = trends(residual[:, i], time)[0]
+        tried.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), best, residual[:, i]))
     tried.sort(key=lambda o: -o[0])
     size = {k: float(np.log(max(energy, 1e-12))) for energy, k, *_ in tried}
-    tried = [o for o in tried if (o[1],) not in refused]
+    tried = [o for o in tried if (o[1],) not in rejected]
     # of single electrodes the levels wander with a load as well
     for energy, k, trend, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
         if k is None and trend.kind == "step" and sharp(level, time, trend.onset) <= SHARP:
@@ -68,7 +68,7 @@ def levels(session: Session, refused: set) -> Candidate | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if trend.size * slope < max(_LEAST, session.step):
             continue
-        if k is not None and _own_share(session, trend, trend.size):
+        if k is not None and _part_of_common(session, trend, trend.size):
             continue
         finding = _shared(session, trend) if k is None else _single(session, trend, k)
         finding.features["lead"] = _lead(size, k, designed(session.counts))
@@ -86,7 +86,7 @@ def _lead(size, k, design):
     return float(np.clip(lead, -1, _PLAINLY))
 
 
-def _beside(session, refused, common):
+def _under_load(session, rejected, common):
     """The electrode that drifts most clearly under load, of those that were not rejected, without those whose
     drift may be part of the common one (common: a trend [ln Z])."""
     m = session.model()
@@ -97,14 +97,14 @@ def _beside(session, refused, common):
     nats = np.array([every.nats(i) for i in range(len(m.used))])
     for i in np.argsort(-nats)[:_CANDIDATES]:
         k = int(m.used[i])
-        if (k,) in refused or k in drifting or nats[i] < _NATS:
+        if (k,) in rejected or k in drifting or nats[i] < _NATS:
             continue
         trend = every.trend(int(i))
-        if trend.size * m.slope[i] < _LEAST or _own_share(session, trend, trend.size, common):
+        if trend.size * m.slope[i] < _LEAST or _part_of_common(session, trend, trend.size, common):
             continue
         finding = _single(session, trend, k)
         answers = every.answers(int(i))
-        finding.detector, finding.beside_load = "process", True
+        finding.detector, finding.under_load = "process", True
         finding.features["likelier"] = float(nats[i] / len(trend.gain))
         if answers > _ANSWERS * nats[i]:
             finding.ties = ("gain",)
@@ -114,17 +114,17 @@ def _beside(session, refused, common):
 
 def _drifting(session):
     """Electrodes that drift while they are loaded. Their drift is not removed from the held-out rows."""
-    return frozenset(f.channels[0] for f in session.findings if f.beside_load)
+    return frozenset(f.channels[0] for f in session.findings if f.under_load)
 
 
-def _own_share(session, trend, size, *common):
+def _part_of_common(session, trend, size, *common):
     """Whether a trend of a size [ln Z] is mostly a multiple of a common trend, found or new: the multiple may
     be four standard deviations from the mean."""
-    found = [f.trend for f in session.findings if f.share is not None]
+    found = [f.trend for f in session.findings if f.fraction is not None]
     y = trend.sampled() - trend.sampled().mean()
     for all_do in (*common, *found):
         g = all_do.sampled() - all_do.sampled().mean()
-        if size < 4 * _SHARES * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
+        if size < 4 * _SCATTER * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
             return True
     return False
 
@@ -146,7 +146,7 @@ def _single(session, trend, k):
         return out
 
     change = -float(trend.sampled()[-1] - trend.sampled()[0]) * m.slope[i]
-    error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
+    error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.residual())[0][:, i]))))
     return Candidate(
         "drift",
         (k,),
@@ -158,16 +158,16 @@ def _single(session, trend, k):
         nats=trend.nats,
         p=trend.p,
         detector="one",
-        features=_features(session, trend) | {"apart": _apart(m, k, designed(session.counts))},
+        features=_features(session, trend) | {"apart": _wandering(m, k, designed(session.counts))},
         correct=correct,
         trend=trend,
     )
 
 
-def _apart(m, k, design):
+def _wandering(m, k, design):
     """Logarithm of how much more the levels of electrode k wander about their mean, in counts, than those of
     the others that have no trend of their own."""
-    level, _ = m.levels(m.alone())
+    level, _ = m.levels(m.residual())
     return ahead(np.log(level.std(0) * m.slope + 0.3), m.used, k, design)
 
 
@@ -177,14 +177,14 @@ def settle(session: Session) -> None:
         for finding in [f for f in session.findings if f.trend is not None]:
             other = session.without(finding)
             m, place = other.model(), np.flatnonzero(other.model().used == finding.channels[0])
-            common = finding.share is not None
+            common = finding.fraction is not None
             if not common and not len(place):
                 continue
-            every = process(m, _drifting(other)) if finding.beside_load else None
+            every = process(m, _drifting(other)) if finding.under_load else None
             if every is not None:
                 trend = every.trend(int(place[0]))
             else:
-                series = m.shared(finding.share[m.used]) if common else m.alone()[:, int(place[0])]
+                series = m.shared(finding.fraction[m.used]) if common else m.residual()[:, int(place[0])]
                 kinds = (finding.trend.kind,) if common else ("step", "smooth")
                 levels_at = m.levels(series)
                 trend = trends(*levels_at, kinds)[0].continued(*levels_at)
@@ -192,7 +192,7 @@ def settle(session: Session) -> None:
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.message = again.nats, again.p, again.message
             finding.features |= again.features
-            finding.trend, finding.share = again.trend, again.share
+            finding.trend, finding.fraction = again.trend, again.fraction
             if common:
                 finding.id, finding.ties, finding.detector = again.id, again.ties, again.detector
             session.replay()
@@ -213,24 +213,24 @@ def _features(session, trend):
 
 def _shared(session, trend):
     m, time = session.model(), session.recording.time
-    share = np.ones(session.counts.shape[1])
+    fraction = np.ones(session.counts.shape[1])
     own = {f.channels[0] for f in session.findings if len(f.channels) == 1 and f.correct is not None}
-    share[m.used] = _shares(m, trend, np.isin(m.used, list(own)), designed(session.counts))
+    fraction[m.used] = _fractions(m, trend, np.isin(m.used, list(own)), designed(session.counts))
     before = trend(time[:1])[0]
 
     def correct(counts, at):
-        return counts_from_log_impedance(log_impedance(counts) - np.outer(trend(at) - before, share))
+        return counts_from_log_impedance(log_impedance(counts) - np.outer(trend(at) - before, fraction))
 
     sampled = trend.sampled()
     change = float(sampled[-1] - sampled[0])
     size = trend.size * float(m.slope.mean())
     finding = Candidate(
         "",  # named below
-        tuple(range(len(share))),
+        tuple(range(len(fraction))),
         trend.start,
         time[-1],
         f"ln Z of all electrodes changes by {change:+.3f} ({size:.0f} counts); shares "
-        f"{share[m.used].min():.2f} to {share[m.used].max():.2f}",
+        f"{fraction[m.used].min():.2f} to {fraction[m.used].max():.2f}",
         nats=trend.nats,
         p=trend.p,
         features=_features(session, trend)
@@ -240,7 +240,7 @@ def _shared(session, trend):
         },
         correct=correct,
         trend=trend,
-        share=share,
+        fraction=fraction,
     )
     _name_shared(session, finding, trend, change)
     return finding
@@ -258,7 +258,7 @@ def _uneven(m, trend):
     return float(np.log(np.clip(spread / max(abs(np.median(each)), 1e-12), 0.05, 5)))
 
 
-def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarray:
+def _fractions(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarray:
     """Relative drift of each electrode (c,), about one: generalised least squares on the cells' levels,
     shrunk towards their mean. An electrode with a change of its own, in `own` (c,), gets the mean of its
     three neighbours."""
@@ -267,30 +267,32 @@ def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarr
     g = trend(time)
     g = g - g.mean()
     marginal = m.given.marginal()
-    alone = m.levels(m.alone())[0]
-    alone = alone - alone.mean(0)
-    alone = alone - np.outer(g, g @ alone / max(g @ g, 1e-12))
+    residual = m.levels(m.residual())[0]
+    residual = residual - residual.mean(0)
+    residual = residual - np.outer(g, g @ residual / max(g @ g, 1e-12))
     # the cells' levels wander by more than the changes within them, and remember where they have been
-    memory = np.clip((alone[1:] * alone[:-1]).sum(0) / np.maximum((alone**2).sum(0), 1e-12), 0, 0.95)
-    scatter = (alone**2).mean(0) * (1 + memory) / (1 - memory)
+    memory = np.clip((residual[1:] * residual[:-1]).sum(0) / np.maximum((residual**2).sum(0), 1e-12), 0, 0.95)
+    scatter = (residual**2).mean(0) * (1 + memory) / (1 - memory)
     worse = max(float(np.median(scatter / m.given.noise**2)), 1e-9)
-    share = np.ones(number)
+    fraction = np.ones(number)
     for _ in range(3):
         # shares far off are a change of one electrode: they are drawn to the mean all the more
-        off = (share - np.median(share)) / _SHARES
-        pull = (1 / (1 + (off / 4) ** 2)) / _SHARES**2
+        off = (fraction - np.median(fraction)) / _SCATTER
+        pull = (1 / (1 + (off / 4) ** 2)) / _SCATTER**2
         pull = (
-            np.maximum(pull, 1 / _SHARES**2 * 0.05) if m.dimensions == 0 else np.full(number, 1 / _SHARES**2)
+            np.maximum(pull, 1 / _SCATTER**2 * 0.05)
+            if m.dimensions == 0
+            else np.full(number, 1 / _SCATTER**2)
         )
         A = g @ g / worse * marginal + np.diag(pull)
-        share = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(share))
+        fraction = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(fraction))
     if not m.dimensions:  # unloaded: a fraction that far off is a change of that electrode alone
-        own = own | (np.abs(share - np.median(share)) > _ALONE)
+        own = own | (np.abs(fraction - np.median(fraction)) > _OFF_MEDIAN)
     place = electrode_positions(design)[m.used]
     for i in np.flatnonzero(own):
         near = np.argsort(np.linalg.norm(place - place[i], axis=1) + 1e3 * own)[:3]
-        share[i] = share[near].mean()
-    return share
+        fraction[i] = fraction[near].mean()
+    return fraction
 
 
 def _name_shared(session, finding, trend, change):
@@ -327,7 +329,7 @@ def _misfits(m, middle, trend):
     for effect in SHARED:
         pattern = effect.pattern(m.slope, middle)
         size = m.given.along(pattern, amplitude[None])[0]
-        spread = m.given.noise**2 + (_SHARES * size * pattern) ** 2
+        spread = m.given.noise**2 + (_SCATTER * size * pattern) ** 2
         beyond = amplitude - size * np.r_[pattern, np.zeros(len(amplitude) - len(pattern))]
         left = m.given.residual(beyond[None])[0] if m.dimensions else beyond
         out[effect.id] = float(left @ (left / spread))
@@ -364,11 +366,11 @@ def _by_temperature(session, finding, trend, ties):
     if not Thermal().possible(alpha):
         return ties
     ties, finding.id, finding.parameters = [finding.id, *ties], "thermal", alpha
-    share = finding.share
+    fraction = finding.fraction
 
     def correct(counts, at):
         warmer = np.interp(at, clock, heat) - heat[0]
-        return counts_from_log_impedance(log_impedance(counts) - np.outer(slope * warmer, share))
+        return counts_from_log_impedance(log_impedance(counts) - np.outer(slope * warmer, fraction))
 
     finding.correct = correct
     return ties

@@ -43,9 +43,9 @@ class Process:
         x = model.value[: n * span].reshape(n, span, -1).mean(1)
         self._time = model.time[: n * span].reshape(n, span).mean(1)
         self._model, self._span, self._x = model, span, x - x.mean(0)
-        apart = np.abs(self._time[:, None] - self._time)
-        self._memory = np.exp(-apart / _SECONDS)
-        self._smooth = np.exp(-0.5 * (apart / (_SMOOTH * np.ptp(self._time))) ** 2)
+        distance = np.abs(self._time[:, None] - self._time)
+        self._memory = np.exp(-distance / _SECONDS)
+        self._smooth = np.exp(-0.5 * (distance / (_SMOOTH * np.ptp(self._time))) ** 2)
         self._fits: dict[int, tuple] = {}
 
     def nats(self, i: int) -> float:

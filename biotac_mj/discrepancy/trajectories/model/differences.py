@@ -21,6 +21,9 @@ from ..base.nuisance import BETWEEN, OTHER_MESH
 from ..trajectory import Trajectory
 from .fields import MAPS, Curve, Fields, stack
 
+if typing.TYPE_CHECKING:
+    from .simulator import Simulator
+
 _SHIFT = 40e-6  # [m] of the poses for differences
 # [m] along the press: densest where errors of poses lie, since rows before the touch begin to touch there
 _DEEPER = 20e-6 * np.array([-6, -4, -2, -1, 0, 1, 2, 4, 6])
@@ -36,26 +39,6 @@ _TACKY = 1.0, 4.0  # [J/m2] of joining, see `stick`
 _STIFFER = 0.3  # c2 of `effects.rubber.Stiffening`
 
 
-class Solver(typing.Protocol):
-    """The part of a `Simulator` that solves the skin; its settings are described there."""
-
-    skin: typing.Any
-    tier: str
-    material: typing.Any
-    options: dict
-    cache: typing.Any
-    effects: list
-
-    def solve(self, trajectories: list[Trajectory], **changes: object) -> list:
-        """Force, pressure and ln Z along trajectories, dicts of arrays."""
-
-    def but(self, models: dict | None = None, **changes: object) -> "Solver":
-        """A copy with other fields."""
-
-    def skin_and_film(self, log_friction: float, bubble: float) -> tuple:
-        """SkinModel and FilmConduction."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Change:
     """A small change of what is solved.
@@ -67,7 +50,7 @@ class Change:
 
     name: str
     by: float
-    sim: Solver
+    sim: "Simulator"
     how: dict = dataclasses.field(default_factory=dict)
     load: float = 1.0
 
@@ -88,7 +71,10 @@ def differences(
 
 
 def solved_fields(
-    sim: Solver, trajectories: list[Trajectory], progress: bool = True, places: Sequence[str] | None = None
+    sim: "Simulator",
+    trajectories: list[Trajectory],
+    progress: bool = True,
+    places: Sequence[str] | None = None,
 ) -> Fields:
     """The skin along the trajectories and its differences: 20 solutions of the data set by the condensed
     tier, beside one of the simulator's own; kept in `cache`.
@@ -103,7 +89,11 @@ def solved_fields(
     deeper, thick = (_DEEPER, _FILM) if fitted else (_DEEPER[2:7:2], _FILM[4:13:4])
     # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
-    lacking = [] if quick is sim else [_stiffer(sim), *(tacky(sim, work) for work in _TACKY)]
+    lacking = []
+    if quick is not sim:
+        inside = memory_of([(Stiffening(), {"c2": _STIFFER})])
+        rubber = plain(inside.rubber(read_material(sim.material)))
+        lacking = [Change("stiffen", _STIFFER, sim.but(material=rubber)), *(tacky(sim, by) for by in _TACKY)]
     small = [*_uneven(quick, places), *filled(quick), *sunk(quick), *softer(quick)]
     if sim.skin in OTHER_MESH:
         small.append(Change("mesh", 1.0, quick.but(skin=OTHER_MESH[sim.skin])))
@@ -191,20 +181,14 @@ def _uneven(sim, places):
         yield Change(way, by, sim.but(options=sim.options | {"modulus": modulus}))
 
 
-def _stiffer(sim):
-    """Rubber that stiffens inside the elements, as the condensed tier cannot."""
-    inside = memory_of([(Stiffening(), {"c2": _STIFFER})])
-    return Change("stiffen", _STIFFER, sim.but(material=plain(inside.rubber(read_material(sim.material)))))
-
-
-def tacky(sim: Solver, work: float) -> Change:
+def tacky(sim: "Simulator", work: float) -> Change:
     """A contact that sticks, of so much work of joining [J/m2], all of it together."""
     inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})])
     skin = plain(inside.options(read_settings(sim.material, sim.options)[1]))
     return Change(f"{TACKY}{work:.9g}", 1.0, sim.but(options=sim.options | {"skin": skin}))
 
 
-def filled(sim: Solver) -> list[Change]:
+def filled(sim: "Simulator") -> list[Change]:
     """The fraction of its liquid that the fingertip has lost or won, the film as it was."""
     model, film = sim.skin_and_film(0.0, 0.0)
     settings = read_settings(sim.material, sim.options)[1]
@@ -215,7 +199,7 @@ def filled(sim: Solver) -> list[Change]:
     return [Change("fill", _FILL, sim.but({"film": film}, options=options, cache=_subfolder(sim, "filled")))]
 
 
-def sunk(sim: Solver) -> list[Change]:
+def sunk(sim: "Simulator") -> list[Change]:
     """The depth [m] to which the skin has sunk towards the core, all else as it was."""
     from ....effects.in_film import SunkFilm
 
@@ -231,7 +215,7 @@ def _subfolder(sim, name):
     return None if sim.cache is None else str(pathlib.Path(sim.cache) / name)
 
 
-def softer(sim: Solver) -> list[Change]:
+def softer(sim: "Simulator") -> list[Change]:
     """The logarithm of the modulus, beyond a factor on force and pressure: there is nothing but where the
     liquid stands under pressure at rest, which another modulus leaves as it is."""
     if not read_settings(sim.material, sim.options)[1].rest_pressure:

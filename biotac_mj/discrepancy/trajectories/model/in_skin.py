@@ -182,12 +182,7 @@ class _Remembering(Simulator):
         bubble: float = 0.0,
         progress: Callable[[], object] | None = None,
     ) -> list:
-        poses = [
-            placed(
-                t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i])
-            )
-            for i, t in enumerate(trajectories)
-        ]
+        poses = placed(trajectories, offset, log_radius)
         model, film = self.skin_and_film(log_friction, bubble)
         power = self.inside.film.get("power")
         film = film if power is None else RoughFilm(film, power)

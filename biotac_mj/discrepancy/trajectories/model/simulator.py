@@ -173,10 +173,7 @@ class Simulator:
           offset: list of (n, 3) [m], or None; log_radius: list of floats, or None.
         """
         out, todo = [None] * len(trajectories), []
-        for i, t in enumerate(trajectories):
-            tool, pos = placed(
-                t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i])
-            )
+        for i, (t, (tool, pos)) in enumerate(zip(trajectories, placed(trajectories, offset, log_radius))):
             entry = None if self.cache is None else self._entry(t, tool, pos, log_friction, bubble)
             out[i] = None if entry is None else entry.load()
             if out[i] is None:
@@ -484,16 +481,20 @@ def _turned(t, turn):
     return dataclasses.replace(t, mat=Rotation.from_rotvec(turn).as_matrix() @ t.mat)
 
 
-def placed(t: Trajectory, shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
-    """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied
-    by exp(grow), its tip kept."""
-    tool, pos = t.tool, t.pos + (0.0 if shift is None else shift)
-    if grow and "sphere" in tool:
-        radius = _sphere_radius(tool)
-        tip = pos if not tool.startswith("geom:") else pos + radius * t.mat[:, :, 1]
-        radius *= np.exp(grow)
-        tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
-    return tool, pos
+def placed(
+    trajectories: list[Trajectory], offset: list | None, log_radius: list | None
+) -> list[tuple[str, np.ndarray]]:
+    """Tool and positions (n, 3) of each trajectory (`Simulator.solve`); a larger sphere keeps its tip."""
+    out = []
+    for i, t in enumerate(trajectories):
+        tool, pos = t.tool, t.pos + (0.0 if offset is None else offset[i])
+        if log_radius is not None and log_radius[i] and "sphere" in tool:
+            radius = _sphere_radius(tool)
+            tip = pos if not tool.startswith("geom:") else pos + radius * t.mat[:, :, 1]
+            radius *= np.exp(float(log_radius[i]))
+            tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
+        out.append((tool, pos))
+    return out
 
 
 def _impedance(film, vert_xpos):
