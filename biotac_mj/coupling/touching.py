@@ -67,8 +67,8 @@ class Touching:
             meshes, self.notes = _meshes(model, core, ids)
             ids = np.array([i for i in ids if meshes.get(int(i), True) is not None], dtype=np.int64)
         # a body's skin and its rigid parts are groups of their own
-        is_skin = np.array([_has_skin(model, core, g) for g in ids], dtype=np.int64)
-        parts = 2 * model.geom_bodyid[ids] + is_skin
+        is_rigid = np.array([not _has_skin(model, core, g) for g in ids], dtype=np.int64)
+        parts = 2 * model.geom_bodyid[ids] + is_rigid
         self.geom = ids
         parts, self._first, group = np.unique(parts, return_index=True, return_inverse=True)
         self.body = parts // 2
