@@ -714,17 +714,6 @@ def test_later_rounds_take_no_more_than_earlier_ones_left(kind):
     assert not last.converged and last.cost < 0.07, "what an iteration takes that has begun is not broken off"
 
 
-@pytest.mark.parametrize("kind", [fem.FemStepper, CondensedStepper])
-def test_a_step_that_may_be_dear_is_so_for_all_its_rounds(kind):
-    """The same work is a smaller share of a larger bound: else its first solve would leave nothing."""
-    stepper, state, touch = ball_stepper(kind=kind)
-    turn, pose = np.eye(3)[None], touch + [0, 4e-4, 0]
-    short, long = (stepper.solve_skin(state, pose, turn, 2e-3, patient=patient) for patient in (False, True))
-    assert short.converged and long.converged and short.cost > 0
-    np.testing.assert_array_equal(short.wrench, long.wrench)
-    assert long.cost == pytest.approx(short.cost / fem.PATIENT, rel=1e-9)
-
-
 def test_what_a_contact_needs_is_made_before_the_first(monkeypatch):
     """Factors and programs take a second, in the middle of whatever moves."""
     made, prepare = [], SkinStep.__init__

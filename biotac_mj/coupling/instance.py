@@ -260,7 +260,7 @@ class Instance:
         self.stays = False
         dt, stepper, before = self.model.opt.timestep, self.setup.skin.stepper, self._skin
         near = near if near is not None and near.converged else None
-        more = {"near": near, "patient": self._may_wait, "spent": spent}
+        more = {"near": near, "spent": spent}
         if stepper.inertial:
             more["core_pos"], more["core_mat"] = core
         if stepper.gives_way:
@@ -268,7 +268,7 @@ class Instance:
         begun = () if near is None else near.pose
         given = () if bodies is None else (bodies.compliance, bodies.wrench)
         poses = [a.tobytes() for a in (pos, mat, *core, *begun, *given)]
-        flags = near is None, bodies is None, more["patient"], self.touching.parted
+        flags = near is None, bodies is None, self.touching.parted
         key = (dt, spent, *flags, *poses, self.parts[1].tobytes(), stepper.key(before))
         # solving is a function of the key, so a second mj_forward costs nothing
         result = self._solved.get(key)
@@ -293,20 +293,6 @@ class Instance:
             self._solved[key] = result
         self._result, self._reading = result, None
         return result
-
-    @property
-    def _may_wait(self):
-        """Whether a solve may take `PATIENT` times the work, because the last step failed with less. Either
-        the skin kept its last state and no touching body can move; or it did not converge against another
-        skin: such contacts are wide, and without an equilibrium the skins approach until their cores
-        meet."""
-        if not self.two_way:
-            return False
-        head, models, _, _ = self.parts
-        if not len(self.dofs):
-            return head[CONVERGED] == -1.0
-        skins = self.touching.skins
-        return bool(skins) and head[CONVERGED] <= 0.0 and bool(models["wrench0"][skins].any())
 
     def _came_to(self, state):
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies for which a skin's state holds; None where the skin

@@ -117,11 +117,11 @@ class SkinStepper:
 
         Args:
           more: further facts about the step; a skin may ignore them. near: a converged result of the same
-            step for poses not far from these, or None; Newton's method may begin from it. patient: whether
-            the step may cost more, because the last one failed. spent: fraction of a step's largest cost that
-            earlier solves of it took; the skin spends at most the rest. core_pos (2, 3), core_mat (2, 3, 3),
-            if `inertial`: the BioTac frame in the world at the start and at the end of the step. bodies
-            (`skin.bodies.BodyMotion`), if it `gives_way`: motion of the touching bodies, or None.
+            step for poses not far from these, or None; Newton's method may begin from it. spent: fraction of
+            a step's largest cost that earlier solves of it took; the skin spends at most the rest. core_pos
+            (2, 3), core_mat (2, 3, 3), if `inertial`: the BioTac frame in the world at the start and at the
+            end of the step. bodies (`skin.bodies.BodyMotion`), if it `gives_way`: motion of the touching
+            bodies, or None.
         """
         raise NotImplementedError
 

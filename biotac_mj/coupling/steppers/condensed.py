@@ -11,7 +11,7 @@ from ...skin.condensed.memory import layout_of
 from ..config import Config
 from ..shared import trim_memory
 from ..stepper import Geom, SkinResult
-from .fem import PATIENT, FemStepper
+from .fem import FemStepper
 
 _PATIENCE = 0.75  # of two-way skins: somebody waits for the step, and the next one goes on
 
@@ -53,7 +53,6 @@ class CondensedStepper(FemStepper):
         core_pos: np.ndarray | None = None,
         core_mat: np.ndarray | None = None,
         near: SkinResult | None = None,
-        patient: bool = False,
         spent: float = 0.0,
         bodies: BodyMotion | None = None,
     ) -> SkinResult:
@@ -62,10 +61,9 @@ class CondensedStepper(FemStepper):
         Raises:
           ValueError: NaN in a pose.
         """
-        bound = PATIENT if patient else 1
         memory = self._read(state)
         begin = self._read(near.state) if near is not None and bodies is not None else None
-        out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies, begin)
+        out = self._skin.solve(memory, geom_pos, geom_mat, 1 - spent, bodies, begin)
         return SkinResult(
             state=out.memory.row,
             wrench=out.wrench,
@@ -78,7 +76,7 @@ class CondensedStepper(FemStepper):
             measured=out.measured,
             load_factor=out.load_factor,
             load=out.load,
-            cost=out.cost / bound,
+            cost=out.cost,
             slack=out.slack,
         )
 

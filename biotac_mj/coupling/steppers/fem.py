@@ -26,7 +26,6 @@ from ..stepper import Geom, SkinResult, SkinStepper
 
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
-PATIENT = 4  # times that, for a skin whose last step failed and would fail again
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
 CLEAR = 1e-3
@@ -70,12 +69,6 @@ class FemStepper(SkinStepper):
     @functools.cached_property
     def _model(self):
         return shared_model(self._geometry, self._settings, self._config.device)
-
-    @functools.cached_property
-    def _patient(self):
-        model = copy.copy(self._model)
-        model.options = dataclasses.replace(model.options, max_work=PATIENT * model.options.max_work)
-        return model
 
     @functools.cached_property
     def _data(self):
@@ -218,11 +211,10 @@ class FemStepper(SkinStepper):
         core_pos: np.ndarray = _STILL[0],
         core_mat: np.ndarray = _STILL[1],
         near: SkinResult | None = None,
-        patient: bool = False,
         spent: float = 0.0,
         bodies: BodyMotion | None = None,
     ) -> SkinResult:
-        """See `SkinStepper`. patient: for a step that may be dear.
+        """See `SkinStepper`.
 
         Raises:
           ValueError: NaN in a pose, or more contact than the state can hold.
@@ -232,7 +224,7 @@ class FemStepper(SkinStepper):
             released = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
         if self._untouched(state, *released):
             return self._still(state, *released)
-        d, geoms, model = self._data, self._geom_set, self._patient if patient else self._model
+        d, geoms, model = self._data, self._geom_set, self._model
         started, instead = self._part(state, "started")[0], {}
         x = self._part(state, "x").reshape(-1, 3)
         if near is not None:
