@@ -13,7 +13,7 @@ from blocks import four_nodes
 
 import biotac_mj
 from biotac_mj import batch as batches
-from biotac_mj.batch import solid
+from biotac_mj.batch import solid_contacts
 from biotac_mj.batch.engine import Contacts, Rows
 from biotac_mj.skin import SkinOptions
 
@@ -603,7 +603,7 @@ def test_contacts_with_the_core_do_the_work_of_their_rows(sparse):
     moved = [wp.array(a[None], dtype=float, ndim=2) for a in (qvel, qacc)]
     lifted = wp.zeros((1, 1), dtype=wp.float64)
     body, bodies_of_geoms = (wp.array(a, dtype=int) for a in ([1], [0, 1, 3, 2]))
-    wp.launch(solid.find_lift, 3, [2, body, step, bodies_of_geoms, contact, rows, *moved], [lifted])
+    wp.launch(solid_contacts.find_lift, 3, [2, body, step, bodies_of_geoms, contact, rows, *moved], [lifted])
     work = step * (force * (J @ (qvel + 0.5 * step * qacc)))
     np.testing.assert_allclose(lifted.numpy()[0, 0], work[:2].sum(), rtol=1e-6)
 

@@ -44,18 +44,18 @@ from . import kernels, rest, skin_kernels
 from .ahead import kernels_of_step, launched_by
 from .batch import Batch
 from .hook import Hook
-from .implicit import dynamics, integrator
+from .implicit import integrator
 from .senses import Senses, draws
 from .skin import BatchSkin
 from .skins import PoseBatch
-from .solids import set_solids
+from .solid_contacts import set_solids
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 # what takes long to compile, or is launched first: it begins before the skin is made
 _KERNELS = [rest_gap.module, meshes, closest, liquid, rest, rounds, film_kernels, core_surface]
-_KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, dynamics, energy, integrator, skin_kernels]
+_KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, energy, integrator, skin_kernels]
 # keywords of `biotac_mj.attach` that a batch has no use for
 _NOT_OF_WORLDS = ("device", "stepper", "on_error")
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)

@@ -19,9 +19,9 @@ from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touches import find_touches
 from ..coupling.touching import Touching
-from . import kernels, solid
+from . import kernels, solid_contacts
 from .engine import contacts_of, rows_of
-from .implicit import dynamics, integrator
+from .implicit import integrator
 from .implicit.factor import Cones, Factor
 from .senses import Senses
 from .skin import BatchSkin
@@ -67,7 +67,7 @@ class Batch(Skins):
             self._jacobian = wp.zeros((*self.groups, mjm.nv), dtype=wp.spatial_vectord)
             self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._acting = wp.zeros(self.groups, dtype=wp.spatial_vectord)
-            self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
+            self._whole = wp.ones(skin.ngroup, dtype=wp.float64)
             kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.spatial_vectord)
             self._touches = [wp.zeros((len(touching.geom), self.nworld), dtype=kind) for kind in kinds]
             self._of_step = r = rounds.make_rounds(*self.groups, limit)
@@ -114,7 +114,7 @@ class Batch(Skins):
             self._find_drift(m, d)
             self._put_bodies(m)
             self._launch(
-                dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
+                kernels.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
 
     def _find_drift(self, m, d):
@@ -130,7 +130,7 @@ class Batch(Skins):
     def add_forces(self, d: "mjw.Data") -> None:
         """Adds the linear models to the forces, after `act`."""
         wrenches = [self._wrench, self._correction_force]
-        self._launch(dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, *wrenches], [d.qfrc_passive])
+        self._launch(kernels.add_forces, d.qfrc_passive.shape, [self._jacobian, *wrenches], [d.qfrc_passive])
 
     def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Finds the linear models' forces, and puts the rest of them into the rows."""
@@ -171,7 +171,7 @@ class Batch(Skins):
         self._launch(*self._bodies.accelerate(self.dt, self._jacobian, qacc, r))
         r.lifted.zero_()
         known = [self._core, self._body, self.dt, m.geom_bodyid, contacts_of(d), rows_of(m, d), d.qvel, qacc]
-        self._launch(solid.find_lift, d.naconmax, known, [r.lifted])
+        self._launch(solid_contacts.find_lift, d.naconmax, known, [r.lifted])
 
     def _put_bodies(self, m):
         """Lets bodies that were placed begin without contact; finds which were placed in the skin."""
@@ -299,7 +299,7 @@ class Batch(Skins):
         if self.moving:
             forces = [self._wrench, self._correction_force, self.model.tangent0]
             known = [self._of_step.square, self._jacobian, d.qacc, *forces, self.skin.reason]
-            self._launch(dynamics.acting_wrenches, self.groups, known, [self._acting])
+            self._launch(kernels.acting_wrenches, self.groups, known, [self._acting])
 
     def report_force(self, m: "mjw.Model", d: "mjw.Data", contact_force: wp.array) -> None:
         """Writes what acts on the BioTac in the step, on its skin and on core, nail and clamp, when each has
@@ -311,11 +311,11 @@ class Batch(Skins):
         acting = self._acting if self.moving else self.model.wrench0
         known = [self._core, m.geom_bodyid, contacts_of(d), contact_force, d.xpos, d.xmat]
         self._on_solid.zero_()
-        self._launch(solid.sum_contacts, contact_force.shape, known, [self._on_solid])
+        self._launch(solid_contacts.sum_contacts, contact_force.shape, known, [self._on_solid])
         for other, group in self.skins_met:
             met = [self._core, other._core, group, other._acting, d.xpos, d.xmat]
-            self._launch(solid.add_push, self.nworld, met, [self._on_solid])
-        known = [self._addresses, acting, self._on_solid]
+            self._launch(solid_contacts.add_push, self.nworld, met, [self._on_solid])
+        known = [self._addresses, acting, self._whole, self._on_solid]
         self._launch(kernels.write_force, (self.nworld, 6), known, [d.sensordata])
 
     def find_touches(self) -> None:

@@ -23,9 +23,8 @@ from ..skin.program import Fork, Launcher
 from .ahead import kernels_of_step
 from .batch import Batch
 from .implicit import integrator
-from .implicit.ends import Ends
 from .implicit.factor import Cones, Factor
-from .implicit.integrator import Integrator
+from .implicit.integrator import Ends, Integrator
 from .memory import Scratch
 from .skin import solve_group
 

@@ -1,9 +1,10 @@
-"""Kernels of `skins.py`: poses in, linear models kept, forces and readings out.
+"""Kernels of `skins.py` and `batch.py`: poses in, linear models kept, forces and readings out.
 
 Arrays of the simulator lead with the world and are single precision; ours are [item, world] and double. A
 wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin,
 unless stated otherwise."""
 
+import mujoco
 import warp as wp
 
 from ..coupling.implicit.rounds import Model
@@ -15,6 +16,8 @@ from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from ..skin.types import double, mat33, mat66, real, vec3, vec6, widen
 
 kernel_module(__name__)
+
+_EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
 
 
 @wp.kernel
@@ -183,32 +186,23 @@ def _add_force(w: int, b: int, force: vec3, torque: vec3, xfrc: wp.array3d(dtype
         xfrc[w, b, 3 + i] = xfrc[w, b, 3 + i] + float(torque[i])
 
 
-@wp.func
-def _force_on_biotac(wrench: wp.array2d(dtype=vec6), fraction: wp.array(dtype=real), w: int, i: int):
-    """Component i of the force on the BioTac: the opposite of all wrenches on bodies. `wrench` holds a
-    fraction of each."""
-    total = real(0.0)
-    for g in range(wrench.shape[0]):
-        total += wrench[g, w][i] / fraction[g]
-    return -total
-
-
 @wp.kernel
 def write_force(
     # In:
     address: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
+    fraction: wp.array(dtype=real),
     besides: wp.array(dtype=vec6),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
-    """contact_force at its address among those of `write_sensors`: what acts on others, turned round, and
-    what others do besides."""
+    """contact_force at its address among those of `write_sensors`: what acts on others, of which `wrench`
+    holds a fraction, turned round, and what others do besides."""
     w, i = wp.tid()
     if address[5] >= 0:
         total = besides[w][i]
         for g in range(wrench.shape[0]):
-            total -= wrench[g, w][i]
+            total -= wrench[g, w][i] / fraction[g]
         sensordata_out[w, address[5] + i] = float(total)
 
 
@@ -218,20 +212,16 @@ def write_sensors(
     at: Place,
     address: wp.array(dtype=int),
     state: wp.array2d(dtype=real),
-    wrench: wp.array2d(dtype=vec6),
-    fraction: wp.array(dtype=real),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
-    """Readings at the addresses of electrodes, pdc, pac, tac, tdc and contact_force; -1: the model has no
-    such sensor. Each thread writes one number of every channel that has as many."""
+    """Readings at the addresses of electrodes, pdc, pac, tac and tdc; -1: the model has no such sensor.
+    Each thread writes one number of every channel that has as many."""
     w, i = wp.tid()
     if address[0] >= 0 and i < at.nelectrode:
         sensordata_out[w, address[0] + i] = float(state[w, at.sampled + i])
     if address[2] >= 0 and i < at.slots / 2:
         sensordata_out[w, address[2] + i] = float(state[w, at.pac + i])
-    if address[5] >= 0 and i < 6:
-        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, fraction, w, i))
     if i > 0:
         return
     if address[1] >= 0:
@@ -280,3 +270,64 @@ def write_status(
     sensordata_out[w, at + 5] = float(rounds[w])
     sensordata_out[w, at + 6] = float(st.load_factor[w])
     sensordata_out[w, at + 7] = float(real(1.0) - least)
+
+
+@wp.kernel
+def add_forces(
+    # In:
+    jacobian: wp.array3d(dtype=vec6),
+    wrench: wp.array2d(dtype=vec6),
+    correction: wp.array2d(dtype=vec6),
+    # In, out:
+    qfrc: wp.array2d(dtype=float),
+):
+    w, i = wp.tid()
+    total = real(0.0)
+    for g in range(wrench.shape[0]):
+        total += wp.dot(jacobian[g, w, i], wrench[g, w] + correction[g, w])
+    qfrc[w, i] += float(total)
+
+
+@wp.kernel
+def acting_wrenches(
+    # In:
+    square: wp.array2d(dtype=real),
+    jacobian: wp.array3d(dtype=vec6),
+    qacc: wp.array2d(dtype=float),
+    wrench: wp.array2d(dtype=vec6),
+    correction: wp.array2d(dtype=vec6),
+    tangent: wp.array2d(dtype=mat66),
+    reason: wp.array(dtype=int),
+    # Out:
+    acting_out: wp.array2d(dtype=vec6),
+):
+    """Total wrench on the bodies in the step: the forces of `add_forces`, and those of the rows of
+    `write_rows` at the accelerations of the constraint solver."""
+    g, w = wp.tid()
+    total = wrench[g, w] + correction[g, w]
+    if reason[w] != NOT_FINITE:  # what is lost has no force, and no accelerations
+        moved = vec6()
+        for i in range(jacobian.shape[2]):
+            moved += square[g, w] * real(qacc[w, i]) * jacobian[g, w, i]
+        total -= tangent[g, w] * moved
+    acting_out[g, w] = total
+
+
+@wp.kernel
+def find_rows(
+    # In:
+    slot: wp.array(dtype=int),
+    ne: wp.array(dtype=int),
+    efc_type: wp.array2d(dtype=int),
+    efc_id: wp.array2d(dtype=int),
+    # Out:
+    row_out: wp.array2d(dtype=int),
+):
+    """The first of the six rows of each weld that holds a slot [slot, world]; -1 where there was no room for
+    it."""
+    s, w = wp.tid()
+    row = int(-1)
+    for r in range(wp.min(ne[w], efc_id.shape[1])):
+        if row < 0 and efc_type[w, r] == _EQUALITY and efc_id[w, r] == slot[s]:
+            row = r
+    row_out[s, w] = row

@@ -45,7 +45,7 @@ class BatchSkin:
     Attributes (wp.arrays on the model's device, double precision unless stated otherwise):
       data: the SkinData: positions, materials and liquids.
       pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before
-        `solve_skins`.
+        `begin_solve`.
       inertial: whether the skins have inertia (implicit dynamics): then the caller also writes where the
         BioTac frames are, core_pos, core_mat (nworld,) when the step begins and data.frame_pos,
         data.frame_mat when it ends.
@@ -140,21 +140,14 @@ class BatchSkin:
         """Contact found by a solve: touching geoms, `wrench`, `tangent`."""
         return [self._touched_by, self.wrench, self.tangent]
 
-    def solve_skins(self) -> None:
-        """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
-        may be captured in a CUDA graph. After `rest.begin_solve`, before
-        `rest.come_to_rest`.
+    def begin_solve(self) -> None:
+        """Begins to solve the worlds that are `data.worlds.wanted` for the geoms where they are now, between
+        `rest.begin_solve` and `rest.come_to_rest`; `solve_group` and `end_solve` follow. Launches only,
+        without loops or branches in the condensed tier.
 
         A world without equilibrium there comes as far as it can (`data.worlds.load_factor`); one whose poses
         are not finite stays as it was. One that nothing touches any more comes to rest, and so does one that
         has not moved on for some steps: then without equilibrium."""
-        self.begin_solve()
-        solve_group([self], Fork(self.model.device, wanted=False))
-        self.end_solve()
-
-    def begin_solve(self) -> None:
-        """The first part of it; `solve_group` and `end_solve` follow. Without loops or branches in the
-        condensed tier."""
         m, d = self.model, self.data
         if self.inertial:
             frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]

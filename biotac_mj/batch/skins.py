@@ -13,12 +13,12 @@ from ..coupling.implicit.poses import Bodies
 from ..coupling.implicit.rounds import Model, make_model
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
-from ..skin.program import compile_ahead, finish_compiling
+from ..skin.program import Fork, compile_ahead, finish_compiling
 from ..skin.state import GUESS, MEMORY, OUTCOME
 from . import kernels
 from .ahead import launched_by
 from .senses import Senses
-from .skin import BatchSkin
+from .skin import BatchSkin, solve_group
 
 
 class Skins:
@@ -67,6 +67,7 @@ class Skins:
             self._push = wp.ones(shape, dtype=wp.float64)
             self._valid = senses.film.valid if senses else wp.ones(self.nworld, dtype=int)
             self._no_state = wp.zeros((self.nworld, self._place.nstate), dtype=wp.float64)
+            self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)  # core, nail and clamp
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.rest = skin.rest
         if self.device.is_cuda:
@@ -151,7 +152,9 @@ class Skins:
         """
         self.place_geoms(pos, mat, geom_pos, geom_quat)
         self.rest.begin_solve()
-        self.skin.solve_skins()
+        self.skin.begin_solve()
+        solve_group([self.skin], Fork(self.device, wanted=False))
+        self.skin.end_solve()
         self.accept(pos, mat)
 
     def accept(self, pos: wp.array, mat: wp.array) -> None:
@@ -181,11 +184,12 @@ class Skins:
             self.senses.solve_film()
 
     def sense(self, sensordata: wp.array) -> None:
-        """Acquisition of the step, then all readings into sensordata (nworld, n) float. Launches only."""
+        """Acquisition of the step, then readings and status into sensordata (nworld, n) float. Launches
+        only."""
         state, skin = self._no_state, self.skin
         if self.senses:
             state = self.senses.sample()
-        read = [self._place, self._addresses, state, self.model.wrench0, skin.fraction]
+        read = [self._place, self._addresses, state]
         self._launch(kernels.write_sensors, (self.nworld, self._widest), read, [sensordata])
         how = [self._valid, self._settled, self.failed, self._rounds, self._push, skin.tier]
         status = [self._addresses, skin.data.worlds, *how]
@@ -269,6 +273,8 @@ class PoseBatch(Skins):
         self.look(self._films)
         wp.capture_if(self._films, self.solve_film)
         self.sense(self.sensordata)
+        force = [self._addresses, self.model.wrench0, self.skin.fraction, self._on_solid]
+        self._launch(kernels.write_force, (self.nworld, 6), force, [self.sensordata])
 
     def readings(self) -> dict:
         """{channel: (nworld, dim)} views of `sensordata`."""

@@ -28,7 +28,7 @@ from .setup import (
     STAYED,
     Setup,
 )
-from .solid import solid_wrench
+from .solid_contacts import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
 from .touches import Touches

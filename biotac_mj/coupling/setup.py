@@ -92,12 +92,6 @@ class Setup:
         self.touching = Touching(model, self.core, self.config, compiling)
         self.skin = _skin(self.config, self.touching)
         self.ngroup = len(self.touching.body)
-        self.surface_energy = self.skin.stepper.surface_energy
-
-    @property
-    def thickness(self) -> float:
-        """From the skin's outside to the core at most [m]."""
-        return self.skin.thickness
 
     @property
     def nstate(self) -> int:

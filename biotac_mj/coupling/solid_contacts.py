@@ -1,4 +1,5 @@
-"""MuJoCo's contacts of core, nail and clamp with what a skin meets, made those of the shapes that it meets.
+"""MuJoCo's contacts of core, nail and clamp with what a skin meets, made those of the shapes that it meets,
+and their forces.
 
 A skin meets closed meshes with their hollows, and no geom before it touches. MuJoCo's contacts of the solid
 parts are with convex hulls, and begin at a geom's margin: a finger in a cup would be thrown out, and the core
@@ -22,8 +23,10 @@ from .structs import LIBRARY, DataView, ModelView, c_structs
 from .touching import Touching, mesh_of
 
 LIBRARY.mj_addContact.argtypes = (ctypes.c_void_p,) * 3
+LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 CONTACT = np.dtype(c_structs("mjContact"))
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+SOLVED = 1e-3  # of the forces at hand, which MuJoCo's constraint solver may leave open
 
 
 def contacts_of(data: DataView) -> np.ndarray:
@@ -188,3 +191,34 @@ def contact_frame(normal: np.ndarray) -> np.ndarray:
     frame[1] /= math.sqrt(frame[1] @ frame[1])
     frame[2] = cross(frame[:1], frame[1:2])[0]
     return frame
+
+
+def solid_wrench(
+    model: ModelView, data: DataView, core: int, dofs: np.ndarray, trees: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """(2, 6) forces [N] and torques [N m] of contacts on the geoms of body `core`, about the origin of its
+    frame and in that frame: of those that act on none of `trees` (ntree,) and of the others; and whether
+    MuJoCo's solver finds them, on these dofs, to `SOLVED`.
+
+    For when all passive forces are known and accelerations are not: where anything touches, MuJoCo's
+    constraint solver runs in advance.
+    """
+    out = np.zeros((2, 6))
+    if not data.ncon:
+        return out, True
+    contacts = contacts_of(data)
+    geom = contacts["geom"]
+    mine = (geom >= 0) & (model.geom_bodyid[geom] == core)  # -1: a flex, or none
+    touching = (mine.any(axis=1) & (contacts["efc_address"] >= 0)).nonzero()[0]
+    if not len(touching):
+        return out, True
+    solved = data.unsolved(data.acceleration(), dofs) < SOLVED
+    which = data.trees_of_rows()[contacts["efc_address"][touching]][:, trees].any(axis=1)
+    found, frame = np.empty(6), data.xmat[core].reshape(3, 3)
+    for i, k in zip(touching, which.astype(int)):
+        LIBRARY.mj_contactForce(model.address, data.address, int(i), found.ctypes.data)
+        sign = float(mine[i, 1]) - float(mine[i, 0])  # it acts on the second
+        force, torque = sign * found.reshape(2, 3) @ contacts["frame"][i].reshape(3, 3)
+        torque += cross((contacts["pos"][i] - data.xpos[core])[None], force[None])[0]
+        out[k] += np.concatenate([force @ frame, torque @ frame])
+    return out, solved

@@ -7,6 +7,7 @@ corrects that. It moves the bodies too: Newton's method finds it, with the slope
 hold, and H is the integrator's matrix: of free bodies all of it, since fast spin makes much of it
 antisymmetric, of other trees its symmetric part."""
 
+import copy
 import typing
 
 import mujoco
@@ -41,6 +42,9 @@ _ACTUATION, _SPRING, _DAMPER, _EULERDAMP = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
     for name in ("ACTUATION", "SPRING", "DAMPER", "EULERDAMP")
 )
+
+# what mujoco_warp's kinematics writes
+_POSES = "xpos xquat xmat xanchor xaxis xipos ximat geom_xpos geom_xmat site_xpos site_xmat".split()
 
 
 @wp.struct
@@ -374,3 +378,39 @@ class Integrator:
 
     def _launch(self, kernel, dim, inputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self._matrix], device=self.qacc.device)
+
+
+class Ends:
+    """Poses of the bodies of a mujoco_warp Data after the step that it is in: joints move along arcs, while
+    the skin is solved along straight lines, and mujoco_warp has no callback after it integrates."""
+
+    def __init__(self, d: "mjw.Data"):
+        # kinematics leaves what never moves as it is
+        self._own = {name: wp.clone(getattr(d, name)) for name in ("qpos", "qvel", *_POSES)}
+
+    def find(self, m: "mjw.Model", d: "mjw.Data", qacc: wp.array) -> "mjw.Data":
+        """`d` after a step with the integrator's accelerations (nworld, nv), as far as velocities and poses.
+        Launches only."""
+        import mujoco_warp as mjw
+        from mujoco_warp._src import forward
+
+        end, step, device = copy.copy(d), m.opt.timestep, d.qpos.device
+        for name, array in self._own.items():
+            setattr(end, name, array)
+        wp.launch(
+            forward._next_velocity,
+            dim=d.qvel.shape,
+            inputs=[step, d.qvel, qacc, 1.0],
+            outputs=[end.qvel],
+            device=device,
+        )
+        joints = [m.jnt_type, m.jnt_qposadr, m.jnt_dofadr]
+        wp.launch(
+            forward._next_position,
+            dim=(d.nworld, m.njnt),
+            inputs=[step, *joints, d.qpos, end.qvel, 1.0],
+            outputs=[end.qpos],
+            device=device,
+        )
+        mjw.kinematics(m, end)
+        return end

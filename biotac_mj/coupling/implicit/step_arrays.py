@@ -74,13 +74,13 @@ class StepArrays:
                 skin.rounds = _of_skin(Rounds, whole, part)
                 skin.model, skin.last = (_of_skin(Model, one, part) for one in (model, last))
                 skin.rounds.began, skin.rounds.inside = skin.flags["began"], skin.flags["inside"]
-                skin.rounds.surface = wp.array([setup.surface_energy], dtype=real)
+                skin.rounds.surface = wp.array([setup.skin.stepper.surface_energy], dtype=real)
                 skin.marks = MarkedWorlds()
                 skin.marks.world, skin.marks.any = skin.flags["marked"], self._any
                 skin.compliance = wp.zeros((setup.ngroup, setup.ngroup, 1), dtype=wp.spatial_matrixd)
                 skin.by_mocap = wp.array(setup.touching.by_mocap, dtype=bool)
                 skin.bodies, skin.loss, skin.solid = kinematics.bodies[k], setup.config.loss, Solid()
-                skin.solid.thickness, skin.solid.area = setup.thickness, 1.0
+                skin.solid.thickness, skin.solid.area = setup.skin.thickness, 1.0
                 skin.solid.inertial = int(setup.skin.stepper.inertial)
         self._tangent = [_seen(skin.tangent) for skin in self._skins]
         self._keep_held = [row((keep_held, skin.tangent.shape, [skin.tangent])) for skin in self._skins]

@@ -21,8 +21,7 @@ from ...geometry.rigid_warp import LEVER
 from ...threads import run_in_threads
 from ..instance import NO_PASSIVE, NO_SENSOR, Instance
 from ..loads import Loads
-from ..solid import SOLVED
-from ..solid_contacts import SolidContacts, contacts_of
+from ..solid_contacts import SOLVED, SolidContacts, contacts_of
 from ..structs import MINVAL, DataView, ModelView
 from .group import SkinGroup
 from .integrator import Integrator

@@ -20,12 +20,16 @@ from ...sensor.vibration import state_size as vibration_size
 from ...skin.modes import NMODE
 from ...skin.settings import read_material
 from ..config import Config
+from ..shared import Shared
 from ..stepper import Geom, SkinResult
 from ..steppers.fem import FemStepper, rest_geometry
 from .vibration import Shaking
 
 if typing.TYPE_CHECKING:
     from ...learning.serve import NetworkFilm
+
+
+_films = Shared(keep=4)  # by geometry and settings
 
 
 class SensorReadings:
@@ -74,7 +78,8 @@ class SensorReadings:
     @property
     def film(self) -> FilmConduction:
         """Between skin and core."""
-        return _film(_Skin(self._rest(), self._film))
+        rest, settings = self._rest(), self._film
+        return _films.get(digest(rest, settings), lambda: FilmConduction(rest, **settings))
 
     @functools.cached_property
     def _physics(self):
@@ -162,22 +167,3 @@ def _by_body(geoms, wanted, read, else_, rng):
     for geom, value in reversed(named):
         bodies[geom.group] = read(value)
     return bodies
-
-
-class _Skin:
-    """A geometry and settings of its film, hashable by content."""
-
-    def __init__(self, geometry, settings):
-        self.geometry, self.settings = geometry, settings
-        self.key = digest(geometry, settings)
-
-    def __hash__(self):
-        return hash(self.key)
-
-    def __eq__(self, other):
-        return self.key == other.key
-
-
-@functools.lru_cache(maxsize=4)
-def _film(skin):
-    return FilmConduction(skin.geometry, **skin.settings)
