@@ -22,7 +22,7 @@ from biotac_mj import batch as batches
 from biotac_mj.batch.batch import Batch
 from biotac_mj.batch.implicit import integrator
 from biotac_mj.coupling.implicit import energy, rounds
-from biotac_mj.coupling.implicit.marks import Marks
+from biotac_mj.coupling.implicit.rounds import Marks
 
 SKINS, NV, WORLDS, H2 = 3, 8, 16, 1.6e-5
 

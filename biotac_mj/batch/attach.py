@@ -18,7 +18,7 @@ from ..coupling.settings import SensorSettings, SettingKeywords, Settings
 from ..coupling.setup import skin_thickness
 from ..coupling.steppers.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
-from ..coupling.touching import Touching, find_geoms
+from ..coupling.touching import Touching, find_geoms, friction_of
 from ..fields import as_whole
 from ..geometry import closest, core_surface
 from ..geometry.skins import skin_of_design, skin_reference
@@ -256,7 +256,7 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     made_with = SkinModelSettings(rubber, *room)
     fem = shared_model(geometry, made_with, device)
     twin = shared_model(geometry, made_with, "cpu") if config.tier == "condensed" else None
-    frictions = _frictions(mjm, touching.geom, mu, priority)
+    frictions = friction_of(mjm, touching.geom, mu[:, None], priority)
 
     def build(tangents):
         return BatchSkin(
@@ -304,16 +304,6 @@ def _per_world(value, nworld, default):
             f"({nworld},)"
         )
     return np.broadcast_to(out, nworld)
-
-
-def _frictions(mjm, geom, friction, priority):
-    """(nworld, ngeom) by MuJoCo's rule: the larger one, or that of the higher priority."""
-    other, rank = mjm.geom_friction[geom, 0], mjm.geom_priority[geom]
-    return np.where(
-        rank == priority,
-        np.maximum(other, friction[:, None]),
-        np.where(rank > priority, other, friction[:, None]),
-    )
 
 
 def _sensor(mjm, name):

@@ -10,14 +10,12 @@ import warp as wp
 
 from ..coupling.implicit import energy, rounds
 from ..coupling.implicit.compliance import Response, add_stiffness
-from ..coupling.implicit.marks import Marks
-from ..coupling.implicit.rounds import Model
+from ..coupling.implicit.rounds import Marks, Model
 from ..coupling.implicit.rows import write_rows
 from ..coupling.implicit.rules import LOSS_FREQUENCY
-from ..coupling.loads import core_geom
+from ..coupling.loads import core_geom, find_touches
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
-from ..coupling.touches import find_touches
 from ..coupling.touching import Touching
 from . import kernels, solid_contacts
 from .engine import contacts_of, rows_of

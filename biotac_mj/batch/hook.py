@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.implicit.marks import Marks
+from ..coupling.implicit.rounds import Marks
 from ..skin.program import Fork, Launcher
 from .ahead import kernels_of_step
 from .batch import Batch

@@ -12,8 +12,7 @@ import typing
 import numpy as np
 import warp as wp
 
-from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
-from ..coupling.implicit.rounds import Model
+from ..coupling.implicit.rounds import MarkedWorlds, Marks, Model, mark
 from ..coupling.implicit.rules import PATIENCE, stayed
 from ..kernels import kernel_module
 from ..skin.contact.broadphase import contact_range

@@ -8,9 +8,8 @@ import numpy as np
 import warp as wp
 
 from ..coupling.handle import SENSORS, sensor_widths
-from ..coupling.implicit.marks import Marks
 from ..coupling.implicit.poses import Bodies
-from ..coupling.implicit.rounds import Model, make_model
+from ..coupling.implicit.rounds import Marks, Model, make_model
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
 from ..skin.program import Fork, compile_ahead, finish_compiling

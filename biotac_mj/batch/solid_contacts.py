@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..coupling.config import Config
-from ..coupling.implicit.marks import MarkedWorlds, Marks, mark
+from ..coupling.implicit.rounds import MarkedWorlds, Marks, mark
 from ..coupling.solid_contacts import SolidPairs
 from ..kernels import kernel_module
 from ..skin.contact.overlap import MOST

@@ -18,6 +18,7 @@ from .config import TIERS
 from .implicit.kinematics import Kinematics
 from .implicit.metric import assign_slots
 from .implicit.rules import EULER, PATIENCE, stayed
+from .loads import Touches
 from .setup import (
     CONVERGED,
     FAILED,
@@ -31,7 +32,6 @@ from .setup import (
 from .solid_contacts import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
-from .touches import Touches
 
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
@@ -51,7 +51,7 @@ class Outcome:
       rounds: through MuJoCo's solver and the skin.
       settled: whether the skin was solved where the bodies go.
       withheld: fraction of the skin's push on a body that was, for lack of energy.
-      energy: (ngroup,) left to each body in the skin at most [J].
+      energy: (ngroup,) left to each body in the skin at most [J]; None leaves the stored one.
       acting: wrenches (ngroup, 6) that the bodies get, None: those of the skin's last solve.
       gamma: (ngroup,) Newmark's. frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s];
         None leaves the stored one.
@@ -60,7 +60,7 @@ class Outcome:
     rounds: int = 1
     settled: bool = True
     withheld: float = 0.0
-    energy: np.ndarray | float = 0.0
+    energy: np.ndarray | float | None = 0.0
     acting: np.ndarray | None = None
     gamma: np.ndarray | float = EULER
     frequency: np.ndarray | None = None
@@ -493,9 +493,9 @@ class Instance:
         for name, value in zip(LINEAR, result.model):
             models[name] = value
         models["end_pos"], models["end_mat"] = self.ends or result.pose
-        models["left"] = self.outcome.energy
-        if self.outcome.frequency is not None:
-            models["frequency"] = self.outcome.frequency
+        for name, value in (("left", self.outcome.energy), ("frequency", self.outcome.frequency)):
+            if value is not None:
+                models[name] = value
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

@@ -22,8 +22,6 @@ from ..geometry.solid import fills_hull
 from .structs import LIBRARY, DataView, ModelView, c_structs
 from .touching import Touching, mesh_of
 
-LIBRARY.mj_addContact.argtypes = (ctypes.c_void_p,) * 3
-LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 CONTACT = np.dtype(c_structs("mjContact"))
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 SOLVED = 1e-3  # of the forces at hand, which MuJoCo's constraint solver may leave open

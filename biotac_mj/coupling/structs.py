@@ -21,26 +21,21 @@ LIBRARY = ctypes.CDLL(
 )  # already loaded: this only finds it
 LIBRARY.mj_getPluginConfig.restype = ctypes.c_char_p
 LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p)
-LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
-for _stage in (
-    "mj_kinematics",
-    "mj_comPos",
-    "mj_comVel",
-    "mj_makeConstraint",
-    "mj_island",
-    "mj_referenceConstraint",
-    "mj_fwdActuation",
-    "mj_fwdAcceleration",
-    "mj_fwdConstraint",
-):
-    getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
-LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
-LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
-LIBRARY.mj_mulJacTVec.argtypes = (ctypes.c_void_p,) * 4
-LIBRARY.mj_mulJacVec.argtypes = (ctypes.c_void_p,) * 4
 LIBRARY.mj_integratePos.argtypes = (*(ctypes.c_void_p,) * 3, ctypes.c_double)
+LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
+LIBRARY.mjd_smooth_vel.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
+_POINTERS = {
+    1: "mj_isSparse",
+    2: "mj_kinematics mj_comPos mj_comVel mj_makeConstraint mj_island mj_projectConstraint mj_fwdConstraint "
+    "mj_referenceConstraint mj_fwdActuation mj_fwdAcceleration mj_rnePostConstraint mj_sensorAcc",
+    3: "mj_addContact",
+    4: "mj_mulM mj_mulJacTVec mj_mulJacVec",
+}
+for _count, _names in _POINTERS.items():
+    for _name in _names.split():
+        getattr(LIBRARY, _name).argtypes = (ctypes.c_void_p,) * _count
 
 _SCALARS = {
     "mjtNum": ctypes.c_double,

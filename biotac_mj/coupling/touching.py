@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..geometry.rigid import matrix
 from ..geometry.solid import bounds_solid, close_rim, convex_hull, face_outwards, ground, joined
@@ -394,14 +395,19 @@ def _solid(vert, face, hull):
     return convex_hull(vert[number] if len(number) else vert), False
 
 
+def friction_of(
+    model: ModelView | mujoco.MjModel, geom: ArrayLike, friction: ArrayLike, priority: int
+) -> np.ndarray:
+    """Friction between geoms and skins of a friction and a priority, by MuJoCo's rule: the larger one, or
+    that of the higher priority."""
+    other, rank = model.geom_friction[geom, 0], model.geom_priority[geom]
+    alone = np.where(rank > priority, other, friction)
+    return np.where(rank == priority, np.maximum(other, friction), alone)
+
+
 def _describe(model, core, index, group, rounding, config, mesh):
     name, kind = model.name("geom", index), int(model.geom_type[index])
-    other, priority = float(model.geom_friction[index, 0]), int(model.geom_priority[index])
-    friction = (
-        max(other, config.friction)
-        if priority == config.priority
-        else (other if priority > config.priority else config.friction)
-    )
+    friction = float(friction_of(model, index, config.friction, config.priority))
     vert, face = mesh or (None, None)
     shape, rigid = _TYPES[kind], None
     if _has_skin(model, core, index):

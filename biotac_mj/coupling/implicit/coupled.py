@@ -86,5 +86,4 @@ class Coupled:
         acting = self.instance.seen(self.part("acting"))
         withheld = 1.0 - self.part("push").min(initial=1.0)
         of_bodies = (self.part(name).copy() for name in ("gamma", "frequency"))
-        energy = self.part("left_out").copy()
-        self.instance.outcome = Outcome(rounds, self.settled, withheld, energy, acting, *of_bodies)
+        self.instance.outcome = Outcome(rounds, self.settled, withheld, None, acting, *of_bodies)

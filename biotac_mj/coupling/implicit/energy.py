@@ -10,8 +10,7 @@ from ...geometry.rigid_warp import is_finite, motion
 from ...kernels import kernel_module
 from ...skin.newton.worlds import CONVERGED
 from ...skin.types import mat66, real, vec6
-from .marks import MarkedWorlds, mark
-from .rounds import Model, Rounds, Solid, force_of
+from .rounds import MarkedWorlds, Model, Rounds, Solid, force_of, mark
 from .rules import EULER, beta_of, fraction_within, in_store, lacking, spared
 
 kernel_module(__name__)

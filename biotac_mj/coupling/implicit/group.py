@@ -188,8 +188,7 @@ class SkinGroup:
         return self.correction + self.arrays.wrench + rows
 
     def conclude(self, rounds: int) -> None:
-        """Tells the instances how the step went."""
-        self._find_left()
+        """Tells the instances how the step went; what energy is left is known when it has ended."""
         for skin in self.skins:
             skin.conclude(rounds)
 
@@ -203,7 +202,9 @@ class SkinGroup:
         travel = self.jacobian @ moved
         error = np.abs((travel - self.arrays.travel) * _SCALE)
         self.arrays.travel[:] = travel
-        self._find_left()
+        converged = np.zeros(len(self._all), bool)
+        converged[[skin.number for skin in self.skins]] = [skin.result.converged for skin in self.skins]
+        self.arrays.conclude(converged)
         for skin in self.skins:
             outcome = skin.instance.outcome
             outcome.energy = skin.part("left_out").copy()
@@ -215,9 +216,3 @@ class SkinGroup:
         pos, mat = self._kinematics.predict(0.0)
         for skin in self._all:
             skin.instance.ends = pos[skin.bodies], mat[skin.bodies]
-
-    def _find_left(self):
-        converged = np.zeros(len(self._all), bool)
-        for skin in self.skins:
-            converged[skin.number] = skin.result.converged
-        self.arrays.conclude(converged)

@@ -9,15 +9,12 @@ on a damped joint, a' is a small part of a.
 They go by the forces that M a should balance, not by a. The two differ where MuJoCo's solver has not
 finished, as with a light body between the skin and a heavy one."""
 
-import ctypes
-
 import mujoco
 import numpy as np
 
 from ..structs import LIBRARY, DataView, ModelView
 from .springs import Springs
 
-LIBRARY.mjd_smooth_vel.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
 _EULER, _FAST, _IMPLICIT = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "IMPLICITFAST", "IMPLICIT")
 )

@@ -12,7 +12,6 @@ from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
 from ...skin.newton.worlds import CONVERGED
 from ...skin.types import mat33, mat66, real, vec3, vec6
-from .marks import MarkedWorlds, mark
 from .rules import EULER, TELEPORT, TOLERANCE, beta_of, gamma_of
 
 kernel_module(__name__)
@@ -20,6 +19,48 @@ kernel_module(__name__)
 
 _gamma_of, _beta_of = (wp.func(rule) for rule in (gamma_of, beta_of))
 _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPORT))
+
+
+@wp.struct
+class MarkedWorlds:
+    """Marks [world] of those that take part in a stage of the step, and whether any is set. The others are
+    frozen: no launch changes a bit of them."""
+
+    world: wp.array(dtype=int)
+    any: wp.array(dtype=int)
+
+
+@wp.func
+def mark(marks: MarkedWorlds, w: int):
+    marks.world[w] = 1
+    marks.any[0] = 1
+
+
+class Marks:
+    """Marked worlds, none at first, on Warp's default device.
+
+    Attributes:
+      world: (nworld,) wp.array int, 1 where marked. any: (1,) wp.array int, 1 where any is.
+      struct: both, for kernels.
+    """
+
+    def __init__(self, nworld: int):
+        self._all = wp.zeros(nworld + 1, dtype=int)
+        self.world, self.any = self._all[:nworld], self._all[nworld:]
+        self.struct = MarkedWorlds()
+        self.struct.world, self.struct.any = self.world, self.any
+
+    def clear(self) -> None:
+        """Marks none. Launches only."""
+        self._all.zero_()
+
+    def fill(self) -> None:
+        """Marks all. Launches only."""
+        self._all.fill_(1)
+
+    def copy(self, other: "Marks") -> None:
+        """Marks those of another. Launches only."""
+        wp.copy(self._all, other._all)
 
 
 @wp.struct

@@ -15,8 +15,7 @@ from ..setup import Setup
 from . import energy, rounds
 from .compliance import Response, add_stiffness
 from .kinematics import Kinematics, row, rows_of
-from .marks import MarkedWorlds
-from .rounds import Model, Rounds, Solid
+from .rounds import MarkedWorlds, Model, Rounds, Solid
 from .rows import keep_held
 from .rules import LOSS_FREQUENCY
 from .springs import Springs

@@ -251,7 +251,6 @@ class World:
             self._solve_all({skin: skin.finish for skin in skins})
             self._forces(outside)
             group.evaluate(np.zeros(self.model.nv))
-            group.arrays.find_energy()
         group.conclude(rounds)
 
     def _touched_trees(self, group):
