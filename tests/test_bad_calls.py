@@ -63,8 +63,8 @@ ATTACH = (
     ("pos", "here", "pos is 'here': give 3 numbers"),
     ("quat", [1, 0, 0, np.nan], "give a finite number"),
     ("skin", 5, "skin is 5: pass one of coarse, default, fine"),
-    ("liquid", ARRAY, "liquid is array([0., 0., 0.]): give True or False"),
-    ("liquid", 2, "liquid is 2: give True or False"),
+    ("liquid", ARRAY, "liquid is array([0., 0., 0.]): pass true or false"),
+    ("liquid", 2, "liquid is 2: pass true or false"),
     ("coupling", ARRAY, "unknown coupling array([0., 0., 0.]): choose one of two-way, one-way"),
     ("tier", ARRAY, "unknown tier array([0., 0., 0.]): choose one of full, condensed"),
     ("on_error", [], "unknown on_error []: choose one of warn, raise"),
@@ -72,7 +72,7 @@ ATTACH = (
     ("sensor", ARRAY, "is array([0., 0., 0.]): pass "),
     ("randomise", ARRAY, "randomise of options['readings'] is array([0., 0., 0.]): pass "),
     ("friction", HUGE, ": give a finite number >= 0"),
-    ("stepper", ARRAY, "stepper is array([0., 0., 0.]): give its name"),
+    ("stepper", ARRAY, "stepper is array([0., 0., 0.]): pass a text"),
     ("readings", ARRAY, "readings is array([0., 0., 0.]): give True, False, a dict"),
     ("signal", ARRAY, "signal is array([0., 0., 0.]): give one of physics, latent_projection"),
     ("options", 5, "options is 5: give a dict"),
@@ -242,7 +242,8 @@ def calls_of_batches():
     yield row("friction is 1000", friction=HUGE)
     for name in ("rounding", "options", "worlds"):
         for wrong in (5, "a", [1], ARRAY, {1: 2}):
-            yield row(f"{name} is {wrong!r}: give a dict", **{name: wrong})
+            verb = "pass" if name == "rounding" and not isinstance(wrong, dict) else "give"
+            yield row(f"{name} is {wrong!r}: {verb} a dict", **{name: wrong})
     yield row("geom 'bal' of the BioTac's settings matches none", rounding={"bal": 1e-3})
     yield row("rounding of a sphere is 0.006: a fillet's radius", rounding={"ball": 6e-3})
     said = "rounding is of geom 'biotac_core', a part of the BioTac: leave"

@@ -80,7 +80,7 @@ def test_materials_are_drawn_at_a_reset():
     assert len(np.unique(states, axis=0)) > 1
     with pytest.raises(ValueError, match="no material is known by 'unobtainium'"):
         made(thermal={"plate": ["steel", "unobtainium"]})
-    with pytest.raises(ValueError, match="thermal is .'steel'.: give a dict"):
+    with pytest.raises(ValueError, match="thermal is .'steel'.: pass a dict or None"):
         made(thermal=["steel"])
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from ..fields import as_real, as_whole, check_choice, refuse_unknown
+from ..fields import as_real, as_whole, check_choice, check_types, refuse_unknown
 from ..short_repr import short_repr
 
 OWN = 1 << 30  # bit of contype and conaffinity that BioTacs alone have
@@ -19,6 +19,7 @@ COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
 _OPTIONS = ("skin", "modulus", "film", "readings", "rounds", "threads", "loss")
+_PLAIN = "skin stepper readings device name liquid rounding options thermal textures".split()
 ROUNDS = 16  # of a skin in two-way coupling, in a step
 
 
@@ -74,7 +75,7 @@ class Config:
     tier: str = "full"
     readings: str = "biotac"
     material: str | dict | None = None
-    liquid: bool | None = True
+    liquid: bool = True
     coupling: str = "two-way"
     geoms: tuple | None = None
     rounding: dict = dataclasses.field(default_factory=dict)
@@ -91,30 +92,18 @@ class Config:
     def __post_init__(self):
         for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
             check_choice(f"unknown {name}", getattr(self, name), choices)
-        for name in ("skin", "stepper", "readings", "device", "name"):
-            if not isinstance(value := getattr(self, name), str):
-                raise ValueError(f"{name} is {short_repr(value)}: give its name")
+        check_types(self, _PLAIN)
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
-        if not isinstance(self.liquid, (bool, np.bool_)):
-            raise ValueError(f"liquid is {short_repr(self.liquid)}: give True or False")
         if self.geoms is not None:
             numpys = isinstance(self.geoms, np.ndarray) and self.geoms.ndim == 1
             listed = isinstance(self.geoms, (list, tuple, set)) or numpys
             if not listed or not all(isinstance(name, str) and name for name in self.geoms):
                 raise ValueError(f"geoms is {short_repr(self.geoms)}: give a list of names")
             self._set("geoms", tuple(dict.fromkeys(self.geoms)))
-        for name in ("rounding", "options"):
-            if not isinstance(getattr(self, name), dict):
-                raise ValueError(f"{name} is {short_repr(getattr(self, name))}: give a dict")
-        for name in ("thermal", "textures"):
-            if not isinstance(value := getattr(self, name), dict | None):
-                raise ValueError(
-                    f"{name} is {short_repr(value)}: give a dict of geoms and materials, or None"
-                )
         for name in ("rounding", "thermal", "textures"):
             if not all(isinstance(geom, str) and geom for geom in getattr(self, name) or ()):
                 raise ValueError(f"{name} is {short_repr(getattr(self, name))}: give a dict, of geoms' names")

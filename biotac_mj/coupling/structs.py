@@ -54,16 +54,6 @@ _SCALARS = {
     "size_t": ctypes.c_size_t,
     "uintptr_t": ctypes.c_size_t,
 }
-_DTYPES = {
-    "mjtNum": np.float64,
-    "float": np.float32,
-    "int": np.int32,
-    "mjtByte": np.uint8,
-    "mjtBool": np.uint8,
-    "char": np.uint8,
-    "uintptr_t": np.uint64,
-    "mjtSize": np.int64,
-}
 _ROWS = (
     *("efc_type", "efc_id", "efc_J", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_pos", "efc_margin"),
     *("efc_KBIP", "efc_D", "efc_R", "efc_aref", "efc_state", "efc_force"),
@@ -152,6 +142,10 @@ class _View:
         return self.pointer(name, tuple(sizes))
 
 
+def _dtype(kind):
+    return np.uint8 if kind in ("char", "mjtBool") else _SCALARS.get(kind)
+
+
 def _extent(extent):
     if isinstance(extent, int) or extent.isdigit():
         return int(extent)
@@ -167,7 +161,7 @@ def _pointer_fields(kind):
     key = kind + "*"
     if key not in _built:
         _built[key] = {
-            f.name: (_DTYPES.get(f.type.inner_type.name), tuple(_extent(e) for e in f.array_extent or ()))
+            f.name: (_dtype(f.type.inner_type.name), tuple(_extent(e) for e in f.array_extent or ()))
             for f in structs.STRUCTS[kind].fields
             if isinstance(getattr(f, "type", None), ast_nodes.PointerType)
             and isinstance(f.type.inner_type, ast_nodes.ValueType)

@@ -15,18 +15,11 @@ from .config import OWN, Config
 from .stepper import Geom
 from .structs import ModelView
 
-_TYPES = {
-    int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
-    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
-    int(mujoco.mjtGeom.mjGEOM_HFIELD): "mesh",  # the ground under it
-    int(mujoco.mjtGeom.mjGEOM_SDF): "mesh",  # that MuJoCo has made of it
-}
+_SHAPES = "plane sphere capsule ellipsoid cylinder box mesh".split()
+_TYPES = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}")): shape for shape in _SHAPES}
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+_TYPES[_HFIELD] = "mesh"  # the ground under it
+_TYPES[int(mujoco.mjtGeom.mjGEOM_SDF)] = "mesh"  # that MuJoCo has made of it
 _HUGE = mujoco.mjMAXVAL  # [m] what MuJoCo takes in no qpos
 _APART = 1e3  # [m] where geoms touch no skin
 _noted = {}  # address of a model -> what was said of it

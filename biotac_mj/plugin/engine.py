@@ -33,6 +33,8 @@ _CALLBACKS = {
     "visualize": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _PTR, _INT),
 }
 
+_UNUSED = "act_dot sdf_distance sdf_gradient sdf_staticdistance sdf_attribute sdf_aabb".split()
+
 
 class _Plugin(ctypes.Structure):
     """mjpPlugin of mjplugin.h."""
@@ -44,17 +46,7 @@ class _Plugin(ctypes.Structure):
         ("capabilityflags", _INT),
         ("needstage", _INT),
         *_CALLBACKS.items(),
-        *(
-            (name, _PTR)
-            for name in (
-                "act_dot",
-                "sdf_distance",
-                "sdf_gradient",
-                "sdf_staticdistance",
-                "sdf_attribute",
-                "sdf_aabb",
-            )
-        ),
+        *((name, _PTR) for name in _UNUSED),
     ]
 
 

@@ -405,10 +405,9 @@ def skin_settings(config: Config) -> Settings:
     Raises:
       ValueError: a value that cannot be. FileNotFoundError: no such material or modulus.
     """
-    # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
-    liquid = {} if config.liquid is None else {"liquid": config.liquid}
     mine = {name: config.options[name] for name in ("skin", "modulus") if name in config.options}
-    return read_settings(config.material, mine, tolerance=3e-4, **liquid)
+    # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
+    return read_settings(config.material, mine, tolerance=3e-4, liquid=config.liquid)
 
 
 def _in_time(config, settings):
