@@ -17,6 +17,7 @@ from ..coupling.loads import core_geom, find_touches
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
+from ..kernels import set_fields
 from . import kernels, solid_contacts
 from .engine import contacts_of, rows_of
 from .implicit import integrator
@@ -83,9 +84,9 @@ class Batch(Skins):
         r.surface = skin.data.laws.struct.work
         if self.moving:
             skin.prepare_keep()
-        self._solid = rounds.Solid()
-        self._solid.thickness, self._solid.inertial = thickness or 0.0, int(skin.inertial)
-        self._solid.area = float(skin.model.outer.area.numpy().sum())
+        area = float(skin.model.outer.area.numpy().sum())
+        known = {"thickness": thickness or 0.0, "area": area, "inertial": skin.inertial}
+        self._solid = set_fields(rounds.Solid(), **known)
 
     def lasting(self) -> tuple[list[wp.array], list[wp.array]]:
         last, first = super().lasting()

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..coupling.steppers.fem import CLEAR
 from ..geometry.rigid_warp import is_finite
-from ..kernels import kernel_module
+from ..kernels import add_zeros, kernel_module
 from ..skin.block import block_max
 from ..skin.contact.broadphase import ALL, contact_range, face_clearance, motion_bound, sample_clearance
 from ..skin.contact.faces import Laws
@@ -167,8 +167,8 @@ def find_clearance(
 def make_seen(ngeom: int, nworld: int) -> Seen:
     """Nothing seen, on Warp's default device."""
     seen = Seen()
-    seen.pos, seen.mat = (wp.zeros((ngeom, nworld), dtype=kind) for kind in (vec3, mat33))
-    seen.clearance = wp.zeros(nworld, dtype=wp.vec2d)
+    add_zeros(seen, "pos mat", ngeom, nworld)
+    add_zeros(seen, "clearance", nworld)
     return seen
 
 

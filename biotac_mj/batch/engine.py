@@ -5,6 +5,7 @@ import typing
 import warp as wp
 
 from ..coupling.implicit.rows import ROWS
+from ..kernels import set_fields
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -56,15 +57,11 @@ def copy_contact(source: Contacts, s: int, target: Contacts, t: int):
 
 def contacts_of(d: "mjw.Data") -> Contacts:
     """The contacts of a Data."""
-    out = Contacts()
-    for name in Contacts.vars:
-        setattr(out, name, d.nacon if name == "nacon" else getattr(d.contact, name))
-    return out
+    own = {name: getattr(d.contact, name) for name in Contacts.vars if name != "nacon"}
+    return set_fields(Contacts(), nacon=d.nacon, **own)
 
 
 def rows_of(m: "mjw.Model", d: "mjw.Data") -> Rows:
     """The constraint rows of a Data."""
-    out = Rows()
-    for name in Rows.vars:
-        setattr(out, name, int(m.is_sparse) if name == "sparse" else getattr(d.efc, name))
-    return out
+    own = {name: getattr(d.efc, name) for name in Rows.vars if name != "sparse"}
+    return set_fields(Rows(), sparse=int(m.is_sparse), **own)

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..coupling.implicit.rounds import MarkedWorlds, Marks, Model, mark
 from ..coupling.implicit.rules import PATIENCE, stayed
-from ..kernels import kernel_module
+from ..kernels import add_zeros, kernel_module
 from ..skin.contact.broadphase import contact_range
 from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
@@ -323,8 +323,7 @@ class Rest:
             self.gone, self.resets = (wp.zeros(n, dtype=bool) for _ in range(2))
             self._any_reset, self._sleep, st = wp.zeros(1, dtype=int), Sleep(), data.worlds
             s = self._sleep
-            for name in ("woken", "near", "at_rest", "undeformed", "resting"):
-                setattr(s, name, wp.zeros(n, dtype=int))
+            add_zeros(s, "woken near at_rest undeformed resting", n)
             s.awake, s.stays, s.seen = self.awake, self.stays, make_seen(skin.geoms.count, n)
             made = np.stack([a.numpy() for a in (st.mu, st.lam, st.kappa, st.natural)], axis=1)
             s.own, s.constants = (wp.array(made, dtype=vec4) for _ in range(2))

@@ -18,7 +18,7 @@ from ...coupling.implicit.compliance import substitute
 from ...coupling.implicit.rounds import Model, make_model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
-from ...kernels import kernel_module
+from ...kernels import add_zeros, kernel_module, set_fields
 from ...skin.block import block_max, sync
 from ...skin.condensed.elimination import eliminate
 from ...skin.program import Launcher
@@ -71,14 +71,12 @@ def corrections(groups: int, nworld: int, nv: int) -> Correction:
     """None so far, on Warp's default device, of `groups` bodies of all skins, in models of nv degrees of
     freedom."""
     out, n = Correction(), 6 * groups
-    out.force, out.amiss = (wp.zeros((groups, nworld), dtype=vec6) for _ in range(2))
-    out.rounds, out.going = (wp.zeros(nworld, dtype=int) for _ in range(2))
-    out.found, out.moved = (wp.zeros((nworld, nv, n), dtype=real) for _ in range(2))
-    out.matrix = wp.zeros((nworld, n * (n + 1)), dtype=float)
-    out.acts, out.square = wp.ones(groups, dtype=int), wp.zeros((groups, nworld), dtype=real)
-    out.jacobian = wp.zeros((groups, nworld, nv), dtype=vec6)
-    out.model = make_model(groups, nworld)
-    return out
+    add_zeros(out, "force amiss square", groups, nworld)
+    add_zeros(out, "rounds going", nworld)
+    add_zeros(out, "found moved", nworld, nv, n)
+    add_zeros(out, "matrix", nworld, n * (n + 1))
+    add_zeros(out, "jacobian", groups, nworld, nv)
+    return set_fields(out, acts=wp.ones(groups, dtype=int), model=make_model(groups, nworld))
 
 
 @wp.func

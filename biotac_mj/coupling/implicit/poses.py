@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from ...geometry.rigid_warp import is_finite, rotation
-from ...kernels import kernel_module
+from ...kernels import kernel_module, set_fields
 from ...skin.types import double, mat33, real, vec3, vec6, widen
 from .rounds import Rounds, follow
 
@@ -40,9 +40,8 @@ _MOTION = {types[0]: _motion(*types) for types in _PRECISIONS}
 
 def _motion_of(m, d):
     out = _MOTION[d.qvel.dtype]()
-    for name in out._cls.vars:
-        setattr(out, name, getattr(m if name.startswith("body") else d, name))
-    return out
+    own = {name: getattr(m if name.startswith("body") else d, name) for name in out._cls.vars}
+    return set_fields(out, **own)
 
 
 @wp.func

@@ -6,7 +6,7 @@ Poses are [group, world], in the BioTac frame."""
 import warp as wp
 
 from ...geometry.rigid_warp import LEVER, displace_at_once, is_finite, motion, motion_at_once, size_of
-from ...kernels import kernel_module
+from ...kernels import add_zeros, kernel_module, set_fields
 from ...skin.bodies import Bodies
 from ...skin.contact.broadphase import contact_range
 from ...skin.contact.faces import Laws
@@ -47,8 +47,7 @@ class Marks:
     def __init__(self, nworld: int):
         self._all = wp.zeros(nworld + 1, dtype=int)
         self.world, self.any = self._all[:nworld], self._all[nworld:]
-        self.struct = MarkedWorlds()
-        self.struct.world, self.struct.any = self.world, self.any
+        self.struct = set_fields(MarkedWorlds(), world=self.world, any=self.any)
 
     def clear(self) -> None:
         """Marks none. Launches only."""
@@ -138,8 +137,7 @@ class Solid:
 def make_model(groups: int, nworld: int) -> Model:
     """No forces of any body, on Warp's default device."""
     model = Model()
-    for name, variable in Model.vars.items():
-        setattr(model, name, wp.zeros((groups, nworld), dtype=variable.type.dtype))
+    add_zeros(model, " ".join(Model.vars), groups, nworld)
     return model
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from ...kernels import kernel_module
+from ...kernels import kernel_module, set_fields
 from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from ...skin.types import mat66, real, vec6
 from ..setup import Setup
@@ -74,13 +74,12 @@ class StepArrays:
                 skin.model, skin.last = (_of_skin(Model, one, part) for one in (model, last))
                 skin.rounds.began, skin.rounds.inside = skin.flags["began"], skin.flags["inside"]
                 skin.rounds.surface = wp.array([setup.skin.stepper.surface_energy], dtype=real)
-                skin.marks = MarkedWorlds()
-                skin.marks.world, skin.marks.any = skin.flags["marked"], self._any
+                skin.marks = set_fields(MarkedWorlds(), world=skin.flags["marked"], any=self._any)
                 skin.compliance = wp.zeros((setup.ngroup, setup.ngroup, 1), dtype=wp.spatial_matrixd)
                 skin.by_mocap = wp.array(setup.touching.by_mocap, dtype=bool)
-                skin.bodies, skin.loss, skin.solid = kinematics.bodies[k], setup.config.loss, Solid()
-                skin.solid.thickness, skin.solid.area = setup.skin.thickness, 1.0
-                skin.solid.inertial = int(setup.skin.stepper.inertial)
+                skin.bodies, skin.loss = kinematics.bodies[k], setup.config.loss
+                of_skin = {"thickness": setup.skin.thickness, "inertial": setup.skin.stepper.inertial}
+                skin.solid = set_fields(Solid(), area=1.0, **of_skin)
         self._tangent = [_seen(skin.tangent) for skin in self._skins]
         self._keep_held = [row((keep_held, skin.tangent.shape, [skin.tangent])) for skin in self._skins]
         self.wrench, self.left_out, self.qacc = _seen(wrench), _seen(left_out), self._qacc.numpy()[0]
