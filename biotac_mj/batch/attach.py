@@ -40,7 +40,7 @@ from ..skin.rubber.material import Material
 from ..skin.settings import Settings as SkinModelSettings
 from ..skin.settings import read_material
 from ..skin.step import kernels_for_cuda
-from . import kernels, rest, skin_kernels
+from . import kernels, rest
 from .ahead import kernels_of_step, launched_by
 from .batch import Batch
 from .hook import Hook
@@ -55,7 +55,7 @@ if typing.TYPE_CHECKING:
 
 # what takes long to compile, or is launched first: it begins before the skin is made
 _KERNELS = [rest_gap.module, meshes, closest, liquid, rest, rounds, film_kernels, core_surface]
-_KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, energy, integrator, skin_kernels]
+_KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, energy, integrator]
 # keywords of `biotac_mj.attach` that a batch has no use for
 _NOT_OF_WORLDS = ("device", "stepper", "on_error")
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)

@@ -21,7 +21,7 @@ from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, allocate, zeros
 from ..skin.state_arrays import StateArrays
 from ..skin.step import launch_step, prepare_step
 from ..skin.transfer import Transfer
-from . import skin_kernels as kernels
+from . import kernels
 from .memory import arrays_of
 from .rest import Rest
 
