@@ -424,8 +424,7 @@ def test_a_ring_that_comes_into_the_core_gains_nothing(seed):
 
 
 def test_a_tool_that_jumps_into_the_condensed_skin_is_followed():
-    """Nothing can give way: where a step was in vain the next one may take four times as much. Without that
-    none settled in so many."""
+    """Nothing can give way: each step goes on from where the one before it was cut off."""
     tool = '<body name="tool" mocap="true" pos="0 0 .01351"><geom type="box" size=".01 .008 .005"/></body>'
     model, data, handle = finger_under(tool, 0.002, skin="coarse", tier="condensed", material="calibrated")
     mujoco.mj_step(model, data)
