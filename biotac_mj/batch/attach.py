@@ -124,9 +124,8 @@ def attach(
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in SENSORS]
     skin = skin_of(bool(slots) or chosen.sensor.textures is not None)
     senses = _senses(chosen, config, geometry, skin, touching, mjm)
-    solid = (
-        skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
-    )  # one-way nothing moves by its forces
+    # one-way nothing moves by its forces
+    solid = skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, config.rounds, config.loss)
     hook = Hook.of(m)
     hook.add(batch, d)

@@ -223,9 +223,8 @@ class PoseBatch(Skins):
         super().__init__(touching, skin, senses, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
         with wp.ScopedDevice(self.device):
             self._geom_pos = wp.array(mjm.geom_pos[None].astype(np.float32), dtype=wp.vec3)
-            self._geom_quat = wp.array(
-                mjm.geom_quat[None].astype(np.float32), dtype=wp.quat
-            )  # (w, x, y, z), as mujoco_warp keeps it
+            # (w, x, y, z), as mujoco_warp keeps it
+            self._geom_quat = wp.array(mjm.geom_quat[None].astype(np.float32), dtype=wp.quat)
             self._pos = wp.zeros(self.groups, dtype=wp.vec3d)
             self._mat = wp.zeros(self.groups, dtype=wp.mat33d)
             self._taking_part, self._films = Marks(self.nworld), wp.zeros(1, dtype=int)

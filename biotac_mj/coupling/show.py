@@ -7,9 +7,8 @@ from ..sensor.colors import electrode_colors
 
 # what all pictures show: as in mjcf/biotac.xml, and of what touches the skin
 SKIN, CORE, OBJECT = np.array([0.25, 0.6, 0.4]), np.array([0.25, 0.25, 0.28]), np.array([0.85, 0.45, 0.15])
-PAD_UP = np.array(
-    [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
-)  # turns the pad, -y of the BioTac, to +z of the world
+# turns the pad, -y of the BioTac, to +z of the world
+PAD_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])
 
 
 class Shown:

@@ -16,9 +16,8 @@ import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, enums, structs
 
-LIBRARY = ctypes.CDLL(
-    str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
-)  # already loaded: this only finds it
+# already loaded: this only finds it
+LIBRARY = ctypes.CDLL(str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*"))))
 LIBRARY.mj_getPluginConfig.restype = ctypes.c_char_p
 LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p)
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
@@ -118,9 +117,8 @@ class _View:
         """(shape) view of the memory that pointer `name` points to now, without looking up its size."""
         address = getattr(self.struct, name)
         last = self._seen.get(name)
-        if (
-            last is not None and last[0] == address and last[1] == shape
-        ):  # the same memory, whatever it holds now
+        # the same memory, whatever it holds now
+        if last is not None and last[0] == address and last[1] == shape:
             return last[2]
         dtype = self._field[name][0]
         if not address:
@@ -152,9 +150,8 @@ def _extent(extent):
     constants = {
         name: value for enum in enums.ENUMS.values() for name, value in enum.values.items() if name == extent
     }
-    return constants.get(
-        extent, getattr(mujoco, extent, extent)
-    )  # a constant such as mjNREF, or the name of a size
+    # a constant such as mjNREF, or the name of a size
+    return constants.get(extent, getattr(mujoco, extent, extent))
 
 
 def _pointer_fields(kind):

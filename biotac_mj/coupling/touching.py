@@ -52,9 +52,8 @@ class Touching:
         _refuse_flexes(model, core)
         find_geoms(model, {**(config.thermal or {}), **(config.textures or {})})
         named = ids = _select(model, core, config.geoms)
-        if (
-            config.geoms is None and not compiling
-        ):  # contact exclusions are not yet in the model while it is compiled
+        # contact exclusions are not yet in the model while it is compiled
+        if config.geoms is None and not compiling:
             ids = _not_excluded(model, core, ids)
         meshes, self.notes = {}, []
         if not compiling:  # nor are meshes
@@ -162,9 +161,8 @@ def _select(model, core, names):
                     "leave it out of geoms"
                 )
         return np.array(sorted(ids), dtype=np.int64)
-    parent = model.body_weldid[
-        model.body_parentid
-    ]  # as in MuJoCo's filter: links joined by one joint do not collide
+    # as in MuJoCo's filter: links joined by one joint do not collide
+    parent = model.body_weldid[model.body_parentid]
     contype, conaffinity = _masks(model, core)
     meets = (model.geom_contype & conaffinity | contype & model.geom_conaffinity) != 0
     pairs = np.stack([model.pair_geom1, model.pair_geom2])  # that MuJoCo collides whatever the masks are

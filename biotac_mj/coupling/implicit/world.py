@@ -63,9 +63,8 @@ class World:
         self._held_trees = np.zeros(model.ntree, bool)  # see `_go_on`
         self._loads = None
         self._solids = {i: SolidContacts(model, one.touching) for i, one in self.instances.items()}
-        self._damped = (
-            None  # whether the integrator's accelerations differ from the constraint solver's in this step
-        )
+        # whether the integrator's accelerations differ from the constraint solver's in this step
+        self._damped = None
         self.integrator = Integrator(
             model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)}
         )

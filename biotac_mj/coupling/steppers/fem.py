@@ -258,9 +258,8 @@ class FemStepper(SkinStepper):
             state=new,
             wrench=d.wrench[0],
             tangent=d.tangent(geoms)[0],
-            vert_xpos=self.vert_xpos(
-                new
-            ),  # not the skin's own memory, which another BioTac's solve overwrites
+            # not the skin's own memory, which another BioTac's solve overwrites
+            vert_xpos=self.vert_xpos(new),
             pressure=float(d.pressure[0]),
             converged=bool(d.converged[0]),
             iterations=int(d.iterations[0]),
