@@ -1048,11 +1048,12 @@ def test_faces_near_moving_geoms_are_all_found(kind):
     rng, skin = np.random.default_rng(7), load_skin("coarse")
     model = shared_model(skin, skin_settings(Config()), "cpu")
     vert, face = np.unique(skin.outer_face, return_inverse=True)
+    of_skin = skin.vert[vert], face.reshape(-1, 3).astype("i4"), skin.rigid
     shape = {
         "sphere": Geom("", "sphere", np.array([4e-3, 0, 0]), 0.0, 0),
         "box": Geom("", "box", np.array([3e-3, 4e-3, 2e-3]), 0.0, 0),
         "mesh": Geom("", "mesh", np.zeros(3), 0.0, 0, 0.0, skin.core_vert, skin.core_face),
-        "skin": Geom("", "skin", np.zeros(3), 0.0, 0, 0.0, skin.vert[vert], face.reshape(-1, 3).astype("i4")),
+        "skin": Geom("", "skin", np.zeros(3), 0.0, 0, 0.0, *of_skin),
     }[kind]
     count = 0
     # bounds of meshes may be less than the distance, by a cell's diagonal
