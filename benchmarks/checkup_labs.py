@@ -12,7 +12,7 @@ unloaded log, that of F1 another's of the same laboratory. Neither has a second 
 after load): an effect of temperature is put into five grasps of a gripper, which has a thermistor.
 
 Effects are put in by the forms of authors' generators (`discrepancy_recordings.py`), each in all of the
-laboratory. practice: F1 and the seventeenth author. blind: F2 and grasps, the twelfth and thirteenth author,
+laboratory. practice: F1, the eleventh and the seventeenth author. blind: F2 and grasps, the twelfth and thirteenth author,
 28 laboratories with one effect, one of each kind before any twice, and 12 with none, drawn by --seed. Each is
 diagnosed as a plain log and with its protocol.
 """
@@ -59,7 +59,7 @@ def plan(authors: Authors, half: str, seed: int) -> list:
     """Laboratories of a half: one of each kind of effect, then further ones at random, and some with none."""
     rng = np.random.default_rng(seed)
     names, sensors = (
-        (("seventeenth",), ("F1",)) if half == "practice" else (("twelfth", "thirteenth"), ("F2",))
+        (("eleventh", "seventeenth"), ("F1",)) if half == "practice" else (("twelfth", "thirteenth"), ("F2",))
     )
     kinds = collections.defaultdict(list)
     for name in names:
@@ -80,7 +80,7 @@ def plan(authors: Authors, half: str, seed: int) -> list:
     for kind, name, i in [*first, *more][:count] + [("none", "", -1)] * 12:
         spec = authors.module(name).plan()[i] if name else None
         # a grasp has no rest before it, and a thermistor
-        grasp = half != "practice" and (kind == "thermal" or not name and rng.random() < 0.2)
+        grasp = kind == "thermal" or half != "practice" and not name and rng.random() < 0.2
         sensor = str(rng.choice(grasps)) if grasp else str(rng.choice(sensors))
         start = float(rng.uniform(0, 40))
         hidden = "+".join("".join(form) if isinstance(form, tuple) else form for form in _forms(spec))
