@@ -35,11 +35,12 @@ def at_rest(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     x = last_measured(log.counts, log.masked)[rows]
     noise = noise_level(x, least=ROUNDING)
     off = (x[1:-1] - 0.5 * (x[2:] + x[:-2])) / noise / np.sqrt(1.5)
+    usual = [np.broadcast_to(_usual(part), part.shape) for part in np.array_split(off, BLOCKS)]
+    off, noise = off / np.concatenate(usual), noise * np.concatenate(usual)
     comes_back = np.abs(x[2:] - x[:-2]) / noise < np.maximum(np.abs(off), _SAMPLE) / 2
     off[:, ~sound] = 0.0
     common = off.sum(1) / np.sqrt(sound.sum())
-    usual = max(float(np.median(np.abs(common))) / norm.ppf(0.75), 1.0)
-    whole = _peaks(np.abs(common) / usual > _ROW, np.abs(common))
+    whole = _peaks(np.abs(common) / _usual(common) > _ROW, np.abs(common))
     found = []
     if whole.sum() >= _FEW:
         mask = np.repeat(whole[:, None], log.channels, axis=1)
@@ -136,6 +137,12 @@ def _of_noise(log, id_, channels, text, values, strength):
     parameters = {name: (value, NAN, NAN) for name, value in values.items()}
     end, which = (len(log) - 1) / log.rate, tuple(int(k) for k in channels)
     return Fault(id_, which, 0.0, end, text, parameters, detector="loud", **evidence(strength))
+
+
+def _usual(off):
+    """Standard deviation of most of off (n, ...), at least 1: noise that is another one at times makes no
+    spikes."""
+    return np.maximum(np.median(np.abs(off), axis=0) / norm.ppf(0.75), 1.0)
 
 
 def _peaks(some, size):
