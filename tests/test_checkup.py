@@ -112,6 +112,16 @@ def test_at_rest_noise_alone_has_no_fault(seed):
     assert at_rest(Log(resting(seed=seed))) == []
 
 
+def breathing(x, noise, rng):
+    louder = 2.5 * np.sin(np.arange(len(x)) / 400) ** 2
+    x[:, 3] += louder * noise[0, 3] * rng.standard_normal(len(x))
+    return x
+
+
+def test_at_rest_noise_that_breathes_has_no_spikes():
+    assert "spikes" not in {f.id for f in at_rest(Log(resting(breathing)))}
+
+
 RESTS = (slice(0, 2000), slice(2000, 4000))
 
 

@@ -171,7 +171,8 @@ class Beliefs:
         against = sum(one.weight for one in others)
         rest = ", ".join(f"{one.name} {one.weight:.0%}" for one in others if one.weight > 0.02)
         likely = f"{first.name} {1 - against:.0%}{', ' * bool(rest)}{rest}"
-        return "; ".join([f"not decided: {likely}", *self.doubts])
+        only = "if it is one of these, " if self.doubts else ""
+        return "; ".join([f"not decided: {only}{likely}", *self.doubts])
 
     def save(self, folder: pathlib.Path, given: Simulator, trajectories: Sequence[Trajectory]) -> None:
         """Writes beliefs.json, given.yaml (the simulator that was compared) and measured.h5."""
