@@ -12,9 +12,9 @@ unloaded log, that of F1 another's of the same laboratory. Neither has a second 
 after load): an effect of temperature is put into five grasps of a gripper, which has a thermistor.
 
 Effects are put in by the forms of authors' generators (`discrepancy_recordings.py`), each in all of the
-laboratory. practice: F1, the eleventh and the seventeenth author. blind: F2 and grasps, the twelfth and thirteenth author,
-28 laboratories with one effect, one of each kind before any twice, and 12 with none, drawn by --seed. Each is
-diagnosed as a plain log and with its protocol.
+laboratory. practice: F1, the eleventh and the seventeenth author. blind: F2 and grasps, the twelfth and
+thirteenth author, 28 laboratories with one effect, one of each kind before any twice, and 12 with none, drawn
+by --seed. Each is diagnosed as a plain log and with its protocol.
 """
 
 import argparse

@@ -112,10 +112,13 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
     score = np.sqrt((others**2).mean(1)) * ((others > 3).mean(1) >= 0.2)
     # a load bends the rows around as well, a loss is a single event
     around = np.maximum(percentile_filter(score, 90, size=81), 1)
+    # after rows that were held all channels jump as well, and none is missing
+    gap = np.diff(rows, prepend=rows[0] - 1)
     places = [
         i
         for i in _isolated(score, around)
-        if all(abs(rows[i + _LINE] / log.rate - start) > _BEGUN for start in begun)
+        if gap[i + _LINE] <= 2 * np.median(gap)
+        and all(abs(rows[i + _LINE] / log.rate - start) > _BEGUN for start in begun)
     ]
     if not places:
         return []

@@ -29,6 +29,8 @@ from .session import Session
 _MOST = 8  # of trends over time
 _LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
+# [counts] beyond a limit, fraction of the rows that may be there
+_LIMIT, _RARELY = 5.0, 0.01
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -186,7 +188,10 @@ def _checkup(session, protocol, named):
     for touched, rows in stretches(r, protocol):
         # levels are of the session's clock: the whole log tells them, and all rests as one
         some = [f for f in diagnose_recording(r.part(rows), named=named).findings if f.trend is None]
-        if not touched:
+        some = [f for f in some if _everywhere(f, session.counts)]
+        if touched:  # loads shake electrodes, too
+            some = [f for f in some if not f.kind.is_noise]
+        else:
             rests.append(rows)
         if not touched and not coarse:  # nothing but noise is there
             faults = [f for f in some if f.of_log]
@@ -211,6 +216,15 @@ def _checkup(session, protocol, named):
             session.weak.append(finding)
         elif not any(_explains(f, finding) for f in session.findings):
             session.accept(finding)  # the first stretch with it
+
+
+def _everywhere(finding, counts):
+    """Whether an electrode hardly ever goes beyond what is said to be its limit, in counts (n, c) of the
+    whole recording."""
+    if not finding.beyond:
+        return True
+    beyond = finding.beyond * (counts[:, finding.channels[0]] - finding.parameters["level"][0])
+    return (beyond > _LIMIT).mean() < _RARELY
 
 
 def _sure_of(faults, named):
