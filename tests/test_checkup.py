@@ -1,5 +1,7 @@
 """The checkup: its protocol, recording while it is said, and what its segments tell. Data are synthetic."""
 
+import types
+
 import numpy as np
 import pytest
 from grids import first
@@ -10,6 +12,7 @@ from scipy.signal import lfilter
 from biotac_mj import cli
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.detectors.memory import remembered
+from biotac_mj.discrepancy.recordings.search import _everywhere
 from biotac_mj.discrepancy.recordings.segments import free_rows
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.quality.check import sample_faults
@@ -235,6 +238,25 @@ def test_taps_are_sharper_than_a_plate_without_a_fault():
     taps, slow = (Protocol((Segment(kind, 0.0, 40.0),)) for kind in ("taps", "loops"))
     assert diagnose_recording(recording, protocol=slow).significant
     assert not diagnose_recording(recording, protocol=taps).significant
+
+
+def test_what_an_electrode_goes_beyond_elsewhere_is_no_limit():
+    limit = types.SimpleNamespace(beyond=1, channels=(4,), parameters={"level": (2700.0, 2699.0, 2701.0)})
+    counts = np.full((1000, 19), 2600.0)
+    counts[:200, 4] = 2700
+    assert _everywhere(limit, counts)
+    counts[900:, 4] = 2750
+    assert not _everywhere(limit, counts)
+
+
+def test_noise_under_touches_is_no_fault_of_an_electrode():
+    rng = np.random.default_rng(4)
+
+    def shaken(x, touched):
+        when = (np.arange(len(x)) > 38 * RATE) & (np.arange(len(x)) < 57 * RATE)
+        return x[:, 4] + 20 * when * rng.standard_normal(len(x))
+
+    assert found(session(put(4, shaken))) == set()
 
 
 def test_a_checkup_finds_spikes_while_nothing_touches():

@@ -429,6 +429,14 @@ def test_lost_rows_are_found_where_they_were():
     assert found.id == "lost_rows" and abs(found.start - 20) < 0.05
 
 
+def test_rows_that_follow_held_ones_are_not_lost():
+    e, _, rng = pressed(12, 50)
+    x = noisy(e, rng, 2.0)
+    for row in (2000, 4000):
+        x[row : row + 250] = x[row - 1]
+    assert ("lost_rows", ALL) not in named(x)
+
+
 def test_rows_are_lost_only_if_the_other_device_lost_them_too():
     counts, force, _ = touched(seed=3, seconds=60)
     keep = np.ones(len(counts), bool)
