@@ -186,12 +186,11 @@ def _checkup(session, protocol, named):
     session.protocol = protocol
     coarse = {k for f in session.findings if f.step for k in f.channels}
     for touched, rows in stretches(r, protocol):
-        # levels are of the session's clock: the whole log tells them, and all rests as one
-        some = [f for f in diagnose_recording(r.part(rows), named=named).findings if f.trend is None]
+        # levels are of the session's clock: the whole log tells them, and all rests as one; loads make noise
+        some = diagnose_recording(r.part(rows), named=named).findings
+        some = [f for f in some if f.trend is None and not (touched and f.kind.is_noise)]
         some = [f for f in some if _everywhere(f, session.counts)]
-        if touched:  # loads shake electrodes, too
-            some = [f for f in some if not f.kind.is_noise]
-        else:
+        if not touched:
             rests.append(rows)
         if not touched and not coarse:  # nothing but noise is there
             faults = [f for f in some if f.of_log]
@@ -219,8 +218,7 @@ def _checkup(session, protocol, named):
 
 
 def _everywhere(finding, counts):
-    """Whether an electrode hardly ever goes beyond what is said to be its limit, in counts (n, c) of the
-    whole recording."""
+    """Whether a limit that an electrode is said to have is one in all counts (n, c)."""
     if not finding.beyond:
         return True
     beyond = finding.beyond * (counts[:, finding.channels[0]] - finding.parameters["level"][0])

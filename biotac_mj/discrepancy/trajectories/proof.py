@@ -60,21 +60,15 @@ def _density(comparison, fit, aside):
 
 def _evidence(comparison, fit, raw, some, independent=()):
     """Logarithm of the likelihood of some trajectories (indices), by residuals `raw` where a Fit has them."""
-    own, _, y, errors, amplitude = _joint(comparison, fit, raw, some, independent)
-    log = own.evidence(y, errors, own.variance(amplitude, fit.size))[0]
-    return log + own.prior(amplitude, fit.law_errors)
-
-
-def _joint(comparison, fit, raw, some, independent=()):
-    """Likelihood of some trajectories, what each effect of a Fit does there, residuals in the eigenvectors,
-    what errors of poses and laws do to these, and amplitudes of what the model misses."""
     own = likelihood.of(comparison, some, independent)
-    done = changes(comparison, own, fit.effects, fit.nuisance)
+    laws = own.laws(changes(comparison, own, fit.effects, fit.nuisance), fit.law_errors)
     poses = own.poses(fit.offsets)
     off = fit.offsets[some].ravel() / comparison.repeatability
     y = own.turned(own.stacked(raw)) + np.tensordot(off, poses, 1)
-    errors = np.concatenate([poses, own.laws(done, fit.law_errors)])
-    return own, done, y, errors, own.amplitudes(y, errors, fit.amplitude, fit.size)
+    errors = np.concatenate([poses, laws])
+    amplitude = own.amplitudes(y, errors, fit.amplitude, fit.size)
+    log = own.evidence(y, errors, own.variance(amplitude, fit.size))[0]
+    return log + own.prior(amplitude, fit.law_errors)
 
 
 def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndarray) -> Proof:
