@@ -146,7 +146,7 @@ def turned_down(x, noise, rng):
     "change, name, channels",
     [
         (coupled, "crosstalk", (5, 6)),
-        (shared, "noise", range(19)),
+        (shared, "common_noise", range(19)),
         (turned_down, "gain", (3,)),
     ],
 )
@@ -170,7 +170,7 @@ def test_noise_is_compared_while_all_electrodes_warm_up():
         disturbed = 0.8 * np.random.default_rng(3).standard_normal((len(x), 1))
         return x * (1 - colder[:, None]) + disturbed * sound_noise(x[:1])
 
-    assert ("noise", tuple(range(19))) in found(session(warming))
+    assert ("common_noise", tuple(range(19))) in found(session(warming))
 
 
 def remembering(memory, force=True):

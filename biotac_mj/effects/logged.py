@@ -169,10 +169,8 @@ class NoiseInLog(Logged):
 
 
 class CommonNoise(Logged):
-    """Not searched."""
-
     id, name = "common_noise", "noise common to all channels"
-    fits, requires = frozenset(), frozenset({"search"})
+    requires = frozenset({"protocol"})
     physics = "one noise is added to every channel: reference, supply"
     params = {"correlation": Param("1", 0.05, 1, "0.001 in a real sensor")}
     confusable = {"crosstalk": "cross-talk falls off with distance"}

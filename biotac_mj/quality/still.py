@@ -91,9 +91,8 @@ def _in_common(log, off, sound):
     found = []
     if common.mean() > _COMMON:
         text = f"{common.mean():.0%} of the noise is common to all electrodes while nothing touches"
-        size = float(np.median(noise_level(log.counts)[channels]) * np.sqrt(common.mean()))
-        every = range(log.channels)
-        found.append(_of_noise(log, "noise", every, text, {"size": size}, rows * (common - _COMMON)))
+        every, values = range(log.channels), {"correlation": float(common.mean())}
+        found.append(_of_noise(log, "common_noise", every, text, values, rows * (common - _COMMON)))
     own = pairs - common[:, None]
     # error of a correlation of differences that overlap, and the largest of so many by chance
     chance = norm.isf(_RARE / len(i)) / np.sqrt(0.6 * len(off))

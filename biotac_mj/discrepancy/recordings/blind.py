@@ -63,5 +63,4 @@ def _lacking(session):
     if session.protocol is None:
         out["protocol"] = "no checkup, whose steps tell these, and no poses"
     out["poses"] = "no poses of what touched, with which `diagnose` searches these"
-    out["search"] = "not searched in any data"
     return out
