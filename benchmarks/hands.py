@@ -29,6 +29,7 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS
 
 import argparse
 import functools
+import itertools
 import json
 import pathlib
 import sys
@@ -77,7 +78,9 @@ def pressed(data, body, depth=DEPTH):
     return body.xpos + body.xmat.reshape(3, 3) @ (PAD - [0, RADIUS - depth, 0])
 
 
-def measure_batch(hand, count, pressing, worlds, device, skin="coarse", steps=40, depth=DEPTH) -> dict:
+def measure_batch(
+    hand, count, pressing, worlds, device, skin="coarse", steps=40, depth=DEPTH, tier="full"
+) -> dict:
     """Milliseconds of a step of a batch, after a settling time."""
     import mujoco_warp as mjw
 
@@ -89,7 +92,7 @@ def measure_batch(hand, count, pressing, worlds, device, skin="coarse", steps=40
         mjd = mujoco.MjData(mjm)
         mujoco.mj_forward(mjm, mjd)
         m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=worlds)
-        batches = [batch.attach(mjm, m, d, prefix=p, skin=skin) for p in prefixes.values()]
+        batches = [batch.attach(mjm, m, d, prefix=p, skin=skin, tier=tier) for p in prefixes.values()]
         mocap = d.mocap_pos.numpy()
         for i, prefix in enumerate(list(prefixes.values())[:pressing]):
             mocap[:, i] = pressed(mjd, f"{prefix}core", depth)
@@ -111,6 +114,7 @@ def measure_batch(hand, count, pressing, worlds, device, skin="coarse", steps=40
         force = np.array([np.linalg.norm(b.wrench[..., :3].sum(1), axis=1) for b in batches])
     return {
         "sensors": count,
+        "tier": tier if count else "none",
         "pressing": pressing,
         "touching_share": float((force[:pressing] > 0.01).mean()) if pressing else 0.0,
         "worlds": worlds,
@@ -126,18 +130,19 @@ def measure_batch(hand, count, pressing, worlds, device, skin="coarse", steps=40
 
 
 def compare_batches(hand, options) -> list[dict]:
-    """A row for each number of worlds and of pressing fingers, and for the hand without BioTacs."""
+    """A row for each number of worlds, tier and number of pressing fingers, and for the hand alone."""
     rows = []
-    print("| worlds | BioTacs | pressing | ms per step | hand-steps per s | failed | set-up s |")
-    print("|---|---|---|---|---|---|---|")
+    print("| worlds | BioTacs | tier | pressing | ms per step | hand-steps per s | failed | set-up s |")
+    print("|---|---|---|---|---|---|---|---|")
+    tiers, pressings = options.tiers.split(","), map(int, options.pressing.split(","))
+    cases = [(0, 0, tiers[0]), *((len(FINGERS), p, tier) for p, tier in itertools.product(pressings, tiers))]
+    how = options.device, options.skin, options.steps, options.depth
     for worlds in map(int, options.worlds.split(",")):
-        for count, pressing in [(0, 0), *((len(FINGERS), int(p)) for p in options.pressing.split(","))]:
-            row = measure_batch(
-                hand, count, pressing, worlds, options.device, options.skin, options.steps, options.depth
-            )
+        for count, pressing, tier in cases:
+            row = measure_batch(hand, count, pressing, worlds, *how, tier)
             rows.append(row)
             print(
-                f"| {worlds} | {count} | {pressing} | {row['ms_per_step']:.2f} | "
+                f"| {worlds} | {count} | {row['tier']} | {pressing} | {row['ms_per_step']:.2f} | "
                 f"{row['hand_steps_per_s']:.0f} | {row['failed']} | {row['setup_s']:.0f} |",
                 flush=True,
             )

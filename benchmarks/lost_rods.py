@@ -1,4 +1,4 @@
-"""The rods that the in-hand task loses, played again by `mj_step`: dropped, or thrown by a skin of the batch?
+"""The rods that the in-hand task loses, played again by `mj_step`: dropped, or thrown by a skin?
 
     MENAGERIE_ROOT=DIR python benchmarks/lost_rods.py --worlds 1024 --device cuda:0 --json OUT
         [--decisions 18] [--seed 1]
@@ -6,7 +6,8 @@
 
 The worlds, actions and limit are those of in_hand_speed.py. Every step of all worlds is recorded. Then each
 world that lost its rod (of none: the one whose rod is furthest off) is played in one world of `mj_step` with
-its rod, friction and controls. A row of the JSON is a world:
+its rod, friction and controls, without the batch's single precision and limit of work. `thrown` of the JSON
+is the number of rods that `mj_step` keeps; the others are dropped by the actions. A row is a world:
 
   lost, mj_step   step in which the rod's middle is beyond the limit, in the batch and in mj_step; null: never
   apart_mm        largest distance of the two rods' middles until then
@@ -24,16 +25,20 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 import mujoco
 import numpy as np
+import warp as wp
 
 __all__ = ["main", "play", "record"]
 
 
 def record(env: object, decisions: int, seed: int) -> tuple[dict, dict]:
-    """Plays random actions from open fingers. Returns {name: (step, world, n)} of qpos, ctrl and force, and
-    {world: step of its first decision's end without the rod}."""
+    """Plays random actions from open fingers. Returns {name: (step, world, n)} of qpos, ctrl and force, with
+    masses, inertias and held places as they begin, since a world that lost its rod gets another; and {world:
+    step of its first decision's end without the rod}."""
     import torch
 
     env.reset(seed=seed)
+    rods = {"mass": env._m.body_mass, "inertia": env._m.body_inertia, "held": wp.from_torch(env._held_at)}
+    rods = {name: array.numpy().copy() for name, array in rods.items()}
     draw = torch.Generator(env.device).manual_seed(seed)
     seen, step = {"qpos": [env.qpos.clone()], "ctrl": [], "force": []}, env._run
 
@@ -48,14 +53,15 @@ def record(env: object, decisions: int, seed: int) -> tuple[dict, dict]:
         gone = env.step(actions)[2]
         for world in gone.nonzero()[:, 0].tolist():
             lost.setdefault(world, (decision + 1) * env.cfg.substeps)
-    return {name: torch.stack(rows).cpu().numpy().astype(float) for name, rows in seen.items()}, lost
+    seen = {name: torch.stack(rows).cpu().numpy().astype(float) for name, rows in seen.items()}
+    return seen | rods, lost
 
 
-def play(env: object, world: int, start: np.ndarray, controls: np.ndarray) -> np.ndarray:
-    """Positions (step, 3) of a world's rod by `mj_step`, with the task's fixture.
+def play(env: object, world: int, seen: dict, end: int) -> np.ndarray:
+    """Positions (end, 3) of a world's rod by `mj_step`, with the task's fixture.
 
     Args:
-      env: the RollRod of the batch. start: (nq,) positions. controls: (step, nu)."""
+      env: the RollRod of the batch. seen: of `record`."""
     from biotac_mj.tasks.batched.hand import build
 
     s, friction = env.cfg, next(iter(env.batches.values())).skin.geoms.struct.friction.numpy()[0]
@@ -70,13 +76,13 @@ def play(env: object, world: int, start: np.ndarray, controls: np.ndarray) -> np
         readings=False,
     )
     model = spec.compile()
-    rod, mass, inertia = model.body("rod").id, env._m.body_mass.numpy(), env._m.body_inertia.numpy()
-    model.body_mass[rod], model.body_inertia[rod] = mass[world, rod], inertia[world, rod]
+    rod = model.body("rod").id
+    model.body_mass[rod], model.body_inertia[rod] = seen["mass"][world, rod], seen["inertia"][world, rod]
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    data, held = mujoco.MjData(model), env._held_at[world].cpu().numpy()
-    data.qpos[:], spin, out = start, np.zeros(3), []
+    data, held = mujoco.MjData(model), seen["held"][world]
+    data.qpos[:], spin, out = seen["qpos"][0, world], np.zeros(3), []
     pos, dof = slice(env._at, env._at + 3), model.joint("rod").dofadr[0]
-    for control in controls:
+    for control in seen["ctrl"][:end, world]:
         fraction = np.clip((s.release - data.time) / (s.release - s.hold), 0.0, 1.0)
         velocity = data.qvel[dof : dof + 6]
         mujoco.mju_rotVecQuat(spin, velocity[3:], data.qpos[env._at + 3 : env._at + 7])
@@ -110,21 +116,22 @@ def main(arguments: list[str] | None = None) -> int:
     furthest = int(np.linalg.norm(rods[-1] - centre, axis=1).argmax())
     rows = []
     for world, end in (lost or {furthest: steps}).items():
-        played = play(env, world, seen["qpos"][0, world], seen["ctrl"][:end, world])
-        own = rods[1 : end + 1, world]
-        gone = [np.flatnonzero(np.linalg.norm(p - centre, axis=1) > env.cfg.lost) for p in (own, played)]
-        first, other = (int(at[0]) if len(at) else None for at in gone)
-        until = len(own) if first is None else first + 1
-        apart = np.linalg.norm(own - played[: len(own)], axis=1)[:until].max()
+        own, played = rods[1 : end + 1, world], play(env, world, seen, end)
+        ways = {"lost": own, "mj_step": played}
+        gone = {n: np.flatnonzero(np.linalg.norm(p - centre, axis=1) > env.cfg.lost) for n, p in ways.items()}
+        row = {"world": world} | {name: int(at[0]) if len(at) else None for name, at in gone.items()}
+        until = len(own) if row["lost"] is None else row["lost"] + 1
+        apart = np.linalg.norm(own - played, axis=1)[:until].max()
         speed = np.linalg.norm(np.diff(own[:until], axis=0), axis=1).max() / env.cfg.timestep
-        row = {"world": world, "lost": first, "mj_step": other, "apart_mm": 1e3 * float(apart)}
-        row |= {"speed": float(speed), "force_n": seen["force"][until - 1, world].tolist()}
+        row |= {"apart_mm": 1e3 * float(apart), "speed": float(speed)}
+        row |= {"force_n": seen["force"][until - 1, world].tolist()}
         rows.append(row)
         print(row, flush=True)
     options.json.parent.mkdir(parents=True, exist_ok=True)
-    found = {"device": options.device, "worlds": options.worlds, "seed": options.seed, "lost": len(lost)}
-    write_json(options.json, found | {"rows": rows})
-    return int(any(row["lost"] != row["mj_step"] for row in rows))
+    thrown = sum(row["lost"] is not None and row["mj_step"] is None for row in rows)
+    found = {"device": options.device, "worlds": options.worlds, "seed": options.seed}
+    write_json(options.json, found | {"lost": len(lost), "thrown": thrown, "rows": rows})
+    return int(thrown > 0 or any(row["lost"] != row["mj_step"] for row in rows))
 
 
 if __name__ == "__main__":

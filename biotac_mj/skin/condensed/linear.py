@@ -217,8 +217,9 @@ class LinearSkin:
         return c
 
 
-# by model; a LinearSkin must not refer to its model, which would keep both
-_made = weakref.WeakKeyDictionary()
+_made = (
+    weakref.WeakKeyDictionary()
+)  # by model; a LinearSkin must not refer to its model, which would keep both
 
 
 def _rings(of, face, number, count):

@@ -20,8 +20,9 @@ from ..types import mat33, real, vec3
 
 kernel_module(__name__)
 
-# index of the block between corners: `faces.block_index`
-_BLOCK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_BLOCK = np.array(
+    [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+)  # index of the block between corners: `faces.block_index`
 
 
 def body_tangent(
