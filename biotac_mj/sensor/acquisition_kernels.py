@@ -329,6 +329,9 @@ def sample_slots(
     low = state[w, at.filter]
     high = state[w, at.filter + 1]
     tac = state[w, at.filter + 2]
+    below = real(_LOW)
+    above = real(_HIGH)
+    slow = real(_TAC)
     before = slots_until(now)
     for k in range(1, wp.int32(slots_until(now + dt) - before) + 1):
         slot = before + wp.int64(k)
@@ -336,8 +339,8 @@ def sample_slots(
         position = _position(slot, at.slots)
         channel = position / 2
         address = at.pac + channel
-        fast = _ramp(old, rise, low, real(_LOW), since)
-        sound = real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since))
+        fast = _ramp(old, rise, low, below, since)
+        sound = real(_BAND) * (fast - _ramp(old, rise, high, above, since))
         if k <= shaken.shape[1]:
             sound += shaken[w, k - 1]
         value = _pac_counts(sound) - real(channels.PAC_REST) + state[w, at.pac_rest]
@@ -369,7 +372,7 @@ def sample_slots(
                 value = state[w, at.pdc_rest] + state[w, at.pdc_gain] * change
                 deviation = state[w, at.pdc_noise]
             elif address == at.tac:
-                rate = _ramp(heating, real(0.0), tac, real(_TAC), since)
+                rate = _ramp(heating, real(0.0), tac, slow, since)
                 value = _thermistor_counts(_heating_exponent(rate))
                 value += state[w, at.tac_rest] - real(channels.TAC_REST)
                 deviation = state[w, at.tac_noise]
@@ -384,9 +387,9 @@ def sample_slots(
             value += hiss
         # in a step longer than a frame a channel is sampled more than once: the last sample counts
         state[w, address] = wp.clamp(wp.rint(value), real(0.0), real(channels.FULL_SCALE))
-    state[w, at.filter] = _ramp(old, rise, low, real(_LOW), dt)
-    state[w, at.filter + 1] = _ramp(old, rise, high, real(_HIGH), dt)
-    state[w, at.filter + 2] = _ramp(heating, real(0.0), tac, real(_TAC), dt)
+    state[w, at.filter] = _ramp(old, rise, low, below, dt)
+    state[w, at.filter + 1] = _ramp(old, rise, high, above, dt)
+    state[w, at.filter + 2] = _ramp(heating, real(0.0), tac, slow, dt)
     state[w, at.pressure] = felt
     state[w, at.temperature] = temperature[w] + warmed
     state[w, at.given_pressure] = pressure[w]

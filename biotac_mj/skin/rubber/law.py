@@ -323,8 +323,9 @@ def barrier_stress(law: int, mu: real, F: mat33):
 def barrier_derivative(law: int, mu: typing.Any, F: typing.Any, dF: typing.Any):
     """Directional derivative of the barrier's stress [Pa], in the precision of F."""
     J = wp.determinant(F)
-    if law == Law.LINEAR or J >= type(J)(COMPRESSED):
+    limit = type(J)(COMPRESSED)
+    if law == Law.LINEAR or J >= limit:
         return F - F
     f = barrier(J)
     G = cofactor(F)
-    return mu * (f[2] / type(J)(COMPRESSED) * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
+    return mu * (f[2] / limit * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
