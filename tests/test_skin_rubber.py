@@ -16,7 +16,7 @@ from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance_bound
 from biotac_mj.skin.forces import Forces
-from biotac_mj.skin.precondition import inverse, sparse
+from biotac_mj.skin.precondition import dense, sparse
 from biotac_mj.skin.precondition.pushed_forward import PushForward
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.state_arrays import StateArrays
@@ -184,7 +184,7 @@ def test_carried_the_dense_inverse_takes_fewer_products(monkeypatch):
         return products, data.wrench[-1, 0, :3].copy(), data.tangent(geoms)[-1, 0]
 
     pushed, force, tangent = press()
-    monkeypatch.setattr(inverse, "pushes_forward", lambda *of: False)
+    monkeypatch.setattr(dense, "pushes_forward", lambda *of: False)
     rest, force_at_rest, tangent_at_rest = press()
     assert pushed < 0.6 * rest
     np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())
