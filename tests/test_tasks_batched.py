@@ -31,8 +31,9 @@ from biotac_mj.tasks.batched.playing import find_policy, seen_by
 from biotac_mj.tasks.batched.policy import Policy, load_policy, read_card, save_policy
 from biotac_mj.tasks.batched.ppo import Learner, Lessons, Numbers
 from biotac_mj.tasks.batched.roll_rod import Settings
+from biotac_mj.tasks.batched.task import BatchTask
 from biotac_mj.tasks.batched.touch import Touch
-from biotac_mj.tasks.batched.training import of_runs, train
+from biotac_mj.tasks.batched.training import of_runs, tier_errors, train
 from biotac_mj.view.offscreen import find_gl
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
@@ -189,8 +190,8 @@ def test_errors_of_the_model_differ_between_episodes():
 
 
 def test_a_lesson_is_sensed_anew():
-    """With other noise of the encoders and other errors of the model, which drift, the same where a young
-    episode repeats its first decision; without both as a policy saw it."""
+    """With other noise of the encoders, the same where a young episode repeats its first decision, and other
+    errors of the model, which stay; without both as a policy saw it."""
     settings = dataclasses.replace(FollowEdge.settings, substeps=1, encoder=1e-3)
     env = make("follow_edge", 2, settings=settings, device="cpu", history=4, model_error=(0.0, 0.1, 0.0))
     for _ in range(2):
@@ -208,8 +209,7 @@ def test_a_lesson_is_sensed_anew():
     np.testing.assert_allclose(changes[..., :19], sensed["changes"][:, :, 0, :19], atol=1e-3)
     gain = changes[..., 19] / sensed["changes"][:, :, 0, 19]
     np.testing.assert_allclose(gain.std(0), 0.1, rtol=0.15)
-    np.testing.assert_allclose(np.corrcoef(gain[:, :3].T)[0, 1:], [0.97, 0.97**2], atol=0.02)
-    assert torch.allclose(gain[:, 2], gain[:, 3])
+    assert torch.allclose(gain, gain[:, :1].expand_as(gain), rtol=1e-5)
     env.model_error, env._blur = (0.0, 0.0, 0.0), 0.0 * env._blur
     env.reset()
     seen = env.observe()
@@ -234,6 +234,41 @@ def test_a_lesson_has_another_goal_and_what_is_done_for_it():
     body = torch.cat(env._sense_body(0.0, 0.0), dim=1)
     np.testing.assert_allclose(sensed["body"][:, 0], body, atol=1e-6)
     assert torch.equal(sensed["body"][..., -2], sensed["body"][:, :1, -2].expand(2, 3))
+
+
+def test_a_lesson_has_the_errors_of_a_tier_in_its_decisions():
+    """Those of a random episode, of the same decisions, times a factor; a share of the RMS of their kind."""
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1)
+    env = make("follow_edge", 2, settings=settings, device="cpu", history=4)
+    for _ in range(2):
+        env.step(torch.ones(2, 4))
+    sensed = {name: value.repeat(200, *[1] * (value.ndim - 1)) for name, value in env.sensed().items()}
+    sensed["changes"] = 100.0 + 0.0 * sensed["changes"]
+    measured = torch.zeros(4, 1, 1, 42)
+    measured[..., :20] = torch.tensor([0.1, 0.2, -0.4, 9.0]).view(4, 1, 1, 1)
+    env._blur = 0.0
+    seen = env.sense_anew("electrodes", **sensed, measured=measured)[:, 4 * 13 :].unflatten(1, (4, 20)) - 1
+    assert torch.allclose(seen, seen[..., :1].expand_as(seen), atol=1e-5)
+    factor = seen[:, 0, 0] / -0.4
+    for k, off in enumerate((-0.4, 0.2, 0.1, 0.1)):  # the first decision is repeated
+        np.testing.assert_allclose(seen[:, k, 0], off * factor, atol=1e-5)
+    assert abs(factor.mean() - 0.5) < 0.15 and abs(factor.std() - 0.7) < 0.15
+
+
+def test_errors_of_a_tier_are_those_of_the_same_episodes():
+    """None between two of the same; a tenth less is a tenth of what is there, as a share of its RMS."""
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1, decisions=3)
+    env, other = (make("follow_edge", 2, device="cpu", settings=settings, sensor="random") for _ in range(2))
+    for one in (env, other):
+        one.prepare_held, one.good = lambda seed: None, torch.arange(2)
+    assert not tier_errors(env, other).any()
+    here = []
+    env.sensed = lambda: here.append(BatchTask.sensed(env)["changes"]) or {"changes": here[-1]}
+    other.sensed = lambda: {"changes": 0.9 * BatchTask.sensed(other)["changes"]}
+    found = tier_errors(env, other)
+    wanted = torch.stack([-0.1 * c[:, 0] / (env._touch.rms(c[:, 0]) + 5.0) for c in here])
+    assert found.shape == (3, 2, 1, 42) and wanted.abs().max() > 1e-3
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
 def test_lessons_lack_electrodes_in_all_their_decisions():

@@ -75,6 +75,7 @@ class RollRod(HeldTask):
     num_actions = 6
     gamma = 0.9  # a decision is paid at once; with 0.97 noise hides what it gave
     settings = Settings()
+    same_in_tiers = True
 
     def __init__(
         self, hand: pathlib.Path | str | None = None, num_envs: int = 256, *args: object, **keywords: object

@@ -17,7 +17,6 @@ from .bank import Bank
 from .touch import OBSERVE, Touch, as_deviations
 
 _FELT = 0.02  # force of a finger that holds something, at least [N]
-_STAYS = 0.97  # correlation of errors of the model in consecutive decisions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +65,8 @@ class BatchTask(abc.ABC):
         latent projections in place of the film's.
       history: number of decisions in "body" and "touch", the last one first; a younger episode repeats its
         first decision.
-      model_error: standard deviations of relative errors of changes of counts, which drift within an
-        episode, for the error of this tier: of electrodes, PDC and PAC, see `Touch.with_errors`; or one
+      model_error: standard deviations of relative errors of changes of counts, constant in an episode,
+        for the error of this tier: of electrodes, PDC and PAC, see `Touch.with_errors`; or one
         number.
       settings: numbers of the task; None: the class's own.
       biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`; by default coarse and condensed.
@@ -87,6 +86,7 @@ class BatchTask(abc.ABC):
     num_actions: int
     settings = TaskSettings()  # of the class
     gamma = 0.95  # discount of a decision in learning
+    same_in_tiers = False  # whether the same actions move the object alike in both tiers of the skin
     camera: tuple  # lookat (3,) [m], distance [m], azimuth, elevation [deg] of a picture
 
     def __init__(
@@ -305,8 +305,9 @@ class BatchTask(abc.ABC):
         Args:
           choice: of `touch.OBSERVE` in place of the environment's own, of the same sensors.
         """
-        body, noise, changes, errors = self._past
-        touch = self._touch.observe(choice or self.observes, self._touch.with_errors(changes, errors))
+        body, noise, changes = self._past
+        touch = self._touch.with_errors(changes, self._errors[:, None])
+        touch = self._touch.observe(choice or self.observes, touch)
         state, body = torch.cat(self._state(), dim=1), body + noise
         return {"body": body.flatten(1), "touch": touch.flatten(1), "state": state}
 
@@ -320,7 +321,7 @@ class BatchTask(abc.ABC):
     def sensed(self) -> dict:
         """{"body" (num_envs, history, n), "changes" (num_envs, history, nfinger, k), "world" (num_envs,)} of
         the last decisions, without the encoders' error and the model's, for `sense_anew`."""
-        body, _, changes, _ = self._past
+        body, _, changes = self._past
         return {"body": body, "changes": changes, "world": torch.arange(self.num_envs, device=self.device)}
 
     def sense_anew(
@@ -330,23 +331,29 @@ class BatchTask(abc.ABC):
         changes: torch.Tensor,
         world: torch.Tensor,
         missing: int = 0,
+        measured: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Observations (n, m) of body and touch for what was `sensed` in n worlds, with new errors of
         encoders and model.
 
         Args:
           choice: of `touch.OBSERVE`. missing: number of random electrodes of each finger that read no change.
+          measured: errors of this tier, see `training.tier_errors`; each world gets those of a random episode
+            times a random factor, 0.5 +- 0.7, so that neither tier is strange.
         """
-        changes = self._touch.without(changes, missing, self._draw) if missing else changes
-        errors = self._touch.draw_errors(body.shape[:2], self.model_error, self._draw)
-        for k in range(self.history - 1, 0, -1):  # the last decision comes first
-            errors[:, k - 1] = _later(errors[:, k], errors[:, k - 1])
         # an episode that is young repeats its first decision, with its errors
         repeats = (body[:, 1:] == body[:, :-1]).all(2)
         first = torch.arange(1, self.history, device=self.device).where(~repeats, 0)
         first = torch.nn.functional.pad(first, (1, 0)).cummax(1).values
         noise = self._noise(body).gather(1, first[..., None].expand_as(body))
-        errors = errors.gather(1, first[..., None, None].expand_as(errors))
+        if measured is not None:
+            n = len(body)
+            which = torch.randint(measured.shape[1], (n, 1), generator=self._draw, device=self.device)
+            factor = 0.5 + 0.7 * torch.randn(n, 1, 1, 1, generator=self._draw, device=self.device)
+            off = measured[first[:, -1:] - first, which]  # of the same decision
+            changes = changes + factor * off * self._touch.rms(changes)
+        changes = self._touch.without(changes, missing, self._draw) if missing else changes
+        errors = self._touch.draw_errors((len(body), 1), self.model_error, self._draw)
         touch = self._touch.observe(choice, self._touch.with_errors(changes, errors), world)
         return torch.cat([(body + noise).flatten(1), touch.flatten(1)], dim=1)
 
@@ -410,9 +417,8 @@ class BatchTask(abc.ABC):
         changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
         body = torch.cat(self._sense_body(0.0, 0.0), dim=1)
         errors = self._touch.draw_errors((self.num_envs,), self.model_error, self._draw)
-        if self._past is not None:
-            errors = errors.where(begun[:, None, None], _later(self._past[3][:, 0], errors))
-        now = [body, self._noise(body), changes, errors]
+        self._errors = errors if self._past is None else errors.where(begun[:, None, None], self._errors)
+        now = [body, self._noise(body), changes]
         first = [one[:, None].expand(-1, self.history, *one.shape[1:]) for one in now]
         if self._past is None:
             self._past = first
@@ -490,9 +496,3 @@ class BatchTask(abc.ABC):
             setattr(m, field, wp.array(many, dtype=one.dtype))
             made.append(getattr(m, field))
         return made
-
-
-def _later(errors, drawn):
-    """Errors of the model one decision after `errors`, from new ones: they drift as the contact's place and
-    force do, because a policy reads changes within an episode."""
-    return _STAYS * errors + (1 - _STAYS**2) ** 0.5 * drawn

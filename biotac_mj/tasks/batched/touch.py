@@ -79,8 +79,13 @@ class Touch:
         n = self._split[0]
         common, own = errors.split([3, n], dim=-1)
         out = changes * (1 + common[..., self._kind])
-        out[..., :n] += own * changes[..., :n].square().mean(-1, keepdim=True).sqrt()
+        out[..., :n] += own * self.rms(changes)[..., :n]
         return out
+
+    def rms(self, changes: torch.Tensor) -> torch.Tensor:
+        """RMS (..., nfinger, k) of changes of the channels over those of a finger and of their kind."""
+        kinds = changes.split(self._split, dim=-1)
+        return torch.cat([c.square().mean(-1, keepdim=True).sqrt().expand_as(c) for c in kinds], dim=-1)
 
     def without(self, changes: torch.Tensor, count: int, draw: torch.Generator) -> torch.Tensor:
         """Changes of the channels (n, ..., nfinger, k) in which `count` random electrodes of each finger read
