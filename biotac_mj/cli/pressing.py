@@ -294,7 +294,7 @@ def _hands(args):
     from ..tasks.hands import HANDS
 
     for name, mounts in HANDS.items():
-        print(f"{name:<16} fingers {', '.join(mounts)}")
+        print(f"{name:<{max(map(len, HANDS))}} fingers {', '.join(mounts)}")
     print("any other: `biotac hand mount HAND.xml --body LINK ...` finds the place and draws it")
 
 

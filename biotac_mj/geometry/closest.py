@@ -121,11 +121,7 @@ def nearest_listed(
         if real(lists.away[n]) - moved > best + _SLACK:  # and so are all that follow
             break
         # read together, since a read after a branch waits for it
-        face = wp.vec3i(
-            lists.face[n],
-            lists.face[wp.min(n + 1, end - 1)],
-            lists.face[wp.min(n + 2, end - 1)],
-        )
+        face = wp.vec3i(lists.face[n], lists.face[wp.min(n + 1, end - 1)], lists.face[wp.min(n + 2, end - 1)])
         away = vec3(
             _distance(corner, first + face[0], q),
             _distance(corner, first + face[1], q),
@@ -256,11 +252,7 @@ def pseudonormals(vert: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def ray_distances(
-    corner: np.ndarray,
-    start: np.ndarray,
-    direction: np.ndarray,
-    least: float = 0.0,
-    margin: float = 1e-9,
+    corner: np.ndarray, start: np.ndarray, direction: np.ndarray, least: float = 0.0, margin: float = 1e-9
 ) -> np.ndarray:
     """Distances (n,) along rays to triangles of corners (n, 3, 3), inf where a ray misses its triangle
     (Moeller and Trumbore 1997).
