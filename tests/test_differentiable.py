@@ -22,6 +22,7 @@ from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forw
 from biotac_mj.differentiable.touching import Anchors
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_distance_grid
+from biotac_mj.skin import step as skin_step
 
 
 def another_shape(skin):
@@ -44,6 +45,29 @@ def test_every_input_against_differences(element, liquid):
     ways = {name: draw.normal(size=value.shape) for name, value in given.items()}
     ways = {name: torch.tensor(way / np.linalg.norm(way)) for name, way in ways.items()}
     assert_slopes(lambda moved: loss_of(press(skin, **given | moved)).item(), given, ways, STEPS, 3e-6)
+
+
+def test_solves_that_begin_near_the_end_end_there_too(monkeypatch):
+    """From where another press was, in fewer iterations; from nodes that are nowhere, along the path."""
+    skin, counts = ball(0.18, liquid=True), []
+
+    def counted(model, data, *given):
+        skin_step(model, data, *given)
+        counts.append(int(data.iterations[0]))
+
+    monkeypatch.setattr("biotac_mj.differentiable.record.step", counted)
+    pos, _ = path(9)
+    given = skin, pos.numpy()[None], np.tile(np.eye(3), (1, 9, 1, 1, 1)), skin.friction, skin.own
+    plain, far = follow(*given).steps, sum(counts)
+    nodes = np.stack([one.x.numpy() for one in plain])
+    nowhere = nodes + np.random.default_rng(0).normal(0, 2e-3, nodes.shape)
+    for near, most in ((nodes, 0.7 * far), (nowhere, np.inf)):
+        counts.clear()
+        again = follow(*given, near=near).steps
+        assert len(again) == len(plain)
+        np.testing.assert_allclose(again[-1].x, plain[-1].x, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(again[-1].wrench, plain[-1].wrench, rtol=1e-4, atol=1e-6)
+        assert sum(counts) < most
 
 
 @pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))

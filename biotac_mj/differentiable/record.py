@@ -15,6 +15,7 @@ from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, SkinWorlds
 from .touching import Anchors, at_sharp_edges, find_touching, rows
 
+_FROM_NEAR = 200  # of a step's work, which one that begins at given nodes may take: a good start takes 30
 _NOTHING = 1e-15  # of the largest energy density of the rubber
 _WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds` in a step
 
@@ -103,6 +104,7 @@ def follow(
     dt: np.ndarray | None = None,
     constants: np.ndarray | None = None,
     smoothing: float = 0.0,
+    near: np.ndarray | None = None,
 ) -> Trajectory:
     """Moves the geoms along paths, from skins at rest.
 
@@ -114,6 +116,8 @@ def follow(
       dt: (nstep,) times of the steps [s]; required for a Prony series.
       constants: of the rubber's memory; None: the skin's.
       smoothing: half width of first contact, see `press` [m].
+      near: (nstep, nvert, nworld, 3) nodes at which the solves of the steps begin [m]; None: by the motion
+        before.
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
@@ -121,6 +125,8 @@ def follow(
     vert = skin.rest if vert is None else vert
     skin.rest_at(vert)
     data.reset()
+    data.worlds.guessed.zero_()
+    data.worlds.spent.zero_()
     skin.write(numbers)
     skin.smooth(smoothing)
     geoms.set_friction(friction)
@@ -141,7 +147,13 @@ def follow(
     steps, before = [], None
     for t in range(pos.shape[1]):
         geoms.set_pose(pos[:, t], mat[:, t])
+        if near is not None:
+            data.increment.assign(near[t] - data.x.numpy())
+            data.worlds.guessed.fill_(1)
+            data.worlds.spent.fill_(skin.model.options.max_work - _FROM_NEAR)
         before = advance(skin, geoms, before, float(dt[t]), constants)
+        if near is not None and not data.converged.all():  # a step that begins so takes no increments
+            return follow(skin, pos, mat, friction, numbers, vert, dt, constants, smoothing)
         steps.append(before)
     return Trajectory(rest, steps, vert)
 

@@ -156,6 +156,7 @@ class _Search:
         self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
         self._steps, self._place, self._bar = presses.path(*presses.at[start]), presses.at[start, :2], bar
         self._axes = frame_of(self._steps, presses.at[start, 1])
+        self._known, self._nodes_by = [], np.zeros((0, 0))
         self._rest = np.log(film.impedance(presses.skin.model.rest.vert[: presses.geometry.nvert]))
 
     def rough(self) -> _Press | None:
@@ -249,10 +250,21 @@ class _Search:
         """Simulates a press of the full skin."""
         self._bar.update()
         skin, (pos, mat) = self._presses.skin, self._path(at)
+        near = self._nodes_near(at, len(pos))
         with skin.lock:
-            trajectory = follow(skin, pos[None], mat[None], skin.friction, skin.own)
+            trajectory = follow(skin, pos[None], mat[None], skin.friction, skin.own, near=near)
+        self._known.append((at, np.stack([step.x.numpy() for step in trajectory.steps])))
         last = self._presses.solved(trajectory.steps[-1], trajectory.rest)
         return self._read(at, last, trajectory)
+
+    def _nodes_near(self, at, nstep):
+        """Nodes (nstep, nvert, 1, 3) of a press by the nearest one of as many steps and its tangents [m];
+        None: not known."""
+        known = [one for one in self._known if len(one[1]) == nstep == self._nodes_by.shape[1]]
+        if not known:
+            return None
+        there, nodes = min(known, key=lambda one: np.linalg.norm(at - one[0]))
+        return nodes + np.tensordot(at - there, self._nodes_by, 1)[:, :, None]
 
     def _approximated(self, at):
         """Simulates a press of the condensed tier."""
@@ -282,6 +294,7 @@ class _Search:
         inputs = Inputs(pose, np.zeros((k, 1, 1)), {name: np.zeros((k, 1)) for name in presses.skin.own})
         with presses.skin.lock:
             tangents = push_forward(presses.skin, trajectory, inputs)
+        self._nodes_by = tangents.nodes[:, 0]
         last = presses.solved(trajectory.steps[-1], trajectory.rest)
         _, slopes = slopes_of_film(self._film, last.x, tangents.nodes[:, 0, -1, : presses.geometry.nvert])
         signal_by = np.column_stack([slopes, 1e-3 * tangents.pressure[:, 0, -1]])[:, : len(self._signal)]
