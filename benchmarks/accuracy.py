@@ -122,11 +122,12 @@ def solve_case(
     model.factor  # noqa: B018  made here, so that `seconds` is of the steps
     geoms, pos, mat = case_geoms(shape, friction)
     walk = _Walk(model, geoms, pos, mat, np.array(shape["pose_start"])[:3, :3], case["start"])
-    force, wrong = [], []
+    force, wrong, squeezed = [], [], []
     begin = time.perf_counter()
     for goal, reference in zip(case["path"], case["displacement"]):
         walk.to(goal, substeps)
         force.append(walk.data.wrench[0, 0, :3])
+        squeezed.append(walk.data.worlds.squeezed.numpy()[0])
         wrong.append(walk.data.vert_xpos[0] - geometry.vert - reference)
     seconds = time.perf_counter() - begin
     wanted = case["force"]
@@ -143,6 +144,7 @@ def solve_case(
         "seconds": seconds,
         "kind": "sliding or core" if sliding_or_core else "normal",
         "stored_uncertainty_force_rel": float(case["uncertainty_force_rel"]),
+        "squeezed": float(max(squeezed)),
         "steps": walk.steps,
         "iterations": walk.iterations,
         "halved": walk.halved,

@@ -13,7 +13,7 @@ import warp as wp
 
 import biotac_mj
 from biotac_mj.cache import cache_folder, cached
-from biotac_mj.coupling.config import Config
+from biotac_mj.coupling.config import TIERS, Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.coupling.steppers.fem import geom_set, shared_model, skin_settings
@@ -634,28 +634,31 @@ def test_a_ball_rests_with_its_weight():
     assert status[0] == 1 and status[1] == 0 and status[4] == 1 and handle.config.tier == "condensed"
 
 
-def test_a_press_beyond_what_was_measured_warns_once():
-    """In status at every such step, in a warning at the first; a light press says nothing."""
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_a_press_beyond_what_was_measured_warns_once(tier):
+    """In status at every such step, to 20 N, in a warning at the first; a light press says nothing."""
     spec = mujoco.MjSpec()
     spec.option.timestep = 4e-3
     top, _ = surface_point(load_skin("coarse"), -10e-3, 0.0)
     above = top + [0, -3.5e-3, 0]
     ball = spec.worldbody.add_body(name="ball", mocap=True, pos=above)
     ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[3.5e-3, 0, 0])
-    settings = dict(skin="coarse", tier="condensed", coupling="one-way", readings="none", geoms=["ball"])
+    settings = dict(skin="coarse", tier=tier, coupling="one-way", readings="none", geoms=["ball"])
     handle = biotac_mj.attach(spec, body="world", **settings)
     model = spec.compile()
     data, tiers = mujoco.MjData(model), []
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        for depth in np.linspace(0, 2.4e-3, 16):
+        for depth in np.linspace(0, 3.2e-3, 22):
             data.mocap_pos[0] = above + [0, depth, 0]
             mujoco.mj_step(model, data)
             tiers.append(handle.read(data, "status")[4])
             warned = [str(one.message) for one in said]
             assert len(warned) == (-1 in tiers), warned
-    assert tiers[:4] == [1] * 4 and tiers[-1] == -1
-    assert "'biotac_core': it is pressed beyond the range" in warned[0] and "tier='full'" in warned[0]
+    assert np.linalg.norm(handle.read(data, "contact_force")[:3]) > 20
+    beyond = tiers.index(-1)
+    assert tiers[:beyond] == [TIERS.index(tier)] * beyond and set(tiers[beyond:]) == {-1} and beyond > 4
+    assert "'biotac_core': it is pressed beyond the range" in warned[0] and f"tier={tier!r}" in warned[0]
 
 
 def test_files_of_a_press_say_the_tier(synthetic_press, tmp_path):

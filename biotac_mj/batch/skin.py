@@ -111,7 +111,7 @@ class BatchSkin:
         if tangents:
             self.bodies = self._condensed.bodies if self._condensed else self.data.bodies
         with wp.ScopedDevice(model.device):
-            self.tier = self._condensed.tier if self._condensed else wp.zeros(nworld, dtype=int)
+            self.tier = (self._condensed or self.data.worlds).tier
             self.slack = self._condensed.slack if self._condensed else wp.zeros((0, nworld), dtype=wp.float64)
             allocate("batch", self, {"group": self.ngroup, "world": nworld})
             self.fraction, self._path = (

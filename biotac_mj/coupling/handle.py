@@ -69,7 +69,7 @@ class Handle:
         contact_force is force [N] and torque [N m] on the BioTac in its frame, as they act in the step (with
         RK4, after mj_step, over its four stages), on its skin and on core, nail and clamp; status is
         (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier: 0
-        full, 1 condensed, -1 condensed where its error has not been measured; rounds through MuJoCo's solver;
+        full, 1 condensed, -1 where its error has not been measured; rounds through MuJoCo's solver;
         fraction of the bodies' motion for which the skin was solved; fraction of its push on a body that was
         withheld): see docs/lab/coupling.md.
 

@@ -360,7 +360,7 @@ class Instance:
         if "contact_force" in self.sensor:
             out[self.sensor["contact_force"]] = wrench
         if "status" in self.sensor:
-            tier = self._tier if result.measured else -self._tier
+            tier = self._tier if result.measured else -1
             if not good:
                 self._warn_once(
                     "a step did not settle, and status[1] counts these: if more do than one in a hundred, "
@@ -369,8 +369,8 @@ class Instance:
             elif not result.measured:
                 self._warn_once(
                     f"it is pressed beyond the range in which the error of tier={TIERS[self._tier]!r} was "
-                    "measured, and status[4] is -1 there: press less, or take tier='full' "
-                    "(docs/concepts/tiers.md)"
+                    "measured, and status[4] is -1 there: press less"
+                    f"{', or take the full tier' * self._tier} (docs/concepts/tiers.md)"
                 )
             failed, way = self.state[FAILED] + (not good), result.load_factor
             of_solve = result.iterations, result.residual

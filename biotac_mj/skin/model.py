@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from ..fields import as_real, check_choice, check_types
 from ..geometry.edge_nodes import with_edge_nodes
@@ -383,6 +384,14 @@ class SkinModel:
                 "check the meshes' frames and units"
             )
         return cavity, cavity - core
+
+    @functools.cached_property
+    def opposite(self) -> wp.array:
+        """(n,) the node across the wall from each of `outer.node`; itself where there is no wall."""
+        g, node = self.geometry, self.outer.node.numpy()
+        wall = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(self.fixed, g.outer_face)
+        found = wall[cKDTree(g.vert[wall]).query(g.vert[node])[1]] if len(wall) else node
+        return wp.array(found.astype(np.int32), dtype=int, device=self.device)
 
     @property
     def rest(self) -> liquid.Rest:

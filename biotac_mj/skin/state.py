@@ -156,6 +156,7 @@ VARIABLES = (
     Variable("reason", "worlds.reason", (), int, 0, OUTCOME, **_OF_STEPS),
     Variable("load_factor", "worlds.load_factor", (), real, 1.0, OUTCOME, **_OF_STEPS),
     Variable("iterations", "worlds.iterations", (), int, 0, OUTCOME, **_OF_STEPS),
+    Variable("full_tier", "worlds.tier", (), int, 0, OUTCOME, tiers=(FULL,), **_OF_STEPS),
     Variable("error", "worlds.error", (), real, 0.0, OUTCOME, **_OF_STEPS),
     # history of the rubber's points, see `rubber.points`: overstress Q [Pa], relaxing stress S eta [Pa]
     # (which follows from nodes and W_max), largest energy density W_max [J/m^3], slip of friction branches
@@ -173,7 +174,7 @@ VARIABLES = (
     # softening and swelling at which the forces were computed, and at the end of the step
     Variable("solved", "condensed.solved", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
     Variable("after", "condensed.after", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
-    # tier of the last step, for the sensor `status`
+    # tier of the last step, for the sensor `status`, as `full_tier`
     Variable("tier", "step.tier", (), int, 1, OUTCOME, **_CONDENSED),
     # of `batch.skin.BatchSkin`: 1: no step was made since the reset; number of steps without motion of the
     # skin; results of the last step

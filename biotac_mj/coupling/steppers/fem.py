@@ -265,6 +265,7 @@ class FemStepper(SkinStepper):
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
             load_factor=float(d.load_factor[0]),
+            measured=bool(d.worlds.tier.numpy()[0] == 0),
             load=np.linalg.norm(
                 d.outer.sample_force.numpy()[self.contact_rows(new)[:, 0].astype(int), 0], axis=1
             ),

@@ -67,7 +67,7 @@ class Correction:
 
 
 FITTED = {
-    "corotational": Correction(6.1e-3, 2.6, 2.8e-3, 0.033, 0.0, (0.25, 0.4), 0.5),
+    "corotational": Correction(6.1e-3, 2.6, 2.8e-3, 0.033, 0.0, (0.25, 0.4), 0.6),
     "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 5.3, (0.4, 0.4999), 0.45, 1.5e-3),
     "linear": Correction(math.inf, 1.0, 1.0, math.inf, 0.0, (0.0, 0.4), 1.0),
 }

@@ -5,6 +5,7 @@ import warp as wp
 
 from ...kernels import kernel_module
 from ..block import block_max, block_sum, sync
+from ..contact.faces import thinned
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
@@ -52,8 +53,8 @@ def place_nodes(w: int, t: int, count: int, pressure: real, l: Linear, c: Consta
 
 @wp.func
 def correct(w: int, t: int, nnode: int, pressure: real, modulus: real, c: Constants, s: Scratch):
-    """Softening and swelling (`correction.Correction`) of the skin as it is; and by which fraction it is
-    squeezed, how far its forces are spread [m^2]."""
+    """Softening and swelling (`correction.Correction`) of the skin as it is; by which fraction its wall is
+    squeezed (`contact.faces.thinned`), and how far its forces are spread [m^2]."""
     own = real(0.0)
     mean = vec3()
     for k in range(t, nnode, wp.block_dim()):
@@ -68,6 +69,7 @@ def correct(w: int, t: int, nnode: int, pressure: real, modulus: real, c: Consta
     depth = real(0.0)
     spread = real(0.0)
     squeezed = real(0.0)
+    lost = real(0.0)
     if total > real(0.0):
         mean = mean / total
         sums = vec3()
@@ -80,14 +82,17 @@ def correct(w: int, t: int, nnode: int, pressure: real, modulus: real, c: Consta
                 i = c.node[s.node[w, k]]
                 j = c.opposite[s.node[w, k]]
                 depth = wp.max(depth, wp.length(s.x[i, w] - c.rest[i, 0]))
-                thin = real(1.0) - wp.length(s.x[i, w] - s.x[j, w]) / wp.length(c.rest[i, 0] - c.rest[j, 0])
-                sums += weight / total * vec3(wp.length_sq(c.rest[i, 0] - mean), thin, real(0.0))
+                across = s.x[i, w] - s.x[j, w]
+                rest = c.rest[i, 0] - c.rest[j, 0]
+                thin = real(1.0) - wp.length(across) / wp.length(rest)
+                sums += weight / total * vec3(wp.length_sq(c.rest[i, 0] - mean), thin, thinned(across, rest))
         sums = block_sum(sums)
         spread = sums[0]
         squeezed = wp.max(sums[1], real(0.0))
+        lost = wp.max(sums[2], real(0.0))
         depth = block_max(depth)
     softening = _softening_of(depth, spread, squeezed, c.depth, c.most, c.width, c.squeeze)
-    return wp.vec2d(softening, _swelling_of(pressure, modulus, c.stretch)), squeezed, spread
+    return wp.vec2d(softening, _swelling_of(pressure, modulus, c.stretch)), lost, spread
 
 
 @wp.func

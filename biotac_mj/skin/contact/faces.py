@@ -286,6 +286,43 @@ def sum_wrench(partial: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=rea
 
 
 @wp.func
+def thinned(across: vec3, rest: vec3):
+    """Fraction of a wall's thickness that is lost, from what leads through it and did so at rest: along the
+    latter, since its sides slide."""
+    return real(1.0) - wp.dot(across, rest) / wp.length_sq(rest)
+
+
+@wp.kernel(module=kernel_module(f"{__name__}.sum_wrench"))
+def find_tier(
+    # In:
+    most: real,
+    node: wp.array(dtype=int),
+    opposite: wp.array(dtype=int),
+    rest: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    force: wp.array2d(dtype=vec3),
+    wanted: wp.array(dtype=int),
+    # Out:
+    squeezed_out: wp.array(dtype=real),
+    tier_out: wp.array(dtype=int),
+):
+    """Fraction by which the wall is squeezed, weighted as in `condensed.results.correct`, and 0, or -1 where
+    that is more than `most`."""
+    w, t = wp.tid()
+    own = vec3()
+    for n in range(t, node.shape[0], wp.block_dim()):
+        i = node[n]
+        j = opposite[n]
+        weight = wp.length_sq(force[i, w])
+        if weight > real(0.0):
+            own += weight * vec3(real(1.0), thinned(x[i, w] - x[j, w], rest[i, 0] - rest[j, 0]), real(0.0))
+    total = block_sum(own)
+    if t == 0 and wanted[w] == 1:
+        squeezed_out[w] = total[1] / wp.max(total[0], real(1.0e-300))
+        tier_out[w] = wp.where(squeezed_out[w] > most, -1, 0)
+
+
+@wp.func
 def commit_face(f: int, w: int, contact: Contact):
     """Stores the anchors of face f for the next step, if it touches or had anchors."""
     touching = contact.touching[f, w]

@@ -63,6 +63,8 @@ class Worlds:
     load_dependent: wp.array(dtype=int)  # its friction coefficient depends on pressure
     inverted: wp.array(dtype=int)  # by an element, at the last evaluation: `ElementForces.evaluate_corners`
     reason: wp.array(dtype=int)  # CONVERGED, NOT_FINITE, INSIDE_CORE or NOT_CONVERGED
+    squeezed: wp.array(dtype=real)  # fraction by which the step has squeezed the wall
+    tier: wp.array(dtype=int)  # 0; -1: the step squeezed the skin more than its error was measured for
     nonconverged: wp.array(dtype=int)  # steps that did not converge since the reset
     iterations: wp.array(dtype=int)  # of Newton's method in this step
     start_iterations: wp.array(dtype=int)  # `iterations` at the start of the try
