@@ -268,7 +268,7 @@ def test_an_effect_that_is_read_back_has_its_parameters(entry):
     """Of a realistic size, as in what may be there unseen; every parameter can be moved."""
     start = Explanation([], Nuisance(), 0.0, np.zeros((0, 0)))
     theta = start.with_unseen(entry, 0.0).effects[0][1]
-    read = _effect(entry.id, theta, (), entry.design)
+    read = _effect(entry.id, theta, entry.design)
     assert read.params.keys() == theta.keys()
     moved = Explanation([(read, theta)], Nuisance(), 0.0, np.zeros((0, 0))).moves()
     assert len(list(moved)) >= len(theta)

@@ -94,15 +94,13 @@ def name_of(id_: str) -> str:
     return found[0].name if found else id_
 
 
-def by_id(name: str, extra: tuple | list = ()) -> Effect:
+def by_id(name: str) -> Effect:
     """The effect with that id, in its form for simulators.
 
     Raises:
       ValueError: unknown; the text lists the ids.
     """
-    for effect in (*extra, *CATALOGUE, *_NOT_SEARCHED):
+    for effect in (*CATALOGUE, *_NOT_SEARCHED):
         if effect.id == name:
             return effect
-    raise ValueError(
-        f"unknown effect {name!r}: choose from {', '.join(e.id for e in CATALOGUE)}, or pass your own Effect"
-    )
+    raise ValueError(f"unknown effect {name!r}: choose from {', '.join(e.id for e in CATALOGUE)}")

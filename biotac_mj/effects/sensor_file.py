@@ -5,7 +5,6 @@ sensor read it (`amended.py`)."""
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
 
 from ..fields import check_choice, check_entries, refuse_unknown
 from ..files import replacing
@@ -48,8 +47,8 @@ class SensorFile:
     intervals: dict
 
 
-def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFile:
-    """Reads a YAML file; `extra`: custom effects.
+def read_sensor_file(path: pathlib.Path | str) -> SensorFile:
+    """Reads a YAML file.
 
     Raises:
       FileNotFoundError, ValueError: no file, no YAML, another schema, unknown effect or parameter.
@@ -69,7 +68,7 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
     design = design_of(document.get("skin") or "default")
     for stage, items in document.get("stages", {}).items():
         for item in items:
-            effect, theta, sure = _effect(f"{path}, stage {stage!r}", stage, item, extra, design)
+            effect, theta, sure = _effect(f"{path}, stage {stage!r}", stage, item, design)
             effects.append((effect, theta))
             if sure:
                 intervals[effect.id] = sure
@@ -95,11 +94,11 @@ def write_sensor_file(path: pathlib.Path | str, file: SensorFile) -> None:
         temporary.write_text(yaml.safe_dump(document, sort_keys=False))
 
 
-def _effect(where, stage, item, extra, design):
+def _effect(where, stage, item, design):
     """Effect, values of its parameters, and their intervals if given."""
     check_entries(f"an effect of {where}", item, _EFFECT, ("name",))
     refuse_unknown(item, _EFFECT, f"an effect of {where}")
-    effect = by_id(item["effect"], extra).on(design).given(list(item["parameters"]))
+    effect = by_id(item["effect"]).on(design).given(list(item["parameters"]))
     where = f"{effect.id!r} of {where}"
     if STAGES[effect.stage] != stage:
         raise ValueError(f"effect {where} acts at the stage {STAGES[effect.stage]!r}")

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from .again import logged_twice
 from .codes import coarse, put_back
-from .confidence import NAMED, clear, confidence
+from .confidence import clear, confidence
 from .fault import Fault
 from .lines import hum
 from .log import Log
@@ -27,20 +27,20 @@ class Checked(typing.NamedTuple):
     weak: list[Fault]
 
 
-def check(log: Log, named: float = NAMED) -> Checked:
-    """Finds all faults of a log. named: smallest confidence of a reported fault."""
-    checked = sample_faults(log, named)
+def check(log: Log) -> Checked:
+    """Finds all faults of a log."""
+    checked = sample_faults(log)
     found = lost_rows(less(checked.log, checked.faults), checked.faults)
     for fault in found:
         fault.confidence = confidence(fault)
     return Checked(
         checked.log,
-        [*checked.faults, *(f for f in found if clear(f, named))],
-        [*checked.weak, *(f for f in found if not clear(f, named))],
+        [*checked.faults, *(f for f in found if clear(f))],
+        [*checked.weak, *(f for f in found if not clear(f))],
     )
 
 
-def sample_faults(log: Log, named: float = NAMED) -> Checked:
+def sample_faults(log: Log) -> Checked:
     """Finds faults of samples: dead, coarse, repeated, stuck, clipped and spiked ones, rows logged twice,
     words that overflow, hum, noise.
 
@@ -55,11 +55,11 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
     for find in (*of_rows, hum, stuck_or_clipped, spikes, noisy):
         for fault in find(less(log, faults), faults):
             fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
-            (faults if clear(fault, named) else weak).append(fault)
+            (faults if clear(fault) else weak).append(fault)
     for fault in faults:  # before all that was found after it
         fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
-    weak += [f for f in faults if not clear(f, named)]
-    faults = [f for f in faults if clear(f, named)]
+    weak += [f for f in faults if not clear(f)]
+    faults = [f for f in faults if clear(f)]
     return Checked(log, faults, weak)
 
 

@@ -61,6 +61,6 @@ def confidence(fault: Fault, others: int = 0, weights: dict = WEIGHTS) -> float:
     return probability(fault.detector, fault.features, others, weights) if fault.detector else _MOST
 
 
-def clear(fault: Fault, named: float = NAMED) -> bool:
+def clear(fault: Fault) -> bool:
     """Whether a fault is named."""
-    return fault.confidence >= named and fault.p < _CHANCE
+    return fault.confidence >= NAMED and fault.p < _CHANCE

@@ -38,7 +38,6 @@ def diagnose_recording(
     recording: PlainRecording | Recording,
     locked: float | None = None,
     progress: bool = False,
-    named: float = NAMED,
     protocol: Protocol | None = None,
 ) -> RecordingDiagnosis:
     """Finds what the model misses in one recording.
@@ -47,7 +46,6 @@ def diagnose_recording(
       recording: with electrodes; force and TDC take part where they are there, poses do not.
       locked: fraction of the rows at the end that takes no part; None: 0.4 without force, 0.3 with force.
       progress: whether to show a bar.
-      named: confidence from which a finding is named.
       protocol: when what was done with the sensor: each stretch in which it was touched, or not, is then
         searched by itself too.
 
@@ -61,20 +59,20 @@ def diagnose_recording(
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: hold out between 0.1 and 0.6 of the rows")
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
-        checked = sample_faults(as_log(recording), named)
+        checked = sample_faults(as_log(recording))
         recording = dataclasses.replace(recording, electrodes=checked.log.counts)
         session = Session(recording, np.arange(n) < round(n * (1 - locked)))
         _adopt(session, checked.faults, checked.weak)
         bar.update()
-        _levels(session, named)
+        _levels(session)
         bar.update()
-        _later_faults(session, checked, named)
+        _later_faults(session, checked)
         bar.update()
-        late = _late(session, named)
+        late = _late(session)
         bar.update()
         session = _proved(session)
         if protocol is not None:
-            _checkup(session, protocol, named)
+            _checkup(session, protocol)
         result = concluded(session, locked, late, protocol)
         bar.update()
     return result
@@ -91,12 +89,12 @@ def _adopt(session, faults, weak):
     session.weak += as_candidates(weak)[0]
 
 
-def _levels(session, named):
+def _levels(session):
     """Channels that are exchanged, jumps, and trends over time, the strongest first."""
     if (finding := slipped(session)) is not None:
-        _take(session, finding, named)
+        _take(session, finding)
     for finding in jumped(session):
-        _take(session, finding, named)
+        _take(session, finding)
     rejected = set()
     for _ in range(_MOST + 4):
         finding = levels(session, rejected)
@@ -104,29 +102,29 @@ def _levels(session, named):
             break
         same = [f for f in session.findings if f.channels == finding.channels]
         jumps = not finding.of_all and any(f.sudden for f in same)
-        if jumps or _refined(session, finding, same) or not _take(session, finding, named):
+        if jumps or _refined(session, finding, same) or not _take(session, finding):
             rejected.add((None,) if finding.of_all else finding.channels)
     settle(session)
 
 
-def _later_faults(session, checked, named):
+def _later_faults(session, checked):
     """Rows that are missing, and how late the electrodes follow the force; then all are judged together."""
     # an exchange or a jump is no lost row, nor what begins on all electrodes
     begun = [f.start for f in session.findings if f.of_all and f.trend is None and f.start > 0]
     begun += session.recording.time[list(session.recording.joints)].tolist()
     for fault in lost_rows(as_log(session.recording, session.counts, session.masked), checked.faults, begun):
         fault.confidence = confidence(fault)
-        _adopt(session, *(([fault], []) if clear(fault, named) else ([], [fault])))
+        _adopt(session, *(([fault], []) if clear(fault) else ([], [fault])))
     if (finding := delayed(session)) is not None:
-        _take(session, finding, named)
+        _take(session, finding)
     if (finding := lagging(session)) is not None:
-        _take(session, finding, named)
+        _take(session, finding)
     for finding in session.findings:
         finding.confidence = _sure(session, finding)
-    session.take_back(*(f for f in session.findings if f.confidence < named))
+    session.take_back(*(f for f in session.findings if f.confidence < NAMED))
 
 
-def _take(session, finding, named):
+def _take(session, finding):
     """Takes a finding out of the counts if it is likely enough beside all others."""
     single = finding.trend is not None and finding.fraction is None
     if finding.p >= _P or not finding.possible:
@@ -137,7 +135,7 @@ def _take(session, finding, named):
     if single:  # judged as it is beside all others
         settle(session)
     finding.confidence = _sure(session, finding)
-    if finding.confidence >= named:
+    if finding.confidence >= NAMED:
         return True
     session.take_back(finding)
     if single:
@@ -180,25 +178,25 @@ def _proved(session):
     return session
 
 
-def _checkup(session, protocol, named):
+def _checkup(session, protocol):
     """Findings of single stretches of a protocol that the whole log does not show."""
     r, found, rests = session.recording, [], []
     session.protocol = protocol
     coarse = {k for f in session.findings if f.step for k in f.channels}
     for touched, rows in stretches(r, protocol):
         # levels are of the session's clock: the whole log tells them, and all rests as one; loads make noise
-        some = diagnose_recording(r.part(rows), named=named).findings
+        some = diagnose_recording(r.part(rows)).findings
         some = [f for f in some if f.trend is None and not (touched and f.kind.is_noise)]
         some = [f for f in some if _everywhere(f, session.counts)]
         if not touched:
             rests.append(rows)
         if not touched and not coarse:  # nothing but noise is there
             faults = [f for f in some if f.of_log]
-            some += _sure_of(at_rest(less(as_log(r.part(rows)), faults), faults), named)
+            some += _sure_of(at_rest(less(as_log(r.part(rows)), faults), faults))
         # at rest a filtered electrode is constant, too: only the whole log shows one that is always constant
         found += [moved(f, rows, r) for f in some if not (f.kind.silent or coarse.issuperset(f.channels))]
     faults = [f for f in (*session.findings, *found) if f.trend is None]
-    found += _sure_of(between_rests(as_log(r, session.counts, session.masked), rests, faults), named)
+    found += _sure_of(between_rests(as_log(r, session.counts, session.masked), rests, faults))
     free = free_rows(r, protocol, max((f.delay for f in session.findings), default=0.0))
     if (finding := remembered(session, free)) is not None:
         finding.confidence = confidence(finding)
@@ -208,10 +206,10 @@ def _checkup(session, protocol, named):
         cut = dict.fromkeys(("force", "tdc", "missing", "since"), None)
         counts = session.without(*(f for f in session.findings if f.trend is not None)).counts[rows]
         still = dataclasses.replace(r, electrodes=counts, joints=(), **cut)
-        found += [moved(f, rows, r) for f in diagnose_recording(still, named=named).findings if f.kind.drifts]
+        found += [moved(f, rows, r) for f in diagnose_recording(still).findings if f.kind.drifts]
     sure = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
     for finding, yes in zip(found, sure):
-        if not yes or finding.confidence < named or finding.verified is False:
+        if not yes or finding.confidence < NAMED or finding.verified is False:
             session.weak.append(finding)
         elif not any(_explains(f, finding) for f in session.findings):
             session.accept(finding)  # the first stretch with it
@@ -225,11 +223,11 @@ def _everywhere(finding, counts):
     return (beyond > _LIMIT).mean() < _RARELY
 
 
-def _sure_of(faults, named):
+def _sure_of(faults):
     """Candidates of faults that are likely enough."""
     for fault in faults:
         fault.confidence = confidence(fault)
-    return as_candidates([f for f in faults if clear(f, named)])[0]
+    return as_candidates([f for f in faults if clear(f)])[0]
 
 
 def _explains(one, other):
@@ -240,7 +238,7 @@ def _explains(one, other):
     return one.id == other.id or not one.of_all or one.of_log and other.of_log
 
 
-def _late(session, named):
+def _late(session):
     """Effects of single electrodes or all that begin in the held-out part: searched in the whole record,
     less what was found; nothing is left to confirm them."""
     r = session.recording
@@ -254,7 +252,7 @@ def _late(session, named):
         finding.confidence = confidence(finding)
         rejected.add((None,) if finding.of_all else finding.channels)
         sudden = finding.trend.kind != "smooth" and finding.trend.onset > _LAST * begin
-        if sudden and finding.confidence >= max(named, _LATE):
+        if sudden and finding.confidence >= _LATE:
             finding.verified, finding.start = None, float(finding.trend.onset)
             finding.message += "; it begins so late that nothing is left to confirm it"
             found.append(finding)

@@ -192,19 +192,19 @@ class Beliefs:
         write_trajectories(folder / "measured.h5", list(trajectories))
 
     @classmethod
-    def load(cls, folder: pathlib.Path | str, extra: Sequence = ()) -> tuple["Beliefs", Simulator]:
-        """Beliefs of a report's folder, and the simulator that was compared; extra: effects of your own.
+    def load(cls, folder: pathlib.Path | str) -> tuple["Beliefs", Simulator]:
+        """Beliefs of a report's folder, and the simulator that was compared.
 
         Raises:
           FileNotFoundError: no report of data with poses.
         """
         round_ = _round(folder)
         document = json.loads((round_ / "beliefs.json").read_text())
-        sim = load_simulator(round_ / "given.yaml", extra)
+        sim = load_simulator(round_ / "given.yaml")
         explanations, unseen = (
             [
                 Explanation(
-                    [(_effect(e["id"], e["theta"], extra, sim.design), e["theta"]) for e in one["effects"]],
+                    [(_effect(e["id"], e["theta"], sim.design), e["theta"]) for e in one["effects"]],
                     Nuisance(**one["nuisance"]),
                     one["score"],
                     np.array(one["information"]),
@@ -240,8 +240,8 @@ def _round(folder):
     return found
 
 
-def _effect(name, theta, extra, design):
-    effect = by_id(name, extra).on(design).given(list(theta))
+def _effect(name, theta, design):
+    effect = by_id(name).on(design).given(list(theta))
     return effect if effect.params.keys() == theta.keys() else effect.only(list(theta))
 
 

@@ -1,7 +1,6 @@
 """A sensor's YAML read back as a simulator."""
 
 import pathlib
-from collections.abc import Sequence
 
 from ....effects.sensor_file import read_sensor_file
 from .in_skin import InSkinSimulator
@@ -10,13 +9,13 @@ from .simulator import Simulator
 _KINDS = {"reduced": Simulator, "in_skin": InSkinSimulator}
 
 
-def load_simulator(path: pathlib.Path | str, extra: Sequence = ()) -> Simulator:
-    """A Simulator from YAML; `extra` are your own effects.
+def load_simulator(path: pathlib.Path | str) -> Simulator:
+    """A Simulator from YAML.
 
     Raises:
       FileNotFoundError, ValueError: see `effects.sensor_file.read_sensor_file`; a model that cannot be.
     """
-    file = read_sensor_file(path, extra)
+    file = read_sensor_file(path)
     kind = file.base.get("constitutive", "reduced")
     if kind not in _KINDS:
         raise ValueError(f"{path}: constitutive {kind!r} is none of {', '.join(_KINDS)}")
