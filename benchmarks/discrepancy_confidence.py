@@ -30,12 +30,12 @@ FEATURES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
     "loss": {"lead": 1, "turns": -1, "seconds": 1},
     "supply": {"lead": 1, "room": 1},
-    "one": {"lead": 1, "apart": 1},
-    "process": {"likelier": 1, "apart": 1},
-    "jump": {"edge": 1, "alone": 1},
+    "one": {"lead": 1, "wandering": 1},
+    "process": {"likelier": 1, "wandering": 1},
+    "jump": {"edge": 1, "isolation": 1},
     "slip": {},
     "late": {"gain": 1, "size": 1},
-    "lag": {"share": 1},
+    "lag": {"explained": 1},
 }
 _ROWS = ("rhythm", "sharp", "sharp1")
 # of what is left: each may be what no name fits. Under a load levels are in recordings without an effect what

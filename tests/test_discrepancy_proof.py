@@ -123,7 +123,7 @@ def test_what_the_amended_sensor_leaves_out_has_no_name(monkeypatch):
     assert not report.effects and not report.apply(Springs()).effects
     assert report.verdict.startswith("unknown (") and report.significant
     assert {(e.id, e.confirmed, e.confidence) for e in report.not_named} == {("latency", False, None)}
-    assert not report.beliefs.told_apart and [e.ids for e in report.beliefs.explanations] == [[]]
+    assert not report.beliefs.distinguished and [e.ids for e in report.beliefs.explanations] == [[]]
 
 
 def test_of_effects_that_tie_the_confirmed_one_has_the_name(monkeypatch):

@@ -17,16 +17,16 @@ def sure(detector, features, beside):
 
 
 def test_a_name_is_less_sure_beside_others_of_its_detector():
-    features = {"edge": 4.0, "alone": 3.4}
+    features = {"edge": 4.0, "isolation": 3.4}
     alone, three, eight = (sure("jump", features, beside) for beside in (0, 2, 7))
     assert alone > NAMED and alone > three > eight
 
 
 def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
-    features = {"lead": 3.3, "apart": 2.3}
+    features = {"lead": 3.3, "wandering": 2.3}
     alone, pair, many = (sure("one", features, beside) for beside in (0, 1, 6))
     assert alone == pair > NAMED > many
-    edge = {"edge": 4.0, "alone": 3.4}
+    edge = {"edge": 4.0, "isolation": 3.4}
     assert sure("jump", edge, 0) > sure("jump", edge, 1)
 
 

@@ -247,7 +247,7 @@ def test_more_effects_do_not_contradict_an_explanation():
     doubted = Beliefs(some, 5e-5, {}, 0.0, ["power-law relaxation may be as good"])
     assert not doubted.decided and "if it is one of these, " in doubted.text and "power-law" in doubted.text
     more = Beliefs(some, 5e-5, {}, 0.0, further=0.1)
-    assert more.told_apart and not more.decided and "may be there as well, 10%" in more.text
+    assert more.distinguished and not more.decided and "may be there as well, 10%" in more.text
 
 
 def test_excluded_effects_are_less_likely_than_unseen_ones():

@@ -55,7 +55,7 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         # one cable may have several channels: as many more must have fewer
         others = 1 + np.append(np.zeros(_CABLE), np.sort(np.delete(number, k)))[-_CABLE]
         one.p = float(poisson.sf(number[k] - 1, others))
-        one.features["alone"] = float(np.log(number[k] / others))
+        one.features["isolation"] = float(np.log(number[k] / others))
         found.append(one)
     return found
 

@@ -99,12 +99,12 @@ def _in_common(log, off, sound):
     over = np.flatnonzero(np.abs(own.mean(0)) > _COUPLED + chance)
     if len(over):
         worst = over[np.argmax(np.abs(own[:, over].mean(0)))]
-        share = float(own[:, worst].mean())
+        fraction = float(own[:, worst].mean())
         a, b = (log.name([channels[k[worst]]]) for k in (i, j))
-        text = f"the noise of {a} and {b} correlates by {share:+.2f} while nothing touches"
+        text = f"the noise of {a} and {b} correlates by {fraction:+.2f} while nothing touches"
         which = sorted({int(channels[k]) for n in over for k in (i[n], j[n])})
-        strength = rows * (np.sign(share) * own[:, worst] - _COUPLED)
-        found.append(_of_noise(log, "crosstalk", which, text, {"kappa": share}, strength))
+        strength = rows * (np.sign(fraction) * own[:, worst] - _COUPLED)
+        found.append(_of_noise(log, "crosstalk", which, text, {"kappa": fraction}, strength))
     return found
 
 

@@ -92,23 +92,23 @@ def _short(recording, name):
     return _SHORT.get(unit, unit)
 
 
-def _change(recording, name):
-    """Change of a channel from its baseline, and its description; tared values are unchanged. The baseline is
-    of the rows with the least force, or else PDC: a recording may start under load."""
-    value = getattr(recording, name)
-    if recording.unit(name).startswith("tared"):
-        return value, f"[{_short(recording, name)}]"
+def _change(recording):
+    """Change of the electrodes from their baseline, and its description; tared values are unchanged. The
+    baseline is of the rows with the least force, or else PDC: a recording may start under load."""
+    value, unit = recording.electrodes, _short(recording, "electrodes")
+    if recording.unit("electrodes").startswith("tared"):
+        return value, f"[{unit}]"
     order, since = np.arange(len(value)), "since the start"
     if recording.force is not None:
         order, since = np.argsort(np.linalg.norm(recording.force, axis=1), kind="stable"), "from least force"
     elif recording.pdc is not None:
         order, since = np.argsort(recording.pdc, kind="stable"), "from least PDC"
     rest = np.nanmedian(value[order[: max(5, int(_REST * len(value)))]], axis=0)
-    return value - rest, f"{since}\n[{_short(recording, name)}]"
+    return value - rest, f"{since}\n[{unit}]"
 
 
 def _map(axis, time, recording):
-    value, unit = _change(recording, "electrodes")
+    value, unit = _change(recording)
     step = np.median(np.diff(time)) if len(time) > 1 else 1.0
     # a gap is an empty column
     gap = np.flatnonzero(np.diff(time) > 1.5 * step)
@@ -125,9 +125,10 @@ def _map(axis, time, recording):
 
 
 def _lines(axis, time, recording):
-    value, unit = _change(recording, "electrodes")
-    for k, column in enumerate(_broken(time, value).T):
-        axis.plot(_broken_time(time), column, lw=0.6, color=line_color(k, value.shape[1]), label=f"e{k + 1}")
+    value, unit = _change(recording)
+    time, value = _broken(time, value)
+    for k, column in enumerate(value.T):
+        axis.plot(time, column, lw=0.6, color=line_color(k, value.shape[1]), label=f"e{k + 1}")
     axis.margins(y=0.25)
     axis.legend(ncols=10, fontsize=6, loc="upper left", handlelength=1, framealpha=0.6)
     axis.set_ylabel("electrodes\n" + unit.replace("\n", " "), fontsize=8)
@@ -135,7 +136,7 @@ def _lines(axis, time, recording):
 
 def _plain(name, color, label):
     def paint(axis, time, recording):
-        axis.plot(_broken_time(time), _broken(time, getattr(recording, name)), lw=0.8, color=color)
+        axis.plot(*_broken(time, getattr(recording, name)), lw=0.8, color=color)
         axis.set_ylabel(f"{label}\n[{_short(recording, name)}]", fontsize=8)
 
     return paint
@@ -144,9 +145,7 @@ def _plain(name, color, label):
 def _pac(axis, time, recording):
     with np.errstate(all="ignore"):
         low, high = np.nanmin(recording.pac, 1), np.nanmax(recording.pac, 1)
-    axis.fill_between(
-        _broken_time(time), _broken(time, low), _broken(time, high), color="C4", lw=0.5, alpha=0.8
-    )
+    axis.fill_between(*_broken(time, low, high), color="C4", lw=0.5, alpha=0.8)
     axis.set_ylabel(f"PAC, range\n[{_short(recording, 'pac')}]", fontsize=8)
 
 
@@ -155,7 +154,7 @@ def _temperature(axis, time, recording):
         if getattr(recording, name) is None:
             continue
         here = side or (axis.twinx() if recording.tdc is not None else axis)
-        here.plot(_broken_time(time), _broken(time, getattr(recording, name)), lw=0.8, color=color)
+        here.plot(*_broken(time, getattr(recording, name)), lw=0.8, color=color)
         here.set_ylabel(f"{name.upper()}\n[{_short(recording, name)}]", fontsize=8, color=color)
 
 
@@ -164,27 +163,20 @@ def _vector(name, label):
         value = getattr(recording, name)
         if name.endswith("_pos"):
             value = 1e3 * (value - np.nanmedian(value, axis=0))
-        for k, column in enumerate(_broken(time, value).T):
-            axis.plot(_broken_time(time), column, lw=0.8, label=_AXES[k])
+        time, value = _broken(time, value)
+        for k, column in enumerate(value.T):
+            axis.plot(time, column, lw=0.8, label=_AXES[k])
         axis.set_ylabel(label, fontsize=8)
         axis.legend(fontsize=7, loc="upper left", ncols=3, handlelength=1)
 
     return paint
 
 
-def _broken_time(time):
-    """Times with one more row in every gap, where lines break."""
-    gap = _gaps(time)
-    return np.insert(time, gap + 1, time[gap] + 1e-9)
-
-
-def _broken(time, value):
-    return np.insert(value, _gaps(time) + 1, np.nan, axis=0)
-
-
-def _gaps(time):
+def _broken(time, *values):
+    """Times and values (n, ...) with one more row in every gap, where lines break."""
     step = np.diff(time)
-    return np.flatnonzero(step > 3 * np.median(step)) if len(step) else np.zeros(0, int)
+    gap = np.flatnonzero(step > 3 * np.median(step)) if len(step) else np.zeros(0, int)
+    return np.insert(time, gap + 1, time[gap] + 1e-9), *(np.insert(v, gap + 1, np.nan, 0) for v in values)
 
 
 # drawing function, its height, and the fields of which it needs one

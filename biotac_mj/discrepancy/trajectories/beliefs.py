@@ -150,7 +150,7 @@ class Beliefs:
         return float((1 - against) / max(against, 1e-9))
 
     @property
-    def told_apart(self) -> bool:
+    def distinguished(self) -> bool:
         """Whether the likeliest explanation is decided against all that contradict it."""
         return self.odds >= ODDS and not self.doubts
 
@@ -158,13 +158,13 @@ class Beliefs:
     def decided(self) -> bool:
         """Whether no further contact is needed: explanations are distinguished, and a further effect is
         unlikely."""
-        return self.told_apart and self.further < SETTINGS.rate
+        return self.distinguished and self.further < SETTINGS.rate
 
     @property
     def text(self) -> str:
         """The decision as text."""
         first, *others = self.rivals
-        if self.told_apart:
+        if self.distinguished:
             text = f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
             hardly = f"; an effect that these data hardly show may be there as well, {self.further:.0%}"
             return text + ("" if self.decided else hardly)

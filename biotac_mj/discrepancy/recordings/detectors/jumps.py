@@ -188,7 +188,7 @@ def jumped(session: Session) -> list[Candidate]:
                 sudden=True,
                 features={
                     "edge": float(np.log(max(e.times for e in mine))),
-                    "alone": float(np.log(max(e.isolation for e in mine))),
+                    "isolation": float(np.log(max(e.isolation for e in mine))),
                 },
                 ties=_gains(session, k, at[0]),
                 correct=correct,

@@ -47,7 +47,7 @@ def lagging(session: Session) -> Candidate | None:
         p=sign_flip(product[:, i] * tau[i] - 0.5 * square[:, i] * tau[i] ** 2),
         detector="lag",
         ties=("latency",),
-        features={"share": float(np.log(fraction[i]))},
+        features={"explained": float(np.log(fraction[i]))},
     )
     if aside is not None:
         later, explained = _lag(aside[0].sum(0), aside[1].sum(0), aside[2])

@@ -158,7 +158,7 @@ def _single(session, trend, k):
         nats=trend.nats,
         p=trend.p,
         detector="one",
-        features=_features(session, trend) | {"apart": _wandering(m, k, designed(session.counts))},
+        features=_features(session, trend) | {"wandering": _wandering(m, k, designed(session.counts))},
         correct=correct,
         trend=trend,
     )
