@@ -234,7 +234,7 @@ def test_an_effect_is_one_class():
 
     effect, (counts, log_z, _) = Half(), at_rest(1)
     time = np.arange(len(counts)) / 100
-    run = Run.of_counts(counts.copy(), log_z, time=time, clock=time)
+    run = Run.of_counts(counts.copy(), log_z, time=time)
     effect.apply(run, {"rate": 2.0})
     assert np.allclose((run.counts - counts)[-1], np.where(np.arange(19) % 2, 0, 2 * run.time[-1]))
     assert not (effect.before_skin or effect.per_channel or effect.undoes({}, 1.0))

@@ -99,15 +99,16 @@ class Run:
 
     @classmethod
     def of_counts(cls, counts: np.ndarray, rest_log_z: np.ndarray, **more: np.ndarray) -> "Run":
-        """A Run of counts (n, nelectrode) without contact, all rows at one time.
+        """A Run of counts (n, nelectrode) without contact, its clock its time.
 
         Args:
           rest_log_z: (nelectrode,) ln of the impedances at rest [ohm]. more: other fields, such as time (n,)
-            [s] or force (n, 3) [N]."""
+            [s], 0 by default, or force (n, 3) [N]."""
         n = len(counts)
+        time = more.get("time", np.zeros(n))
         plain = {
-            "time": np.zeros(n),
-            "clock": np.zeros(n),
+            "time": time,
+            "clock": time,
             "tool": "",
             "heading": np.zeros(3),
             "depth": np.zeros(n),
