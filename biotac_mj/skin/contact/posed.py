@@ -119,9 +119,19 @@ def _between_skins(geoms: Geoms, g: int, p: vec3, y: vec3, R: mat33):
 
 @wp.func
 def _apart(geoms: Geoms, g: int, p: vec3, y: vec3):
-    """Lower bound of the value of `_between_skins`, but for errors of the grids."""
-    theirs = grid_value(geoms.grids, geoms.grid[g], y)
-    return wp.min(theirs, real(0.5) * (theirs - grid_value(geoms.grids, geoms.own, p)))
+    """The value of `_between_skins`, but for errors of the grids."""
+    k = geoms.grid[g]
+    theirs = grid_value(geoms.grids, k, y)
+    mine = grid_value(geoms.grids, geoms.own, p)
+    half = real(0.5) * (theirs - mine)
+    overlap = theirs + mine
+    if overlap >= real(0.0):
+        return half
+    other = wp.max(grid_value(geoms.grids, k + 1, y) - theirs, real(0.0))
+    own = wp.max(grid_value(geoms.grids, geoms.own + 1, p) - mine, real(0.0))
+    if own + other == real(0.0):
+        return half
+    return half + (own / (own + other) - real(0.5)) * overlap
 
 
 # a call copies all that Geoms hold: 1.6 kB, more work on the CPU than the distance from a sphere
