@@ -2,6 +2,7 @@
 
 import math
 import types
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -26,6 +27,18 @@ def skew(v: torch.Tensor) -> torch.Tensor:
 def add_rows(into: torch.Tensor, at: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
     """Adds value (m, ...) to the rows `at` (m,) of `into`, with repetitions; returns it."""
     return into.index_add_(0, at.reshape(-1), value.reshape(-1, *into.shape[1:]))
+
+
+def transposed(
+    outputs: Sequence[torch.Tensor], inputs: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]
+) -> Sequence[torch.Tensor]:
+    """Cotangents of the inputs of a linear map from those of its outputs."""
+    pairs = [(out, given) for out, given in zip(outputs, cotangents) if out.requires_grad]
+    if not pairs:
+        return [torch.zeros_like(value) for value in inputs]
+    out, given = zip(*pairs)
+    how = {"retain_graph": True, "allow_unused": True, "materialize_grads": True}
+    return torch.autograd.grad(out, inputs, given, **how)
 
 
 def real_tensor(

@@ -31,58 +31,21 @@ _HEAD = ("pressure", "temperature", "impedance_time", "filter", "hiss")
 _BEGAN = ("began", "given_pressure", "given_temperature", "relaxed")
 
 
+def _widths(n, frames, npac, nnumber):
+    """Numbers of each field of the state vector, in order."""
+    widths = {"impedance": n, **dict.fromkeys(_HEAD, 1), "filter": 3}
+    widths |= {"sampled": n, "pdc": 1, "tac": 1, "tdc": 1, "pac": npac}
+    return widths | {**dict.fromkeys(_BEGAN, 1), "past": (1 + frames) * n, "own": nnumber}
+
+
 @wp.struct
 class Place:
-    """Offsets of the fields of a state vector (`place_of`), and the layout of a frame."""
+    """Offsets of the fields of a state vector (`place_of`) and of the sensor's constants, `nstate`, and the
+    layout of a frame."""
 
-    nelectrode: int
-    slots: int
-    frames: int
-    impedance: int
-    pressure: int
-    temperature: int
-    impedance_time: int
-    filter: int
-    hiss: int
-    sampled: int
-    pdc: int
-    tac: int
-    tdc: int
-    pac: int
-    began: int
-    given_pressure: int
-    given_temperature: int
-    relaxed: int
-    past: int
-    own: int
-    scale: int
-    base: int
-    noise: int
-    warm_share: int
-    drift: int
-    mixing: int
-    mixed: int
-    pdc_rest: int
-    pdc_gain: int
-    pdc_noise: int
-    pac_rest: int
-    pac_noise: int
-    pac_colour: int
-    tdc_noise: int
-    tac_rest: int
-    tac_noise: int
-    warm_up: int
-    warm_time: int
-    relax_fraction: int
-    relax_time: int
-    loss: int
-    per_degree: int
-    power: int
-    saturated: int
-    knee: int
-    lowpass: int
-    latency: int
-    nstate: int
+    __annotations__ = dict.fromkeys(
+        ("nelectrode", "slots", "frames", *_widths(0, 0, 0, 0), *numbers_of(0)[0], "nstate"), int
+    )
 
 
 @wp.struct
@@ -100,11 +63,8 @@ def place_of(design: Design) -> Place:
     place.nelectrode, place.slots = n, design.slots
     place.frames = round(MOST_LATENCY * SLOT_RATE / design.slots) + 2
     numbers, nnumber = numbers_of(n)
-    widths = {"impedance": n, **dict.fromkeys(_HEAD, 1), "filter": 3}
-    widths |= {"sampled": n, "pdc": 1, "tac": 1, "tdc": 1, "pac": design.npac}
-    widths |= {**dict.fromkeys(_BEGAN, 1), "past": (1 + place.frames) * n, "own": nnumber}
     at = 0
-    for name, width in widths.items():
+    for name, width in _widths(n, place.frames, design.npac, nnumber).items():
         setattr(place, name, at)
         at += width
     place.nstate = at

@@ -82,7 +82,7 @@ class PadShape:
         return self.core is not None
 
 
-def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> SkinGeometry:
+def pad_skin(shape: PadShape, design: Design) -> SkinGeometry:
     """The skin of a pad on a flat backing.
 
     Raises:
@@ -124,8 +124,6 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
                 f"the core reaches {-room.min():.3g} mm into the skin: no liquid fits; give a smaller "
                 "core, its .obj in metres"
             )
-    if element == "linear":
-        return skin
     project = None
     if curved is not None:
 

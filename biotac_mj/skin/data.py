@@ -14,7 +14,7 @@ from .bodies import make_bodies
 from .contact.broadphase import ClearanceCache
 from .contact.faces import Contact, Laws
 from .contact.law import WorldLaws
-from .liquid import Liquid, Rests
+from .liquid import Liquid, Rest
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.bodies import BodyContact
 from .newton.nodes import SurfaceForces
@@ -90,10 +90,8 @@ class ContactState:
     def active(self, w: int) -> tuple[np.ndarray, np.ndarray]:
         """Touching faces (n,) of world w, and their tangents (n, 6, 3, 3), on the host."""
         if self._host is None or self.touching.device.is_cuda:
-            self._host = (
-                self.touching.numpy(),
-                self.block.numpy(),
-            )  # views on the CPU, which follow the arrays
+            # views on the CPU, which follow the arrays
+            self._host = self.touching.numpy(), self.block.numpy()
         touching, block = self._host
         faces = touching[:, w].nonzero()[0]
         return faces, block[6 * faces[:, None] + np.arange(6), w]
@@ -134,7 +132,7 @@ class SkinData:
     On the device, [item, world] in Warp arrays that may be overwritten between steps:
       worlds: `newton.worlds.Worlds`, scalars of every world. rubber: `rubber.points.Rubber`.
       rest_vert: nodes without contact (nvert, 1), or (nvert, nworld) if worlds have rests of their own.
-      rests: `liquid.Rests` of worlds with rests of their own, else None.
+      rests: `liquid.Rest` of worlds with rests of their own, else None.
       laws: `contact.law.WorldLaws`. memory: RubberMemory, or None.
       x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
         and the pose of the BioTac frame in the world at the end of the step.
@@ -261,7 +259,7 @@ class SkinData:
         self._counts = (0, 0)
         self.set_external(None)
 
-    def rest_at(self, rests: Rests) -> None:
+    def rest_at(self, rests: Rest) -> None:
         """Sets each world's own equilibrium without contact, and resets it. Call it before steps are
         recorded."""
         self.rests = rests

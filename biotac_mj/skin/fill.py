@@ -9,7 +9,7 @@ from ..cache import cached
 from . import model as skin_model
 from .data import SkinData
 from .geoms import GeomSet
-from .liquid import Rest, Rests
+from .liquid import Rest
 from .step import step
 
 # Tolerances of intermediate steps and of the last, which leaves no residual for later steps. Without contact
@@ -34,11 +34,8 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
     if not (model.has_liquid and (options.fill_volume or options.rest_pressure)):
         return Rest(vert, 0.0, volume, volume)
     _refuse_filling(model, options.fill_volume, options.fill_volume)
-
-    def inflate():
-        return dataclasses.asdict(_inflated(model))
-
-    found = cached("rest", _inputs(model), inflate)
+    world = [model.material], None, np.array([options.bulk_modulus]), np.zeros(1)
+    found = cached("rest", [*_inputs(model), *world], lambda: dataclasses.asdict(_inflated(model, *world)))
     numbers = (float(found[name][0]) for name in ("pressure", "volume", "natural_volume"))
     return Rest(found["vert"][0], *numbers)
 
@@ -64,7 +61,7 @@ def _most_liquid(model):
 
 
 def _inputs(model):
-    """All inputs of the equilibrium without contact, for the cache."""
+    """All of the model that the equilibrium without contact depends on, for the cache."""
     core = model.core_surface.face_np if model.has_core else None
     rubber = [model.element, model._elem, model.material, model.modulus]
     return [model.geometry, core, *rubber, model.options, model.device.is_cuda]
@@ -98,19 +95,15 @@ def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> 
     first = np.unique(which, return_index=True)[1]
     chosen = [materials[w] for w in first]
     factors = None if modulus is None else np.asarray(modulus)[first]
-
-    def inflate():
-        return dataclasses.asdict(_inflated(model, chosen, factors, bulk[first], extra[first]))
-
-    inputs = [*_inputs(model), *chosen, factors, bulk[first], extra[first]]
-    found = cached("rests", inputs, inflate)
-    data.rest_at(Rests(**{name: value[which] for name, value in found.items()}))
+    own = chosen, factors, bulk[first], extra[first]
+    found = cached("rests", [*_inputs(model), *own], lambda: dataclasses.asdict(_inflated(model, *own)))
+    data.rest_at(Rest(**{name: value[which] for name, value in found.items()}))
 
 
-def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
-    """`Rests` of worlds; by default of one world with the model's material."""
+def _inflated(model, materials, modulus, bulk, extra):
+    """`Rest` of worlds of these materials, moduli (nworld, nelem) or None, bulk moduli of the liquid
+    (nworld,) [Pa] and additional fillings (nworld,) [m^3]."""
     options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
-    materials = [model.material] if materials is None else materials
     model.inverse if model.device.is_cuda else model.factor  # noqa: B018 - computed now, and shared by the copy
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
@@ -128,8 +121,7 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     bare.rest = Rest(vert, 0.0, volume, volume)
     data = SkinData(bare, len(relaxed), relaxed, modulus)
     nothing, liquid = GeomSet([], [], nworld=len(relaxed), device=model.device), data.liquid
-    if bulk is not None:
-        liquid.set(bulk)
+    liquid.set(bulk)
     K, target, more = liquid.bulk_modulus, options.rest_pressure, options.fill_volume
     if target and ((K > 0) & (K <= target)).any():  # the volume without pressure would be negative
         raise ValueError(
@@ -150,7 +142,7 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
         _inflate(
             bare, data, nothing, f"fill_volume {np.max(extra):g}", lambda s: liquid.fill(natural + s * extra)
         )
-    return Rests(data.vert_xpos.copy(), liquid.gauge_pressure, data.volume, natural)
+    return Rest(data.vert_xpos.copy(), liquid.gauge_pressure, data.volume, natural)
 
 
 def _inflate(bare, data, nothing, what, fill, size=0.25):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from ..kernels import set_fields
+from ..kernels import add_zeros, set_fields
 from . import liquid
 from .contact import broadphase, faces, touch
 from .data import SkinData
@@ -15,7 +15,7 @@ from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, worlds
 from .program import FEW, LANES_FEW, THREADS_FEW, Fork, Launcher
-from .types import mat33, real, vec3
+from .types import real, vec3
 
 _LISTED = 1 << 16  # most threads for listed faces: each takes several faces if there are more
 _BLOCKS = 1 << 10  # most blocks of threads, likewise
@@ -104,7 +104,7 @@ class Forces:
             setattr(cache, name, getattr(state.clearances, name))
         cache.center, cache.radius = center, 2.0 * radius
         with wp.ScopedDevice(self.m.device):
-            cache.pos, cache.mat = (wp.zeros((ngeom, self.d.nworld), dtype=t) for t in (vec3, mat33))
+            add_zeros(cache, "pos mat", ngeom, self.d.nworld)
         m, stiffness = self.m, self.st.contact_stiffness
         law = [m.sample, m.options.stick_ratio, stiffness, laws, self.k.x_start, bound]
         return cache, state.contact(*law)

@@ -171,41 +171,6 @@ def settle_pressure(
         tangent_out[w] = pressure
 
 
-@wp.func
-def soften_face(
-    f: int,
-    w: int,
-    # In:
-    sample: wp.array(dtype=vec3),
-    area: wp.array(dtype=real),
-    stiffness: real,
-    reference: real,
-    p: real,
-    geom: wp.array2d(dtype=int),
-    force: wp.array2d(dtype=vec3),
-    # In, out:
-    block: wp.array2d(dtype=mat33),
-):
-    """Subtracts the decrease of the liquid's force with the dry fraction, p / (2 p_ref) k, from the tangent
-    of a core face. Gradients and the tangents of bodies need it; a press takes the same work without it."""
-    nsample = sample.shape[0]
-    fraction = area[f] / real(nsample)
-    factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * fraction
-    for s in range(nsample):
-        i = f * nsample + s
-        c = contact_pressure(i, w, geom, force, fraction)
-        if c > real(0.0) and c < real(2.0) * reference:
-            n = wp.normalize(force[i, w])
-            K = factor * wp.outer(n, n)
-            b = sample[s]
-            block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
-            block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
-            block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
-            block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
-            block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
-            block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
-
-
 @wp.kernel
 def release_pressure(
     # In:
@@ -222,39 +187,52 @@ def release_pressure(
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """`soften_face` of face f, if its tangent was evaluated."""
+    """Subtracts the decrease of the liquid's force with the dry fraction, p / (2 p_ref) k, from the tangent
+    of core face f, if that was evaluated. Gradients and the tangents of bodies need it; a press takes the
+    same work without it."""
     f, w = wp.tid()
     if on[w] == 0:
         return
-    if near[f, w] == 1 and touching[f, w] == 1 and pressure[w] > real(0.0):
-        soften_face(f, w, sample, area, stiffness[w], reference[w], pressure[w], geom, force, block)
+    p = pressure[w]
+    if near[f, w] == 1 and touching[f, w] == 1 and p > real(0.0):
+        nsample = sample.shape[0]
+        fraction = area[f] / real(nsample)
+        factor = wp.min(p / (real(2.0) * reference[w]), real(1.0)) * stiffness[w] * fraction
+        for s in range(nsample):
+            i = f * nsample + s
+            c = contact_pressure(i, w, geom, force, fraction)
+            if c > real(0.0) and c < real(2.0) * reference[w]:
+                n = wp.normalize(force[i, w])
+                K = factor * wp.outer(n, n)
+                b = sample[s]
+                block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
+                block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
+                block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
+                block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
+                block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
+                block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
 
 
 @dataclasses.dataclass(frozen=True)
 class Rest:
-    """Equilibrium of a skin without contact.
+    """Equilibrium of a skin without contact, or, with arrays of a leading nworld, of those of many worlds.
 
     Attributes:
       vert: (nvert, 3) nodes [m].
       pressure: of the liquid, above the surroundings [Pa].
-      volume: of the liquid [m^3]; natural_volume: the same liquid without pressure [m^3].
+      volume: of the liquid [m^3]; natural_volume: the same liquid without pressure, and of worlds without
+        `Liquid.extra` [m^3].
     """
 
     vert: np.ndarray
-    pressure: float
-    volume: float
-    natural_volume: float
+    pressure: float | np.ndarray
+    volume: float | np.ndarray
+    natural_volume: float | np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Rests:
-    """`Rest` of many worlds: vert (nworld, nvert, 3), the others (nworld,); natural_volume is without
-    `Liquid.extra`."""
-
-    vert: np.ndarray
-    pressure: np.ndarray
-    volume: np.ndarray
-    natural_volume: np.ndarray
+def _copy_of(name):
+    """Property: a copy of a number of the worlds on the host."""
+    return property(lambda liquid: getattr(liquid._worlds, name).numpy().copy())
 
 
 class Liquid:
@@ -277,21 +255,9 @@ class Liquid:
         self.rest_at(*(np.full(nworld, x) for x in numbers))
         self.reset()
 
-    @property
-    def natural_volume(self) -> np.ndarray:
-        return self._worlds.natural.numpy().copy()
-
-    @property
-    def stiffness(self) -> np.ndarray:
-        return self._worlds.kappa.numpy().copy()
-
-    @property
-    def gauge_pressure(self) -> np.ndarray:
-        return self._worlds.pressure.numpy().copy()
-
-    @property
-    def volume(self) -> np.ndarray:
-        return self._worlds.volume.numpy().copy()
+    natural_volume, stiffness, gauge_pressure, volume = map(
+        _copy_of, ("natural", "kappa", "pressure", "volume")
+    )
 
     @property
     def last_pressure(self) -> np.ndarray:

@@ -25,6 +25,7 @@ import weakref
 import numpy as np
 import warp as wp
 
+from ..kernels import add_zeros
 from ..threads import single_thread
 from .bodies import Bodies
 from .compliant_bodies import CompliantBodies
@@ -40,18 +41,10 @@ from .newton import convergence, krylov, line_search, load_path, nodes, worlds
 from .precondition import Residual, batched_inverse
 from .program import Launcher, Program, compile_ahead, compile_kernels
 from .rubber.element_forces import module_for_cuda
-from .types import mat33, vec3
 
-_FREE = (
-    "tolerance",
-    "max_newton",
-    "max_cg",
-    "max_work",
-    "stick_ratio",
-    "mass_damping",
-    "stiffness_damping",
-    "max_core_depth",
-)
+_FREE = """
+    tolerance max_newton max_cg max_work stick_ratio mass_damping stiffness_damping max_core_depth
+""".split()
 
 _LEAST_INCREMENT = 1 / 32  # of the load factor
 _SQUEEZED = 0.43  # fraction of the wall's thickness to which `benchmarks/accuracy.py` has measured the error
@@ -189,22 +182,12 @@ class SkinStep:
         with wp.ScopedDevice(model.device):
             self._bodies = data.bodies or Bodies()
             self._path = LoadPath()
-            self._path.pos_start, self._path.pos_end = (
-                wp.zeros((geoms.count, w), dtype=vec3) for _ in range(2)
-            )
-            self._path.mat_start, self._path.mat_end = (
-                wp.zeros((geoms.count, w), dtype=mat33) for _ in range(2)
-            )
+            add_zeros(self._path, "pos_start pos_end mat_start mat_end", geoms.count, w)
         self._geom_memory = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
-        (
-            self._any_open,
-            self._any_increment,
-            self._any_short,
-            self._any_lagged,
-            self._any_pending,
-        ) = (flags[i : i + 1] for i in range(3, 8))
+        self._any_open, self._any_increment, self._any_short = (flags[i : i + 1] for i in range(3, 6))
+        self._any_lagged, self._any_pending = (flags[i : i + 1] for i in range(6, 8))
         self._graph = None
         compile_kernels(model.device, self._record)
         if model.device.is_cuda:

@@ -12,12 +12,9 @@ from ..geometry.surface import FORCE_TOUCHES, OF_HERTZ
 from ..kernels import kernel_module
 from .data import SkinData
 from .modes import SkinModes
-from .types import real, vec3
+from .types import mat66, real, vec3, vec6
 
 kernel_module(__name__)
-
-vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 
 _TOUCHES, _OF_HERTZ = wp.constant(real(FORCE_TOUCHES)), wp.constant(real(OF_HERTZ))
 

@@ -5,8 +5,6 @@ The volume is a scalar: one backward pass gives its gradient. The nine component
 one world each, so that one pass gives all Jacobians. The rotation of the area vectors with the corners is
 explicit: the wet area of a face depends on the core's contact forces only."""
 
-import dataclasses
-
 import numpy as np
 import torch
 import warp as wp
@@ -50,19 +48,19 @@ class LinearLiquid:
         if data.core:
             none = data.core.sample_force.numpy()[:, 0], data.core.trial_geom.numpy()[:, 0]
             area = data.core.surface.area
-        own = differentiate_volume(
+        by_node, by_force, *numbers = differentiate_volume(
             x, model.inner.face, model.core_slot, area, model.sample, *none, stiffness, reference
         )
-        self._by = {"contact_stiffness": own.by_stiffness, "reference": own.by_reference}
+        self._by = dict(zip(("contact_stiffness", "reference"), numbers))
         by_area = np.zeros(0)
         if data.core:  # only pressures matter: a larger area is like a smaller force
-            lost = (own.by_force * np.where(none[1][:, None] >= 0, none[0], 0.0)).sum(1)
+            lost = (by_force * np.where(none[1][:, None] >= 0, none[0], 0.0)).sum(1)
             by_area = -lost.reshape(len(area), -1).sum(1) / area.numpy()
         self._by_area = torch.from_numpy(by_area)
-        by_node = torch.from_numpy(own.by_node)[:, None].contiguous()
+        by_node = torch.from_numpy(by_node)[:, None].contiguous()
         if core:
-            self._by_force = torch.from_numpy(own.by_force)[core.at.sample]
-            felt = torch.einsum("mij,mi->mj", core.by_node[:, :3], self._by_force)
+            self._by_force = torch.from_numpy(by_force)[core.at.sample]
+            felt = torch.einsum("mij,mi->mj", core.by_node, self._by_force)
             add_rows(by_node.view(-1, 3), core.at.node, felt)
             self._dry(skin, x, stiffness, reference)
         self.by_node = -kappa * by_node
@@ -98,23 +96,6 @@ class LinearLiquid:
         node = torch.from_numpy(face.astype(np.int64))
         return FaceBlocks(torch.arange(len(face)), node, torch.from_numpy(turn))
 
-    def pull(self, pressure: torch.Tensor, balance: torch.Tensor, given: dict) -> torch.Tensor | None:
-        """Adds to cotangents of the step's inputs, see `step.GIVEN`, those through the pressure (1,) and the
-        balance (nvert, 1, 3). Returns cotangents of the core samples' forces (m, 3) through the volume."""
-        given["offset"] += pressure
-        given["kappa"] += pressure * self._lacks
-        given["natural"] += pressure * self._kappa
-        by_volume = -self._kappa * pressure
-        for name, slope in self._by.items():
-            given[name] += by_volume * slope
-        given["core_area"][:, 0] += by_volume * self._by_area
-        if not self._core:
-            return None
-        given["reference"] += (self._dry_by_reference * balance).sum()
-        felt = balance.reshape(-1, 3)[self._dry_node].reshape(-1, 9)
-        given["core_area"][self._dry_face, 0] += (self._dry_by_area * felt).sum(1)
-        return by_volume * self._by_force
-
     def change(self, given: dict, core_force: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
         """Tangents of the pressure (1,) and of its force on nodes (nvert, 1, 3) at fixed nodes, from those of
         the step's inputs and of the core samples' forces."""
@@ -132,33 +113,11 @@ class LinearLiquid:
         return pressure, force
 
 
-@dataclasses.dataclass(frozen=True)
-class VolumeSlopes:
-    """Derivatives of the liquid's volume.
-
-    Attributes:
-      by_node: (nvert, 3) [m^2]. by_force: (nsample, 3) by the core's force on each sample [m^3/N].
-      by_stiffness: of the contact. by_reference: by the pressure at which skin and core separate.
-    """
-
-    by_node: np.ndarray
-    by_force: np.ndarray
-    by_stiffness: float
-    by_reference: float
-
-
 def differentiate_volume(
-    x: np.ndarray,
-    face: wp.array,
-    slot: wp.array,
-    area: wp.array,
-    sample: wp.array,
-    force: np.ndarray,
-    geom: np.ndarray,
-    stiffness: float,
-    reference: float,
-) -> VolumeSlopes:
-    """Derivatives of the volume under the inner faces.
+    x: np.ndarray, face: wp.array, slot: wp.array, area: wp.array, sample: wp.array, force: np.ndarray,
+    geom: np.ndarray, stiffness: float, reference: float,
+) -> tuple[np.ndarray, np.ndarray, float, float]:  # fmt: skip
+    """Derivatives of the liquid's volume under the inner faces.
 
     Args:
       x: (nvert, 3) nodes [m].
@@ -166,16 +125,16 @@ def differentiate_volume(
       area: (ncore,) of these at rest [m^2]. sample: (s,) barycentric coordinates.
       force: (ncore s, 3) of the core on their samples [N]; geom: (ncore s,) -1 without contact.
       stiffness: of the contact [Pa/m]. reference: `Worlds.reference` [Pa].
+
+    Returns:
+      by nodes (nvert, 3) [m^2], by the core's force on each sample (ncore s, 3) [m^3/N], by the stiffness of
+      the contact, and by the reference.
     """
     n = len(face)
     inputs = _Inputs(1, x, force, geom, len(sample), stiffness, reference)
     inputs.pull(n, face, slot, area, sample, volume=wp.ones((1, n, 1), dtype=real, device="cpu"))
-    return VolumeSlopes(
-        inputs.x.grad.numpy()[:, 0].copy(),
-        inputs.force.grad.numpy()[:, 0].copy(),
-        float(inputs.stiffness.grad.numpy()[0]),
-        float(inputs.reference.grad.numpy()[0]),
-    )
+    of_items = (array.grad.numpy()[:, 0].copy() for array in (inputs.x, inputs.force))
+    return *of_items, *(float(array.grad.numpy()[0]) for array in (inputs.stiffness, inputs.reference))
 
 
 def differentiate_push(

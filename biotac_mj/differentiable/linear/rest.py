@@ -14,71 +14,45 @@ import numpy as np
 import torch
 
 from ..skin import SkinWorlds
+from ..tensors import add_rows
 
 
-def pull_rest(skin: SkinWorlds, x: np.ndarray, balance: np.ndarray) -> np.ndarray:
-    """(nvert, 3) derivatives of balance . f by rest positions, f the forces of the rubber.
-
-    Args:
-      x: (nvert, 3) nodes [m]. balance: (nvert, 3).
-    """
-    points = _Points(skin, x)
-    along = np.einsum("eai,eqaj->eqij", balance[points.elem], points.gradient)
-    P, change, theta, direction = points.slopes(along)
-    stiff_volume, F, eye = points.stiff_volume, points.F, np.eye(3)
-    work = np.einsum("eqij,eqij->eq", P, along)[..., None, None] * eye
-    S = work - np.swapaxes(F, 2, 3) @ change - np.swapaxes(along, 2, 3) @ P
-    S *= -stiff_volume[..., None, None]
-    if points.averaged:
-        felt = np.einsum("eq,eqij,eqij->e", stiff_volume, direction, along)
-        S -= (points.averaged * felt / points.volume)[:, None, None, None] * points.of_mean(theta, direction)
-    out = np.zeros((len(x), 3))
-    np.add.at(out, points.elem, np.einsum("eqij,eqaj->eai", S, points.gradient))
-    return out
-
-
-def push_rest(skin: SkinWorlds, x: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """(nvert, 3) change of the rubber's forces for a change (nvert, 3) of rest positions [m]."""
-    points = _Points(skin, x)
-    G = np.einsum("eai,eqaj->eqij", change[points.elem], points.gradient)
-    P, dP, theta, direction = points.slopes(-points.F @ G)
-    if points.averaged:
-        mean = np.einsum("eqij,eqij->e", points.of_mean(theta, direction), G) / points.volume
-        dP = dP + points.averaged * mean[:, None, None, None] * direction
-    trace = np.trace(G, axis1=2, axis2=3)[..., None, None]
-    dP = -points.stiff_volume[..., None, None] * (trace * P + dP - P @ np.swapaxes(G, 2, 3))
-    out = np.zeros((len(x), 3))
-    np.add.at(out, points.elem, np.einsum("eqij,eqaj->eai", dP, points.gradient))
-    return out
+def push_rest(skin: SkinWorlds, x: np.ndarray, change: torch.Tensor) -> torch.Tensor:
+    """(nvert, 3) change of the rubber's forces for a change (nvert, 3) of rest positions [m], at nodes x
+    (nvert, 3) [m]; linear, so that PyTorch transposes it."""
+    elements, numbers = skin.model.elements, skin.read("mu", "lam")
+    elem, gradient = torch.from_numpy(elements.elem.astype(np.int64)), torch.from_numpy(elements.gradient)
+    weight, modulus = torch.from_numpy(elements.weight), elements.modulus
+    stiff_volume = weight if modulus is None else weight * torch.from_numpy(np.asarray(modulus))[:, None]
+    volume = weight.sum(1)
+    # part of the law's second constant that acts on the mean dilatation of an element [Pa]
+    averaged = max(float(numbers["lam"] - elements.cap * numbers["mu"]), 0.0)
+    F = torch.einsum("eai,eqaj->eqij", torch.from_numpy(x)[elem], gradient)
+    G = torch.einsum("eai,eqaj->eqij", change[elem], gradient)
+    P, _, theta, direction = map(torch.from_numpy, skin.point_slopes(np.zeros(F.shape)))
+    dP = _Stress.apply(-F @ G, skin)
+    if averaged:  # by an element's mean dilatation
+        own = theta - ((weight * theta).sum(1) / volume)[:, None]
+        by_mean = own[..., None, None] * torch.eye(3, dtype=torch.float64) - F.mT @ direction
+        mean = torch.einsum("eq,eqij,eqij->e", weight, by_mean, G) / volume
+        dP = dP + averaged * mean[:, None, None, None] * direction
+    trace = G.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    dP = -stiff_volume[..., None, None] * (trace * P + dP - P @ G.mT)
+    return add_rows(torch.zeros_like(change), elem, torch.einsum("eqij,eqaj->eai", dP, gradient))
 
 
-class _Points:
-    """Integration points at x (nvert, 3).
+class _Stress(torch.autograd.Function):
+    """Derivative of the stress along a change of the deformation gradients, which is symmetric."""
 
-    Attributes:
-      elem, gradient: of `Tetrahedra`. F: (nelem, npoint, 3, 3). stiff_volume: (nelem, npoint) volume times
-        the factor on the modulus. volume: (nelem,) [m^3].
-      averaged: part of the law's second constant that acts on the mean dilatation of an element [Pa].
-    """
+    @staticmethod
+    def forward(context, change, skin):
+        context.skin = skin
+        return torch.from_numpy(skin.point_slopes(change.detach().numpy())[1])
 
-    def __init__(self, skin, x):
-        elements, numbers = skin.model.elements, skin.read("mu", "lam")
-        self._skin, self.elem, self.gradient = skin, elements.elem, elements.gradient
-        self.stiff_volume = self._weight = elements.weight
-        if elements.modulus is not None:
-            self.stiff_volume = self.stiff_volume * elements.modulus[:, None]
-        self.volume = self._weight.sum(1)
-        self.averaged = max(float(numbers["lam"] - elements.cap * numbers["mu"]), 0.0)
-        self.F = np.einsum("eai,eqaj->eqij", x[self.elem], self.gradient)
-
-    def slopes(self, change):
-        return self._skin.point_slopes(change)
-
-    def of_mean(self, theta, direction):
-        """(nelem, npoint, 3, 3) derivative by G of an element's mean dilatation times its volume."""
-        mean = (self._weight * theta).sum(1) / self.volume
-        own = (theta - mean[:, None])[..., None, None] * np.eye(3)
-        return self._weight[..., None, None] * (own - np.swapaxes(self.F, 2, 3) @ direction)
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(context, stress):
+        return torch.from_numpy(context.skin.point_slopes(stress.numpy())[1]), None
 
 
 def areas_at(vert: torch.Tensor, face: np.ndarray) -> torch.Tensor:

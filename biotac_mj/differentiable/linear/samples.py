@@ -16,7 +16,7 @@ from ...skin.contact.shapes import distance
 from ...skin.contact.touch import smooth_stick_or_slip, smooth_traction, stick_or_slip
 from ...skin.data import ContactState
 from ...skin.types import real, vec3
-from ..tensors import add_rows, skew
+from ..tensors import add_rows
 from ..touching import Touching, rows
 from .inverse import FaceBlocks
 
@@ -128,73 +128,6 @@ def differentiate_samples(
     return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes)
 
 
-@dataclasses.dataclass(frozen=True)
-class SampleSlopes:
-    """Derivatives of m samples' force in the BioTac frame and anchor in the geom's frame. Blocks of six rows:
-    force, anchor.
-
-    Attributes:
-      by_point: (m, 6, 3) by the sample's position. by_springs: (m, 6) by its stiffness.
-      by_pose: (m, 6, 6) by the geom's translation and rotation vector about its origin. by_friction: (m, 6).
-        by_stick: (m, 6, 3) by the old anchor, in the geom's frame.
-      old, new: numbers of samples with the same geom as at the start of the step, and of the k others, which
-        are anchored at their position then. by_last: (k, 6, 3), by_pose_last: (k, 6, 6) of these.
-      collect: (m, 6, 3) wrench on the geom by force. wrench_by_node: (m, 6, 9) by the corners of its face.
-    """
-
-    by_point: torch.Tensor
-    by_springs: torch.Tensor
-    by_pose: torch.Tensor
-    by_friction: torch.Tensor
-    by_stick: torch.Tensor
-    old: torch.Tensor
-    new: torch.Tensor
-    by_last: torch.Tensor
-    by_pose_last: torch.Tensor
-    collect: torch.Tensor
-    wrench_by_node: torch.Tensor
-
-
-def slopes_of_samples(
-    at: Touching, geoms: Geoms, springs: torch.Tensor, stick_ratio: float, smoothing: float = 0.0
-) -> SampleSlopes:
-    """Derivatives of samples in contact, with stiffness springs (m,) [N/m]."""
-    pos, R, pos_last, R_last, friction = (
-        rows(getattr(geoms, name))[at.geom] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
-    )
-    given = at.kind, at.plane, at.local, at.stick, friction, springs
-    own, RT = differentiate_samples(geoms, *given, stick_ratio, smoothing), R.transpose(1, 2)
-
-    def outward(J):  # forces into the BioTac frame
-        return torch.cat([R @ J[:, :3], J[:, 3:]], 1)
-
-    by_local, by_stick = outward(own.by_local), outward(own.by_stick)
-    by_point = by_local @ RT
-    # if the geom moves, the sample moves the opposite way in its frame, and the outputs rotate with it
-    by_pose = by_local @ torch.cat([-RT, RT @ skew(at.point - pos)], 2)
-    force = torch.einsum("mij,mj->mi", R, own.force)
-    by_pose[:, :3, 3:] -= skew(force)
-    old, new = (torch.nonzero(side).ravel() for side in (at.old >= 0, at.old < 0))
-    then = R_last[new].transpose(1, 2)
-    last = torch.cat([-then, then @ skew(at.last[new] - pos_last[new])], 2)
-    # wrench: -sum F, -sum p x F
-    one = torch.eye(3, dtype=R.dtype, device=R.device).expand_as(R)
-    collect = torch.cat([-one, -skew(at.point)], 1)
-    turn = torch.cat([torch.zeros_like(R), skew(force)], 1)
-    wrench_by_node = _of_corners(at.weight, collect @ by_point[:, :3] + turn)
-    by_springs, by_friction = (outward(J[..., None])[..., 0] for J in (own.by_stiffness, own.by_friction))
-    return SampleSlopes(
-        by_point, by_springs, by_pose, by_friction, by_stick, old, new,
-        by_stick[new] @ then, by_stick[new] @ last, collect, wrench_by_node,
-    )  # fmt: skip
-
-
-def _of_corners(weight, block):
-    """(m, r, 9) derivatives by the corners of faces, from those (m, r, 3) by a point with weights (m, 3) on
-    them."""
-    return (block[:, :, None, :] * weight[:, None, :, None]).reshape(*block.shape[:2], 9)
-
-
 class LinearSurface:
     """Linearised samples of a surface in contact at the end of a step.
 
@@ -205,7 +138,7 @@ class LinearSurface:
       core: whether it is the inner surface, whose geom, the core, is no input and has no friction.
 
     Attributes:
-      slopes: of the samples. by_node: (m, 6, 9) by the nodes of their faces.
+      force: (m, 3) of the samples [N]. by_node: (m, 3, 9) by the nodes of their faces.
       spread: (m, 9, 3) forces on these nodes by the samples' forces.
     """
 
@@ -220,62 +153,54 @@ class LinearSurface:
         core: bool = False,
     ):
         self.at, self._core, self._area = at, core, "core_area" if core else "area"
+        names = "pos", "mat", "pos_last", "mat_last", "friction"
+        pos, R, pos_last, R_last, friction = (rows(getattr(geoms, name))[at.geom] for name in names)
         springs = stiffness[at.world] * at.area
-        self.slopes = slopes_of_samples(at, geoms, springs, stick_ratio, smoothing)
+        given = at.kind, at.plane, at.local, at.stick, friction, springs
+        self._own = own = differentiate_samples(geoms, *given, stick_ratio, smoothing)
         self._by_area = springs / wp.to_torch(state.surface.area).double()[at.face // at.nworld]
-        self.by_node = _of_corners(at.weight, self.slopes.by_point)
+        self._R, self._R_last, self.force = R, R_last, _times(R, own.force)
+        self._arm, self._last_arm = at.point - pos, at.last - pos_last
+        self._old = torch.nonzero(at.old >= 0).ravel()  # the others are anchored where they were
+        by_point = R @ own.by_local[:, :3] @ R.mT
+        self.by_node = (by_point[:, :, None, :] * at.weight[:, None, :, None]).reshape(-1, 3, 9)
         one = torch.eye(3, dtype=springs.dtype, device=springs.device)
         self.spread = (at.weight[:, :, None, None] * one).reshape(-1, 9, 3)
 
     def blocks(self) -> FaceBlocks:
         """Derivatives of nodal forces by nodes, summed by faces."""
-        return FaceBlocks.of(self.at.face, self.at.node, self.spread @ self.by_node[:, :3])
-
-    def at_samples(self, nodal: torch.Tensor) -> torch.Tensor:
-        """(m, 3) cotangents of the samples' forces from those of nodal forces (nvert, nworld, 3)."""
-        felt = nodal.reshape(-1, 3)[self.at.node].reshape(-1, 9)
-        return torch.einsum("mij,mi->mj", self.spread, felt)
+        return FaceBlocks.of(self.at.face, self.at.node, self.spread @ self.by_node)
 
     def at_nodes(self, force: torch.Tensor, nodal: torch.Tensor) -> None:
         """Adds forces of the samples (m, 3) to nodal forces (nvert, nworld, 3)."""
-        add_rows(nodal.view(-1, 3), self.at.node, torch.einsum("mij,mj->mi", self.spread, force))
+        add_rows(nodal.view(-1, 3), self.at.node, _times(self.spread, force))
 
-    def pull(self, force: torch.Tensor, anchor: torch.Tensor | None, given: dict) -> None:
-        """Adds to cotangents of the step's inputs, see `step.GIVEN`, those from forces and anchors of the
-        samples (m, 3)."""
-        s, at = self.slopes, self.at
-        rows = 3 if anchor is None else 6
-        felt = force if anchor is None else torch.cat([force, anchor], 1)
-        by_springs = (s.by_springs[:, :rows] * felt).sum(1)
-        add_rows(given["contact_stiffness"], at.world, at.area * by_springs)
-        add_rows(given[self._area].view(-1), at.face, self._by_area * by_springs)
-        if self._core:
-            return
-        add_rows(given["pose"].view(-1, 6), at.geom, torch.einsum("mij,mi->mj", s.by_pose, felt))
-        add_rows(given["friction"].view(-1), at.geom, (s.by_friction * felt).sum(1))
-        anchors = torch.einsum("mij,mi->mj", s.by_stick[s.old], felt[s.old])
-        add_rows(given["anchor"], at.sample[s.old], anchors)
-        felt = felt[s.new]
-        last = torch.einsum("mij,mi->mj", s.by_pose_last, felt)
-        add_rows(given["pose_last"].view(-1, 6), at.geom[s.new], last)
-        last = torch.einsum("mij,mi->mj", _of_corners(at.weight[s.new], s.by_last), felt)
-        add_rows(given["x_last"].view(-1, 3), at.node[s.new], last)
+    def points(self, x: torch.Tensor) -> torch.Tensor:
+        """(m, 3) tangents of the contact points from those of the nodes (nvert, nworld, 3)."""
+        return torch.einsum("ma,mak->mk", self.at.weight, x.reshape(-1, 3)[self.at.node])
 
-    def push(self, given: dict) -> tuple[torch.Tensor, torch.Tensor]:
-        """Tangents of the samples' forces and anchors (m, 3) from those of the step's inputs, at fixed
-        nodes."""
-        s, at = self.slopes, self.at
+    def push(self, given: dict, x: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Tangents of the samples' forces, and of their anchors in the geom's frame (m, 3), from those of the
+        step's inputs, see `step.GIVEN`, and of the nodes; None: they are held."""
+        at, own = self.at, self._own
         springs = at.area * given["contact_stiffness"][at.world]
         springs = springs + self._by_area * given[self._area].reshape(-1)[at.face]
-        felt = s.by_springs * springs[:, None]
-        if not self._core:
-            felt = felt + torch.einsum("mij,mj->mi", s.by_pose, given["pose"].reshape(-1, 6)[at.geom])
-            felt = felt + s.by_friction * given["friction"].reshape(-1)[at.geom][:, None]
-            anchors = given["anchor"][at.sample[s.old]]
-            felt[s.old] += torch.einsum("mij,mj->mi", s.by_stick[s.old], anchors)
-            last = given["pose_last"].reshape(-1, 6)[at.geom[s.new]]
-            felt[s.new] += torch.einsum("mij,mj->mi", s.by_pose_last, last)
-            last = given["x_last"].reshape(-1, 3)[at.node[s.new]].reshape(-1, 9)
-            by_last = _of_corners(at.weight[s.new], s.by_last)
-            felt[s.new] += torch.einsum("mij,mj->mi", by_last, last)
-        return felt[:, :3], felt[:, 3:]
+        felt = own.by_stiffness * springs[:, None]
+        moved = torch.zeros_like(at.point) if x is None else self.points(x)
+        if not self._core:  # relative to the geom, which carries the force along
+            move, turn = given["pose"].reshape(-1, 6)[at.geom].split(3, 1)
+            moved = moved - move - torch.linalg.cross(turn, self._arm)
+            felt = felt + own.by_friction * given["friction"].reshape(-1)[at.geom][:, None]
+            move_last, turn_last = given["pose_last"].reshape(-1, 6)[at.geom].split(3, 1)
+            last = self.points(given["x_last"]) - move_last - torch.linalg.cross(turn_last, self._last_arm)
+            stick = _times(self._R_last.mT, last).index_copy(
+                0, self._old, given["anchor"][at.sample[self._old]]
+            )
+            felt = felt + _times(own.by_stick, stick)
+        felt = felt + _times(own.by_local, _times(self._R.mT, moved))
+        force = _times(self._R, felt[:, :3])
+        return force if self._core else force + torch.linalg.cross(turn, self.force), felt[:, 3:]
+
+
+def _times(matrix, vector):
+    return torch.einsum("mij,mj->mi", matrix, vector)

@@ -16,11 +16,12 @@ import warp as wp
 from ...threads import single_thread
 from ..record import Record, restore
 from ..skin import NUMBERS, SkinWorlds
+from ..tensors import transposed
 from ..touching import Anchors, find_touching, rows
 from .inverse import FaceBlocks, FactorInverse, StepInverse, solve_by_gmres
 from .liquid import LinearLiquid
 from .memory import LinearMemory, Memory
-from .rest import pull_rest, push_rest
+from .rest import push_rest
 from .samples import LinearSurface
 
 # inputs of a step, besides rest positions and memory of the rubber: nodes at its start (nvert, nworld, 3);
@@ -132,6 +133,34 @@ class LinearStep:
         shapes |= {"area": (outer, w), "core_area": (core, w)} | dict.fromkeys(_SCALARS, (w,))
         return {name: like.new_zeros(shapes[name]) for name in GIVEN}
 
+    def _load(self, given):
+        """Forces on the nodes (nvert, nworld, 3) and pressures by tangents of the step's inputs, at fixed
+        nodes, without those of the rubber's memory and rest."""
+        force, core_felt = torch.zeros_like(self.record.x), None
+        self._outer.at_nodes(self._outer.push(given)[0], force)
+        if self._core:
+            core_felt = self._core.push(given)[0]
+            self._core.at_nodes(core_felt, force)
+        pressure = force.new_zeros(self._skin.nworld)
+        if self._liquid:
+            pressure, pushed = self._liquid.change(given, core_felt)
+            force = force + pushed
+        for name, column in self._by_rubber.items():
+            force = force + column * given[name][:, None]
+        return force, pressure
+
+    def _ends(self, given, x, pressure):
+        """Tangents of wrenches, pressures and anchors by those of the inputs, the nodes and the pressure at
+        fixed nodes."""
+        outer, at = self._outer, self.touching
+        force, anchor = outer.push(given, x)
+        turn = torch.linalg.cross(at.point, force) + torch.linalg.cross(outer.points(x), outer.force)
+        wrench = x.new_zeros((self.record.geoms.ngroup, self._skin.nworld, 6))
+        wrench.view(-1, 6).index_add_(0, self._group, -torch.cat([force, turn], 1))
+        if self._liquid:
+            pressure = pressure + (self._liquid.by_node * x).sum()
+        return wrench, pressure, torch.zeros_like(given["anchor"]).index_copy(0, at.sample, anchor)
+
     def pull(
         self,
         x: torch.Tensor,
@@ -141,7 +170,8 @@ class LinearStep:
         shape: bool = False,
         memory: Memory | None = None,
     ) -> dict:
-        """Cotangents of the step's inputs, by the names of GIVEN, from those of its outputs.
+        """Cotangents of the step's inputs, by the names of GIVEN, from those of its outputs: the transpose of
+        `push`, which PyTorch finds.
 
         Args:
           x: (nvert, nworld, 3). wrench: (ngroup, nworld, 6). pressure: (nworld,).
@@ -150,28 +180,19 @@ class LinearStep:
           memory: of the rubber at the end of the step; None without memory. Adds "memory" at its start, and
             "constants" of it.
         """
-        outer, core, liquid, given = self._outer, self._core, self._liquid, self.none()
-        at, s = self.touching, outer.slopes
-        wrench, anchor = wrench.reshape(-1, 6)[self._group], anchor[at.sample]
-        g = x.clone(memory_format=torch.contiguous_format)
-        if liquid:
-            g += pressure[:, None] * liquid.by_node
-        felt = torch.einsum("mij,mi->mj", s.wrench_by_node, wrench)
-        felt += torch.einsum("mij,mi->mj", outer.by_node[:, 3:], anchor)
-        g.view(-1, 3).index_add_(0, at.node.ravel(), felt.view(-1, 3))
+        with torch.enable_grad():
+            inputs = {name: value.requires_grad_() for name, value in self.none().items()}
+            nodes = torch.zeros_like(x).requires_grad_()
+            force, held = self._load(inputs)
+            ends = self._ends(inputs, nodes, held)
+        cotangents = wrench, pressure, anchor
+        g = x + transposed(ends, [nodes], cotangents)[0]
         if memory:
             deformation = self.memory.pull_deformation(memory)
             g += torch.from_numpy(self.memory.pull_nodes(deformation))[:, None]
         balance = self.solve(g, transpose=True)
-        outer.pull(outer.at_samples(balance) + torch.einsum("mij,mi->mj", s.collect, wrench), anchor, given)
-        by_volume = None
-        if liquid:
-            by_volume = liquid.pull(pressure + (liquid.push * balance).sum(), balance, given)
-        if core:
-            force = core.at_samples(balance)
-            core.pull(force if by_volume is None else force + by_volume, None, given)
-        for name, column in self._by_rubber.items():
-            given[name] += (column * balance).sum((0, 2))
+        found = transposed((force, *ends), list(inputs.values()), (balance, *cotangents))
+        given = dict(zip(inputs, found))
         if memory:
             own = self.memory.pull(memory, balance[:, 0].numpy())
             given["memory"], given["constants"], moduli = own
@@ -179,8 +200,11 @@ class LinearStep:
                 given[name] += slope
         if shape:
             fixed = (1 - self._free) * (g - self._whole_tangent(balance, transpose=True))
-            by_rubber = pull_rest(self._skin, self.record.x[:, 0].numpy(), balance[:, 0].numpy())
-            given["vert"] = fixed[:, 0].numpy() + by_rubber
+            with torch.enable_grad():
+                vert = torch.zeros_like(x[:, 0]).requires_grad_()
+                moved = push_rest(self._skin, self.record.x[:, 0].numpy(), vert)
+            (by_rubber,) = transposed([moved], [vert], [balance[:, 0]])
+            given["vert"] = (fixed[:, 0] + by_rubber).numpy()
             if memory:
                 given["vert"] += self.memory.pull_rest(deformation)
         return given
@@ -195,20 +219,7 @@ class LinearStep:
         """Tangents of the step's outputs, as named in `pull`, from those of its inputs, of rest positions
         (nvert, 3), of the old memory and of the memory's constants; omitted ones are zero."""
         given = self.none() | given
-        outer, core, at, s = self._outer, self._core, self.touching, self._outer.slopes
-        felt, anchor = outer.push(given)
-        force = torch.zeros_like(self.record.x)
-        outer.at_nodes(felt, force)
-        core_felt = None
-        if core:
-            core_felt = core.push(given)[0]
-            core.at_nodes(core_felt, force)
-        pressure = force.new_zeros(self._skin.nworld)
-        if self._liquid:
-            pressure, pushed = self._liquid.change(given, core_felt)
-            force += pushed
-        for name, column in self._by_rubber.items():
-            force += column * given[name][:, None]
+        force, held = self._load(given)
         if memory:
             moduli = {name: float(given[name]) for name in ("mu", "lam")}
             own = constants.numpy()
@@ -216,19 +227,10 @@ class LinearStep:
         fixed = torch.zeros_like(force)
         if vert is not None:
             fixed = (1 - self._free) * vert[:, None]
-            moved = push_rest(self._skin, self.record.x[:, 0].numpy(), vert.numpy())
-            force += torch.from_numpy(moved)[:, None] - self._whole_tangent(fixed)
+            moved = push_rest(self._skin, self.record.x[:, 0].numpy(), vert)
+            force += moved[:, None] - self._whole_tangent(fixed)
         x = self.solve(force) + fixed
         if memory:
             there = None if vert is None else vert.numpy()
             memory = self.memory.push(memory, own, moduli, x[:, 0].numpy(), there)
-        corner = x.reshape(-1, 3)[at.node].reshape(-1, 9)
-        six = torch.einsum("mij,mj->mi", s.wrench_by_node, corner)
-        six += torch.einsum("mij,mj->mi", s.collect, felt)
-        wrench = force.new_zeros((self.record.geoms.ngroup, self._skin.nworld, 6))
-        wrench.view(-1, 6).index_add_(0, self._group, six)
-        if self._liquid:
-            pressure = pressure + (self._liquid.by_node * x).sum()
-        anchors = force.new_zeros(given["anchor"].shape)
-        anchors[at.sample] = anchor + torch.einsum("mij,mj->mi", outer.by_node[:, 3:], corner)
-        return x, wrench, pressure, anchors, memory
+        return x, *self._ends(given, x, held), memory

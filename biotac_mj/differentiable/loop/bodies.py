@@ -40,20 +40,16 @@ class Bodies:
     def __init__(self, model: mujoco.MjModel, instances: list[Instance]):
         self.model = bare = copy.copy(model)
         option = bare.opt
-        option.tolerance, option.iterations = (
-            min(option.tolerance, _SOLVED[0]),
-            max(option.iterations, _SOLVED[1]),
-        )
+        option.tolerance = min(option.tolerance, _SOLVED[0])
+        option.iterations = max(option.iterations, _SOLVED[1])
         self.data = mujoco.MjData(bare)
         # MuJoCo makes no model without its plugins: the step runs with a plugin count of zero
         struct = c_structs("mjModel").from_address(bare._address)
         struct.nplugin = 0
         view = ModelView(bare._address)
         seen = DataView(self.data._address, view)
-        self.instances, self._kinematics = (
-            instances,
-            [Kinematics(view, seen, [one.touching]) for one in instances],
-        )
+        self.instances = instances
+        self._kinematics = [Kinematics(view, seen, [one.touching]) for one in instances]
         nv, na, nu, nm = model.nv, model.na, model.nu, model.nmocap
         names = "qpos", "qvel", "act", "ctrl", "qfrc_applied", "mocap_pos", "mocap_quat"
         self.sizes = dict(zip(names, (nv, nv, na, nu, nv, 3 * nm, 3 * nm)))
@@ -66,11 +62,8 @@ class Bodies:
         data = self.data
         for name in Start.NAMES:
             getattr(data, name)[:] = getattr(start, name)
-        data.qacc_warmstart[:], data.eq_active[:], data.time = (
-            start.qacc_warmstart,
-            start.eq_active,
-            start.time,
-        )
+        data.qacc_warmstart[:], data.eq_active[:] = start.qacc_warmstart, start.eq_active
+        data.time = start.time
         data.eq_active[self._slots] = 0  # wrenches of the skins are given
         for name, value in moved.items():
             if name == "qpos":

@@ -114,12 +114,8 @@ class FilmConduction:
             seed = excitation_places(design.excitation, design, published=True)
         else:
             seed = excitation_places(excitation, design)
-        self.geometry, self.conductivity, self.residual_film, self.electrode_radius = (
-            geometry,
-            conductivity,
-            residual_film,
-            electrode_radius,
-        )
+        self.geometry, self.conductivity = geometry, conductivity
+        self.residual_film, self.electrode_radius = residual_film, electrode_radius
         self.core = CoreSurface(geometry.core_vert, geometry.core_face)
         _, self.excitation_pos, triangle = self.core.closest(seed)
         self._pos = np.concatenate([geometry.electrode_pos, self.excitation_pos])
@@ -239,10 +235,8 @@ class FilmConduction:
     def _set_single(self):
         """Makes the arrays of one world on the CPU, for one thread at a time."""
         self._single, self._lock = BatchFilm(self, 1), threading.Lock()
-        self._x, self._now = (
-            wp.zeros((self.geometry.nvert, 1), dtype=vec3, device="cpu"),
-            wp.ones(1, dtype=int, device="cpu"),
-        )
+        self._x = wp.zeros((self.geometry.nvert, 1), dtype=vec3, device="cpu")
+        self._now = wp.ones(1, dtype=int, device="cpu")
         self._solve_single = self._single.recorded(self._x, self._now)
         arrays = self._x, self._single.valid, self._single.impedance, self._single.local
         self._views = [array.numpy() for array in arrays]

@@ -12,10 +12,9 @@ from ..bodies import Bodies, follow_wrench
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.load_path import partial_turn
-from ..types import real, vec3
+from ..types import real, vec3, vec6
 from .structs import Constants, F, Scratch
 
-vec6 = wp.spatial_vectord
 _LEVER = wp.constant(real(1e-2))  # lever arm of rotations [m]
 
 

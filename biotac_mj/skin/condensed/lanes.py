@@ -34,50 +34,26 @@ def keep_rows(
     ...
 
 
-_ROWS = """
+@wp.func_native("""
 #if !defined(__CUDA_ARCH__)
     const int* __restrict at = coordinate.data + (long long)world * coordinate.shape[1];
+    const int* __restrict take = place.data + (long long)world * place.shape[1];
     int* __restrict there = ready.data + (long long)world * ready.shape[1];
-    for (int i = row; i < row + count; ++i) {{
+    for (int i = row; i < row + count; ++i) {
         float* __restrict b = B.data + (long long)world * B.shape[1] + (long long)i * m;
         const float* __restrict c = C.data + at[i] * (long long)C.shape[1];
-        if (there[i] == 0) {{
+        if (there[i] == 0) {
             there[i] = 1;
             for (int j = 0; j < m; ++j) b[j] = c[at[j]];
-        }}
-        {columns}
-    }}
-#endif
-"""
-
-
-@wp.func_native(_ROWS.format(columns=""))
-def gather_rows(
-    C: wp.array2d(dtype=float),
-    world: int,
-    m: int,
-    coordinate: wp.array2d(dtype=int),
-    row: int,
-    count: int,
-    ready: wp.array2d(dtype=int),
-    B: wp.array2d(dtype=float),
-):
-    """Makes `count` rows of B from `row` on the entries of C at the candidates' coordinates."""
-    ...
-
-
-@wp.func_native(
-    _ROWS.format(
-        columns="""
-        if (there[i] == 2) continue;
+        }
+        if (n == 0 || there[i] == 2) continue;
         there[i] = 2;
-        const int* __restrict take = place.data + (long long)world * place.shape[1];
         float* __restrict p = P.data + (long long)world * P.shape[1] + (long long)i * n;
         for (int j = 0; j < n; ++j) p[j] = b[take[j]];
-"""
-    )
-)
-def gather_rows(  # noqa: F811
+    }
+#endif
+""")
+def gather_rows(
     C: wp.array2d(dtype=float),
     world: int,
     m: int,
@@ -90,7 +66,8 @@ def gather_rows(  # noqa: F811
     place: wp.array2d(dtype=int),
     P: wp.array2d(dtype=float),
 ):
-    """The same, and of P what these rows have at n listed places, unless `ready` is 2."""
+    """Makes `count` rows of B from `row` on the entries of C at the candidates' coordinates, and those of P
+    what these have at n listed places, unless n is 0 or `ready` 2."""
     ...
 
 

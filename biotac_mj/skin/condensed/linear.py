@@ -217,9 +217,8 @@ class LinearSkin:
         return c
 
 
-_made = (
-    weakref.WeakKeyDictionary()
-)  # by model; a LinearSkin must not refer to its model, which would keep both
+# by model; a LinearSkin must not refer to its model, which would keep both
+_made = weakref.WeakKeyDictionary()
 
 
 def _rings(of, face, number, count):

@@ -8,19 +8,17 @@ from ..block import block_max, block_sum, sync
 from ..contact.faces import thinned
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
-from ..types import real, vec3, widen
+from ..types import mat66, real, vec3, widen
 from .correction import softening_of, swelling_of
 from .elimination import eliminate
 from .lanes import dot_columns, sum_rows
 from .states import Linear
 from .structs import DU, Constants, F, G, Remembered, Scratch
-from .system import equations_of, fill_contact, gather_blocks
+from .system import fill_contact, gather_blocks
 
 kernel_module(__name__)
 
 _softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)
-
-mat66 = wp.spatial_matrixd
 
 
 @wp.func
@@ -234,7 +232,7 @@ def find_tangents(
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
-            fill_contact(w, t, equations_of(outer, inner, wide), nnode, nin, 1.0, 1, l, c, s)
+            fill_contact(w, t, outer, inner, wide, nnode, nin, 1.0, 1, l, c, s)
             for k in range(t, outer, wp.block_dim()):
                 D = s.vector[w, DU, k] * widen(s.block[w, k, 0])
                 turned = -D * wp.skew(s.x[c.node[s.node[w, s.touched[w, k]]], w])

@@ -42,9 +42,8 @@ _FIRST, _SHORT = (wp.constant(real(x)) for x in (0.125, 1e-4))
 _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
 _PASSING = wp.constant(real(1e-2))  # tolerance of intermediate increments, which have one pass
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
-_STANDS = wp.constant(
-    real(5e-6)
-)  # motion of bodies by the last change of their wrenches that ends the step [m]
+# motion of bodies by the last change of their wrenches that ends the step [m]
+_STANDS = wp.constant(real(5e-6))
 
 
 @wp.func

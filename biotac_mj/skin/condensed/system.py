@@ -40,6 +40,14 @@ def gather_load(w: int, t: int, n: int, p: int, c: Constants, s: Scratch):
 
 
 @wp.func
+def _gather(w: int, m: int, row: int, count: int, n: int, c: Constants, s: Scratch):
+    """`gather_rows` of the candidates' m coordinates and of n columns."""
+    gather_rows(
+        c.compliance, w, m, s.coordinate, row, count, s.ready, s.between, n, s.column_place, s.columns
+    )
+
+
+@wp.func
 def multiply(
     w: int, t: int, nnode: int, n: int, p: int, out: int, shifted: int, l: Linear, c: Constants, s: Scratch
 ):
@@ -51,7 +59,7 @@ def multiply(
         push += l.bulk_stiffness * l.swell * l.bulge
     if wp.block_dim() == 1:
         for a in range(count):
-            gather_rows(c.compliance, w, n, s.coordinate, s.loaded_place[w, a], 1, s.ready, s.between)
+            _gather(w, n, s.loaded_place[w, a], 1, 0, c, s)
         sum_rows(s.between, w, n, count, s.loaded_place, s.load, s.sum)
     for j in range(t, n, wp.block_dim()):
         cj = s.coordinate[w, j]
@@ -156,33 +164,12 @@ def coordinate_at(w: int, k: int, outer: int, nnode: int, s: Scratch):
     return 3 * nnode + s.touched[w, outer + k - 3 * outer] - nnode
 
 
-@wp.struct
-class Equations:
-    """Size of a system: numbers of touching outer and inner nodes, and the length of its rows."""
-
-    outer: int
-    inner: int
-    wide: int
-
-
-@wp.func
-def equations_of(outer: int, inner: int, wide: int):
-    size = Equations()
-    size.outer = outer
-    size.inner = inner
-    size.wide = wide
-    return size
-
-
 @wp.func
 def _fill_by_rows(
-    w: int, size: Equations, nnode: int, nin: int, soft: float, lumped: int, scale: float, c: Constants,
-    s: Scratch,
+    w: int, outer: int, inner: int, wide: int, nnode: int, nin: int, soft: float, lumped: int, scale: float,
+    c: Constants, s: Scratch,
 ):  # fmt: skip
     """The matrix of `fill_contact` by one thread."""
-    outer = size.outer
-    inner = size.inner
-    wide = size.wide
     n = 3 * outer + inner
     m = 3 * nnode + nin
     keep_rows(w, n, s.column_place, s.last_column, m, 1, s.ready)
@@ -194,9 +181,7 @@ def _fill_by_rows(
             block = s.block[w, k, e - c.ring_start[p]]
             if wp.ddot(block, block) > 0.0:
                 row = 3 * wp.where(lumped == 1, s.touched[w, k], s.place[w, c.ring[e]])
-                gather_rows(
-                    c.compliance, w, m, s.coordinate, row, 3, s.ready, s.between, n, s.column_place, s.columns
-                )
+                _gather(w, m, row, 3, n, c, s)
                 add_rows(s.matrix, w, n, wide, 3 * k, scale * block, s.columns, row)
     for k in range(inner):
         i = 3 * outer + k
@@ -208,30 +193,17 @@ def _fill_by_rows(
             if lumped == 1:
                 one = wp.where(row == place, float(s.stiff[w, place - 3 * nnode]), 0.0)
             if one != 0.0:
-                gather_rows(
-                    c.compliance, w, m, s.coordinate, row, 1, s.ready, s.between, n, s.column_place, s.columns
-                )
+                _gather(w, m, row, 1, n, c, s)
                 add_row(s.matrix, w, n, wide, i, scale * one, s.columns, row)
 
 
 @wp.func
 def fill_contact(
-    w: int,
-    t: int,
-    size: Equations,
-    nnode: int,
-    nin: int,
-    soft: float,
-    lumped: int,
-    l: Linear,
-    c: Constants,
-    s: Scratch,
-):
-    """1 + D W over what touches, D being softer by a factor. lumped: whether D is diagonal, its blocks being
-    the first of each node."""
-    outer = size.outer
-    inner = size.inner
-    wide = size.wide
+    w: int, t: int, outer: int, inner: int, wide: int, nnode: int, nin: int, soft: float, lumped: int,
+    l: Linear, c: Constants, s: Scratch,
+):  # fmt: skip
+    """1 + D W over the outer and inner nodes that touch, in rows of length `wide`, D being softer by a
+    factor. lumped: whether D is diagonal, its blocks being the first of each node."""
     n = 3 * outer + inner
     scale = soft * float(l.scale)
     pressed = float(l.bulk_stiffness * l.swell * l.scale)
@@ -262,7 +234,7 @@ def fill_contact(
         s.held[w, i] = held
     sync()
     if wp.block_dim() == 1:
-        _fill_by_rows(w, size, nnode, nin, soft, lumped, scale, c, s)
+        _fill_by_rows(w, outer, inner, wide, nnode, nin, soft, lumped, scale, c, s)
         return
     for m in range(t, outer * n, wp.block_dim()):
         k = m / n
@@ -374,7 +346,7 @@ def solve_system(
     sync()
     if equations > 0:
         soft = float(softer)
-        fill_contact(w, t, equations_of(outer, inner, wide), nnode, nin, soft, 0, l, c, s)
+        fill_contact(w, t, outer, inner, wide, nnode, nin, soft, 0, l, c, s)
         for k in range(t, outer, wp.block_dim()):
             p = s.node[w, s.touched[w, k]]
             total = wp.vec3()

@@ -122,6 +122,20 @@ def predict_free_flight(
     target_out[i, w] = wp.transpose(mat[w]) * (at + dt[w] * velocity[i, w] - pos[w])
 
 
+@wp.func
+def sum_contact(i: int, w: int, lane: int, lanes: int, surface: SurfaceForces):
+    """Sums a surface's contact forces at node i, and stores them where it has the node."""
+    push = vec3()
+    for k in range(surface.start[i] + lane, surface.start[i + 1], lanes):
+        s = surface.slot[k]
+        if surface.touching[s // 3, w] == 1:
+            push += surface.corner[s, w]
+    push = sum_of_lanes(push, lanes)
+    if surface.start[i + 1] > surface.start[i]:  # elsewhere it stays zero
+        surface.node_force[i, w] = push
+    return push
+
+
 @wp.kernel
 def assemble_force(
     # In:
@@ -148,25 +162,9 @@ def assemble_force(
     total = sum_of_lanes(total, lanes)
     if external.shape[0] > 0:
         total += external[i, w]
-    push = vec3()
-    for k in range(outer.start[i] + lane, outer.start[i + 1], lanes):
-        s = outer.slot[k]
-        if outer.touching[s // 3, w] == 1:
-            push += outer.corner[s, w]
-    push = sum_of_lanes(push, lanes)
-    if outer.start[i + 1] > outer.start[i]:  # elsewhere it stays zero
-        outer.node_force[i, w] = push
-        total += push
+    total += sum_contact(i, w, lane, lanes, outer)
     if core.start.shape[0] > 0:
-        push = vec3()
-        for k in range(core.start[i] + lane, core.start[i + 1], lanes):
-            s = core.slot[k]
-            if core.touching[s // 3, w] == 1:
-                push += core.corner[s, w]
-        push = sum_of_lanes(push, lanes)
-        if core.start[i + 1] > core.start[i]:
-            core.node_force[i, w] = push
-            total += push
+        total += sum_contact(i, w, lane, lanes, core)
     if liquid.start.shape[0] > 0:
         push = vec3()
         for k in range(liquid.start[i] + lane, liquid.start[i + 1], lanes):

@@ -79,9 +79,8 @@ class DissectedInverse:
         # at least one separator, which may be padding
         self.npiece, self.nseparator = len(pieces), _padded(3 * max(1, len(separators)))
         self.size = _padded(3 * max(map(len, pieces)))  # rows of a piece
-        self.width = _padded(
-            3 * max(1, *map(len, piece_separators)), _ALIGN // 2
-        )  # rows of the separators that it meets
+        # rows of the separators that it meets
+        self.width = _padded(3 * max(1, *map(len, piece_separators)), _ALIGN // 2)
         self.first = self.npiece * (self.size + self.width)  # row of the first separator
         self.padded = self.first + self.nseparator
         self.row = np.empty(len(points), np.int32)

@@ -20,9 +20,8 @@ from ..types import mat33, real, vec3
 
 kernel_module(__name__)
 
-_BLOCK = np.array(
-    [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-)  # index of the block between corners: `faces.block_index`
+# index of the block between corners: `faces.block_index`
+_BLOCK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 def body_tangent(

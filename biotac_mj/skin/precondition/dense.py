@@ -20,7 +20,6 @@ from .block_products import Product
 from .pushed_forward import PushForwardMatrices, pushes_forward
 
 if typing.TYPE_CHECKING:
-    from ..data import SkinData
     from ..geoms import GeomSet
 
 
@@ -30,7 +29,7 @@ class DensePreconditioner(Preconditioner):
 
     precision = SINGLE
 
-    def __init__(self, data: "SkinData"):
+    def __init__(self, data: typing.Any):
         model, nworld, capacity = data.model, data.nworld, data.contact_capacity
         self._bodies, self._body_contact, self._st = data.bodies, data.body_contact, data.worlds
         self.m, self.nworld, self.chunk, self.capacity = model, nworld, data.chunk, capacity

@@ -25,9 +25,8 @@ if typing.TYPE_CHECKING:
 kernel_module(__name__)
 
 _LEAST_DETERMINANT = 0.1  # of a node's deformation gradient; below it M is the identity
-_MOST_NORM = (
-    4.0  # of M in half precision, whose range is four times a right-hand side; else M is the identity
-)
+# of M in half precision, whose range is four times a right-hand side; else M is the identity
+_MOST_NORM = 4.0
 
 
 @wp.func

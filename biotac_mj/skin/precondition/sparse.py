@@ -29,7 +29,6 @@ from .body_tangent import assemble, body_tangent
 from .pushed_forward import PushForward, pushes_forward
 
 if typing.TYPE_CHECKING:
-    from ..data import SkinData
     from ..geoms import GeomSet
 
 _DENSE = 300  # coordinates below which a dense matrix of springs is faster than a sparse one
@@ -49,7 +48,7 @@ class SparsePreconditioner(Preconditioner):
 
     precision = DOUBLE
 
-    def __init__(self, data: "SkinData"):
+    def __init__(self, data: typing.Any):
         model, st = data.model, data.worlds
         self._bodies, self._body_contact = data.bodies, data.body_contact
         self._model, self._surfaces = model, [s for s in (data.outer, data.core) if s]

@@ -104,6 +104,13 @@ def _kernels(corners: int) -> types.SimpleNamespace:
     module = kernel_module(f"{__name__}.{corners}")
     deformation = deformation_of(corners)
 
+    @wp.func
+    def point(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3), e: int, q: int, w: int):
+        """Number of point q of an element, its deformation gradient and the law's constants there."""
+        mu = rubber.mu[w]
+        i = mesh.weight.shape[1] * e + q
+        return i, deformation(mesh, e, q, x, w), mu, wp.min(rubber.lam[w], cap * mu)
+
     @wp.kernel(module=module)
     def commit(
         # In:
@@ -118,10 +125,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
         e, q, w = wp.tid()
         if failed[w] == 1:
             return
-        i = mesh.weight.shape[1] * e + q
-        F = deformation(mesh, e, q, x, w)
-        mu = rubber.mu[w]
-        lam = wp.min(rubber.lam[w], cap * mu)
+        i, F, mu, lam = point(cap, mesh, rubber, x, e, q, w)
         if rubber.last.shape[0] > 0:
             worst = largest_energy(rubber, e, w, mu, lam, F, rubber.worst[i, w])
             S = relaxing_stress(rubber, e, w, mu, lam, F, worst)
@@ -144,10 +148,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
         e, q, w = wp.tid()
         if not mask[w]:
             return
-        i = mesh.weight.shape[1] * e + q
-        F = deformation(mesh, e, q, x, w)
-        mu = rubber.mu[w]
-        lam = wp.min(rubber.lam[w], cap * mu)
+        i, F, mu, lam = point(cap, mesh, rubber, x, e, q, w)
         if rubber.last.shape[0] > 0:
             worst = largest_energy(rubber, e, w, mu, lam, F, real(0.0))
             rubber.worst[i, w] = worst
@@ -161,10 +162,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
     def recall(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3)):
         """Computes the stress that relaxes at x, the end of the last step."""
         e, q, w = wp.tid()
-        i = mesh.weight.shape[1] * e + q
-        F = deformation(mesh, e, q, x, w)
-        mu = rubber.mu[w]
-        lam = wp.min(rubber.lam[w], cap * mu)
+        i, F, mu, lam = point(cap, mesh, rubber, x, e, q, w)
         worst = largest_energy(rubber, e, w, mu, lam, F, rubber.worst[i, w])
         rubber.last[i, w] = relaxing_stress(rubber, e, w, mu, lam, F, worst)
 
@@ -183,10 +181,7 @@ def _kernels(corners: int) -> types.SimpleNamespace:
     ):
         """See `RubberMemory.point_slopes`."""
         e, q, w = wp.tid()
-        i = mesh.weight.shape[1] * e + q
-        F = deformation(mesh, e, q, x, w)
-        mu = rubber.mu[w]
-        lam = wp.min(rubber.lam[w], cap * mu)
+        i, F, mu, lam = point(cap, mesh, rubber, x, e, q, w)
         R = rotation(rubber.law, F)
         stress_out[i, w] = points.remembered(rubber, e, w, mu, lam, F, R)
         change_out[i, w] = points.remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])

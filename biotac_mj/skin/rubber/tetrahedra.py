@@ -31,10 +31,8 @@ from .points import Mesh
 POINTWISE = 5.0  # of mu; docs/lab/elements.md has the error of other values
 CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/lab/elements.md has the error
 _LEAST_STRETCH = 0.2  # of `deformed`
-_GAUSS_NEAR, _GAUSS_FAR = (
-    (5 + 3 * 5**0.5) / 20,
-    (5 - 5**0.5) / 20,
-)  # barycentric Gauss points, exact to degree 2
+# barycentric Gauss points, exact to degree 2
+_GAUSS_NEAR, _GAUSS_FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20
 _POINTS = np.full((4, 4), _GAUSS_FAR) + (_GAUSS_NEAR - _GAUSS_FAR) * np.eye(4)
 
 
