@@ -34,7 +34,7 @@ SECTIONS = {
     "ROS, live": "neighbours.ros",
     "Effects and diagnosis": """effects.Effect discrepancy.diagnose discrepancy.diagnose_recording
         discrepancy.Verdict discrepancy.Finding discrepancy.read_recording discrepancy.PlainRecording
-        discrepancy.Simulator discrepancy.Trajectory""",
+        discrepancy.Simulator discrepancy.trajectories.model.solver.Solver discrepancy.Trajectory""",
     "Gradients": """differentiable.Skin differentiable.press differentiable.Pressed differentiable.Changes
         differentiable.rollout differentiable.Rolled differentiable.impedance differentiable.electrode_counts
         differentiable.pdc_counts differentiable.temperatures differentiable.tdc_counts

@@ -25,7 +25,7 @@ from biotac_mj.calibration.indentation import Indentation
 from biotac_mj.data.objects import make_object
 from biotac_mj.discrepancy import Trajectory
 from biotac_mj.discrepancy.plates import tables
-from biotac_mj.discrepancy.trajectories.model import simulator
+from biotac_mj.discrepancy.trajectories.model import solver
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.skins import load_skin, skin_reference
 from biotac_mj.matching.states import PlateGrid, PlateStates, plate_states
@@ -115,10 +115,10 @@ def presses(geometry, poisson):
 
 
 def field(geometry, pos, mat):
-    sim = simulator.Simulator(cache="fields")
+    sim = solver.Solver(cache="fields")
     moves = Trajectory("a", "sphere_7mm", 0.0, np.arange(8.0), pos, mat, np.full((8, 19), 2500.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulator, "load_skin", lambda name: geometry)
+        patch.setattr(solver, "load_skin", lambda name: geometry)
         sim.solve([moves])
 
 

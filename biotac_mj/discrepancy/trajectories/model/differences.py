@@ -4,7 +4,6 @@ effect cheap to fit (`Fields`). The settings of a `Simulator` decide what is sol
 import contextlib
 import dataclasses
 import pathlib
-import typing
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -20,9 +19,7 @@ from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import BETWEEN, OTHER_MESH
 from ..trajectory import Trajectory
 from .fields import MAPS, Curve, Fields, stack
-
-if typing.TYPE_CHECKING:
-    from .simulator import Simulator
+from .solver import Solver
 
 _SHIFT = 40e-6  # [m] of the poses for differences
 # [m] along the press: densest where errors of poses lie, since rows before the touch begin to touch there
@@ -50,7 +47,7 @@ class Change:
 
     name: str
     by: float
-    sim: "Simulator"
+    sim: Solver
     how: dict = dataclasses.field(default_factory=dict)
     load: float = 1.0
 
@@ -71,7 +68,7 @@ def differences(
 
 
 def solved_fields(
-    sim: "Simulator",
+    sim: Solver,
     trajectories: list[Trajectory],
     progress: bool = True,
     places: Sequence[str] | None = None,
@@ -181,14 +178,14 @@ def _uneven(sim, places):
         yield Change(way, by, sim.but(options=sim.options | {"modulus": modulus}))
 
 
-def tacky(sim: "Simulator", work: float) -> Change:
+def tacky(sim: Solver, work: float) -> Change:
     """A contact that sticks, of so much work of joining [J/m2], all of it together."""
     inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})])
     skin = plain(inside.options(read_settings(sim.material, sim.options)[1]))
     return Change(f"{TACKY}{work:.9g}", 1.0, sim.but(options=sim.options | {"skin": skin}))
 
 
-def filled(sim: "Simulator") -> list[Change]:
+def filled(sim: Solver) -> list[Change]:
     """The fraction of its liquid that the fingertip has lost or won, the film as it was."""
     model, film = sim.skin_and_film(0.0, 0.0)
     settings = read_settings(sim.material, sim.options)[1]
@@ -199,7 +196,7 @@ def filled(sim: "Simulator") -> list[Change]:
     return [Change("fill", _FILL, sim.but({"film": film}, options=options, cache=_subfolder(sim, "filled")))]
 
 
-def sunk(sim: "Simulator") -> list[Change]:
+def sunk(sim: Solver) -> list[Change]:
     """The depth [m] to which the skin has sunk towards the core, all else as it was."""
     from ....effects.in_film import SunkFilm
 
@@ -215,7 +212,7 @@ def _subfolder(sim, name):
     return None if sim.cache is None else str(pathlib.Path(sim.cache) / name)
 
 
-def softer(sim: "Simulator") -> list[Change]:
+def softer(sim: Solver) -> list[Change]:
     """The logarithm of the modulus, beyond a factor on force and pressure: there is nothing but where the
     liquid stands under pressure at rest, which another modulus leaves as it is."""
     if not read_settings(sim.material, sim.options)[1].rest_pressure:

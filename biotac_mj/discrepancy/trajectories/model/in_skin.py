@@ -19,7 +19,8 @@ from ....sensor.film import FilmConduction
 from ....skin.model import SkinModel
 from ..trajectory import Trajectory
 from .fields import Fields, stack, unlike
-from .simulator import Simulator, _impedance, placed
+from .simulator import Simulator
+from .solver import impedance_of, placed
 
 FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that the solved skin makes needless
 _LITTLE = 0.01  # size of an effect below which nothing is solved
@@ -79,7 +80,7 @@ def solve_with_memory(
                 "force": np.array(one["force"]),
                 "pressure": np.array(one["pressure"]),
                 "converged": np.array(one["converged"]),
-                "log_z": np.log(_impedance(film, one["x"])),
+                "log_z": np.log(impedance_of(film, one["x"])),
             }
         )
         if progress:
