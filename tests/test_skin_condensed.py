@@ -106,10 +106,13 @@ def cavity(model, nodes):
 
 
 def press_both(model, depths):
-    """Force, nodes and pressure of full and condensed skin at depths [m]."""
+    """Force, nodes and pressure of full and condensed skin at depths [m] below the first touch."""
     start, direction = touch(model.geometry)
     skin, data, geoms = CondensedSkin(model, sphere()), SkinData(model), sphere()
-    condensed = walk(skin, start + np.outer(depths, direction))
+    # without earlier poses the full tier's geoms begin where they are, those of the condensed one outside
+    came = skin.at_rest(start[None], EYE).memory
+    condensed = walk(skin, start + np.outer(depths, direction), came)
+    geoms.set_pose(start[None])
     full = []
     for depth in depths:
         geoms.set_pose((start + depth * direction)[None])
@@ -210,7 +213,8 @@ def test_a_filled_skin_is_that_of_the_full_fem():
         model.rest.pressure == pytest.approx(3e3, rel=1e-2)
         and np.abs(model.rest.vert - model.geometry.vert).max() > 1e-5
     )
-    for c, depth in zip(walk(skin, start + np.outer(depths, direction)), depths):
+    geoms.set_pose((start - 1e-3 * direction)[None])
+    for c, depth in zip(walk(skin, start + np.outer(depths, direction), away.memory), depths):
         geoms.set_pose((start + depth * direction)[None])
         step(model, data, geoms)
         assert data.converged.all()
