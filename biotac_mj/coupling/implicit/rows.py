@@ -12,7 +12,7 @@ kernel_module(__name__)
 
 
 _NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
-_PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
+_PIVOT = wp.constant(wp.float64(1e-9))  # of `_scale`: stiffness that is rounding
 
 
 def _rows(precision):
@@ -40,11 +40,20 @@ ROWS = {precision: _rows(precision) for precision in (wp.float32, wp.float64)}
 
 
 @wp.func
-def _pivot(S: mat66, whole: vec6, k: int):
-    """Pivot k of the remaining matrix, 0 if it is negligible against the diagonal `whole`, and its column of
-    L."""
+def _scale(S: mat66):
+    """Stiffness against translations and rotations to which rounding is in proportion. A diagonal entry may
+    be nothing else, as along a flat side without friction, and its pivot divides the rounding of others."""
+    d = wp.abs(wp.get_diag(S))
+    push = d[0] + d[1] + d[2]
+    turn = d[3] + d[4] + d[5]
+    return vec6(push, push, push, turn, turn, turn)
+
+
+@wp.func
+def _pivot(S: mat66, scale: vec6, k: int):
+    """Pivot k of the remaining matrix, 0 if it is negligible, and its column of L."""
     column = vec6()
-    if S[k, k] <= _PIVOT * wp.abs(whole[k]):
+    if S[k, k] <= _PIVOT * scale[k]:
         return wp.float64(0.0), column
     for i in range(k, 6):
         column[i] = S[i, k] / S[k, k]
@@ -55,11 +64,11 @@ def _pivot(S: mat66, whole: vec6, k: int):
 def hold_by_rows(S: mat66):
     """The part of a stiffness that constraint rows can represent: L D L' without the pivots that are not
     positive. A model has only that part, so that its forces are those of the rows."""
-    whole = wp.get_diag(S)
+    scale = _scale(S)
     left = S
     held = mat66()
     for k in range(6):
-        pivot, column = _pivot(left, whole, k)
+        pivot, column = _pivot(left, scale, k)
         one = pivot * wp.outer(column, column)
         left -= one
         held += one
@@ -101,9 +110,9 @@ def write_rows(
         if group_slot[g] == s:  # bodies that are welded together move as one: their stiffnesses add
             S += square[g, w] * tangent[g, w]
             group = g
-    whole = wp.get_diag(S)
+    scale = _scale(S)
     for k in range(6):
-        pivot, column = _pivot(S, whole, k)
+        pivot, column = _pivot(S, scale, k)
         S -= pivot * wp.outer(column, column)
         r = first + k
         if t == 0:
