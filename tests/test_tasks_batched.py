@@ -210,6 +210,11 @@ def test_a_lesson_is_sensed_anew():
     gain = changes[..., 19] / sensed["changes"][:, :, 0, 19]
     np.testing.assert_allclose(gain.std(0), 0.1, rtol=0.15)
     assert torch.allclose(gain, gain[:, :1].expand_as(gain), rtol=1e-5)
+    deviations = 0.0, 0.0, 0.0, 0.2  # in place of the environment's; the last of each electrode
+    changes = env.sense_anew("electrodes", **sensed, model_error=deviations)[:, 4 * 13 :]
+    changes = changes.unflatten(1, (4, 20))
+    assert (changes[..., 19] * 100 - sensed["changes"][:, :, 0, 19]).abs().max() < 1e-3
+    np.testing.assert_allclose(changes[..., :19].std(0) / changes[..., :19].mean(0), 0.2, rtol=0.2)
     env.model_error, env._blur = (0.0, 0.0, 0.0), 0.0 * env._blur
     env.reset()
     seen = env.observe()

@@ -22,8 +22,8 @@ class Numbers:
         an update changes the policy by `divergence` [nat].
       norm: limit of gradients.
       taught: fraction of the training time with imitation, before PPO.
-      study: time of imitation between updates over that of acting; lessons: limit of its steps, each from
-        `several` states of the newest `remembered`.
+      lessons: limit of steps of imitation between updates, each from `several` states of the newest
+        `remembered`.
       renew: stored initial states are replaced after so many times the decisions that this takes, because a
         policy would memorise the same few states.
     """
@@ -39,7 +39,6 @@ class Numbers:
     divergence: float = 0.01
     norm: float = 1.0
     taught: float = 0.7
-    study: float = 0.4
     lessons: int = 400
     several: int = 8192
     remembered: int = 524288

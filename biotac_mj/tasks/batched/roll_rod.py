@@ -75,6 +75,7 @@ class RollRod(HeldTask):
     num_actions = 6
     gamma = 0.9  # a decision is paid at once; with 0.97 noise hides what it gave
     settings = Settings()
+    study = 0.9
     same_in_tiers = True
 
     def __init__(

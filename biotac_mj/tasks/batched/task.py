@@ -86,6 +86,7 @@ class BatchTask(abc.ABC):
     num_actions: int
     settings = TaskSettings()  # of the class
     gamma = 0.95  # discount of a decision in learning
+    study = 0.4  # time of imitation between updates over that of acting
     same_in_tiers = False  # whether the same actions move the object alike in both tiers of the skin
     camera: tuple  # lookat (3,) [m], distance [m], azimuth, elevation [deg] of a picture
 
@@ -332,6 +333,7 @@ class BatchTask(abc.ABC):
         world: torch.Tensor,
         missing: int = 0,
         measured: torch.Tensor | None = None,
+        model_error: tuple[float, ...] | None = None,
     ) -> torch.Tensor:
         """Observations (n, m) of body and touch for what was `sensed` in n worlds, with new errors of
         encoders and model.
@@ -340,6 +342,7 @@ class BatchTask(abc.ABC):
           choice: of `touch.OBSERVE`. missing: number of random electrodes of each finger that read no change.
           measured: errors of this tier, see `training.tier_errors`; each world gets those of a random episode
             times a random factor, 0.5 +- 0.7, so that neither tier is strange.
+          model_error: deviations of the others, see `Touch.draw_errors`; None: the environment's.
         """
         # an episode that is young repeats its first decision, with its errors
         repeats = (body[:, 1:] == body[:, :-1]).all(2)
@@ -353,7 +356,7 @@ class BatchTask(abc.ABC):
             off = measured[first[:, -1:] - first, which]  # of the same decision
             changes = changes + factor * off * self._touch.rms(changes)
         changes = self._touch.without(changes, missing, self._draw) if missing else changes
-        errors = self._touch.draw_errors((len(body), 1), self.model_error, self._draw)
+        errors = self._touch.draw_errors((len(body), 1), model_error or self.model_error, self._draw)
         touch = self._touch.observe(choice, self._touch.with_errors(changes, errors), world)
         return torch.cat([(body + noise).flatten(1), touch.flatten(1)], dim=1)
 

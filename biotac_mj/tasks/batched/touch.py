@@ -68,8 +68,9 @@ class Touch:
         self, shape: tuple[int, ...], deviation: tuple[float, ...], draw: torch.Generator
     ) -> torch.Tensor:
         """Errors (*shape, nfinger, 3 + nelectrode) for `with_errors`, of these deviations: of all electrodes
-        of a finger, PDC and PAC, and of each electrode."""
-        each = torch.tensor(deviation + deviation[:1] * self._split[0], device=draw.device)
+        of a finger, PDC and PAC, and of each electrode; of three, the first is also the last."""
+        own = (*deviation, deviation[0])[3:4]
+        each = torch.tensor(deviation[:3] + own * self._split[0], device=draw.device)
         return each * torch.randn(*shape, len(self._seeds), len(each), generator=draw, device=draw.device)
 
     def with_errors(self, changes: torch.Tensor, errors: torch.Tensor) -> torch.Tensor:

@@ -30,8 +30,9 @@ from .task import BatchTask
 
 # effects of the sensors in learning, in addition to the spread of real ones (`sensor="random"`)
 RANDOMISED = ("gain", "pdc_gain", "warmup", "drift")
-# of electrodes, PDC and PAC, beside what is measured where a task is the same in both tiers
-_MODEL_ERROR = (0.1, 0.25, 0.15)  # (docs/lab/tasks.md)
+_MODEL_ERROR = (0.1, 0.25, 0.15)  # of electrodes, PDC and PAC (docs/lab/tasks.md)
+# in lessons, beside what is measured where a task is the same in both tiers; the last of each electrode
+_BESIDE_MEASURED = (0.12, 0.25, 0.15, 0.07)
 _MISSING = 1  # electrode of each finger that a lesson lacks (docs/lab/tasks.md)
 _KEEP = 30.0  # [s] between files
 _STRAY = 0.3  # deviation of the teacher's actions, so that it also shows how to recover
@@ -162,7 +163,9 @@ def train(
             run.resume(out, task)
     about = _about(env) | (about or {})
     lessons = Lessons(numbers.remembered, 0, env.device)
-    measured = tier_errors(env, _in_full_tier(env, task)) if env.same_in_tiers and not resume else None
+    errors = {}
+    if env.same_in_tiers and not resume:
+        errors = {"measured": tier_errors(env, _in_full_tier(env, task)), "model_error": _BESIDE_MEASURED}
     env.reset(seed=sum(run.decisions for run in learners))
     env.stagger()
     begin = last = kept = time.perf_counter()
@@ -195,7 +198,7 @@ def train(
         for run in learners:
             run.learn(not learns)
         if learns:
-            _study(learners, lessons, measured, acted, (last - begin) / of_teacher)
+            _study(learners, lessons, errors, acted, (last - begin) / of_teacher)
         if env.cfg.prepare and since >= numbers.renew * env.cfg.prepare:
             env.prepare_held()
             env.stagger()
@@ -258,8 +261,8 @@ def _in_full_tier(env, task):
     )
 
 
-def _study(learners, lessons, measured, acted, progress):
-    """Trains by imitation for `Numbers.study` times the time spent on acting, `acted` [s]; progress: elapsed
+def _study(learners, lessons, errors, acted, progress):
+    """Trains by imitation for `BatchTask.study` times `acted`, the time of acting [s]; progress: elapsed
     fraction of the phase with a teacher. Each lesson draws new errors of encoders and model, because a policy
     would recognise the few states by these errors, and leaves electrodes out, because it would rely on few of
     them, whose errors would then mislead it; and another goal, because what was done towards the goal that
@@ -267,20 +270,17 @@ def _study(learners, lessons, measured, acted, progress):
     numbers, env, begin = learners[0].learner.numbers, learners[0].env, time.perf_counter()
     for _ in range(numbers.lessons):
         sensed, right = env.aim_anew(*lessons.draw(numbers.several))
-        draw = functools.partial(env.sense_anew, **sensed, missing=_MISSING, measured=measured)
-        draw = functools.cache(draw)
+        draw = functools.cache(functools.partial(env.sense_anew, **sensed, **errors, missing=_MISSING))
         for run in learners:
             run.learner.imitate(draw(run.observe), right.clamp(-1, 1), progress)
-        if _now(env) - begin > numbers.study * acted:
+        if _now(env) - begin > env.study * acted:
             break
 
 
 def _about(env):
-    device = wp.get_device(env.device)
-    packages = versions()
     made = {"settings": dataclasses.asdict(env.cfg), "biotac": env.biotac, "worlds": env.num_envs}
     made |= {"history": env.history, "model_error": env.model_error}
-    return {"data": "synthetic", **made, "device": device.name, "versions": packages}
+    return {"data": "synthetic", **made, "device": wp.get_device(env.device).name, "versions": versions()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -290,17 +290,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("task", choices=TASKS)
     parser.add_argument(
-        "--observe",
-        nargs="+",
-        default=["electrodes"],
-        choices=OBSERVE,
-        help="kinds of touch that policies read",
+        "--observe", nargs="+", default=["electrodes"], choices=OBSERVE, help="kinds of touch that are read"
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds, for each kind of touch")
     parser.add_argument("--worlds", type=int, default=512, help="number of worlds for each policy")
-    parser.add_argument(
-        "--minutes", type=float, default=5.0, help="time to learn, besides compiling and playing"
-    )
+    parser.add_argument("--minutes", type=float, default=5.0, help="of learning, besides compiling, playing")
     parser.add_argument("--device", help="Warp device, cpu or cuda:0 say")
     parser.add_argument(
         "--out", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder of the policies"
