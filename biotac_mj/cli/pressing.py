@@ -246,7 +246,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "--policy",
         metavar="FILE",
         help="in a task, what acts (default: the policy that comes with the package); script uses "
-        "the true state, random draws actions; electrodes of roll_rod carries over to other sensors",
+        "the true state, random draws actions; electrodes is that of roll_rod without PAC",
     )
     verb.add_argument(
         "--episodes", type=whole(1, 100000), help="in a task, number of episodes to score without a picture"

@@ -37,8 +37,8 @@ def play_task(
     """Plays a task of `biotac_mj.tasks.batched` with a policy.
 
     Args:
-      policy: a file; None: the shipped one; "electrodes": that of `roll_rod` that carries over to other
-        sensors; "script": a script that uses the true state; "random".
+      policy: a file; None: the shipped one; "electrodes": that of `roll_rod` without PAC; "script": a script
+        that uses the true state; "random".
       episodes: number of episodes to score, in parallel worlds; None: show episodes one after the other.
       json: print scores as JSON. render: GIF of episodes. window: MuJoCo's viewer instead of the page at
       `port`.
