@@ -187,15 +187,8 @@ class _Remembering(Simulator):
         model, film = self.skin_and_film(log_friction, bubble)
         power = self.inside.film.get("power")
         film = film if power is None else RoughFilm(film, power)
-        return solve_with_memory(
-            model,
-            film,
-            trajectories,
-            poses,
-            progress,
-            self.inside.film.get("loss", 0.0),
-            self.inside.film.get("before", 0.0),
-        )
+        loss, before = (self.inside.film.get(name, 0.0) for name in ("loss", "before"))
+        return solve_with_memory(model, film, trajectories, poses, progress, loss, before)
 
     def skin_and_film(self, log_friction, bubble):
         from ....skin.model import SkinModel

@@ -215,12 +215,8 @@ class Simulator(Solver):
             for i, r in enumerate(runs)
             if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble
         ]
-        if exact is True:
-            anew = changed
-        elif exact is False:
-            anew = []
-        else:
-            anew = [i for i in changed if i in set(np.atleast_1d(exact).tolist())]
+        wanted = changed if exact is True else [] if exact is False else np.atleast_1d(exact).tolist()
+        anew = [i for i in changed if i in wanted]
         if anew:
             kept = [runs[i] for i in anew]
             solved = self.solve(
@@ -231,22 +227,14 @@ class Simulator(Solver):
                 kept[0].bubble,
             )
             for run, one in zip(kept, solved):
-                run.force, run.pressure, run.log_z = (
-                    modulus * one["force"],
-                    modulus * one["pressure"],
-                    one["log_z"] + self.log_rest,
-                )
+                run.force, run.pressure = modulus * one["force"], modulus * one["pressure"]
+                run.log_z = one["log_z"] + self.log_rest
         curves = fields.bent(moving)
         for i in sorted(set(changed) - set(anew)):
             run = runs[i]
-            parts = [
-                ("radius", run.log_radius),
-                ("friction", run.log_friction),
-                ("friction2", run.log_friction**2),
-                ("bubble", run.bubble),
-            ]
+            amounts = run.log_radius, run.log_friction, run.log_friction**2, run.bubble
             change = fields.shifted(i, run.offset) if run.offset.any() else 0.0
-            for name, amount in parts:
+            for name, amount in zip(("radius", "friction", "friction2", "bubble"), amounts):
                 several = np.ndim(amount) > 0
                 if name in fields.slopes and (amount.any() if several else amount):
                     slope = fields.slopes[name][i]
