@@ -196,6 +196,12 @@ def test_the_papers_networks_train_too(folder, tmp_path):
         assert field.shape == (1, skin.nvert, 3) and field.abs().max() < 1e-4  # [mm]
 
 
+def test_a_set_is_no_folder_of_predictions(tmp_path):
+    (tmp_path / "shard-00000.h5").touch()
+    with pytest.raises(FileNotFoundError, match="learn train .* --out trained"):
+        evaluate_models(tmp_path)
+
+
 def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
     skin = load_skin("coarse")
     model = load_forward(weights, skin)

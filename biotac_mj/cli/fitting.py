@@ -113,7 +113,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         default=list(CONFIGURATIONS),
         choices=CONFIGURATIONS,
         metavar="NAME",
-        help="configurations to compare (default: all)",
+        help="configurations to compare",
     )
     verb.add_argument(
         "--data",
@@ -127,7 +127,7 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         default=INDENTERS,
         choices=INDENTERS,
         metavar="NAME",
-        help="indenters of the reference (default: all)",
+        help="indenters of the reference",
     )
     verb.add_argument(
         "--count", type=whole(1, 10_000), default=1, help="random indentations for each indenter"

@@ -18,7 +18,7 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="number of interactions")
     verb.add_argument("--steps", type=whole(8, 2000), default=20, help="time steps of each, at least 8")
     verb.add_argument(
-        "--rate", type=real(1e-3, 1e6), default=20.0, metavar="HZ", help="rate of the time steps"
+        "--rate", type=real(1e-3, 4400.0), default=20.0, metavar="HZ", help="rate of the time steps"
     )
     verb.add_argument(
         "--labelled",

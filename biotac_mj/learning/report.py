@@ -36,9 +36,10 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
     folder = pathlib.Path(folder)
     reports = [report_of(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
     if not reports:
-        raise FileNotFoundError(
-            f"no predictions in {folder}: run `biotac learn train SET --out {folder}` first"
-        )
+        is_set = any(folder.glob("shard-*.h5"))
+        first = f"{folder} --out trained" if is_set else f"SET --out {folder}"
+        then = ", then judge the folder trained" if is_set else ""
+        raise FileNotFoundError(f"no predictions in {folder}: run `biotac learn train {first}` first{then}")
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
         raise ValueError(f"{folder} holds predictions on different sets: give every set its own folder")
     sensor = reports[0].get("sensor", "synthetic")
