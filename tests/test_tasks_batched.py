@@ -487,6 +487,11 @@ def test_a_policy_learns_and_is_played_as_its_card_says(tmp_path, capsys):
     score = json.loads(capsys.readouterr().out)
     assert score["episodes"] == 3 and score["card"] == read_card(path) and score["agrees"]
     assert score["card"]["settings"]["decisions"] == 3
+    words = ["play", "follow_edge", "--policy", str(path), "--episodes", "3", "--json", "--tier", "condensed"]
+    assert main(words) == 0  # a card says nothing of other settings
+    score = json.loads(capsys.readouterr().out)
+    assert score["biotac"] == {"tier": "condensed"} and score["agrees"] is None
+    assert main([*words, "--skin", "nowhere"]) == 2 and "no skin at nowhere" in capsys.readouterr().err
     assert main(["play", "insert_peg", "--policy", str(path), "--episodes", "3"]) == 2
     assert "is a policy of follow_edge" in capsys.readouterr().err
     if find_gl():
@@ -497,6 +502,8 @@ def test_a_policy_learns_and_is_played_as_its_card_says(tmp_path, capsys):
 
 
 def test_what_only_a_task_has_is_refused_elsewhere(capsys):
+    assert main(["play", "follow_edge", "--hand", "hand.xml", "--episodes", "1"]) == 2
+    assert "hand is not of follow_edge" in capsys.readouterr().err
     assert main(["play", "press.h5", "--episodes", "3"]) == 2
     said = "--episodes is of one task, and press.h5 is none: pass one of roll_rod, insert_peg"
     assert said in capsys.readouterr().err

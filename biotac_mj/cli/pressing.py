@@ -211,11 +211,13 @@ def _view(args):
     view(render=args.render, seconds=args.seconds, hand=args.hand, mount=args.mount, **_displayed_skin(args))
 
 
+_SKIN = "skin", "tier", "material", "liquid", "options"
+
+
 def _displayed_skin(args):
     """The displayed skin."""
     check_device(args.device)
-    names = ("skin", "tier", "material", "liquid", "seed", "device", "options")
-    return {name: getattr(args, name) for name in names}
+    return {name: getattr(args, name) for name in (*_SKIN, "seed", "device")}
 
 
 def add_play(verbs: argparse._SubParsersAction) -> None:
@@ -225,7 +227,8 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "play",
         _play,
         "A page in the browser with skin, electrodes and traces: of recorded presses, of a press with "
-        "sliders for depth and place, or of a policy that does a task by touch (extra web).",
+        "sliders for depth and place (coarse skin, condensed tier), or of a policy that does a task by "
+        "touch, with the BioTacs that it learned with (extra web). Settings of the skin replace these.",
     )
     verb.add_argument(
         "recording",
@@ -234,7 +237,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         help=f"skin.h5 of presses, one or several; or a task: {', '.join(TASKS)}",
     )
     add_skin(verb)
-    verb.set_defaults(skin="coarse", tier="condensed")  # a press takes a second or two
+    verb.set_defaults(skin=None, tier=None, material=None)
     verb.add_argument(
         "--hand", metavar="FILE", help="MJCF of a hand: with BioTacs on its fingertips and a ball"
     )
@@ -266,10 +269,13 @@ def _play(args):
             trained = "`python -m biotac_mj.tasks.batched.training TASK --out FOLDER`"
             with reading(args.policy, "policy", f"give script, random, or a file that {trained} wrote"):
                 pass
+        if args.mount:
+            raise ValueError("--mount is not of a task: leave it out")
         from ..view.policy import play_task
 
         more = {name: getattr(args, name) for name in (*of_task, "hand", "port", "device", "seed")}
-        play_task(args.recording[0], **more)
+        biotac = {name: value for name in _SKIN if (value := getattr(args, name)) is not None}
+        play_task(args.recording[0], biotac=biotac, **more)
         return
     given = [f"--{name}" for name in of_task if getattr(args, name)]
     if given:
@@ -282,7 +288,9 @@ def _play(args):
     from ..view import view
 
     more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)
-    view(web=True, **more, **_displayed_skin(args))
+    quick = {"skin": "coarse", "tier": "condensed", "material": "default"}  # a press takes a second or two
+    shown = {name: value for name, value in _displayed_skin(args).items() if value is not None}
+    view(web=True, **more, **quick | shown)
 
 
 def add_hands(verbs: argparse._SubParsersAction) -> None:

@@ -1,6 +1,7 @@
 """Plays a task by touch with a policy: scores, a GIF, MuJoCo's viewer or the page in the browser (`biotac
 play TASK`)."""
 
+import inspect
 import pathlib
 import time as clock
 from collections.abc import Callable
@@ -13,6 +14,8 @@ import torch
 from ..files import replacing
 from ..geometry import load_skin
 from ..sensor.colors import electrode_colors
+from ..skin.settings import read_dict
+from ..tasks.batched import TASKS
 from ..tasks.batched.playing import HELD_OUT, acting, agree, env_of, play
 from ..tasks.batched.task import BatchTask
 from .maps import Maps
@@ -33,6 +36,7 @@ def play_task(
     device: str = "cpu",
     seed: int = 0,
     hand: pathlib.Path | str | None = None,
+    biotac: dict | None = None,
 ) -> dict | None:
     """Plays a task of `biotac_mj.tasks.batched` with a policy.
 
@@ -43,17 +47,27 @@ def play_task(
       json: print scores as JSON. render: GIF of episodes. window: MuJoCo's viewer instead of the page at
       `port`.
       seed: of initial states. hand: for the rod's task.
+      biotac: settings of the BioTacs, as `batch.attach` has them, in place of those that the policy learned
+        with; its card is not compared then.
 
     Returns:
       The scores of `episodes`.
+
+    Raises:
+      ValueError: the task has no hand.
     """
+    if hand and "hand" not in inspect.signature(TASKS[task]).parameters:
+        raise ValueError(f"hand is not of {task}: leave it out")
     _, act, card = acting(task, policy, device)
-    own = {"hand": hand} if hand else {}
+    biotac = dict(biotac or {})
+    if "options" in biotac:
+        biotac["options"] = read_dict(biotac["options"], "options")
+    own = ({"hand": hand} if hand else {}) | biotac
     env = env_of(card, episodes or 1, device=device, seed=seed, **own)
     if episodes:
         (score,) = play(env, [(slice(None), act)], HELD_OUT + seed)
         score = {"task": task, "policy": str(policy or "shipped")} | score
-        score |= {"card": card, "agrees": agree(score, card)}
+        score |= {"biotac": biotac, "card": card, "agrees": None if biotac else agree(score, card)}
         print(dumps(score, indent=1) if json else _said(score))
         return score
     if render is not None:
