@@ -187,7 +187,7 @@ def test_the_search_with_poses_has_the_effects_that_it_can_fit():
     assert entries("poses") == CATALOGUE and all("poses" in e.fits for e in CATALOGUE)
     assert {e.id for e in entries("log")} - {e.id for e in CATALOGUE} == {
         *("count_offset", "count_gain", "flip", "stuck", "freeze"),
-        *("lost_rows", "quantise", "spikes", "hum", "noise"),
+        *("lost_rows", "quantise", "spikes", "hum", "noise", "common_noise"),
     }
 
 

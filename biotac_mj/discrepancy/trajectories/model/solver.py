@@ -18,6 +18,9 @@ from ....sensor.presets import SENSORS, Sensor, read_sensor
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..trajectory import Trajectory
 
+if typing.TYPE_CHECKING:
+    from ....sensor.film import FilmConduction
+
 TIERS = ("condensed", "full")
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
@@ -230,7 +233,7 @@ def placed(
     return out
 
 
-def impedance_of(film, vert_xpos):
+def impedance_of(film: "FilmConduction", vert_xpos: np.ndarray) -> np.ndarray:
     """(n, nelectrode) [ohm]; a row whose film has no solution keeps the last one, as does one that has not
     moved."""
     rows, last = [], None
