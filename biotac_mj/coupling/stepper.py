@@ -148,7 +148,7 @@ class SkinStepper:
         return None
 
     def resting(self, state: np.ndarray) -> bool:
-        """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
+        """Whether the skin is at rest in this state, so that a step changes it only if a geom touches."""
         return False
 
     def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool | None:

@@ -112,8 +112,9 @@ def _distance(corner: wp.array2d(dtype=Any), face: int, q: vec3):
 def nearest_listed(
     lists: TriangleLists, k: int, corner: wp.array2d(dtype=Any), first: int, q: vec3, moved: real
 ):
-    """The face of list k that is closest to q, which has moved by `moved` [mm] from the list's point; -1 if
-    the list is too short. corner: (nface, 3) [mm] of all faces; those of the list's mesh start at `first`."""
+    """Index of the face of list k that is closest to q; -1 if the list is too short to tell, since q is
+    `moved` [mm] from the point that the list was made for. corner: (nface, 3) [mm] of all faces; those of the
+    list's mesh start at `first`."""
     found = int(-1)
     best = real(wp.inf)
     end = lists.begin[k + 1]

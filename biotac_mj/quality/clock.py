@@ -14,8 +14,8 @@ _FREQUENT = 0.1  # of the steps
 _GUESS = (0.02, 0.98)  # fraction of repeated rows within which a rate can be estimated
 # mean distance of steps from whole rows above which missing rows cannot be counted
 _TREMBLE = 0.3
-# segments of a log; fewest rows to compare; difference of their sampling intervals (at most 0.0003 with a
-# correct clock)
+# A log is compared in this many segments, if each has so many rows; a clock is faulty if their sampling
+# intervals differ by this fraction (with a correct clock they differ by at most 0.0003)
 _SEGMENTS, _ROWS, _PACE = 8, 400, 0.1
 _CONTINUES = 4.0  # times the usual change between rows, of the median channel
 

@@ -10,19 +10,19 @@ _NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
 
 
 def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **about: object) -> Recording:
-    """Makes a recording, for `write`, `write_bag` and other functions, of readings from the user's own loop.
+    """Makes a Recording from readings of a simulation; `write` and `write_bag` take it as any other.
 
-    A real sensor's rows are a frame apart: 10 ms of a BioTac, 14 ms of a BioTac SP.
+    Rows should be one frame of the sensor apart: 10 ms for a BioTac, 14 ms for a BioTac SP.
 
     Args:
       time: (n,) of the rows [s]. reads: n results of `Handle.read(data)`.
       about: further fields of Recording, such as object_pos, object_quat or name.
 
     Returns:
-      the recording; force is on the touching object, in the BioTac frame.
+      the recording. Its force acts on the touching object, in the BioTac frame.
 
     Raises:
-      ValueError: a row without a channel, or another number of times than rows.
+      ValueError: a row lacks a channel, or there are not as many times as rows.
     """
     reads = list(reads)
     for i, row in enumerate(reads):

@@ -199,7 +199,7 @@ class World:
         instance.solve_for_pose(*pose, core)
 
     def failed(self, index: int) -> None:
-        """After an exception: no skin that was being solved is known, and none acts."""
+        """Discards solves that an exception interrupted: these skins have no result and exert no force."""
         instance = self.instances[index]
         for other in self.coupled if instance.two_way else [instance]:
             other.failed()

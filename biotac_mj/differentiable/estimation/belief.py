@@ -24,9 +24,8 @@ _FILL = 0.75  # [ul]
 _PRESSURE, _PRESSURE_MEAN = 0.2, -0.23  # of the pressure's gain
 _MODULUS, _MODULUS_MEAN = 0.353, 0.049  # of ln of the force
 TILT = 0.18  # [rad] of a press from the normal, in each of two directions: uniform to 25 degrees
-# Residual over an electrode's change, and over the RMS of all. CHOSEN: the most likely values, 0.43 and 0.08,
-# times 1.6,
-# intervals need less widening
+# Standard deviation of the residual, as a fraction of an electrode's change and of the RMS change of all.
+# CHOSEN: 1.6 times the most likely values (0.43, 0.08), so that intervals need less widening
 _OFF, _LEVEL = 0.68, 0.126
 _CORRELATION = 0.4  # correlation of both between neighbours
 _ABSOLUTE, _COMMON = 0.006, 0.007  # residual of ln Z: of each, common to all

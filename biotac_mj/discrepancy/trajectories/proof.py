@@ -23,10 +23,12 @@ class Proof:
 
     Attributes:
       fit: Fit that they do not contradict: with effects, with the base model's constants alone, or the base
-        model as it was given. before, after: of the model without effects and of that one the mean square of
-        each trajectory and RMS of groups and channels. residuals: (before, after), of each trajectory
-        (n, width), its pose's most probable error taken out. closed: fraction of the root mean square of
-        what effects act on that they take away (a modulus where there is none of them), nan without both.
+        model as it was given.
+      before, after: without effects and with this fit, the mean square of each trajectory and the RMS of
+        groups and channels.
+      residuals: (before, after) for each trajectory (n, width), without its pose's most probable error.
+      closed: fraction of the RMS residual that the effects remove from the readings they act on (without
+        effects, that a fitted modulus removes); nan if there is neither.
     """
 
     fit: "Fit"

@@ -370,8 +370,8 @@ def is_known(w: int, t: int, o: Increment, geoms: Geoms, c: Constants, s: Scratc
 
 @wp.func
 def find_inner_faces(w: int, t: int, fraction: real, c: Constants, s: Scratch):
-    """Adds the inner faces that are nearer to the core than a fraction of their displacement; how many there
-    are, and how many are new. Beyond capacity none is listed."""
+    """Lists the inner faces whose distance to the core is below `fraction` of their displacement. Returns how
+    many there are, and how many are new; the list may be shorter, it ends at its capacity."""
     nsample = c.sample.shape[0]
     new = int(0)
     inside = int(0)

@@ -21,11 +21,11 @@ def seen_by(env: BatchTask, observe: str, worlds: slice = slice(None)) -> torch.
 
 
 def find_policy(task: str, policy: pathlib.Path | str | None = None) -> pathlib.Path:
-    """The file of a policy: a path; None: the one of the task that comes with the package; a word: another
-    one of it that comes with it.
+    """Path of a policy of the task: None is the shipped one, a name another shipped one; anything else is a
+    path.
 
     Raises:
-      FileNotFoundError: none came with it.
+      FileNotFoundError: None, and the package ships no policy of this task.
     """
     name = task if policy is None else f"{task}-{policy}"
     assets = pathlib.Path(str(importlib.resources.files("biotac_mj.assets")))
