@@ -237,9 +237,9 @@ class TrajectoryLikelihood(Likelihood):
         return np.concatenate([values[i][r] - rest for i, r in zip(self.chosen, self._rows)])
 
     def poses(self, offsets: np.ndarray) -> np.ndarray:
-        """Changes of the residual (m, n, width), in the eigenvectors, by pose errors of one standard deviation,
-        three for each trajectory, about its offset in `offsets` (trajectories, 3) [m]. Their mean is left
-        out: an offset of all trajectories is a finding, not an error."""
+        """Changes of the residual (m, n, width), in the eigenvectors, by pose errors of one standard
+        deviation: three for each trajectory, about its offset in `offsets` (trajectories, 3) [m]. Their mean
+        is left out: an offset of all trajectories is a finding, not an error."""
         out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
         for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
             own = self._vectors[edges[k] : edges[k + 1]].T  # of all other rows the rest alone moves
