@@ -155,6 +155,17 @@ def test_values_far_beyond_an_electrodes_range_are_no_limit():
         assert {f.id for f in (*checked.faults, *checked.weak)} == {name}
 
 
+def test_an_electrode_with_a_limit_may_be_stuck_as_well():
+    """At an end of the converter for the last quarter, where nothing is measured any more."""
+    e, _, rng = pressed(3)
+    counts = noisy(e, rng)
+    counts[:, 6] = np.minimum(counts[:, 6], np.quantile(counts[:, 6], 0.8))
+    counts[-len(counts) // 4 :, 6] = 0
+    found = [f for f in stuck_or_clipped(Log(as_read(counts))) if f.channels == (6,)]
+    assert {f.id for f in found} == {"saturate", "stuck"} and all(f.mask[:, 6].any() for f in found)
+    assert next(f for f in found if f.id == "stuck").mask[-len(counts) // 4 :, 6].all()
+
+
 def test_codes_that_a_converter_prefers_are_no_limit():
     """Nor is the rest of a log that tells how far, and not which way."""
     rng = np.random.default_rng(0)

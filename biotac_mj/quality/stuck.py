@@ -131,12 +131,15 @@ def _constant_faults(log, k, still, sure):
             return []
     stays = still[on[0] : on[-1] + 1].mean() > _STAYS_PUT
     low, high = _at_ends(values, ends)
-    for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
+    left = np.ones(len(values), bool)
+    for side, mine in ((-1, low), (1, high), (0, left)):
         if side < 0 and not log.signed:  # its baseline
             continue
         if side and (mine.sum() < 2 or np.ptp(ends) < 20 * _ALIVE):
             continue
-        if not side and (found or length.max() < _BRIEF * log.rate):
+        if not side and found:  # beside limits, what no chance makes
+            mine = left & [sure[a : a + n].any() for a, n in zip(start, length)]
+        if not side and length[mine].max(initial=0) < _BRIEF * log.rate:
             continue
         one = _constant_fault(log, k, side, values[mine], start[mine], length[mine])
         if (one.mask[:, k] & sure).any():
@@ -144,6 +147,7 @@ def _constant_faults(log, k, still, sure):
         if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
             if any(at.all() for at in (low, high, *_at_ends(values, ever))):
                 one.ties = ("saturate",)  # a single stay at a limit
+        left = left & ~mine
         found.append(_with_ties(one, mine.sum(), stays))
     return found
 

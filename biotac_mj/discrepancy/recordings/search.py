@@ -209,7 +209,7 @@ def _checkup(session, protocol):
         found += [moved(f, rows, r) for f in diagnose_recording(still).findings if f.kind.drifts]
     sure = discoveries([f.p for f in (*session.findings, *found)])[len(session.findings) :]
     for finding, yes in zip(found, sure):
-        if not yes or finding.confidence < NAMED or finding.verified is False:
+        if not (yes and finding.possible) or finding.confidence < NAMED or finding.verified is False:
             session.weak.append(finding)
         elif not any(_explains(f, finding) for f in session.findings):
             session.accept(finding)  # the first stretch with it
