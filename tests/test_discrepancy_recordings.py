@@ -23,7 +23,6 @@ from biotac_mj.discrepancy.recordings.detectors.trends import Trend, sharp, tren
 from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.report.files import write_report
-from biotac_mj.discrepancy.report.plots import overview
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.effects.catalogue import entries
 from biotac_mj.effects.effect import shifted
@@ -734,13 +733,6 @@ def test_a_gripped_sensor_shows_its_temperature(most):
         d = diagnose_recording(PlainRecording(data["F0Electrodes"].T, None, data["F0tdc"].ravel(), 100.0))
         found += any("thermal" in {f.id, *f.ties} for f in d.findings)
     assert found > len(paths) / 2
-
-
-def test_each_electrode_of_the_overview_has_its_own_color():
-    counts = np.full((600, 19), 2000.0) + np.random.default_rng(0).normal(0, 3, (600, 19))
-    figure = overview(np.arange(600) / RATE, {"a": counts, "b": counts}, None, (4.0, 6.0))
-    for axes in figure.axes[:2]:
-        assert len({line.get_color() for line in axes.lines}) == 19
 
 
 @pytest.mark.parametrize(

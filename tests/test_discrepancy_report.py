@@ -15,7 +15,7 @@ from verdicts import check_verdict, schema
 from biotac_mj.discrepancy.report import plots
 from biotac_mj.discrepancy.report.files import page, write_report
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.discrepancy.report.verdict import SCHEMA, VERSION, Estimate, Finding, Gap, Picture, Verdict
+from biotac_mj.discrepancy.report.verdict import SCHEMA, VERSION, Estimate, Finding, Gap, Verdict
 from biotac_mj.effects.effect import Param
 
 HOSTILE = '<script>alert("1")</script>&amp;'
@@ -88,7 +88,7 @@ class Drawn(Verdict):
     figure: object
 
     def pictures(self):
-        return [Picture("channels", "gap", self.figure)]
+        return {"channels": self.figure}
 
 
 class Tags(html.parser.HTMLParser):
@@ -219,11 +219,10 @@ def test_a_parameter_at_its_bound_says_so():
 
 def test_curves_have_a_panel_for_each_channel():
     time = np.linspace(0, 1, 50)
-    panels = [plots.Panel(f"e{k}", "counts", time, time, time, None, (0.7, 1.0)) for k in range(5)]
-    figure = plots.curves(panels, columns=3)
-    drawn = [ax for ax in figure.axes if ax.lines]
-    assert [ax.get_title() for ax in drawn] == [one.title for one in panels]
-    assert [len(ax.lines) for ax in drawn] == [2] * 5
+    panels = [plots.Panel(f"e{k}", "counts", time, time, time, None, (0.7, 1.0)) for k in range(6)]
+    figure = plots.curves([panels[:3], panels[3:]])
+    assert [ax.get_title() for ax in figure.axes] == [one.title for one in panels]
+    assert [len(ax.lines) for ax in figure.axes] == [2] * 6
 
 
 def test_a_report_opens_with_the_channel_that_is_most_off():

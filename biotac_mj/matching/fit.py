@@ -33,7 +33,6 @@ class Setup:
       shear: [N] sigma of the plate's tangential force about the measured one; 0: not used.
       modulus: initial Young's modulus [Pa]. hold_modulus: it is fixed.
       spread: sigma of the states about the middle of the table, in half widths of its axes; weak.
-      memory: sigma of the fraction of the load with a delayed response, see `Rows.past`; 0: none.
       amount: sigma of the amount of each of the response's changes; 0: none.
     """
 
@@ -44,7 +43,6 @@ class Setup:
     modulus: float = 1.2e6
     hold_modulus: bool = False
     spread: float = 2.0
-    memory: float = 0.0
     amount: float = 0.0
 
 
@@ -55,22 +53,14 @@ class Rows:
     Attributes:
       counts: (n, nelectrode). force: (n, 3) of the plate on the skin, along the finger (towards the tip),
         across (to +z), pressing [N]. time: (n,) as a fraction of the recording.
-      past: (n,) load history as creeping rubber remembers it [N]; None: unknown.
     """
 
     counts: np.ndarray
     force: np.ndarray
     time: np.ndarray
-    past: np.ndarray | None = None
 
     def __getitem__(self, which) -> "Rows":
-        past = None if self.past is None else self.past[which]
-        return Rows(self.counts[which], self.force[which], self.time[which], past)
-
-    def pressing(self, memory: float) -> np.ndarray:
-        """(n,) effective load [N] on the skin with a delayed fraction."""
-        now = self.force[:, 2]
-        return now if self.past is None else now + memory * (self.past - now)
+        return Rows(self.counts[which], self.force[which], self.time[which])
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -102,19 +92,18 @@ def rows_of(counts: np.ndarray, force: np.ndarray | None, every: int = 10) -> Ro
 
 class _Places(typing.NamedTuple):
     """Positions of constants in their vector: offset and gain of the electrodes; drift, ln of the modulus,
-    memory, and amounts of the response's changes."""
+    and amounts of the response's changes."""
 
     offset: slice
     gain: slice
     drift: slice
     modulus: int
-    memory: int
     amount: int
 
     @classmethod
     def of(cls, n):
         ends = slice(n), slice(n, 2 * n), slice(2 * n, 2 * n + 2)
-        return cls(*ends, 2 * n + 2, 2 * n + 3, 2 * n + 4)
+        return cls(*ends, 2 * n + 2, 2 * n + 3)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,15 +112,14 @@ class Constants:
 
     Attributes:
       offset: (nelectrode,) ln Z at rest at the first row. gain: (nelectrode,) on its change. drift: size a,
-        ln tau (tau as a fraction of the recording). modulus: Young's modulus [Pa]. memory: fraction of the
-        load with a delayed response. amount: (k,) of each of the response's changes.
+        ln tau (tau as a fraction of the recording). modulus: Young's modulus [Pa]. amount: (k,) of each of
+        the response's changes.
     """
 
     offset: np.ndarray
     gain: np.ndarray
     drift: np.ndarray
     modulus: float
-    memory: float = 0.0
     amount: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
     def drifted(self, time: np.ndarray) -> np.ndarray:
@@ -144,8 +132,7 @@ class Constants:
 
     @property
     def _vector(self):
-        tail = [np.log(self.modulus), self.memory], self.amount
-        return np.concatenate([self.offset, self.gain, self.drift, *tail])
+        return np.concatenate([self.offset, self.gain, self.drift, [np.log(self.modulus)], self.amount])
 
     @property
     def _places(self):
@@ -154,10 +141,10 @@ class Constants:
     def _like(self, vector):
         """Constants from a vector of the same length."""
         at = self._places
-        drift, modulus, memory = vector[at.drift], vector[at.modulus], vector[at.memory]
+        drift, modulus = vector[at.drift], vector[at.modulus]
         drift = np.array([drift[0], np.clip(drift[1], -3.0, 1.0)])
-        gain, memory = np.clip(vector[at.gain], 0.1, 5.0), float(np.clip(memory, -0.5, 0.95))
-        return Constants(vector[at.offset], gain, drift, float(np.exp(modulus)), memory, vector[at.amount :])
+        gain = np.clip(vector[at.gain], 0.1, 5.0)
+        return Constants(vector[at.offset], gain, drift, float(np.exp(modulus)), vector[at.amount :])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -299,7 +286,7 @@ class _Problem:
         return self._loaded[1]
 
     def _at(self, const):
-        return self.response.at_load(self.rows.pressing(const.memory) / const.modulus, const.amount)
+        return self.response.at_load(self.rows.force[:, 2] / const.modulus, const.amount)
 
     def residuals(self, value, state, const):
         """(n, m): electrodes in counts, then shear and prior in the same unit; and counts (n, nelectrode)."""
@@ -404,7 +391,7 @@ class _Problem:
         return out
 
 
-_PROBE = 1e-2  # finite difference of ln E, memory and amounts
+_PROBE = 1e-2  # finite difference of ln E and amounts
 
 
 def _slope(counts):
@@ -437,11 +424,10 @@ def _prior(setup, const, design):
         at.append(np.array([0.0, weight * np.log(_TAU)]))
     if not setup.hold_modulus:
         free.append(np.array([place.modulus]))
-    for sigma, which in ((setup.memory, [place.memory]), (setup.amount, np.arange(place.amount, size))):
-        if sigma and len(which):
-            free.append(np.array(which))
-            P.append(np.eye(size)[which] * weight / sigma)
-            at.append(np.zeros(len(which)))
+    if setup.amount and size > place.amount:
+        free.append(np.arange(place.amount, size))
+        P.append(np.eye(size)[free[-1]] * weight / setup.amount)
+        at.append(np.zeros(len(free[-1])))
     return np.concatenate(free), np.concatenate(P), np.concatenate(at)
 
 

@@ -3,13 +3,10 @@ one further parameter show in which stage the residual lies, and several sensors
 base model's."""
 
 import dataclasses
-import itertools
 
 import numpy as np
-from scipy.stats import PermutationMethod, pearsonr
 from tqdm import tqdm
 
-from ...effects.effect import STAGES
 from ...effects.plate import PLATE, PlateEffect
 from ...effects.sensor_file import SensorFile
 from ...matching.fit import SIGNS, Rows
@@ -18,16 +15,16 @@ from ...quality.noise import noise_level
 from ...skin import Material
 from ...skin.rubber.material import PRESETS
 from ...skin.settings import plain
-from ..evidence import RATE, asked, by_chance, not_distinguished
+from ..evidence import RATE, asked, by_chance, max_t, not_distinguished
 from ..recordings.diagnosis import RecordingDiagnosis
 from ..recordings.recording import PlainRecording
-from ..report import plots
-from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, electrode_names
-from .models import BASE, Fit, Model, fitted, models, press_rows
-from .where import leading, missing, press_cells
+from ..report.plots import Panel, Table
+from ..report.verdict import Estimate, Finding, Gap, Verdict, electrode_names
+from .models import Fit, fitted, press_rows
 
-_TIMES = 4000  # permutations of the electrodes
 _LEAST = 5e-3  # [N] noise of a force
+_LEADS = 1.3  # times the median electrode's RMS: such electrodes lead
+_BLOCKS = 16  # units of time: rows of one press are one piece of evidence
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,59 +33,77 @@ class Sensor:
 
     Attributes:
       recording; rows: of the first 70 %, and the held-out ones; fit: of the base model; noise:
-        (nelectrode + 2,) [counts, N]; cells: see `press_cells`; worst: electrodes that lead, from 0; slope,
-        error: (nelectrode,) see `missing`.
+        (nelectrode + 2,) [counts, N].
     """
 
     recording: PlainRecording
     rows: tuple[Rows, Rows]
     fit: Fit
     noise: np.ndarray
-    cells: list[dict]
-    worst: list[int]
-    slope: np.ndarray
-    error: np.ndarray
 
     @classmethod
     def of(cls, recording: PlainRecording, response: Response) -> "Sensor":
         rows, force = press_rows(recording), (recording.force @ SIGNS)[:, :2]
         noise = noise_level(recording.electrodes, recording.repeated)
         noise = np.append(noise, noise_level(force, recording.repeated, _LEAST))
-        fit = fitted(Model(None, response, BASE), recording, rows, noise)
-        cells = press_cells(rows[0], fit, noise[:-2])
-        return cls(recording, rows, fit, noise, cells, leading(fit), *missing(fit))
+        return cls(recording, rows, fitted(response, recording, rows, noise), noise)
 
     @property
     def name(self) -> str:
         return self.recording.name
 
+    @property
+    def worst(self) -> list[int]:
+        """Electrodes that err most, by number from 0, the worst first."""
+        rms = np.sqrt((self.fit.error**2).mean(0))
+        order = np.argsort(-rms)
+        return [int(k) for k in order if rms[k] > _LEADS * np.median(rms)] or [int(order[0])]
+
+    @property
+    def off(self) -> list[dict]:
+        """Electrodes whose error is more than noise, the worst first: RMS [counts], what noise explains of it
+        (expected), and family-wise p that it is no more."""
+        square, noise = self.fit.error**2, self.noise[:-2]
+        t, p = max_t(np.array([part.mean(0) for part in np.array_split(square - noise**2, _BLOCKS)]))
+        rms = np.sqrt(square.mean(0))
+        return [
+            {
+                "sensor": self.name,
+                "channel": f"e{k + 1}",
+                "counts": float(rms[k]),
+                "expected": float(noise[k]),
+                "p": float(p[k]),
+            }
+            for k in np.argsort(-rms)
+            if t[k] > 0 and p[k] < RATE
+        ]
+
+    def gap(self, fit: Fit) -> Gap:
+        """Of the electrodes that lead, on held-out rows."""
+        channels = electrode_names(range(self.fit.error.shape[1]))
+        each = zip(*(fit.rms([i]) for i in range(len(channels))))
+        noise = float(np.sqrt((self.noise[self.worst] ** 2).mean()))
+        name = f"{', '.join(electrode_names(sorted(self.worst)))} of {self.name}"
+        return Gap("counts", *fit.rms(self.worst), noise, name, tuple(channels), *map(tuple, each))
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tried:
-    """A model that was tried on all sensors.
+    """An effect that was tried on all sensors.
 
     Attributes:
-      model. tested: Fit by sensor. significant: by sensor, 20 times likelier than none. whose: "base model",
+      effect. tested: Fit by sensor. significant: by sensor, 20 times likelier than none. whose: "base model",
         "sensor NAME", "nobody", or "unknown" where there is but one sensor.
     """
 
-    model: Model
+    effect: PlateEffect
     tested: tuple[Fit, ...]
     significant: tuple[bool, ...]
     whose: str
 
     @property
     def id(self) -> str:
-        return self.model.effect.id
-
-    @property
-    def name(self) -> str:
-        return self.model.effect.name
-
-    @property
-    def values(self) -> list[float]:
-        """Of the parameter, by sensor."""
-        return [self.model.value(t.amount) for t in self.tested]
+        return self.effect.id
 
     @property
     def evidence(self) -> float:
@@ -104,8 +119,8 @@ class Tried:
     def attached(self) -> list[dict] | None:
         """Arguments of `biotac_mj.attach` for a sensor with the effect, by sensor; None if no running sensor
         can have it."""
-        attach = self.model.effect.attach
-        return attach and [attach(value) for value in self.values]
+        attach = self.effect.attach
+        return attach and [attach(self.effect.value(t.amount)) for t in self.tested]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,14 +129,12 @@ class PlateDiagnosis(Verdict):
 
     Attributes:
       sensors; models: those with most evidence first; named: those that the evidence names, all of them tied
-        where it cannot part them; alike: correlation of the sensors' `slope` and its p, None with one sensor;
-        first: what was found in the first recording alone, see `joined`.
+        where it cannot part them; first: what was found in the first recording alone, see `joined`.
     """
 
     sensors: list[Sensor]
     models: list[Tried]
     named: list[Tried]
-    alike: tuple[float, float] | None
     first: RecordingDiagnosis | None = None
 
     @property
@@ -149,30 +162,22 @@ class PlateDiagnosis(Verdict):
             unknown=first.unknown or self.unknown,
             next_experiment=first.next_experiment,
             next_command=first.next_command,
-            details=first.details | self.details,
+            details=first.details,
             first=first,
             **lists,
         )
 
-    def pictures(self) -> list[Picture]:
+    def panels(self) -> list[list[Panel]]:
+        return self.first.panels() if self.first else []
+
+    def table(self) -> Table:
         """What each model takes away of the squared error of the worst electrodes, with dots for those that
-        are named; what each electrode's change lacks; and its error."""
-        names, models = [s.name for s in self.sensors], self.models
-        closed = [[100 * f.tested[i].closed(s.worst) for i, s in enumerate(self.sensors)] for f in models]
-        tried = [f.name for f in models]
-        dots = [(models.index(f), i) for f in self.named for i in range(len(names))]
-        lacks = np.array([100 * s.slope for s in self.sensors])
-        electrodes = electrode_names(range(lacks.shape[1]))
-        own = [
-            Picture("models", "tried", plots.matrix(closed, tried, names, dots, "gained [%]")),
-            Picture("lacking", "where", plots.matrix(lacks, names, electrodes, [], "lacks [%]")),
-            Picture(
-                "simulated",
-                "gap",
-                plots.channels([_gap(s, self.named, k) for k, s in enumerate(self.sensors)]),
-            ),
-        ]
-        return [*self.first.pictures(), *own] if self.first else own
+        are named."""
+        closed = [[100 * t.closed(s.worst) for s, t in zip(self.sensors, f.tested)] for f in self.models]
+        dots = [(self.models.index(f), i) for f in self.named for i in range(len(self.sensors))]
+        return Table(
+            closed, [f.effect.name for f in self.models], [s.name for s in self.sensors], dots, "gained [%]"
+        )
 
     def sensor(self) -> SensorFile | None:
         """The first recording's sensor (rest, noise, effects), with the rubber that its poses were fitted
@@ -205,27 +210,26 @@ def diagnose_presses(
     Raises:
       ValueError: a recording without force, or with too few loaded rows.
     """
-    some, sensors = list(models(response, effects)), []
+    sensors, tested = [], [[] for _ in effects]
     base = response.amended(np.zeros(len(response.changes)))
-    tested = [[] for _ in some]
-    total = len(recordings) * (1 + len(some))
+    total = len(recordings) * (1 + len(effects))
     with tqdm(total=total, desc="models", unit="model", disable=quiet or None) as bar:
         for recording in recordings:
-            sensors.append(Sensor.of(recording, base))
+            one = Sensor.of(recording, base)
+            sensors.append(one)
             bar.update()
-            for model, parts in zip(some, tested):
-                one = sensors[-1]
-                parts.append(fitted(model, recording, one.rows, one.noise, one.fit))
+            for k, parts in enumerate(tested):
+                parts.append(fitted(response.only(k), recording, one.rows, one.noise, one.fit))
                 bar.update()
-    tried = _tried(some, tested, sensors)
-    return _concluded(sensors, tried, _named(tried), _alike(sensors))
+    tried = _tried(effects, tested, sensors)
+    return _concluded(sensors, tried, _named(tried))
 
 
-def _tried(some, tested, sensors):
-    """Tried of models with what was tested on each sensor, those with most evidence first."""
+def _tried(effects, tested, sensors):
+    """Tried of effects with what was tested on each sensor, those with most evidence first."""
     out = []
-    for model, parts in zip(some, tested):
-        significant = tuple(t.nats > asked(len(some)) for t in parts)
+    for effect, parts in zip(effects, tested):
+        significant = tuple(t.nats > asked(len(effects)) for t in parts)
         # an amount to one side on one sensor and to the other on the other is not the base model's
         side = {np.sign(t.amount) for t in parts}
         if not any(significant):
@@ -236,12 +240,12 @@ def _tried(some, tested, sensors):
             whose = "base model"
         else:
             whose = "sensor " + ", ".join(s.name for s, yes in zip(sensors, significant) if yes)
-        out.append(Tried(model, tuple(parts), significant, whose))
+        out.append(Tried(effect, tuple(parts), significant, whose))
     return sorted(out, key=lambda f: -f.evidence)
 
 
 def _named(tried):
-    """The model with most evidence in every sensor, and those that no sensor distinguishes from it."""
+    """The effect with most evidence in every sensor, and those that no sensor distinguishes from it."""
     good = [f for f in tried if f.whose in ("base model", "unknown")]
 
     def tied(other):
@@ -251,144 +255,97 @@ def _named(tried):
     return [f for f in good if f is good[0] or tied(f)]
 
 
-def _alike(sensors):
-    """Lowest correlation of two sensors' slopes, and its p under permutations of the electrodes."""
-    if len(sensors) < 2:
-        return None
-    by = PermutationMethod(n_resamples=_TIMES, rng=np.random.default_rng(0))
-    pairs = (
-        pearsonr(a.slope, b.slope, alternative="greater", method=by)
-        for a, b in itertools.combinations(sensors, 2)
-    )
-    return min((float(pair.statistic), float(pair.pvalue)) for pair in pairs)
-
-
-def _listed(electrodes):
-    return ", ".join(electrode_names(sorted(electrodes)))
-
-
-def _concluded(sensors, tried, named, alike):
-    red = [(s, c) for s in sensors for c in s.cells if c["red"]]
+def _concluded(sensors, tried, named):
+    off = [one for s in sensors for one in s.off]
     out = PlateDiagnosis(
         kind="flat presses, simulated",
         name=", ".join(s.name for s in sensors),
         data=f"{', '.join(str(len(s.rows[0])) for s in sensors)} loaded rows, each with a fitted pose",
-        verdict=_in_words(sensors, named, alike) if red else "no significant disagreement",
-        significant=bool(red),
+        verdict=_in_words(sensors, named) if off else "no significant disagreement",
+        significant=bool(off),
         effects=[_finding(f, named, tried, sensors) for f in named],
         gap={
-            f"worst electrodes of {s.name} in simulated presses": _gap(s, named, k)
+            f"worst electrodes of {s.name} in simulated presses": s.gap(
+                named[0].tested[k] if named else s.fit
+            )
             for k, s in enumerate(sensors)
         },
         aside="rows that took no part in any fit",
-        where=[{"sensor": s.name} | {k: v for k, v in c.items() if k != "red"} for s, c in red],
-        where_note="electrodes and conditions of simulated presses that are off; RMS [counts], and expected",
-        remainder="" if named or not red else "no effect that was tried takes the gap away",
-        unknown=bool(red) and not named,
+        where=off,
+        where_note="electrodes of simulated presses that are off; RMS [counts], and expected",
+        remainder="" if named or not off else "no effect that was tried takes the gap away",
+        unknown=bool(off) and not named,
         tried=[_row(f, s, t) for f in tried for s, t in zip(sensors, f.tested)],
         tried_note=(
             "evidence of each over the base model, all states marginalised; RMS [counts] without -> with it "
             "on rows that took no part in any fit; its value, 95 %"
         ),
-        details={
-            "simulated": {
-                "where": {s.name: _where(s) for s in sensors},
-                "alike": alike and {"correlation": alike[0], "p": alike[1]},
-            }
-        },
         sensors=sensors,
         models=tried,
         named=named,
-        alike=alike,
     )
-    lines = [f"sensor_amended.yaml has, as {sensors[0].name} has it: {out.acting.name}"] if out.acting else []
+    lines = (
+        [f"sensor_amended.yaml has, as {sensors[0].name} has it: {out.acting.effect.name}"]
+        if out.acting
+        else []
+    )
     lines += [
-        f"{f.name} as {s.name} has it: attach(spec, **{given})"
+        f"{f.effect.name} as {s.name} has it: attach(spec, **{given})"
         for f in named
         for s, given in zip(sensors, f.attached or ())
     ]
     return dataclasses.replace(out, amended=lines)
 
 
-def _in_words(sensors, named, alike):
-    where = "; ".join(f"{s.name} at {_listed(s.worst)}" for s in sensors)
+def _in_words(sensors, named):
+    where = "; ".join(f"{s.name} at {', '.join(electrode_names(sorted(s.worst)))}" for s in sensors)
     if len(named) == 1:
-        what = f"{named[0].name} (of the {named[0].whose})"
+        what = f"{named[0].effect.name} (of the {named[0].whose})"
     elif named:
-        what = "a tie of " + ", ".join(f.name for f in named)
+        what = "a tie of " + ", ".join(f.effect.name for f in named)
     else:
         what = "unknown: no mechanism tried takes it away" + (" from every sensor" * (len(sensors) > 1))
-    shared = ""
-    if alike:
-        r, p = alike
-        whose = "of the base model" if p < RATE else "not shown to be of the base model"
-        shared = f"; what the electrodes lack correlates {r:.2f} between sensors (p {p:.2g}): {whose}"
-    return f"the simulation errs most in {where}: {what}{shared}"
-
-
-def _gap(sensor, named, k):
-    """Gap of the electrodes of sensor k that lead."""
-    fit, worst = named[0].tested[k] if named else sensor.fit, sensor.worst
-    noise = float(np.sqrt((sensor.noise[worst] ** 2).mean()))
-    channels = electrode_names(range(len(sensor.slope)))
-    each = zip(*(fit.rms([i]) for i in range(len(channels))))
-    name = f"{_listed(worst)} of {sensor.name}"
-    return Gap("counts", *fit.rms(worst), noise, name, tuple(channels), *map(tuple, each))
+    return f"the simulation errs most in {where}: {what}"
 
 
 def _finding(f, named, tried, sensors):
-    effect, locked = f.model.effect, np.square([t.rms(s.worst) for s, t in zip(sensors, f.tested)])
+    locked = np.square([t.rms(s.worst) for s, t in zip(sensors, f.tested)])
     before, after = np.sqrt(locked.mean(0)).tolist()
+    name = f.effect.parameter
     parameters = {
-        effect.parameter + (f" of {s.name}" if len(sensors) > 1 else ""): Estimate(
-            *_interval(f.model, t), effect.unit
-        )
+        name + (f" of {s.name}" if len(sensors) > 1 else ""): Estimate(*_interval(f, t), f.effect.unit)
         for s, t in zip(sensors, f.tested)
     }
     return Finding.of(
-        effect,
+        f.effect,
         channels=tuple(sorted({k for s in sensors for k in s.worst})),
         parameters=parameters,
         evidence=f.evidence,
         p=by_chance(f.evidence, len(tried)),
         confirmed=bool((locked[:, 1] < locked[:, 0]).all()),
-        ties={one.id: one.name for one in named if one is not f},
+        ties={one.id: one.effect.name for one in named if one is not f},
         gap=Gap("counts", before, after, name="worst electrodes, RMS on held-out rows"),
         note=f"of the {f.whose}" if f.whose == "base model" else "",
     )
 
 
-def _interval(model, t):
-    """Value of a model's parameter by a Fit, and its interval of 95 %."""
-    return model.value(t.amount), *sorted(map(model.value, (t.low, t.high)))
+def _interval(f, t):
+    """Value of an effect's parameter by a Fit, and its interval of 95 %."""
+    value = f.effect.value
+    return value(t.amount), *sorted(map(value, (t.low, t.high)))
 
 
 def _row(f, sensor, t):
-    """A line of the table of what was tried: a model on one sensor."""
-    effect, attach = f.model.effect, f.model.effect.attach
+    """A line of the table of what was tried: an effect on one sensor."""
+    attach = f.effect.attach
     return {
         "id": f.id,
-        "name": f.name,
-        "stage": STAGES[effect.stage],
+        "name": f.effect.name,
         "sensor": sensor.name,
-        "parameter": effect.parameter,
-        "unit": effect.unit,
-        "value": "{:.3g} ({:.3g} .. {:.3g})".format(*_interval(f.model, t)),
+        "unit": f.effect.unit,
+        "value": "{:.3g} ({:.3g} .. {:.3g})".format(*_interval(f, t)),
         "worst_electrodes": "{:.0f} -> {:.0f}".format(*t.rms(sensor.worst)),
-        "all_electrodes": "{:.0f} -> {:.0f}".format(*t.rms()),
         "nats": t.nats,
         "whose": f.whose,
-        "closed": t.closed(sensor.worst),
-        "attach": attach and attach(f.model.value(t.amount)),
-    }
-
-
-def _where(s):
-    """Location of the disagreement of one sensor, as numbers."""
-    return {
-        "worst": electrode_names(s.worst),
-        "rms": float(np.sqrt((s.fit.error**2).mean())),
-        "missing": dict(zip(electrode_names(range(len(s.slope))), s.slope.tolist())),
-        "missing_error": s.error.tolist(),
-        "cells": s.cells,
+        "attach": attach and attach(f.effect.value(t.amount)),
     }

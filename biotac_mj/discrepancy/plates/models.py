@@ -3,12 +3,9 @@ model is judged by the one likelihood, the state of every row marginalised."""
 
 import dataclasses
 import types
-from collections.abc import Callable, Iterator
 
 import numpy as np
-from scipy.signal import lfilter
 
-from ...effects.plate import PlateEffect
 from ...matching.fit import Constants, Rows, Setup, fit_constants, fit_states, rows_of, tangent
 from ...matching.response import Response
 from ...matching.states import frame
@@ -17,16 +14,15 @@ from ..recordings.recording import PlainRecording
 from ..trajectories.likelihood import Likelihood, courses, kernel
 from ..trajectories.settings import SETTINGS
 
-BASE = Setup(gains=0.0)
+_SETUP = Setup(gains=0.0, amount=1.0)  # of the changes that a response has
 _DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chosen; the rest is held out
 _ROWS = 300  # loaded rows that are looked at: time to fit goes with them
 _JUDGED = 100  # rows of the evidence, whose four columns each it marginalises
-_MEMORY = 0.5, 5.0  # [s] of a grip's relaxation, as measured on holds (docs/lab/memory.md)
 _ROUNDS = 3  # of amplitudes and errors of laws in turn
 
 
 def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
-    """Loaded rows of a recording with what pressed before: of the first 70 %, and the held-out ones.
+    """Loaded rows of a recording: of the first 70 %, and the held-out ones.
 
     Raises:
       ValueError: no force, or too few loaded rows.
@@ -38,56 +34,19 @@ def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Model:
-    """The base model with one effect.
-
-    Attributes:
-      effect: in words, and what attaches it; None: the base model. response, setup: of the fit. value: of
-        its parameter by the last of the constants. tau: of the load's memory [s], or None.
-    """
-
-    effect: PlateEffect | None
-    response: Response
-    setup: Setup
-    value: Callable[[float], float] = float
-    tau: float | None = None
-
-    def of(self, recording: PlainRecording, rows: Rows) -> Rows:
-        """Rows with the pressing force as the model's memory has it."""
-        if self.tau is None:
-            return rows
-        pressing, keep = -recording.force[:, 2], np.exp(-1 / (recording.rate * self.tau))
-        past = lfilter([1 - keep], [1, -keep], pressing, zi=keep * pressing[:1])[0]
-        return dataclasses.replace(rows, past=past[np.rint(rows.time * len(pressing)).astype(int)])
-
-
-def models(response: Response, effects: tuple[PlateEffect, ...]) -> Iterator[Model]:
-    """All that are tried; response: the base model's, with a change for each of `effects`, in their order."""
-    plain = response.amended(np.zeros(len(response.changes)))
-    for tau in _MEMORY:
-        one = PlateEffect(f"memory_{tau:g}s", f"relaxation within {tau:g} s", "C", "", "fraction of the load")
-        setup = dataclasses.replace(BASE, memory=0.3)
-        yield Model(one, plain, setup, tau=tau)
-    for k, one in enumerate(effects):
-        setup = dataclasses.replace(BASE, amount=1.0)
-        yield Model(one, response.only(k), setup, one.value)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """A model with the constants and states that fit n rows best.
 
     Attributes:
-      constants. state: (n, 4). error, change: (n, nelectrode) modelled less measured, and modelled change
-        from rest [counts]. unseen: (m, nelectrode) error on held-out rows.
-      score: log evidence of the rows for the model [nats]. amount, low, high: of its last constant, with
+      constants. error: (n, nelectrode) modelled less measured [counts]; unseen: (m, nelectrode) of held-out
+        rows. score: log evidence of the rows for the model [nats]. amount, low, high: of its effect, with
         95 %; law_error: of what this one does, as a fraction. base: Fit of the base model; None: it is.
+      state: (n, 4).
     """
 
     constants: Constants
     state: np.ndarray
     error: np.ndarray
-    change: np.ndarray
     unseen: np.ndarray
     score: float
     amount: float
@@ -113,7 +72,7 @@ class Fit:
 
 
 def fitted(
-    model: Model,
+    response: Response,
     recording: PlainRecording,
     rows: tuple[Rows, Rows],
     noise: np.ndarray,
@@ -123,15 +82,16 @@ def fitted(
     all constants and the state of every row marginalised about the fit.
 
     Args:
-      rows: that are fitted, and held-out ones. noise: (nelectrode + 2,) of the electrodes [counts] and of the
-        tangential force [N]. base: from which the search goes on, of a model with an effect.
+      response: the base model's, or with the change of one effect. rows: that are fitted, and held-out ones.
+        noise: (nelectrode + 2,) of the electrodes [counts] and of the tangential force [N]. base: from which
+        the search goes on, of a model with an effect.
     """
-    response, setup, (rows, locked) = model.response, model.setup, (model.of(recording, r) for r in rows)
-    const, match = fit_constants(response, rows, setup, base and (base.constants, base.state))
+    rows, locked = rows
+    const, match = fit_constants(response, rows, _SETUP, base and (base.constants, base.state))
     rest = counts_from_log_impedance(const.offset + const.drifted(rows.time)[:, None])
     change = match.counts - rest
     some = slice(None, None, -(-len(rows) // _JUDGED))
-    residual, columns, away, scale = tangent(response, rows[some], const, match.state[some], setup)
+    residual, columns, away, scale = tangent(response, rows[some], const, match.state[some], _SETUP)
     largest = np.abs(np.hstack([change, match.force])).max(0)
     contact = _contact(response, rows, match, const.modulus, len(recording) / recording.rate)
     every = [np.arange(len(rows))[some]]
@@ -153,8 +113,7 @@ def fitted(
         const,
         match.state,
         match.counts - rows.counts,
-        change,
-        fit_states(response, locked, const, setup).counts - locked.counts,
+        fit_states(response, locked, const, _SETUP).counts - locked.counts,
         log + own.prior(amplitude, known),
         amount,
         amount - half,

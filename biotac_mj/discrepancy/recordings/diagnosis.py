@@ -2,11 +2,15 @@
 
 import dataclasses
 
+import numpy as np
+
 from ...effects.catalogue import name_of
 from ...effects.sensor_file import SensorFile
 from ...recordings.protocol import Protocol
 from ...recordings.recording import REST_LIKE
-from ..report.verdict import Estimate, Finding, Picture, Verdict, experiments
+from ...sensor.channels import counts_from_log_impedance
+from ..report.plots import Panel
+from ..report.verdict import Estimate, Finding, Verdict, experiments
 from .amended import amended_sensor, running
 from .blind import not_identifiable, searched
 from .candidates import Candidate
@@ -15,6 +19,7 @@ from .recording import PlainRecording
 from .rest import Rest, rest
 from .session import Session
 
+_PANELS = 4  # channels, of the report's first figure
 _CHECKUP = "three minutes of touches that isolate one effect each tell what a plain log mixes"
 
 
@@ -32,6 +37,8 @@ class RecordingDiagnosis(Verdict):
     late: list[Candidate]
     rest: Rest
 
+    predicted = "simulated: rest and load, as the others say it"
+
     @property
     def recording(self) -> PlainRecording:
         """With upper bits put back where counts overflowed."""
@@ -47,10 +54,32 @@ class RecordingDiagnosis(Verdict):
         """Findings that held-out rows contradict or that are too weak to be named."""
         return self.session.weak
 
-    def pictures(self) -> list[Picture]:
-        from .pictures import pictures_of
-
-        return pictures_of(self)
+    def panels(self) -> list[list[Panel]]:
+        """Some channels that the effects change most on the held-out part, or those with the largest
+        residual; beside each baseline and load as the other electrodes predict them."""
+        s, r, m = self.session, self.recording, self.session.model()
+        said = counts_from_log_impedance(m.value - (m.residual() if m.dimensions else m.value) + m.mean)
+        effect = r.electrodes - s.filled()
+        change = np.sqrt((effect[~s.fit] ** 2).mean(0))
+        some = [int(k) for k in np.argsort(-change)[:_PANELS] if change[k] > 0.2 * change.max()]
+        if not self.findings:
+            some = [int(c["channel"][1:]) - 1 for c in self.rest.cells][:2]
+        measured, effect = (
+            x[: len(m.time) * m.width].reshape(len(m.time), m.width, -1).mean(1)
+            for x in (r.electrodes, effect)
+        )
+        aside, out = (r.time[~s.fit][0], r.time[-1]), []
+        for k in some or [0]:
+            simulated = said[:, np.flatnonzero(m.used == k)[0]] if k in m.used else None
+            amended = None if simulated is None else simulated + effect[:, k]
+            names = dict.fromkeys(
+                f.kind.name
+                for f in self.findings
+                if k in f.channels and (f.correct is not None or f.mask is not None)
+            )
+            title = f"e{k + 1}" + (": " + "; ".join(names) if names else "")
+            out.append([Panel(title, "counts", m.time, measured[:, k], simulated, amended, aside)])
+        return out
 
     def sensor(self) -> SensorFile:
         return amended_sensor(self.session)

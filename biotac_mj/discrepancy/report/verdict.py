@@ -3,10 +3,7 @@
 Diagnoses of recordings, of trajectories and of presses of a flat plate are each a `Verdict` with additions of
 their kind of data. Text (`text.py`), page and files (`files.py`) are made from any of them."""
 
-import base64
 import dataclasses
-import functools
-import io
 import json
 import math
 import re
@@ -16,6 +13,7 @@ import numpy as np
 
 from ...effects.catalogue import entries, name_of
 from ...effects.effect import STAGES
+from . import plots
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Entry, Param
@@ -223,30 +221,6 @@ class Finding:
         }
 
 
-@dataclasses.dataclass(frozen=True)
-class Picture:
-    """A figure of a report.
-
-    Attributes:
-      name: of its file, without suffix. section: "curves", "gap", "where", "tried" or "unknown". figure: of
-        matplotlib.
-    """
-
-    name: str
-    section: str
-    figure: object
-
-    @functools.cached_property
-    def png(self) -> bytes:
-        store = io.BytesIO()
-        self.figure.savefig(store, dpi=110, format="png")
-        return store.getvalue()
-
-    @property
-    def data(self) -> str:
-        return base64.b64encode(self.png).decode()
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
     """Result of a diagnosis.
@@ -291,9 +265,23 @@ class Verdict:
     amended: list[str] = dataclasses.field(default_factory=list)
     details: dict = dataclasses.field(default_factory=dict)
 
-    def pictures(self) -> list[Picture]:
-        """Figures of the report."""
+    predicted: typing.ClassVar[str] = "simulated"  # what is drawn beside the measurement
+
+    def panels(self) -> list[list[plots.Panel]]:
+        """Rows of channels that are drawn over time."""
         return []
+
+    def table(self) -> plots.Table | None:
+        """Where the model is off, or what each cause takes away."""
+        return None
+
+    def pictures(self) -> dict[str, object]:
+        """Name of each figure of the report -> figure of matplotlib."""
+        panels, table = self.panels(), self.table()
+        gaps = [gap for gap in self.gap.values() if gap.channels]
+        out = {"curves": plots.curves(panels, self.predicted)} if panels else {}
+        out |= {"channels": plots.channels(gaps)} if gaps else {}
+        return out | ({} if table is None else {"where": plots.matrix(table)})
 
     def sensor(self) -> "SensorFile | None":
         """The sensor with what was found, None where there is none to write."""

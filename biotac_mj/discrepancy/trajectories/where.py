@@ -4,7 +4,7 @@ import typing
 
 import numpy as np
 
-from ..where import Cells
+from ..evidence import max_t
 from .settings import SETTINGS
 
 if typing.TYPE_CHECKING:
@@ -76,12 +76,24 @@ def channel_groups(comparison: "Comparison") -> dict:
 
 def residual_cells(
     comparison: "Comparison", null: "Fit", chosen: np.ndarray, channels: dict[str, slice]
-) -> Cells:
-    """Cells of the chosen trajectories' residuals, divided by noise and resolution; channels: name ->
-    columns."""
-    white = null.posed(comparison)
-    asked = conditions([comparison.trajectories[i] for i in chosen])
-    return Cells.of([white[i] for i in chosen], asked, channels)
+) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Residuals of the chosen trajectories, divided by noise and resolution: names of conditions, number of
+    rows (trajectories, conditions), and means over these (trajectories, conditions, channels), nan where
+    there are none; channels: name -> columns."""
+    white, asked = null.posed(comparison), conditions([comparison.trajectories[i] for i in chosen])
+    rows = np.array([[part.sum() for part, _ in parts] for parts in asked.values()]).T
+    mean = np.full((*rows.shape, len(channels)), np.nan)
+    for c, parts in enumerate(asked.values()):
+        for u, (i, (some, weight)) in enumerate(zip(chosen, parts)):
+            if some.any():
+                mean[u, c] = [weight * white[i][some, part].mean() for part in channels.values()]
+    return list(asked), rows, mean
+
+
+def overall(mean: np.ndarray) -> np.ndarray:
+    """(conditions, channels) mean (trajectories, conditions, channels) over those that have it, else nan."""
+    known = np.isfinite(mean).sum(0)
+    return np.where(known, np.nansum(mean, axis=0) / np.maximum(known, 1), np.nan)
 
 
 def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dict]:
@@ -89,18 +101,17 @@ def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dic
 
     All trajectories share the error of the rest levels, which sign flips do not cover: a mean has to be three
     times that, a trend 0.3 sigma."""
-    cells = residual_cells(comparison, null, chosen, channel_groups(comparison))
-    t, p = cells.tested(cells.mean * np.sqrt(cells.rows)[:, :, None], _FEWEST)
-    trend = np.array([name in TRENDS for name in cells.conditions])
-    least = np.where(trend, 0.3, 3 / np.sqrt(len(chosen)))
+    groups = channel_groups(comparison)
+    names, rows, mean = residual_cells(comparison, null, chosen, groups)
+    statistic, channels = mean * np.sqrt(rows)[:, :, None], list(groups)
+    known = np.isfinite(statistic).sum(0) >= _FEWEST
+    t, p = np.full((2, *known.shape), np.nan)
+    if known.any():
+        t[known], p[known] = max_t(statistic[:, known])
+    least = np.where(np.isin(names, TRENDS), 0.3, 3 / np.sqrt(len(chosen)))
     out = [
-        {
-            "channel": cells.channels[k],
-            "condition": cells.conditions[c],
-            "t": float(t[c, k]),
-            "p": float(p[c, k]),
-        }
-        for c, k in np.argwhere((p < SETTINGS.rate) & (np.abs(cells.overall) > least[:, None]))
+        {"channel": channels[k], "condition": names[c], "t": float(t[c, k]), "p": float(p[c, k])}
+        for c, k in np.argwhere((p < SETTINGS.rate) & (np.abs(overall(mean)) > least[:, None]))
     ]
     return sorted(out, key=lambda c: -abs(c["t"]))
 

@@ -11,7 +11,8 @@ import tqdm
 from ...effects.catalogue import CATALOGUE
 from ...effects.sensor_file import SensorFile
 from ...geometry.design import check_nelectrode
-from ..report.verdict import Estimate, Finding, Gap, Picture, Verdict, of_electrodes
+from ..report.plots import Panel, Table
+from ..report.verdict import Estimate, Finding, Gap, Verdict, of_electrodes
 from .base.exchanges import exchanged
 from .base.findings import other_modulus
 from .base.rests import rested
@@ -24,7 +25,7 @@ from .remarks import few_off, next_experiment, of_base, of_data, of_search, stra
 from .search import found
 from .settings import SETTINGS
 from .trajectory import FEWEST, measurement_noise
-from .where import left_over, where
+from .where import left_over, overall, residual_cells, where
 from .whitening import REPEATABILITY, Comparison
 
 if typing.TYPE_CHECKING:
@@ -32,6 +33,7 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
 _GROUPS = {"electrodes": "the electrodes", "pdc": "the liquid's pressure (PDC)", "force": "the force"}
+_PANELS = 4  # trajectories, of the report's first figure
 _SURE = 1 - SETTINGS.rate  # the most that is stated: so many of all names are false
 
 
@@ -57,10 +59,31 @@ class TrajectoryDiagnosis(Verdict):
     beliefs: Beliefs
     trace: dict
 
-    def pictures(self) -> list[Picture]:
-        from .pictures import pictures_of
+    def panels(self) -> list[list[Panel]]:
+        """The two channels with the largest error, in some of the held-out trajectories."""
+        c, rows = self.comparison, []
+        for channel in np.argsort(-np.array(self.proof.before["channels"]) / c.sigma)[:2]:
+            name, row = c.channels[channel], []
+            for k, i in enumerate(self.locked[:_PANELS]):
+                t, measured = c.trajectories[i], c.measured[i][:, channel]
+                each = (measured - part[k][:, channel] for part in self.proof.residuals)
+                unit = "N" if name.startswith("F") else "counts"
+                row.append(Panel(f"{name}, {t.id}", unit, t.time, measured, *each))
+            rows.append(row)
+        return rows
 
-        return pictures_of(self)
+    def table(self) -> Table:
+        """Mean residual of the model without effects, in noise and resolution, or its trend over
+        trajectories."""
+        c = self.comparison
+        columns = {name: slice(k, k + 1) for k, name in enumerate(c.channels)}
+        asked, _, mean = residual_cells(c, self.null, self.selection, columns)
+        column = {"force": "Fy"}
+        dots = [
+            (asked.index(one["condition"]), c.channels.index(column.get(one["channel"], one["channel"])))
+            for one in self.where
+        ]
+        return Table(overall(mean), asked, c.channels, dots, "mean residual, or trend [sigma]")
 
     def sensor(self) -> SensorFile:
         return self.apply(self.given).file
