@@ -170,8 +170,8 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
     assert "held-out data contradict it" in doubtful.headline and "added" not in doubtful.headline
     assert "no known cause" in dataclasses.replace(VERDICT, effects=[]).headline
     there = dataclasses.replace(VERDICT, lead="force").headline
-    assert there.startswith("With warm-up (or temperature) added, 10 become 4 counts RMS in the electrodes")
-    assert there.endswith("; the largest gap is in the force, 0.3 N RMS, and stays.")
+    assert there.startswith("The largest gap is in the force, 0.3 N RMS; warm-up (or temperature) takes ")
+    assert there.endswith("takes the electrodes from 10 to 4 counts instead.")
     agree = dataclasses.replace(VERDICT, effects=[], significant=False)
     assert "agree within" not in agree.headline and "may be off by" in agree.headline
     small = {"electrodes": Gap("counts", 2.03, 2.03, 2.0, "the electrodes")}
@@ -184,10 +184,8 @@ def test_a_headline_says_where_nothing_is_gained():
     said = dataclasses.replace(VERDICT, gap={"electrodes": same}).headline
     assert said.endswith("; warm-up (or temperature) gains nothing there.") and "added" not in said
     said = dataclasses.replace(VERDICT, gap={"electrodes": same, "force": force}).headline
-    assert said.startswith("With warm-up (or temperature) added, 0.3 become 0.2 N RMS in the force, where")
-    assert said.endswith(
-        "is in the electrodes, 2.03 counts RMS where 1 counts are noise and resolution, and stays."
-    )
+    assert said.startswith("The largest gap is in the electrodes, 2.03 counts RMS where 1 counts are noise")
+    assert said.endswith("; warm-up (or temperature) takes the force from 0.3 to 0.2 N instead.")
 
 
 def test_the_summary_has_effect_proof_gap_and_what_is_unknown():

@@ -302,8 +302,7 @@ class Verdict:
 
     @property
     def headline(self) -> str:
-        """The verdict in one line: the largest gap, what closes it, by how much; what was gained elsewhere
-        comes first where nothing is gained there."""
+        """The verdict in one line: the largest gap, and what closes it, by how much, or another one."""
         gap = self.leading
         size = f"{gap.before:.3g} {gap.unit} RMS"
         size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""
@@ -313,29 +312,25 @@ class Verdict:
                 begin = "No difference is larger than the comparison itself may be off by"
             return f"{begin}; the largest difference is in {gap.name}, {size}."
         text = f"The largest gap is in {gap.name}, {size}"
+        added, told = {}, set()
+        for f in self.effects:  # one of several that tie speaks for all
+            if f.id not in told and f.confirmed is not False:
+                added[f.title], told = None, told | f.ties.keys()
+        what = " and ".join(added) or " and ".join(f.title for f in self.effects)
         if not self.effects:
             return f"{text}; no known cause is sure enough for a name."
-        added = [f for f in self.effects if f.confirmed is not False]
         if not added:
-            what = " and ".join(f.title for f in self.effects)
             return f"{text}; {what} would explain what was fitted, and held-out data contradict it."
-        names, told = {}, set()
-        for f in added:  # one of several that tie speaks for all
-            if f.id not in told:
-                names[f.title] = None
-                told |= f.ties.keys()
-        rest = "; for the rest no cause is known" if self.unknown else ""
-        what = " and ".join(names)
-        if gap.gained:
-            return f"{text}; with {what} added it is {gap.after:.3g} {gap.unit}{rest}."
         other = max(self.gap.values(), key=lambda one: one.taken / max(one.before, 1e-12))
-        if not other.gained:
-            return f"{text}; {what} gains nothing there{rest}."
-        taken = f"{other.before:.3g} become {other.after:.3g} {other.unit} RMS in {other.name}, where"
-        return (
-            f"With {what} added, {taken} {other.floor} {other.unit} are noise and resolution; "
-            f"{text[0].lower()}{text[1:]}, and stays{rest}."
-        )
+        if gap.gained:
+            said = f"with {what} added it is {gap.after:.3g} {gap.unit}"
+        elif other.gained:
+            said = (
+                f"{what} takes {other.name} from {other.before:.3g} to {other.after:.3g} {other.unit} instead"
+            )
+        else:
+            said = f"{what} gains nothing there"
+        return f"{text}; {said}{'; for the rest no cause is known' if self.unknown else ''}."
 
     def to_dict(self) -> dict:
         """Content of verdict.json: numbers, strings, lists and dicts only, no NaN."""

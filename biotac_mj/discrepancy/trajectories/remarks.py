@@ -72,53 +72,42 @@ def _size(comparison, i, residual) -> str:
 
 def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[str]:
     """Remarks on the base model and the poses by the fitted nuisance parameters; they name no effect."""
-    nuisance, notes = fit.nuisance, []
-    if abs(nuisance.log_modulus) > 0.2:
-        notes.append(
-            f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data"
-        )
+    nuisance, sim = fit.nuisance, comparison.sim
     poses = comparison.poses(fit.effects, nuisance)[chosen]
     mean, error = poses.mean(0), poses.std(0, ddof=1) / np.sqrt(len(chosen))
-    if (np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))).any():
-        notes.append(
-            f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
-            "effect found takes up: check the set-up, or the base model"
-        )
-    if abs(nuisance.log_film) > 0.2:
-        notes.append(
-            f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data"
-        )
-    if abs(nuisance.footprint) > 0.05:
-        notes.append(
-            f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
-            "calibrate before looking for small effects"
-        )
-    if nuisance.mesh > 0.5:
-        notes.append(
-            f"the data lie nearer to the mesh {OTHER_MESH[comparison.sim.skin]!r} than to "
-            f"{comparison.sim.skin!r}: use that one"
-        )
-    return notes
+    far = np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))
+    said = {
+        f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data": (
+            abs(nuisance.log_modulus) > 0.2
+        ),
+        f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
+        "effect found takes up: check the set-up, or the base model": far.any(),
+        f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data": (
+            abs(nuisance.log_film) > 0.2
+        ),
+        f"the base model's contact footprint is {nuisance.footprint:+.0%} off: calibrate before looking for "
+        "small effects": abs(nuisance.footprint) > 0.05,
+        f"the data lie nearer to the mesh {OTHER_MESH.get(sim.skin)!r} than to {sim.skin!r}: use that one": (
+            nuisance.mesh > 0.5
+        ),
+    }
+    return [text for text, so in said.items() if so]
 
 
 def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
     """Remarks on effects that trajectories like these cannot show."""
-    notes = []
-    if len(data) < 12:
-        notes.append(f"{len(data)} trajectories: small effects stay unseen")
-    unloading = any(phases(t)["unload"].any() for t in data)
-    if not unloading:
-        notes.append("no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known")
-    if not any(phases(t)["free"].sum() > 1 for t in data):
-        notes.append(
-            "no free segment: drift and warm-up cannot be told from load; "
-            "begin each trajectory before the touch"
-        )
-    if not any(phases(t)["hold"].sum() > 3 for t in data):
-        notes.append("no holds: relaxation cannot be told from hysteresis")
-    if not comparison.has_force:
-        notes.append("no force: the rubber's modulus shows in the liquid's pressure alone")
-    return notes
+    most = {name: max(phases(t)[name].sum() for t in data) for name in ("unload", "free", "hold")}
+    said = {
+        f"{len(data)} trajectories: small effects stay unseen": len(data) < 12,
+        "no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known": (
+            not most["unload"]
+        ),
+        "no free segment: drift and warm-up cannot be told from load; begin each trajectory before the "
+        "touch": most["free"] < 2,
+        "no holds: relaxation cannot be told from hysteresis": most["hold"] < 4,
+        "no force: the rubber's modulus shows in the liquid's pressure alone": not comparison.has_force,
+    }
+    return [text for text, so in said.items() if so]
 
 
 def of_search(search: "Search") -> list[str]:
