@@ -8,14 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from blocks import four_nodes
-from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj import cli
-from biotac_mj.discrepancy import diagnose
-from biotac_mj.discrepancy.trajectories import search
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-from biotac_mj.discrepancy.trajectories.model.fields import Fields
-from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator, remember, solve_with_memory
+from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
@@ -23,7 +19,7 @@ from biotac_mj.discrepancy.trajectories.workflow import TrajectoryDiagnosis
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry.skins import skin_reference
-from biotac_mj.skin import Material, SkinModel
+from biotac_mj.skin import Material
 
 SKIN, _ = skin_reference(four_nodes("coarse"))  # its file; a quarter of the work of ten nodes an element
 
@@ -93,85 +89,15 @@ def test_it_is_run_as_any_simulator(monkeypatch):
     assert seen == [((["press"], None, True, [gain], 1.1, ["slip"]), {"nuisance": "known"})] * 2
 
 
-def test_what_a_reduced_form_misses_is_kept_and_scales():
-    """Fits with a relaxation are those of rubber that relaxes itself, film and pressure too, once the skin
-    was solved with it; twice the share misses twice as much, and near by nothing is solved again."""
-    press = _pressed(np.array([-0.1, 0.2, 0.5, 0.8, 0.8, 0.8, 0.5, 0.2]) * 1e-3, 0.3)
-    sim = Simulator(SKIN, tier="full")
-    fields = Fields(sim.solve([press]), {}, [press])
-    relax, theta = by_id("relax"), {"g": 0.3, "film": 0.05, "tau": 0.5}
-    clean = theta | {"film": 0.0}
-
-    def seen(theta):
-        run = sim.run([press], fields, False, [(relax, theta)])[0]
-        return np.column_stack([run.force, run.pressure, run.log_z])
-
-    reduced = seen(clean)
-    model, film = sim.skin_and_film(0.0, 0.0)
-    rubber = dataclasses.replace(model.material, prony=((0.3, 0.5),))
-    truth = solve_with_memory(SkinModel(model.geometry, rubber, model.options), film, [press])[0]
-    truth = np.column_stack([truth["force"], truth["pressure"], truth["log_z"]])
-    assert np.abs(reduced - truth)[:, 3].max() > 10  # [Pa]: the reduced form is not it
-    assert remember(sim, fields, relax, theta)
-    np.testing.assert_allclose(seen(clean), truth, rtol=1e-9, atol=1e-9)
-    half = seen(clean | {"g": 0.15})
-    alone = dataclasses.replace(fields, remembered={})
-    run = sim.run([press], alone, False, [(relax, clean | {"g": 0.15})])[0]
-    expected = np.column_stack([run.force, run.pressure, run.log_z]) + (truth - reduced) / 2
-    np.testing.assert_allclose(half, expected, rtol=1e-9, atol=1e-9)
-    assert not remember(sim, fields, relax, clean | {"g": 0.33, "tau": 0.45})
-    assert len(fields.remembered["relax"]) == 1
-    for other, effect, values in (
-        (sim, by_id("gain"), {"e1": 0.2}),  # of no rubber
-        (sim, relax, clean | {"g": 0.0}),
-        (Simulator(), relax, clean | {"tau": 5.0}),  # the condensed tier's rubber cannot
-    ):
-        assert not remember(other, fields, effect, values)
-
-
-def test_a_fit_of_solved_rubber_is_judged_as_others_are(monkeypatch):
-    """The skin's own answer is put in place of the reduced form's where that has much evidence."""
-    effect, solved = by_id("relax"), []
-    data = measured([(effect, {**effect.default(), "g": 0.25, "tau": 0.5})], n=8)
-    monkeypatch.setattr(search, "remember", lambda *args: solved.append(args[2].id) is None)
-    report = diagnose(Springs(), data, effects=[effect], progress=False)
-    assert solved and [e.id for e in report.effects] == ["relax"]
-
-
-@pytest.mark.parametrize("solved", (True, False))
-def test_what_was_fitted_inside_the_skin_is_written_so(solved, tmp_path):
+def test_what_was_fitted_is_written_with_its_interval(tmp_path):
     effects = [(by_id("relax"), {"g": 0.3, "film": 0.0, "tau": 2.0})]
     fit = SimpleNamespace(
         effects=effects, names=[("relax", "g")], nuisance=Nuisance(), interval=lambda k: (0.2, 0.4)
     )
-    fields = SimpleNamespace(remembered={"relax": [None]} if solved else {"creep": [None]})
-    comparison = SimpleNamespace(fields=fields, sim=Simulator(tier="full"))
-    report = SimpleNamespace(beside=[], fit=fit, comparison=comparison)
+    report = SimpleNamespace(fit=fit, comparison=SimpleNamespace(sim=Simulator(tier="full")))
     TrajectoryDiagnosis.apply(report, Simulator(tier="full")).save(tmp_path / "amended.yaml")
     again = load_simulator(tmp_path / "amended.yaml")
-    assert type(again) is (InSkinSimulator if solved else Simulator)
     assert again.effects == effects and again.intervals["relax"]["g"] == (0.2, 0.4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("effect, theta", [("hyster", (0.2, 0.2e-3)), ("fric_load", (0.4, -0.4))])
-def test_loops_and_friction_are_solved_inside_the_skin(effect, theta):
-    press = _pressed(np.array([-0.1, 0.2, 0.5, 0.8, 0.5, 0.8, 0.6, 0.2]) * 1e-3, 0.3)
-    slide = press.pos + np.outer(np.clip(np.arange(8) - 3, 0, 4), [0.0, 0.0, 0.3e-3])
-    press = dataclasses.replace(press, pos=slide)
-    sim = Simulator(tier="full")
-    fields = Fields(sim.solve([press]), {}, [press])
-    effect = by_id(effect)
-    names = [name for name in effect.params if name != "film"]
-    theta = dict.fromkeys(effect.params, 0.0) | dict(zip(names, theta))
-    assert remember(sim, fields, effect, theta)
-    seen, truth = (
-        sim.run([press], fields, False, [(effect, theta)])[0],
-        InSkinSimulator().run([press], effects=[(effect, theta)])[0],
-    )
-    plain = sim.run([press], fields, False, [])[0]
-    change = np.abs(truth.force - plain.force).max()
-    assert change > 0.01 and np.abs(seen.force - truth.force).max() < 0.02 * change
 
 
 def _pressed(depth, dt):

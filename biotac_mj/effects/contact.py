@@ -48,7 +48,6 @@ class FrictionLoad(Effect):
         "log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5, at a newton", 0.3),
     }
     equivalents = ("friction",)
-    remembers = True
     answers = ("friction", "friction2")
     instead_of = ("log_friction",)
     confusable = {"friction": "slides at three normal loads"}

@@ -213,7 +213,6 @@ class Effect(Entry, abc.ABC):
       wiring: whether it assigns electrodes to channels, and has no other form.
       of_rest: whether it changes only the baselines of electrodes, about which trajectories are compared.
       pose_offset: whether it moves all poses of the object equally, like their scatter between trials.
-      remembers: whether rubber or contact can model it inside the skin, with a delay of the films.
       answers: names of the sensitivities of the skin (`discrepancy.trajectories.model.fields`) that it uses.
       instead_of: nuisance parameters of the base model that it replaces.
       sound: root mean square of its parameters that a healthy sensor may have.
@@ -227,7 +226,6 @@ class Effect(Entry, abc.ABC):
     wiring = False
     of_rest = False
     pose_offset = False
-    remembers = False
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0

@@ -46,7 +46,7 @@ class Relaxation(Effect):
     }
     rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1), "more": _MORE}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
-    equivalents, remembers = ("creep",), True
+    equivalents = ("creep",)
     confusable = {
         "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
         "creep": "a hold of 100 s",
@@ -79,7 +79,7 @@ class PowerCreep(Effect):
     requires = frozenset({"protocol"})
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
     rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04), "more": _MORE}
-    equivalents, remembers = ("relax",), True
+    equivalents = ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def rejection_reason(self, theta: dict) -> str | None:
@@ -123,7 +123,7 @@ class Hysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
-    equivalents, remembers = ("hyster_load",), True
+    equivalents = ("hyster_load",)
     confusable = {
         "relax": "the same depth at ten times the speed",
         "mullins": "a third cycle to the same depth",
@@ -160,7 +160,7 @@ class LoadHysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1}, {"width": 0.3})
-    equivalents, remembers = ("hyster",), True
+    equivalents = ("hyster",)
     confusable = {
         "hyster": "a small cycle on a large load",
         "relax": "the same depth at ten times the speed",
@@ -239,7 +239,7 @@ class Mullins(Effect):
         for w in (0.3, 1.0)
         for r, s in ((1.5e-3, 0.01), (4e-3, 0.01), (4e-3, 0.4))
     )
-    equivalents, remembers = ("damage",), True
+    equivalents = ("damage",)
     confusable = {
         "hyster": "a third cycle to the same depth",
         "adhesion": "talc on the skin",

@@ -10,7 +10,6 @@ import tqdm
 
 from ..evidence import asked, by_chance, not_distinguished
 from .fitting import Fit, fit_effects, sizes
-from .model.in_skin import FOLLOWS, remember
 from .settings import SETTINGS
 from .signatures import Signatures
 
@@ -19,9 +18,9 @@ if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
 _SOLVED, _FURTHER = 2, 4  # times that the skin is solved for an effect that moves the object; and again
-_WORTH, _MUCH = 5.0, 30.0  # [nats] of evidence that is worth it; that solving the rubber is worth
+_WORTH = 5.0  # [nats] of evidence that is worth it
 _SETTLED = 1.0  # [nats] that a solution changes where a fit has found its end
-_KINS, _SOME = 2, 0.15  # effects whose rubber is solved for, and their fraction of the best one's evidence
+_KINS, _SOME = 2, 0.15  # effects that are solved further, and their fraction of the best one's evidence
 _ELECTRODES = 5  # at most; where more have it, all may
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 
@@ -158,10 +157,6 @@ def _round(comparison, search, usable, chosen, bar):
     for k in _moving(out):
         fit = _solved(comparison, out[k].fit, out[k].effect, current, chosen, _FURTHER, True)
         out[k] = _candidate(comparison, out[k].effect, fit, current, usable)
-    for k in _remembering(out):
-        fit = _remembered(comparison, out[k], current, chosen)
-        if fit is not None:
-            out[k] = _candidate(comparison, out[k].effect, fit, current, usable)
     return sorted(out, key=lambda c: -c.gain)
 
 
@@ -236,24 +231,6 @@ def _moving(out):
     least = max(_WORTH, _SOME * max((c.gain for c in out), default=0.0))
     some = [k for k, c in enumerate(out) if c.effect.before_skin and c.gain > least]
     return sorted(some, key=lambda k: -out[k].gain)[:_KINS]
-
-
-def _remembering(out):
-    """Indices of the likeliest Candidates whose rubber can do it itself: reduced forms are right about a
-    separable field, which rubber under liquid is not."""
-    best = max((c.gain for c in out), default=0.0)
-    some = [k for k, c in enumerate(out) if c.effect.remembers and c.gain > max(_MUCH, _SOME * best)]
-    return sorted(some, key=lambda k: -out[k].gain)[:_KINS]
-
-
-def _remembered(comparison, one, current, chosen):
-    """Fit of a Candidate's effect where the skin's rubber does it itself; None where that is not solved."""
-    theta = one.fit.effects[-1][1]
-    if not remember(comparison.sim, comparison.fields, one.effect, theta):
-        return None
-    # what its form lets film and liquid do besides follows from the skin now
-    begin = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
-    return fit_effects(comparison, [*current.effects, (one.effect, begin)], chosen, current)
 
 
 def screened(

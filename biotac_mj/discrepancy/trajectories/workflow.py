@@ -18,7 +18,6 @@ from .base.findings import other_modulus
 from .base.rests import rested
 from .beliefs import Beliefs, believed
 from .fitting import Fit, fit_effects
-from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import Proof, borne_out, proved
 from .remarks import few_off, next_experiment, of_base, of_data, of_search, strays
@@ -89,15 +88,14 @@ class TrajectoryDiagnosis(Verdict):
         return self.apply(self.given).file
 
     def apply(self, sim: Simulator) -> Simulator:
-        """The simulator with the effects found as further stages, and the modulus that was fitted with them;
-        where the skin was solved with them for that, they act inside it."""
+        """The simulator with the effects found as further stages, and the modulus that was fitted with
+        them."""
         own = self.comparison.sim.log_rest * (1 - self.fit.nuisance.stands_off)
         sim = sim.rested(own)
         new = sim.with_effects(self.fit.effects, sim.modulus * self.fit.nuisance.modulus)
         for k, (effect, name) in enumerate(self.fit.names):
             new.intervals.setdefault(effect, {})[name] = self.fit.interval(k)
-        solved = self.comparison.fields.remembered
-        return in_the_skin(new) if any(e.id in solved for e, _ in self.fit.effects) else new
+        return new
 
 
 def diagnose(

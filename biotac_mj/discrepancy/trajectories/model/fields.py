@@ -4,11 +4,11 @@ once, these make every effect cheap."""
 import dataclasses
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import PchipInterpolator
 
 from ....effects.catalogue import CATALOGUE
 from ....effects.contact import TACKY
-from ....effects.effect import Effect, Run
+from ....effects.effect import Run
 from ....effects.rubber import SPOT
 from ....sensor.channels import temperature_from_counts
 
@@ -32,16 +32,13 @@ class Fields:
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: error of the slopes there with all of them}, {parameter: derivative of that error})], see
     `Simulator.bend`: at a fraction s of these parameters the error is s^2 of it, its derivative s. All
-    solutions are kept, since several fits use theirs. remembered: ids of effects of the rubber -> [(their
-    parameters, error of their reduced form against the effect inside the rubber [(n, nelectrode + 4) per
-    trajectory])], see `in_skin.remember`."""
+    solutions are kept, since several fits use theirs."""
 
     base: list
     slopes: dict
     trajectories: list
     quick: list | None = None
     curves: dict[frozenset, list] = dataclasses.field(default_factory=dict)
-    remembered: dict[str, list] = dataclasses.field(default_factory=dict)
     deeper: "Curve | None" = None
     film: "Curve | None" = None
 
@@ -101,26 +98,17 @@ class Fields:
                 left -= ids
         return out
 
-    def recalled(self, effect: Effect, theta: dict, i: int) -> np.ndarray | None:
-        """(n, nelectrode + 4) that the effect's reduced form misses in trajectory i, where the skin was
-        solved with it; it grows with the effect's first parameter, its fraction."""
-        if effect.id not in self.remembered:
-            return None
-        there, missed = min(self.remembered[effect.id], key=lambda one: unlike(effect, theta, one[0]))
-        name = next(iter(effect.params))
-        return theta[name] / there[name] * missed[i]
-
 
 class Curve:
     """Change by one number of the base: a cubic between the values that were solved, straight beyond them. It
-    has no more turns than they have (Fritsch and Carlson 1980): an object that does not touch yet changes
-    nothing, and a film matters only where the skin lies on the core."""
+    has no more turns than they have: an object that does not touch yet changes nothing, and a film matters
+    only where the skin lies on the core."""
 
     def __init__(self, at: np.ndarray, changes: list[np.ndarray]):
         """at: (m,) that were solved, rising, one of them 0. changes: per trajectory
         (m, n, nelectrode + 4)."""
         self.solved, self.changes = at, changes
-        self._cubics = [CubicHermiteSpline(at, one, _tangents(at, one)) for one in changes]
+        self._cubics = [PchipInterpolator(at, one) for one in changes]
         self._last = {}  # trajectory -> the values that were asked for last, and the change
 
     def part(self, which: np.ndarray) -> "Curve":
@@ -152,27 +140,6 @@ class Curve:
         value = np.broadcast_to(value, row.shape)
         k = np.clip(np.searchsorted(cubics.x, value, "right") - 1, 0, len(cubics.x) - 2)
         return cubics.c[:, k, row], (value - cubics.x[k])[:, None]
-
-
-def _tangents(at, changes):
-    """(m, n, nelectrode + 4) slopes of changes at (m,): parabolas', within three times that to either
-    side."""
-    wide = np.diff(at)[:, None, None]
-    secant = np.diff(changes, axis=0) / wide
-    out = np.empty_like(changes)
-    out[1:-1] = (secant[1:] * wide[:-1] + secant[:-1] * wide[1:]) / (wide[1:] + wide[:-1])
-    limit = 3 * np.minimum(np.abs(secant[1:]), np.abs(secant[:-1]))
-    out[1:-1] = np.clip(out[1:-1], -limit, limit)
-    for end, inner in ((0, 1), (-1, -2)):
-        limit = 3 * np.abs(secant[end])
-        out[end] = np.clip(2 * secant[end] - out[inner], -limit, limit)
-    return out
-
-
-def unlike(effect: Effect, theta: dict, there: dict) -> float:
-    """Distance between an effect's shapes: the largest logarithm of their ratios."""
-    shapes = [name for name, p in effect.params.items() if p.shape]
-    return max((abs(float(np.log(theta[n] / there[n]))) for n in shapes), default=0.0)
 
 
 def sizes(effects: list) -> dict:

@@ -12,19 +12,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ....effects.effect import Effect, Run
+from ....effects.effect import Run
 from ....effects.in_film import RoughFilm, drain, remaining_liquid
 from ....effects.in_skin import memory_of, moduli
 from ....sensor.film import FilmConduction
 from ....skin.model import SkinModel
 from ..trajectory import Trajectory
-from .fields import Fields, stack, unlike
+from .fields import Fields
 from .simulator import Simulator
 from .solver import impedance_of, placed
-
-FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that the solved skin makes needless
-_LITTLE = 0.01  # size of an effect below which nothing is solved
-_ALIKE = 0.25  # of logarithms of size and shapes, within which a solution is used again
 
 
 def solve_with_memory(
@@ -128,36 +124,6 @@ class InSkinSimulator(Simulator):
         listed = set(np.atleast_1d(exact).tolist())
         others = super().run(trajectories, fields, False, effects, *more, **kw)
         return [runs[i] if i in listed else other for i, other in enumerate(others)]
-
-
-def remember(sim: Simulator, fields: Fields, effect: Effect, theta: dict) -> bool:
-    """Solves the skin of all trajectories with an effect inside the rubber or contact, and stores in the
-    fields the error of the effect's reduced form, which acts on the load alone. From then on fits with the
-    effect are right near theta.
-
-    Returns: whether that was needed and could be: in the full tier, of the effects that remember, and not
-    where it was solved near theta already."""
-    main = next(iter(effect.params))
-    if sim.tier != "full" or not effect.remembers or abs(theta[main]) < _LITTLE:
-        return False
-    kept = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
-    for there, _ in fields.remembered.get(effect.id, ()):
-        ratio = kept[main] / there[main]
-        if ratio > 0 and abs(np.log(ratio)) < _ALIKE and unlike(effect, kept, there) < _ALIKE:
-            return False
-    plain = dataclasses.replace(fields, remembered={})
-    reduced = sim.run(fields.trajectories, plain, False, [(effect, kept)], 1.0)
-    within = memory_of([(effect, kept)])
-    slide = sum(th["log_mu"] for e, th in within.rest if e.before_skin)
-    true = _remembering(sim, within).solve(fields.trajectories, log_friction=slide)
-    missed = [stack(b | {"log_z": b["log_z"] + sim.log_rest}) - stack(vars(a)) for a, b in zip(reduced, true)]
-    fields.remembered.setdefault(effect.id, []).append((kept, missed))
-    return True
-
-
-def in_the_skin(sim: Simulator) -> InSkinSimulator:
-    """A simulator with what effects do in the skin inside it, as their fits were after `remember`."""
-    return InSkinSimulator(**_settings(sim))
 
 
 def _remembering(sim, inside):

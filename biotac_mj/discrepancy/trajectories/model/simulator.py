@@ -145,15 +145,12 @@ class Simulator(Solver):
                 run.add(between)
             if nuisance.footprint:
                 run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint, self.design)
-        for i, run in enumerate(runs):
+        for run in runs:
             for stage in ("K", "C", "T"):
                 for effect, theta in after:
                     if effect.stage != stage:
                         continue
                     effect.apply(run, theta)
-                    missed = fields.recalled(effect, theta, i)
-                    if missed is not None:
-                        run.add(missed)
             if np.ndim(run.turn) and run.turn.any():  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
