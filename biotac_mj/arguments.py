@@ -141,17 +141,6 @@ def quantity(
     return read
 
 
-def place(text: str) -> float | str:
-    """One number of a position: a length or an angle, depending on its place; a plain number is in SI."""
-    for kind in ("length", "angle"):
-        try:
-            read_quantity("it", text, kind)
-            return text
-        except ValueError as error:
-            wrong = error
-    raise argparse.ArgumentTypeError(str(wrong))
-
-
 def _number(kind, called, low, high):
     limits = f" from {low:g} to {high:g}" if math.isfinite(low) or math.isfinite(high) else ""
 

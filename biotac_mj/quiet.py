@@ -64,9 +64,9 @@ def headers() -> concurrent.futures.Future | None:
     """Begins to precompile Warp's headers for the CPU, which takes 4 s: as long as what a press imports
     beside it. Returns the number of the thread that has them; None where kernels are in the cache."""
     quiet_warp()
+    wp.init()  # quiet_warp does not where the user has set a log level
     if _compiled("cpp"):
         return None
-    wp.init()
     pool = concurrent.futures.ThreadPoolExecutor(1)
     found = pool.submit(_precompile)
     pool.shutdown(wait=False)

@@ -865,7 +865,7 @@ def numbers():
         ("--speed 10", "speed is 10 m/s: did you mean 10mm/s?"),
         ("--timestep 4", "'4' is 4 s: 0 to 100 ms can be given; did you mean 4ms?"),
         ("--depth 2deg", "it is '2deg': give a number with a unit, as in 2mm (of m, mm, cm, um)"),
-        ("--location here", "give a number with a unit, as in 2deg"),
+        ("--location here", "give a number with a unit, as in 2mm"),
         ("--location -12mm 3mm", "location is '3mm': give a number with a unit, as in 2deg"),
     ):
         yield Row(f"press --skin coarse {words}", asked)
@@ -876,7 +876,7 @@ def numbers():
         "data resimulate --out out",
     ):
         yield Row(f"{verb} /proc/self/mem", "/proc/self/mem: Input/output error: check the path")
-    yield Row("press --location 1mm 2mm 3mm 4mm", "--location has 4 numbers: give X, X and ANGLE")
+    yield Row("press --location 1mm 2mm 3mm 4mm", "give x, x and an angle, or x, y and z")
     yield Row("press --skin coarse --location 40mm", "no skin at x = 40 mm")
     yield Row(
         "press --skin coarse --location 0 0 0", "location (0, 0, 0) mm lies inside the finger's rigid core"

@@ -123,7 +123,7 @@ def test_first_touch_is_where_rays_find_it(skin, name):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     assert (
-        abs(got - approach.first_touch(skin, model, data, direction)) < 1.5e-5
+        abs(got - approach.first_touch(skin.vert, skin.outer_face, model, data, direction)) < 1.5e-5
     )  # samples 0.1 mm apart on a face
 
 

@@ -1,6 +1,7 @@
 """Models that are kept: synthetic electrodes that answer to force and place by a rule written here."""
 
 import dataclasses
+import json
 
 import h5py
 import numpy as np
@@ -23,6 +24,7 @@ from biotac_mj.learning.instants.terms import Terms  # noqa: E402
 from biotac_mj.learning.protocol import is_better  # noqa: E402
 from biotac_mj.learning.weights import load_forward, shipped  # noqa: E402
 from biotac_mj.recordings import write  # noqa: E402
+from biotac_mj.samples import make_samples  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance  # noqa: E402
 
 STEPS = 8
@@ -306,3 +308,22 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys):
     assert "has no intervals: write it with" in capsys.readouterr().err
     with pytest.raises(ValueError, match="neither force nor contact place"):
         from_recording(dataclasses.replace(one, force=None))
+
+
+@pytest.mark.slow
+def test_a_model_of_a_log_is_judged_on_a_set_and_back(tmp_path, capsys, monkeypatch):
+    """A force has one sign in logs and sets; what a log lacks is not judged."""
+    monkeypatch.chdir(tmp_path)
+    electrodes, forces, _, made = map(str, make_samples("samples"))
+    cli.main(["learn", "train", electrodes, "--force", forces, "--out", "log.safetensors"])
+    cli.main(["learn", "train", made, "--out", "set.safetensors"])
+    assert cli.main(["learn", "judge", made, "--model", "log.safetensors", "--json", "judged.json"]) == 0
+    force = json.loads((tmp_path / "judged.json").read_text())["targets"]["force"]
+    assert force["rmse"] < 0.3 * force["rmse_of_mean"] and not force["useless"]
+    back = ["learn", "judge", electrodes, "--force", forces, "--model", "set.safetensors"]
+    capsys.readouterr()
+    assert cli.main(back) == 2 and "--tare ROWS" in capsys.readouterr().err
+    assert cli.main([*back, "--tare", "20"]) == 0
+    said = capsys.readouterr().out
+    assert "place" not in said and "no better than the mean here" in said
+    assert cli.main([*back[:-2], "--tare", "20"]) == 2 and "goes with --model" in capsys.readouterr().err

@@ -164,7 +164,7 @@ def test_quaternion_turns_y_to_the_direction():
         (dict(depth=0.0), "depth is 0 mm: it must be a positive number"),
         (dict(speed=float("nan")), "speed is nan"),
         (dict(location=(float("nan"), 0.0)), "location .* NaN"),
-        (dict(location=(0.0,)), "1 numbers: give x and an angle, or x, y and z"),
+        (dict(location=(0.0,) * 4), "give x, x and an angle, or x, y and z"),
         (dict(direction=(0.0, 0.0, 0.0)), "is no direction"),
         (dict(indenter="sphere_8mm"), "unknown indenter 'sphere_8mm': choose one of .*ring_7mm"),
         (dict(indenter="geom:torus:1"), "unknown geom type 'torus'.* sphere, capsule"),
@@ -209,30 +209,47 @@ def test_effects_act_once_on_a_press():
     assert config.friction == pytest.approx(np.exp(-0.5) * PRESETS["default"].friction)
 
 
-def test_what_lies_over_the_core_is_known():
+@pytest.mark.parametrize("name", ["geom:plane", "cube_14mm", "sphere_7mm"])
+def test_what_lies_over_the_core_is_known(name):
     skin = load_skin("coarse")
-    point, normal = approach.surface_point(skin, -12e-3, 0.0)
+    options = PressOptions(indenter=name, location=(-12e-3, 0.0))
+    path = plan_path(skin, make_indenter(name), options)
     # the core is a cylinder of 5.325 mm about the finger's axis, in facets
-    assert approach.room(skin, point, -normal) == pytest.approx(-point[1] - 5.325e-3, abs=3e-5)
-    point, normal = approach.surface_point(skin, -12e-3, np.pi)
-    assert approach.room(skin, point, -normal) < 1e-5  # the nail
+    assert path.room == pytest.approx(-path.start[1] - 5.325e-3, abs=5e-5)
     for y, inside in ((-5.2e-3, True), (-5.4e-3, False), (0.0, True)):
         assert approach.is_inside(skin.core_vert, skin.core_face, [-5e-3, y, 0]) is inside
 
 
 @pytest.mark.parametrize(
-    ("stiffness", "room", "text"), [(0.0, 9e-3, "nothing was felt"), (40.0, 9e-4, "crushed")]
+    ("change", "text"),
+    [
+        (
+            dict(depth=3e-3),
+            "depth is 3 mm, and the indenter meets core, nail or clamp 2.8. mm after the skin",
+        ),
+        (dict(location=(-12e-3, np.pi)), "core, nail or clamp 1.00 mm before the skin"),
+    ],
 )
-def test_a_press_that_tells_nothing_of_a_finger_says_so(springs, monkeypatch, stiffness, room, text):
-    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", stiffness)
-    monkeypatch.setattr(approach, "room", lambda *_: room)
-    with pytest.warns(UserWarning, match=text):
-        press(PressOptions(**springs), progress=False)
-    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", 40.0)
-    monkeypatch.setattr(approach, "room", lambda *_: 9e-3)
+def test_a_path_into_the_core_is_refused_before_it_is_run(change, text):
+    with pytest.raises(ValueError, match=text):
+        press(PressOptions(skin="coarse", **change), progress=False)
+
+
+def test_a_press_that_felt_nothing_says_so(springs, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         press(PressOptions(**springs), progress=False)
+    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", 0.0)
+    with pytest.warns(UserWarning, match="nothing was felt"):
+        press(PressOptions(**springs), progress=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("skin", ["coarse", "default"])
+def test_the_default_press_stays_where_errors_are_known(skin):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        press(PressOptions(skin=skin, timestep=10e-3), progress=False)
 
 
 def test_indenter_meshes_are_checked(tmp_path):

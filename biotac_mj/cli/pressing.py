@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import SEED, check_device, output_file, output_folder, place, quantity, real, whole
+from ..arguments import SEED, check_device, output_file, output_folder, quantity, real, whole
 from ..files import check_output_file, refuse_inputs
 from ..reading import reading
 from .common import add_results, add_sensor, add_skin, add_verb
@@ -23,7 +23,6 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=INDENTER_HELP)
     verb.add_argument(
         "--location",
-        type=place,
         nargs="+",
         metavar=("X", "ANGLE | Y Z"),
         help=f"{LOCATION_HELP} (default: -12mm on a BioTac, else the middle of the pad)",
@@ -38,7 +37,7 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         )
     hold, step = quantity("time", plain=_LONG_HOLD), quantity("time", _LONGEST_STEP, 0.0)
     for name, kind, default, metavar, text in (
-        ("depth", quantity("length"), "2.4mm", "LENGTH", "from first touch"),
+        ("depth", quantity("length"), "2mm", "LENGTH", "from first touch"),
         ("slide", quantity("length"), "0mm", "LENGTH", "along the skin after the press"),
         ("speed", quantity("speed"), "10mm/s", "SPEED", "of press and slide"),
         ("hold", hold, "20ms", "TIME", "rest at the end of press and slide"),
@@ -89,20 +88,13 @@ def _press(args):
     from ..press import PressOptions, press, render, report
     from ..press.record import write_readings, write_skin
 
-    location = args.location
-    if location and len(location) > 3:
-        raise ValueError(
-            f"--location has {len(location)} numbers: give X, X and ANGLE, or X Y Z, as in -12mm 30deg"
-        )
-    if location:
-        location = tuple(location) if len(location) > 1 else (*location, 0.0)
     same = (
         "indenter depth slide tier liquid timestep speed hold two_way friction seed device options sensor "
         "randomise thermal texture"
     )
     options = PressOptions(
         **{name: getattr(args, name) for name in same.split()},
-        location=location,
+        location=args.location and tuple(args.location),
         direction=args.direction and tuple(args.direction),
         slide_direction=tuple(args.slide_direction),
         # defaults are taken from the effects' file
@@ -120,7 +112,6 @@ def _press(args):
             print(f"biotac: note: {message}", file=sys.stderr, flush=True)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("always")
         warnings.showwarning = warn
         record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)

@@ -188,8 +188,12 @@ def _add_judge(verbs, verb):
         nargs="?",
         metavar="SOURCE",
         help="a folder that `biotac learn train` wrote, or a recording: reconstruction is judged, force too "
-        "if it has one",
+        "if it has one; with --model, a recording with force or a set",
     )
+    v.add_argument(
+        "--model", metavar="FILE.safetensors", help="of `biotac learn train`, to be judged on SOURCE"
+    )
+    _add_tare(v)
     v.add_argument(
         "--force", metavar="FILE", help="force of a recording: text, 3 columns of force [N] row by row"
     )
@@ -230,6 +234,8 @@ def _judge(args):
         )
     bag = args.source and os.path.isfile(os.path.join(args.source, "metadata.yaml"))  # of ROS 2
     recorded = bool(args.source) and (bag or not os.path.isdir(args.source))
+    if args.tare and not args.model:
+        raise ValueError("--tare goes with --model: give both, or neither")
     for name, given in (("force", args.force), ("recording", args.which)):
         if given and not recorded:
             raise ValueError(f"--{name} goes with a recording: give both, or neither")
@@ -237,11 +243,13 @@ def _judge(args):
         if getattr(args, name) and not args.new_sensor:
             raise ValueError(f"--{name} goes with --new-sensor: give both, or neither")
     if args.json is None:
-        name = "recording" if recorded else "new_sensor"
-        folder = args.source and not recorded
+        name = "model" if args.model else "recording" if recorded else "new_sensor"
+        folder = args.source and not recorded and not args.model
         args.json = f"{args.source}/evaluation.json" if folder else f"out/judge/{name}.json"
         check_output_file(args.json)
-    if recorded:
+    if args.model:
+        _judge_model(args, recorded)
+    elif recorded:
         _judge_recording(args)
     elif args.source:
         _judge_networks(args)
@@ -265,6 +273,30 @@ def _judge_new_sensor(args):
         print(f"written: {args.sensor}, the film with a mixing; use it with attach(effects={args.sensor!r})")
 
 
+def _judge_model(args, recorded):
+    from ..files import write_json
+    from .instants.examples import from_recording, from_set
+    from .instants.reader import Reader, judge_on
+
+    reader = Reader.load(args.model)
+    if recorded:
+        from ..recordings import load_one
+
+        recording, notes = load_one(args.source, args.which, force=args.force)
+        data = from_recording(recording, args.tare)
+    else:
+        data, notes = from_set(args.source), []
+    if "source" in reader.meta and reader.meta["source"] == data.source:
+        notes = [*notes, f"{data.source} is the name of what the model was trained on, too"]
+    scores = judge_on(reader, data)
+    _say_errors(scores)
+    useless = [name for row in scores["targets"].values() for name in row["useless"]]
+    for note in [*notes, *([f"{', '.join(useless)}: no better than the mean here"] if useless else [])]:
+        print(f"  note: {note}")
+    write_json(args.json, scores)
+    print(f"written: {args.json}")
+
+
 def _judge_networks(args):
     from .report import evaluate_models, table
 
@@ -280,6 +312,14 @@ def _save_reader(args, reader, scores):
         f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} held out "
         f"calibrate the intervals{tested}"
     )
+    _say_errors(scores)
+    _note_useless(reader.meta)
+    outputs = {name for target in scores["targets"] for name in TARGETS[target]}
+    use = f"; use it with `biotac learn predict {args.out} RECORDING`"
+    print(f"written: {args.out}{use if outputs - set(reader.meta['useless']) else ''}")
+
+
+def _say_errors(scores):
     for name, row in scores["targets"].items():
         covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
         error = ""
@@ -287,15 +327,16 @@ def _save_reader(args, reader, scores):
             mean = f"the mean {row['rmse_of_mean']:.4g}"
             error = f"RMSE of a component {row['rmse']:.4g} {row['unit']} ({mean}), "
         print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
-    _note_useless(reader.meta)
-    outputs = {name for target in scores["targets"] for name in TARGETS[target]}
-    use = f"; use it with `biotac learn predict {args.out} RECORDING`"
-    print(f"written: {args.out}{use if outputs - set(reader.meta['useless']) else ''}")
 
 
 def _note_useless(meta):
     if useless := meta.get("useless"):
         print(f"  note: {', '.join(useless)}: no better than the mean: do not use it, record more touches")
+
+
+def _add_tare(v):
+    text = "number of first rows whose mean is the sensor at rest, for models of changes"
+    v.add_argument("--tare", type=whole(1, 10_000_000), metavar="ROWS", help=text)
 
 
 def _add_predict(verbs, verb):
@@ -318,12 +359,7 @@ def _add_predict(verbs, verb):
     )
     add_which(v)
     add_load_arguments(v)
-    v.add_argument(
-        "--tare",
-        type=whole(1, 10_000_000),
-        metavar="ROWS",
-        help="number of first rows whose mean is the sensor at rest, for models of changes",
-    )
+    _add_tare(v)
     v.add_argument(
         "--row",
         type=int,

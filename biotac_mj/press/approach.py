@@ -12,7 +12,6 @@ from ..geometry.surface import face_areas
 
 # radius over which a normal is averaged [m]: about two edges of the default skin
 _PATCH = 1.5e-3
-_TOUCHING = 1e-5  # [m] largest depth of bonded skin in a solid
 
 
 def normal_at(geometry: SkinGeometry, point: np.ndarray) -> np.ndarray:
@@ -63,20 +62,6 @@ def is_inside(vert: np.ndarray, face: np.ndarray, point: np.ndarray) -> bool:
     return bool(abs(winding(np.asarray(point, float), vert[face])) > 0.5)
 
 
-def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> float:
-    """Distance from a point (3,) of the outer surface along a direction (3,) to core, nail or clamp [m]; inf
-    if the ray misses them."""
-    solids = (
-        (geometry.core_vert, geometry.core_face),
-        (geometry.nail_vert, geometry.nail_face),
-        (geometry.clamp_vert, geometry.clamp_face),
-    )
-    along = np.asarray(direction, float) / np.linalg.norm(direction)
-    start = np.asarray(point, float) - _TOUCHING * along
-    distances = [ray_distances(vert[face], start, along).min(initial=np.inf) for vert, face in solids]
-    return max(float(min(distances)) - _TOUCHING, 0.0)
-
-
 def _split(tri):
     """Divides each triangle (m, 3, 3) into four."""
     a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
@@ -85,31 +70,29 @@ def _split(tri):
 
 
 def first_touch(
-    geometry: SkinGeometry,
+    vert: np.ndarray,
+    face: np.ndarray,
     model: mujoco.MjModel,
     data: mujoco.MjData,
     direction: np.ndarray,
     resolution: float = 2e-5,
     keep: int = 48,
 ) -> float:
-    """Distance that the geoms of a model travel along a direction until they first touch the undeformed skin.
+    """Distance that the geoms of a model travel along a direction until they first touch a surface.
 
-    Rays are cast from the skin's faces against the direction to the geoms. The faces closest to a geom are
+    Rays are cast from the surface's faces against the direction to the geoms. The faces closest to a geom are
     divided repeatedly, so that contact inside faces is found, too.
 
     Args:
-      geometry: the skin, in the world frame of the model.
-      model, data: with the indenter's geoms only, in front of the skin, after `mj_forward`.
+      vert, face: the surface, (n, 3) in the world frame of the model [m], (m, 3).
+      model, data: with the indenter's geoms only, in front of the surface, after `mj_forward`.
       direction: of travel (3,).
       resolution: edge to which the nearest faces are divided [m]; on a sphere of radius r the distance is
         accurate to resolution^2 / r.
       keep: number of faces that are divided each time.
 
     Returns:
-      travel [m].
-
-    Raises:
-      ValueError: the indenter would pass the skin.
+      travel [m]; inf if the geoms pass the surface.
     """
     backward = -np.asarray(direction, float) / np.linalg.norm(direction)
     geom = np.empty(1, np.int32)
@@ -119,18 +102,13 @@ def first_touch(
         hits = np.array([mujoco.mj_ray(model, data, p, backward, None, 1, -1, geom, normal) for p in points])
         return np.where(hits < 0, np.inf, hits)
 
-    facing = face_areas(geometry.vert, geometry.outer_face) @ backward > 0
-    tri = _split(geometry.vert[geometry.outer_face[facing]])
+    tri = _split(vert[face[face_areas(vert, face) @ backward > 0]])
     best = np.inf
-    while True:
+    while len(tri):
         nearest = np.minimum(gap(tri.mean(1)), gap(tri.reshape(-1, 3)).reshape(-1, 3).min(1))
         best = min(best, nearest.min())
         tri = tri[np.argsort(nearest)[:keep]]
         if np.linalg.norm(tri - np.roll(tri, 1, axis=1), axis=2).max() < resolution:
             break
         tri = _split(tri)
-    if not np.isfinite(best):
-        raise ValueError(
-            "the indenter passes the skin without touching it: change the location or the direction"
-        )
     return float(best)

@@ -1,7 +1,6 @@
 """Options of a press, and the path of its indenter: to the depth, then along the skin."""
 
 import dataclasses
-import itertools
 import math
 import pathlib
 
@@ -67,7 +66,7 @@ class PressOptions:
     indenter: str = "sphere_7mm"
     location: tuple | None = None
     direction: tuple | None = None
-    depth: float = 2.4e-3
+    depth: float = 2e-3
     slide: float = 0.0
     slide_direction: tuple = (1.0, 0.0, 0.0)
     timestep: float = 4e-3
@@ -126,11 +125,6 @@ class PressOptions:
                 f"this press takes {steps:.3g} steps of {_said('timestep', self.timestep)}: {_MOST_STEPS} at "
                 "most; shorten hold, depth or slide, or raise speed or timestep"
             )
-        if self.location is not None and len(self.location) not in (2, 3):
-            raise ValueError(
-                f"location {self.location} has {len(self.location)} numbers: "
-                "give x and an angle, or x, y and z"
-            )
         for name in ("location", "direction", "slide_direction"):
             value = getattr(self, name)
             if value is not None and np.asarray(value).dtype.kind not in "fiu":
@@ -150,11 +144,13 @@ class PressOptions:
 
 def _location(value):
     """Lengths, and the angle of a position along and around the finger, in SI."""
-    if isinstance(value, (str, bytes)) or not np.iterable(value):
-        raise ValueError(f"location is {short_repr(value)}: give x and an angle, or x, y and z")
-    second = "angle" if len(value) == 2 else "length"
-    kinds = itertools.chain(["length", second], itertools.repeat("length"))
-    return tuple(read_quantity("location", one, kind) for one, kind in zip(value, kinds))
+    parts = value.split() if isinstance(value, str) else value
+    if not np.iterable(parts) or isinstance(parts, bytes) or not 1 <= len(parts) <= 3:
+        given = short_repr(value)
+        raise ValueError(f"location is {given}: give x, x and an angle, or x, y and z, as in -12mm 30deg")
+    kinds = ("length", "angle") if len(parts) < 3 else ("length",) * 3
+    found = tuple(read_quantity("location", one, kind) for one, kind in zip(parts, kinds))
+    return found if len(found) > 1 else (*found, 0.0)
 
 
 def _refuse_larger(name, value, most, why, kind):
@@ -182,7 +178,7 @@ class Path:
       quat: (4,) its orientation.
       direction, slide_direction: (3,) unit vectors, perpendicular to each other.
       depth, slid: (n,) travel at each step [m]; row 0 is the start before first contact.
-      room: thickness of skin and liquid over core, nail or clamp at the location, along the direction [m].
+      room: from first contact to where the indenter meets core, nail or clamp, along the direction [m].
     """
 
     start: np.ndarray
@@ -239,7 +235,12 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    travel = approach.first_touch(geometry, model, data, direction)
+    travel = approach.first_touch(geometry.vert, geometry.outer_face, model, data, direction)
+    if not np.isfinite(travel):
+        raise ValueError(
+            "the indenter passes the skin without touching it: change the location or the direction"
+        )
+    room = approach.first_touch(*geometry.rigid, model, data, direction) - travel
     start = point + (travel - back) * direction
 
     step = options.speed * options.timestep
@@ -260,5 +261,4 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
         ]
     )
     slid = np.concatenate([[0], 0 * down, hold, along, (hold if options.slide else hold[:0]) + options.slide])
-    room = approach.room(geometry, point, direction)
     return Path(start, quat, direction, across, depth, slid, room)

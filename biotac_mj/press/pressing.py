@@ -54,10 +54,11 @@ def press(
         record.
       progress: whether to show a progress bar.
 
-    Warns if nothing was touched, and if the press is deeper than skin and liquid over the core.
+    Warns if nothing was touched.
 
     Raises:
-      ValueError, FileNotFoundError: an impossible option; the message names cause and remedy.
+      ValueError, FileNotFoundError: an impossible option, or a path into core, nail or clamp; the message
+        names cause and remedy.
     """
     from ..coupling.steppers.fem import rest_geometry
     from ..geometry import SkinGeometry, load_skin
@@ -72,12 +73,11 @@ def press(
     # the filled skin, which the indenter touches first
     rest = rest_geometry(options.settings.config(geometry=geometry), geometry)
     path = plan_path(rest, indenter, options)
-    room = f"{1e3 * path.room:.2f} mm of skin and liquid lie over core, nail or clamp at the location"
-    if options.depth > path.room:
-        warnings.warn(
-            f"{room}, and the press is to go {1e3 * options.depth:.2f} mm deep: its force will be that of "
-            "crushed rubber, not a finger's, and such steps take long; press less deep, or elsewhere",
-            stacklevel=2,
+    if options.depth > path.room and not options.two_way:
+        raise ValueError(
+            f"depth is {1e3 * options.depth:.6g} mm, and the indenter meets core, nail or clamp "
+            f"{abs(1e3 * path.room):.2f} mm {'after' if path.room > 0 else 'before'} the skin: press less "
+            "deep, or elsewhere"
         )
     spec, handle = build_scene(indenter, path, options)
     with plugin.explained():
@@ -115,7 +115,7 @@ def press(
         warnings.warn(
             "the indenter has met no skin that gives way, and nothing was felt: "
             + (
-                f"{room}; choose another one"
+                f"{1e3 * path.room:.2f} mm lie over core, nail or clamp at the location; choose another one"
                 if options.depth > 0.05 * path.room
                 else f"it went {1e3 * options.depth:.3g} mm deep; press deeper"
             ),

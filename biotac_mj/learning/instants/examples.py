@@ -43,8 +43,11 @@ def blocks(n: int) -> np.ndarray:
     return np.arange(n) * _BLOCKS // n
 
 
-def from_recording(recording: Recording) -> Examples:
+def from_recording(recording: Recording, rest: int | None = None) -> Examples:
     """A recording as 56 blocks in order of time, with force and contact position if it has them.
+
+    Args:
+      rest: number of first rows whose mean is the sensor at rest; None: not known.
 
     Raises:
       ValueError: no raw counts, or neither force nor contact position.
@@ -57,12 +60,14 @@ def from_recording(recording: Recording) -> Examples:
             f"{recording.name} has neither force nor contact place, so that no model can be kept: "
             "give --force"
         )
-    return Examples(counts, counts, blocks(len(counts)), targets, False, recording.name, False)
+    tare = np.broadcast_to(counts[:rest].mean(0), counts.shape)
+    known = rest is not None
+    return Examples(counts, tare, blocks(len(counts)), targets, known, recording.name, False)
 
 
 def from_set(path: pathlib.Path | str) -> Examples:
     """A data set: measured counts of labelled interactions or, without labels, simulated ones. The first row
-    of each is its tare. The force is the object's on the skin, from a measurement if known.
+    of each is its tare. The force is the skin's on the object, from a measurement if known.
 
     Raises:
       FileNotFoundError, ValueError: no set, or one without counts.
@@ -86,7 +91,7 @@ def from_set(path: pathlib.Path | str) -> Examples:
             force = data[known[0]][rows][:, :3].astype(float)
             for other in known[1:]:
                 force = np.where(np.isfinite(force), force, data[other][rows][:, :3])
-            targets["force"] = -force  # the store has the skin's force on the object
+            targets["force"] = force
         if "contact_pos" in data.columns:
             targets["place"] = data["contact_pos"][rows].astype(float)
         if not targets:

@@ -304,16 +304,27 @@ def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple
     return reader, scores
 
 
+def judge_on(reader: Reader, data: Examples) -> dict:
+    """Errors of a model on other data than it was trained on, beside those of these data's own mean.
+
+    Raises:
+      ValueError: a model of changes from rest where the data's rest is not known, or of other electrodes.
+    """
+    names = np.unique(data.owner)
+    return _scored(reader, data, names, names)[1]
+
+
 def _scored(reader, data, test, train):
     """The model whose description names the outputs that the trajectories `test` do not show to be better
     than the mean of `train`, and its errors on them beside those of that mean."""
     known = np.isin(data.owner, train)
     rows = np.isin(data.owner, test)
-    found = reader.predict(data.counts[rows], data.tare[rows], None if data.pdc is None else data.pdc[rows])
+    tare = data.tare[rows] if data.tared else None
+    found = reader.predict(data.counts[rows], tare, None if data.pdc is None else data.pdc[rows])
     truth = data.targets | {"electrodes": data.counts}
     out = {}
-    for name, value in found.value.items():
-        error = np.abs(value - truth[name][rows])
+    for name in (name for name in found.value if name in truth):
+        error = np.abs(found.value[name] - truth[name][rows])
         mean = np.abs(np.nanmean(truth[name][known], axis=0) - truth[name][rows])
         there = np.isfinite(error).all(1)
         error, mean, owner = error[there], mean[there], data.owner[rows][there]
