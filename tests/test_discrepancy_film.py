@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+import biotac_mj.data.generation.simulate as simulation
 from biotac_mj.discrepancy.trajectories.model.differences import differences, filled, sunk
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
-from biotac_mj.effects.in_film import RoughFilm, SunkFilm, drain, remaining_liquid
+from biotac_mj.effects.in_film import RoughFilm, SeveralFilms, SunkFilm, drain, remaining_liquid
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.film import FilmConduction
@@ -57,14 +58,29 @@ def test_a_skin_that_has_sunk_leaves_a_thinner_film(film):
     assert np.isfinite(SunkFilm(film, 5e-3).impedance(rest)).all()
 
 
-def test_a_skin_that_sinks_is_lost_liquid():
-    """Solved once with the skin nearer to the core, in air: the hour's 0.1 mm by its difference."""
+def test_films_laid_together_are_what_each_is_alone(film):
+    alone, together = ([film.with_residual_film(t) for t in (2e-5, 5e-5, 2e-4)] for _ in range(2))
+    together = SeveralFilms(together)
+    for x in (thinner(film, 0.2), thinner(film, 0.1)):
+        expected = np.stack([one.impedance(x) for one in alone])
+        assert (expected[0] > expected[-1]).all()
+        np.testing.assert_array_equal(together.impedance(x), expected)
+
+
+def test_a_skin_that_sinks_is_lost_liquid(monkeypatch):
+    """Solved once with the skin nearer to the core, in air: the hour's 0.1 mm by its difference. What lies
+    under the two films is solved once."""
+    solved = []
+    monkeypatch.setattr(
+        simulation, "simulate", lambda *a, own=simulation.simulate, **k: solved.append(a) or own(*a, **k)
+    )
     t = np.linspace(0, 1, 8)
     pos = np.tile([-12e-3, -30e-3, 0], (8, 1))
     air = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (8, 1, 1)), np.full((8, 19), 2500.0))
     sim, both = Simulator(), [air, dataclasses.replace(air, clock=3600.0)]
     base = sim.solve(both)
-    fields = Fields(base, differences([*filled(sim), *sunk(sim)], both, base), both)
+    fields = Fields(base, differences([*sunk(sim), *filled(sim)], both, base), both)
+    assert len(solved) == 2  # the base and less liquid
     lost = by_id("fluidloss").given(["sink"])
     theta = {**lost.default(), "sink": 0.1e-3, "suction": 1e4}
     fresh, late = sim.run(both, fields, False, [(lost, theta)])

@@ -1,6 +1,7 @@
 """Loss of liquid and rough walls as changes of the skin and the film: less liquid under the skin, a sunk
 skin, another law of the film's conductance."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,13 +52,25 @@ class SunkFilm(FilmConduction):
 
 
 class SeveralFilms:
-    """Films under one skin: impedances (nfilm, ...) of each."""
+    """Films under one skin that differ in their least thickness alone: impedances (nfilm, ...) of each.
+
+    Args:
+      films: smooth ones, from the thinnest on, by which the others are laid.
+    """
 
     def __init__(self, films: Sequence[FilmConduction]):
         self._films = films
+        for one in films[1:]:
+            one._solve_single[0] = functools.partial(_lay_as, films[0]._single, one)
 
     def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
         return np.stack([one.impedance(vert_xpos) for one in self._films])
+
+
+def _lay_as(laid, film):
+    """Lays a film as a thinner one is laid."""
+    film._single.middle.assign(laid.middle)
+    np.maximum(laid.thickness.numpy(), film.residual_film, out=film._single.thickness.numpy())
 
 
 def remaining_liquid(rate: float, clock: float, before: float = 0.0) -> float:

@@ -91,7 +91,7 @@ def solved_fields(
         inside = memory_of([(Stiffening(), {"c2": _STIFFER})])
         rubber = plain(inside.rubber(read_material(sim.material)))
         lacking = [Change("stiffen", _STIFFER, sim.but(material=rubber)), *(tacky(sim, by) for by in _TACKY)]
-    small = [*_uneven(quick, places), *filled(quick), *sunk(quick), *softer(quick)]
+    small = [*sunk(quick), *_uneven(quick, places), *filled(quick), *softer(quick)]
     if sim.skin in OTHER_MESH:
         small.append(Change("mesh", 1.0, quick.but(skin=OTHER_MESH[sim.skin])))
     if any("sphere" in t.tool for t in trajectories):
@@ -111,10 +111,11 @@ def solved_fields(
             with contextlib.suppress(GridTooCoarse):
                 for change in lacking:
                     slopes |= differences([change], trajectories, base, tick)
+        # films first, while what the skin does is known
+        film = _films(quick, trajectories, here, thick, tick)
         slopes |= differences(small, trajectories, here, tick)
         for name in slopes.keys() & set(BETWEEN):
             slopes[name] = [one - one[0] for one in slopes[name]]
-        film = _films(quick, trajectories, here, thick, tick)
         deeper = _deeper(quick, trajectories, here, deeper, tick)
         slopes |= _shifts(quick, trajectories, here, deeper, tick)
         less, more = (quick.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)

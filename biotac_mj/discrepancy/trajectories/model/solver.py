@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import typing
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -24,6 +25,7 @@ if typing.TYPE_CHECKING:
 TIERS = ("condensed", "full")
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
+_LAST = weakref.WeakKeyDictionary()  # what a skin was solved for last, and its fields
 # what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
 _ACTING = "mixing pdc_gain warm_up relaxation loss drift power saturation lowpass latency".split()
 
@@ -171,7 +173,13 @@ class Solver:
         rows = [np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _, _ in todo]
         motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _, _) in zip(rows, todo)]
         times = [_waiting(time, longest) for *_, time, _ in todo]
-        fields = simulate(model, [tool for _, tool, *_ in todo], motions, time=times, tier=self.tier)
+        tools = [tool for _, tool, *_ in todo]
+        poses = [a.tobytes() for m, time in zip(motions, times) for a in (m.pos, m.mat, time)]
+        asked = self.tier, tools, poses  # one skin under several films is solved once
+        known, fields = _LAST.get(model, (None, None))
+        if known != asked:
+            fields = simulate(model, tools, motions, time=times, tier=self.tier)
+            _LAST[model] = asked, fields
         for w, (i, _, pos, _, _, entry) in enumerate(todo):
             n = len(pos)
             impedance = impedance_of(film, fields.vert_xpos(model.geometry.vert, w)[:n])
