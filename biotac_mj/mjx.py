@@ -20,6 +20,7 @@ from .batch.attach import core_of
 from .batch.rows import Rows
 from .coupling.handle import SENSORS
 from .coupling.settings import SettingKeywords, Settings
+from .fields import as_whole
 
 if typing.TYPE_CHECKING:
     import jax
@@ -101,8 +102,8 @@ class Model:
 
     Attributes:
       mjm: the MjModel.
-      rest: {field of Data: (1, ...)}, the initial state of a world. draws: position of the seeds in the words
-        of its skins, see `batch.rows.Rows`.
+      rest: {field of Data: (1, ...)}, the initial state of a world. draws: what seeds draw in words of its
+        skins, see `batch.rows.Rows`.
     """
 
     def __init__(self, mjm: mujoco.MjModel, prefixes: tuple, room: dict, settings: dict, device: str):
@@ -165,16 +166,25 @@ def make_data(model: Model, seed: "jax.typing.ArrayLike" = 0) -> Data:
 
     Args:
       model: of `put_model`.
-      seed: integer >= 0, of the noise of the world's sensors, and of the draws of `sensor="random"`,
-        `randomise` and lists of `thermal` and `textures`.
+      seed: integer from 0 to 2**32 - 1, of the noise of the world's sensors, and of the draws of
+        `sensor="random"`, `randomise` and lists of `thermal` and `textures`: those of `batch.attach(seed=)`.
+
+    Raises:
+      ValueError: another seed; of a traced one its type alone is known.
     """
+    import jax
     import jax.numpy as jnp
 
+    if not isinstance(seed, jax.core.Tracer):
+        seed = as_whole("seed", np.asarray(seed).tolist(), 0, 2**32 - 1)
+    elif seed.dtype.kind not in "iu":
+        raise ValueError(f"seed is of {seed.dtype}: pass integers")
     fields = {name: jnp.asarray(value[0]) for name, value in model.rest.items()}
     row, seed = fields["skins"], jnp.asarray(seed, jnp.uint32)
-    for at_seed, pool in model.draws:
-        for at, words in pool:
-            row = row.at[at : at + words.shape[1]].set(jnp.asarray(words)[seed % len(words)])
+    for at_seed, places, words in model.draws:
+        if len(places):
+            like = jax.ShapeDtypeStruct(places.shape, np.uint32)
+            row = row.at[places].set(jax.pure_callback(words, like, seed, vmap_method="sequential"))
         row = row.at[at_seed].set(seed)  # the lower word: the upper one is of the BioTac's name
     return Data(**{**fields, "skins": row})
 

@@ -818,7 +818,7 @@ NUMBERS = {
     "element:cubic device:tpu",
     "diagnose shard.h5": "rate:0,-1,nan,a locked:0,1,nan,-1 tier:turbo device:gpu",
     "data import electrodes.txt": "rate:0,nan,a block:0,-1,nan seed:-1",
-    "learn train shard.h5": "seeds:-1,a,1.5 steps:0,-1,a limit:0,-1 device:gpu",
+    "learn train shard.h5": "seeds:-1,a,1.5 steps:0,-1,a device:gpu",
     "learn judge trained": "fraction:nan,a seed:-1",
     "learn predict inverse electrodes.txt": "tare:a,1.5 row:a",
     "lab estimate electrodes.txt": "rest:0,a row:a,99999 rate:0,nan indenter:cone material:jelly",

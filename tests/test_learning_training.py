@@ -118,9 +118,10 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
     same = dict(paper=False, progress=False)
     train_all(folder, trained, (0,), ("trajectory",), SMALL, **same)
     assert (trained / "trajectory-0.json").stat().st_mtime_ns == stamp
-    for name, changes in (("paper", same | {"paper": True}), ("limit", same | {"limit": 9})):
+    other = dataclasses.replace(SMALL, steps=SMALL.steps + 1)
+    for name, config, paper in (("paper", SMALL, True), ("config", other, False)):
         with pytest.raises(ValueError, match=rf"json is of other settings \({name}\): choose another --out"):
-            train_all(folder, trained, (0,), ("trajectory",), SMALL, **changes)
+            train_all(folder, trained, (0,), ("trajectory",), config, paper=paper, progress=False)
 
 
 @pytest.mark.slow
@@ -318,7 +319,7 @@ def test_a_batch_gives_what_single_sensors_give(weights):
 
     skin = load_skin("coarse")
     u = np.stack([dent(skin, [x, -7e-3, 0], 0.6e-3, 2e-3, 0) for x in (-12e-3, -9e-3, -5e-3)])
-    film = LearnedBatchFilm(skin, 3, "cpu", weights=weights, sensor="2")
+    film = LearnedBatchFilm(skin, 3, "cpu", weights=weights)
     x = wp.array(np.ascontiguousarray((skin.vert + u).transpose(1, 0, 2)), dtype=wp.vec3d)
     film.solve_film(x, wp.array(np.array([1, 0, 1], np.int32), dtype=int))
     one = NetworkFilm(skin, weights)
@@ -341,6 +342,8 @@ def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
     assert table["weights with mixing"]["5"] < 0.5 * table["weights"]["0"] < table["no change"]["0"]
     assert table["weights with gains"]["5"] < 0.5 * table["weights"]["0"]
     sensor = read_sensor(amend(Model(None, None, None, None, None), file).sensor)
+    with pytest.raises(ValueError, match="signal is 'latent_projection' and .*sensor.yaml has 'physics'"):
+        amend(Model(None, None, None, None, None, "latent_projection"), file)
     with biotac_mj.data.TactileSet(other) as data:
         rest = data["measured_counts"][data.start][:, :19]
     np.testing.assert_allclose(sensor.rest, rest[data.labelled].mean(0), atol=1e-3)

@@ -154,6 +154,25 @@ def test_a_seed_is_a_worlds_noise_and_sensor(model):
     assert (electrodes[0] != electrodes[1]).sum() > 10
 
 
+@pytest.mark.parametrize("seed", [0, 256, 2**32 - 1])
+def test_a_seed_draws_the_sensor_that_a_batch_has(seed):
+    own = {"sensor": "random", "randomise": ["drift"], "thermal": {"ball": ["steel", "plastic"]}}
+    model = mjx.put_model(ball_model(), skin=shell(), **own)
+    data = jax.jit(jax.vmap(lambda s: mjx.make_data(model, s)))(jnp.array([seed, 1], jnp.uint32))
+    again = mjx.put_model(ball_model(), skin=shell(), **own)
+    again._settings["seed"], again._worlds = seed, {}
+    np.testing.assert_array_equal(data.skins[0], again.worlds(1).rest()["skins"][0])
+    assert (data.skins[0] != data.skins[1]).sum() > 100
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 1.7, True, "1", [1, 2]])
+def test_a_seed_that_is_none_is_named(model, seed):
+    with pytest.raises(ValueError, match="seed is "):
+        mjx.make_data(model, seed)
+    with pytest.raises(ValueError, match="seed is of float32"):
+        jax.jit(lambda s: mjx.make_data(model, s))(1.0)
+
+
 def test_two_biotacs_have_noise_of_their_own():
     spec = ball_spec()
     for prefix, z in (("left_", 0.0), ("right_", 0.05)):

@@ -27,7 +27,7 @@ from biotac_mj.tasks.batched import (
     rsl_rl_env,
     skrl_env,
 )
-from biotac_mj.tasks.batched.playing import find_policy, seen_by
+from biotac_mj.tasks.batched.playing import find_policy, interval, seen_by
 from biotac_mj.tasks.batched.policy import Policy, load_policy, read_card, save_policy
 from biotac_mj.tasks.batched.ppo import Learner, Lessons, Numbers
 from biotac_mj.tasks.batched.roll_rod import Settings
@@ -35,6 +35,7 @@ from biotac_mj.tasks.batched.task import BatchTask
 from biotac_mj.tasks.batched.touch import Touch
 from biotac_mj.tasks.batched.training import of_runs, tier_errors, train
 from biotac_mj.view.offscreen import find_gl
+from biotac_mj.view.policy import _said
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
 needs_hand = pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
@@ -163,7 +164,7 @@ def test_errors_of_the_model_differ_between_episodes():
         """(3, 42) of changes of 100 counts in all channels."""
         env.step(torch.zeros(3, 4))
         env.sensordata[:, env._touch._place] = env.rest_counts + 100.0
-        env._sense(~env._everyone)
+        env._sense()
         return env.observe()["touch"]
 
     seen = felt()
@@ -336,7 +337,7 @@ def test_libraries_get_what_they_ask_for():
     assert vector.observation_space.contains(seen) and not seen[:, 13:].any()
     seen, reward, ended, over, told = vector.step(vector.action_space.sample())
     assert vector.observation_space.contains(seen) and reward.shape == ended.shape == over.shape == (2,)
-    assert told["success"].shape == (2,)
+    assert told["success"].shape == (2,) and "final_obs" not in told
     with pytest.raises(ValueError, match="all worlds are reset"):
         vector.reset(options={"reset_mask": [True, False]})
     for one in (env, vector, other):
@@ -347,6 +348,33 @@ def test_libraries_get_what_they_ask_for():
     observations, reward, done, extras = worlds.step(torch.zeros(2, 4))
     assert observations["touch"].shape == (2, 20) and reward.shape == done.shape == (2,)
     assert done.dtype == torch.long and "time_outs" in extras
+
+
+def test_gymnasium_gets_the_last_observation_of_an_episode():
+    """Beside the first of the next, of worlds that ended alone, as its own vector environments give it."""
+    pytest.importorskip("gymnasium")
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1, decisions=3, encoder=0.0)
+    env = make("follow_edge", 2, device="cpu", settings=settings)
+    vector = gymnasium_env(env)
+    vector.reset(seed=0)
+    env.episode_length_buf[1] = 1
+    for _ in range(2):
+        seen, _, _, over, told = vector.step(np.ones((2, 4), np.float32))
+    assert over.tolist() == told["_final_obs"].tolist() == told["_final_info"].tolist() == [False, True]
+    last = told["final_obs"]
+    assert last[0] is None and last[1].shape == seen[1].shape
+    np.testing.assert_allclose(last[1][8:12], seen[0][8:12])  # goals of the actions, alike in both
+    assert not seen[1][8:12].any() and seen[0][8:12].all()
+    final = told["final_info"]
+    assert final["error"][1] == told["error"][1] and final["_error"].tolist() == [False, True]
+
+
+def test_learned_touch_needs_sensors_with_a_network():
+    env = make("follow_edge", 1, device="cpu")
+    with pytest.raises(ValueError, match="observe is 'learned': .*observe='learned'"):
+        env.observe("learned")
+    with pytest.raises(ValueError, match="observe is 'learned'"):
+        make("follow_edge", 1, device="cpu", observe="learned", signal="physics")
 
 
 def test_a_seed_repeats_an_episode_with_its_random_sensor():
@@ -499,6 +527,14 @@ def test_a_policy_learns_and_is_played_as_its_card_says(tmp_path, capsys):
         assert main(["play", "follow_edge", "--policy", str(path), "--render", str(picture)]) == 0
         with Image.open(picture) as film:
             assert film.n_frames == 12 and film.size == (480, 540)  # four episodes
+
+
+def test_a_score_says_what_else_would_agree_with_a_card():
+    score = {"task": "roll_rod", "policy": "shipped", "agrees": True, "card": interval(86, 96)}
+    said = _said(score | interval(12, 16))
+    assert "0.75 (0.51 to 0.90) of 16 episodes; that agrees with its card: 0.90 (0.82 to 0.94) of 96" in said
+    assert said.endswith("of 96, as 0.69 to 1.00 would in 16 episodes")
+    assert interval(11, 16)["high"] >= interval(86, 96)["low"] > interval(10, 16)["high"]
 
 
 def test_what_only_a_task_has_is_refused_elsewhere(capsys):

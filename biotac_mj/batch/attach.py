@@ -400,7 +400,7 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
         for one in wanted if isinstance(wanted, list) else [wanted]:
             check_geoms(what, one, read)
             find_geoms(ModelView(mjm._address), one or ())
-    rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms, geometry.design)
+    drawn = draws(nworld, seed, config, settings, thermal, textures, touching.geoms, geometry.design)
     signal = "physics" if sensor.signal is None else sensor.signal
     signal, weights = read_signal(signal, settings.pop("weights", None))
     if signal != "physics":
@@ -416,4 +416,4 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
     settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
     seeds = [int(seed) + w for w in range(nworld)] if np.ndim(seed) == 0 else [int(s) for s in seed]
     seeds = [config.noise_seed(s) for s in seeds]
-    return Senses(skin, film, touching.group, rows, redraw, seeds, float(mjm.opt.timestep), **settings)
+    return Senses(skin, film, touching.group, *drawn, seeds, float(mjm.opt.timestep), **settings)

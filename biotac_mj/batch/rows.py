@@ -1,7 +1,7 @@
 """The state that batches carry from step to step, as one row of words for each world: for callers that keep
 the states themselves, as JAX does."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +13,12 @@ from .batch import Batch
 
 
 class Draws(NamedTuple):
-    """Random draws of one BioTac: the word where its seed begins, and [(first word, words (n, k) of n
-    sensors)] that differ between the sensors drawn by resets; empty if these draw nothing."""
+    """Random draws of one BioTac: the word where its seed begins, the words (n,) of what the seed draws, and
+    their values (n,) as a function of it; n is 0 if it draws nothing."""
 
     seed: int
-    pool: list[tuple[int, np.ndarray]]
+    places: np.ndarray
+    words: Callable[[int], np.ndarray]
 
 
 class Rows:
@@ -66,12 +67,9 @@ class Rows:
         self._write = Transfer([pair[::-1] for pair in pairs], nworld, device, words=True)
         self._all = wp.full(nworld, True, dtype=bool, device=device)
         self.draws = [
-            Draws(
-                at[batch.senses.acquisition.seed.ptr],
-                [(at[array.ptr], _table(rows)) for array, rows in batch.senses.pool],
-            )
+            Draws(at[senses.acquisition.seed.ptr], *_drawn(senses, at))
             for batch in batches
-            if batch.senses
+            if (senses := batch.senses)
         ]
 
     def read(self) -> None:
@@ -83,5 +81,10 @@ class Rows:
         self._write.launch_where(self._all)
 
 
-def _table(rows):
-    return np.ascontiguousarray(rows).view(np.uint32).reshape(len(rows), -1)
+def _drawn(senses, at):
+    def words(seed):
+        values = [np.ravel(value).view(np.uint32) for _, value in senses.drawn(int(seed))]
+        return np.concatenate([np.zeros(0, np.uint32), *values])
+
+    places = [at[array.ptr] + np.arange(2 * np.size(value)) for array, value in senses.drawn(0)]
+    return np.concatenate([np.zeros(0, int), *places]), words

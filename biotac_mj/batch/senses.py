@@ -1,5 +1,6 @@
 """The sensors of all worlds: film, acquisition, and heat and vibration where they are wanted."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ def draws(
     textures: dict | list | None,
     geoms: list[Geom],
     design: Design = BIOTAC,
-) -> tuple[list[Draw], bool]:
+) -> tuple[list[Draw], Callable[[int], Draw] | None]:
     """Draws the sensors with which worlds begin, or from which their resets draw.
 
     Args:
@@ -53,7 +54,7 @@ def draws(
       geoms: that can touch. design: of the sensors.
 
     Returns:
-      [Draw], one for each world or more, and whether every reset draws one.
+      [Draw], one for each world or more, and what a seed draws, where every reset draws one.
 
     Raises:
       ValueError: lists of another length, or what cannot be.
@@ -68,22 +69,24 @@ def draws(
     if np.ndim(seed) == 0:
         seeds = [seeds[0] + w for w in range(nworld)]
 
-    def row(i):
-        mine = {**settings, "sensor": lists["sensor"][i]} if "sensor" in lists else settings
-        made, brushed = (v[i] if isinstance(v, list) else v for v in (thermal, textures))
-        key = seeds[i] if i < len(seeds) else max(seeds) + 1 + i - len(seeds)
-        sensor, _, drawn = take_sensor(mine, config.own_seed(key), design)
+    def draw(key, own=settings, made=thermal, brushed=textures):
+        sensor, _, drawn = take_sensor(own, config.own_seed(key), design)
         bodies = None if made is None else materials_of(geoms, made, key)
         surfaces = None if brushed is None else textures_of(geoms, brushed, key)
         choices = [*(made or {}).values(), *(brushed or {}).values()]
         return Draw(sensor, bodies, surfaces), drawn or any(isinstance(c, (list, tuple)) for c in choices)
 
-    first, drawn = row(0)
-    if not (drawn or lists):
-        return [first] * nworld, False
-    redraw = not lists
-    count = max(_POOL, nworld) if redraw else nworld
-    return [row(i)[0] for i in range(count)], redraw
+    def of_world(w):
+        own = {**settings, "sensor": lists["sensor"][w]} if "sensor" in lists else settings
+        return draw(seeds[w], own, *(v[w] if isinstance(v, list) else v for v in (thermal, textures)))
+
+    first, drawn = of_world(0)
+    if lists:
+        return [of_world(w)[0] for w in range(nworld)], None
+    if not drawn:
+        return [first] * nworld, None
+    keys = [*seeds, *range(max(seeds) + 1, max(seeds) + 1 + _POOL - nworld)]
+    return [draw(key)[0] for key in keys], lambda seed: draw(seed)[0]
 
 
 @wp.kernel
@@ -137,7 +140,7 @@ class Senses:
     Args:
       skin: BatchSkin. film: BatchFilm, or what stands for it.
       group: (ngeom,) body of each geom.
-      rows: [Draw] of `draws`; redraw: whether resets draw from them.
+      rows: [Draw] of `draws`, from which resets draw if `of_seed`, (seed) -> Draw, is given.
       seed: see `BatchAcquisition`. dt: time step [s].
       cold, temperature: see `PhysicsReadings`. settings: noise, film_every_step.
 
@@ -151,7 +154,7 @@ class Senses:
         film: object,
         group: np.ndarray,
         rows: list[Draw],
-        redraw: bool,
+        of_seed: Callable[[int], Draw] | None,
         seed: ArrayLike,
         dt: float,
         cold: bool = False,
@@ -159,6 +162,7 @@ class Senses:
         **settings: object,
     ):
         self._skin, self.film, self._dt = skin, film, dt
+        self._of_seed, self._warmth = of_seed, (temperature, cold)
         device, nworld, ngroup = skin.model.device, skin.nworld, skin.ngroup
         warm, shaken = rows[0].bodies is not None, rows[0].textures is not None
         self.heat = self.vibration = self._touched = None
@@ -179,7 +183,7 @@ class Senses:
             temperature=temperature,
             liquid=begins[:, ABOVE] if warm else 0.0,
             sensor=[r.sensor for r in rows],
-            redraw=redraw,
+            redraw=of_seed is not None,
             heat=warm,
             device=device,
             design=film.design,
@@ -220,18 +224,20 @@ class Senses:
             own += [a.temperature, a.liquid]
         return own + [state for _, state in self._rests]
 
-    @property
-    def pool(self) -> list[tuple[wp.array, np.ndarray]]:
-        """Sensors from which resets draw: arrays of `lasting`, and the values (n, ...) of sensor 0 .. n -
-        1."""
-        a = self.acquisition
-        if not a.redraws:
+    def drawn(self, seed: int) -> list[tuple[wp.array, np.ndarray]]:
+        """Of the sensor that a seed draws, the values at rest in a world's rows of arrays of `lasting`; empty
+        where none is drawn."""
+        if not self._of_seed:
             return []
-        rest = a.rest_states.numpy()
-        own = [(a.row, np.arange(len(rest), dtype=np.int32)), (a.state, rest)]
-        if not self.heat:
-            own.append((a.temperature, rest[:, a.place.given_temperature]))
-        return own + [(state, table.numpy()) for table, state in self._rests]
+        row, a, warmth = self._of_seed(seed), self.acquisition, self._warmth[:1]
+        begin = _begin(row, *self._warmth) if self.heat else None
+        if self.heat:
+            warmth = float(begin[THERMISTOR]), float(begin[ABOVE])
+        rest = a.rest_state(row.sensor, *warmth)
+        parts = [begin] if self.heat else []
+        parts += [self.vibration.rest(row.textures)] if self.vibration else []
+        found = [(a.state, rest)] + [(s, part) for (_, s), part in zip(self._rests, parts, strict=True)]
+        return found if self.heat else [*found, (a.temperature, rest[a.place.given_temperature])]
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest; may draw other sensors."""

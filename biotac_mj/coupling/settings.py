@@ -258,11 +258,11 @@ class Settings:
             if isinstance(value, (list, tuple)):
                 raise ValueError(f"{name} of each world beside effects: give one of them, or neither")
         mesh = skin.mesh if skin.design is None else skin_of_design(skin.design, skin.mesh)
-        model = Model(mesh, skin.material, self.options, sensor.individual, contact.friction)
+        model = Model(mesh, skin.material, self.options, sensor.individual, contact.friction, sensor.signal)
         model = amend(model, self.effects)
         given = {"skin": model.skin, "material": model.material}
         if not sensor.left_out:
-            given["sensor"] = model.sensor
+            given |= {"sensor": model.sensor, "signal": model.signal}
         changes = {_PLACES[name]: value for name, value in given.items()}
         changes[_PLACES["friction"]] = model.friction
         return dataclasses.replace(self._with_options(model.options)._with(changes), effects=None)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..fields import either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import design_of, skin_reference
 from ..geometry.tet_mesh import enclosed_volume
@@ -32,7 +33,7 @@ _ORDER = {effect.id: i for i, effect in enumerate(CATALOGUE)}
 
 @dataclasses.dataclass
 class Model:
-    """Settings of a sensor, as for `attach`: `skin`, `material`, `options` and `sensor` may be None.
+    """Settings of a sensor, as for `attach`: all but `friction` may be None.
     `friction` is the caller's."""
 
     skin: str | pathlib.Path | SkinGeometry | None
@@ -40,6 +41,7 @@ class Model:
     options: dict | None
     sensor: object
     friction: object
+    signal: str | pathlib.Path | None = None
 
 
 def take_effects(effects: Effects) -> tuple[SensorFile, str]:
@@ -69,9 +71,11 @@ def amend(model: Model, effects: Effects) -> Model:
       effects: a sensor file, such as `biotac diagnose` writes, or [(Effect, theta)].
 
     Raises:
-      FileNotFoundError, ValueError: see `take_effects`; an effect that a running sensor cannot have.
+      FileNotFoundError, ValueError: see `take_effects`; an effect that a running sensor cannot have; another
+        signal than the file's.
     """
     file, where = take_effects(effects)
+    signal = either("signal", model.signal, file.base, where)
     base, omitted = file.base, []
     skin = base.get("skin", "default") if model.skin is None else model.skin
     material = read_material(base.get("material") if model.material is None else model.material)
@@ -116,7 +120,7 @@ def amend(model: Model, effects: Effects) -> Model:
     if inside.model:
         given = read_modulus(options.get("modulus"))
         options["modulus"] = plain(moduli(given, inside.model["modulus"], skin_reference(skin)[1]))
-    return Model(skin, material, options, plain(vars(with_effects(sensor, of_sensor))), friction)
+    return Model(skin, material, options, plain(vars(with_effects(sensor, of_sensor))), friction, signal)
 
 
 def amend_settings(given: dict, kind: type, effects: Effects) -> dict:

@@ -22,6 +22,7 @@ _KEYS = {
     "material": str | dict,
     "options": dict,
     "sensor": str | dict,
+    "signal": str,
     "constitutive": str,
     "modulus_factor": float,
     "stages": dict[str, list],
@@ -37,8 +38,8 @@ class SensorFile:
     """Content of a sensor file.
 
     Attributes:
-      base: settings in the file among skin, tier, material, options, sensor (as for `attach`), constitutive
-        ("reduced" | "in_skin") and modulus_factor, on the material's Young's modulus.
+      base: settings in the file among skin, tier, material, options, sensor and signal (as for `attach`),
+        constitutive ("reduced" | "in_skin") and modulus_factor, on the material's Young's modulus.
       effects: [(Effect, theta)]. intervals: {effect id: {parameter: (low, high)}}, 95 %.
     """
 

@@ -94,7 +94,8 @@ def contact_patch(
             f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at: "
             "give fewer, and 1 at least"
         )
-    rest, recorded = counts[:tare].mean(0), _recorded(recording)
+    rest, force = counts[:tare].mean(0), recording.force
+    recorded = None if force is None else np.linalg.norm(force, axis=1)  # NaN in rows without
     if row is None:
         row = int(np.nanargmax(np.abs(counts - rest).sum(1) if recorded is None else recorded))
     if not -len(counts) <= row < len(counts):
@@ -131,11 +132,6 @@ def contact_patch(
     here = Estimate(field[row], contact[row], is_force, fraction)
     _figure(geometry, outer, here, centre[row], counts[row] - rest, one, out / "contact.png")
     return one
-
-
-def _recorded(recording):
-    """(n,) norm of the recorded force [N], NaN in rows without; None if no force was recorded."""
-    return None if recording.force is None else np.linalg.norm(recording.force, axis=1)
 
 
 def _drift(tdc, change, force):

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.presets import Sensor, read_sensor
+from ..sensor.presets import read_sensor
 from .predictor import ForwardModel
 from .weights import check_forward, find_weights, load_forward
 
@@ -36,11 +36,6 @@ class NetworkFilm:
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
         """(n,) [ohm] for nodes (nvert, 3) [m]."""
-        vert_xpos = np.asarray(vert_xpos, float)
-        if vert_xpos.shape != self.geometry.vert.shape:
-            raise ValueError(
-                f"vert_xpos has shape {vert_xpos.shape}: this network reads {self.geometry.vert.shape}"
-            )
         u = torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)
         return self.rest * np.exp(self.model.log_change(u[None])[0].double().numpy())
 
@@ -52,8 +47,7 @@ class LearnedBatchFilm:
     comes from a pool of its own, which lives as long as this object.
 
     Args:
-      geometry, weights: as for `NetworkFilm`. sensor: whose rest it reads. nworld: worlds. device: Warp
-        device.
+      geometry, weights: as for `NetworkFilm`. nworld: worlds. device: Warp device.
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
@@ -66,13 +60,12 @@ class LearnedBatchFilm:
         nworld: int,
         device: str = "cpu",
         weights: pathlib.Path | str | None = None,
-        sensor: str | Sensor | None = None,
     ):
         self.device = wp.get_device(device)
         torch_device = wp.device_to_torch(self.device)
         self.model = load_forward(find_weights(weights), geometry).to(torch_device)
         self.design = geometry.design
-        self.rest = read_sensor(sensor, design=self.design).impedance
+        self.rest = read_sensor(None, design=self.design).impedance
         with wp.ScopedDevice(self.device):
             self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=wp.float64)
             self.valid = wp.ones(nworld, dtype=int)

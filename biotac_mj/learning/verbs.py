@@ -71,7 +71,6 @@ def _add_train(verbs, verb):
     v.add_argument(
         "--steps", type=whole(1, 10_000_000), help="steps of each training (default: the config's)"
     )
-    v.add_argument("--limit", type=whole(1, 10_000_000), help="interactions to read, the first ones")
     v.add_argument("--device", type=device, default="cpu", help="device of torch: cpu, cuda")
     add_ray(v)
     v.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -157,7 +156,6 @@ def _train_all(args):
         LearningConfig(**settings),
         args.device,
         args.paper,
-        args.limit,
         progress=not args.quiet,
         ray=args.ray,
     )

@@ -121,17 +121,13 @@ def save_points_model(
     more = {"direction": "points", "kind": {"kind": kind}, "config": dataclasses.asdict(config)}
     graph = {f"points.{k}": torch.from_numpy(np.asarray(v)) for k, v in points.arrays().items()}
     graph = {k: v.float() if v.is_floating_point() else v.int() for k, v in graph.items()}
-    meta = about | more | _channels(design_of(points.reference)) | {"reference": points.reference}
-    _write(path, net.state_dict(), meta, graph)
-
-
-def _channels(design):
-    return {"channels": list(design.electrodes)}
+    more |= {"reference": points.reference, "channels": list(design_of(points.reference).electrodes)}
+    _write(path, net.state_dict(), about | more, graph)
 
 
 def _save(path, tensors, geometry, meta):
-    where = {"mesh": mesh_key(geometry), "skin": geometry.name}
-    _write(path, tensors, meta | where | _channels(geometry.design))
+    where = {"mesh": mesh_key(geometry), "skin": geometry.name, "channels": list(geometry.design.electrodes)}
+    _write(path, tensors, meta | where)
 
 
 def _write(path, tensors, meta, graph=()):
@@ -264,7 +260,6 @@ def load_forward(path: pathlib.Path | str, geometry: SkinGeometry) -> ForwardMod
       FileNotFoundError: no such file.
       ValueError: another mesh, other channels, or tensors that do not fit.
     """
-
     meta, tensors = _load(path, geometry, "forward")
     if meta["direction"] == "points":
         return _points_model(path, meta, tensors, geometry)
@@ -297,7 +292,6 @@ def _points_model(path, meta, tensors, geometry):
 def load_inverse(path: pathlib.Path | str, geometry: SkinGeometry) -> InverseHead | PointsModel:
     """An `inverse.InverseHead`, or a latent projection's `predictor.PointsModel`, from weights; raises like
     `load_forward`."""
-
     meta, tensors = _load(path, geometry, "inverse")
     if meta["direction"] == "points":
         return _points_model(path, meta, tensors, geometry)

@@ -13,6 +13,7 @@ memory, and noise is a function of (seed, slot), so a replay from a saved state 
 `Acquisition` is one multiplexer whose state the caller owns. `BatchAcquisition` holds those of many worlds on
 their device. Both launch the kernels of `acquisition_kernels`."""
 
+import functools
 import math
 import threading
 
@@ -348,16 +349,10 @@ class BatchAcquisition:
                 f"{len(sensors)} sensors for {nworld} worlds: pass one for each, or a single one"
             )
         self.place = place_of(design)
-        rows, states = np.zeros((len(sensors), self.place.nstate)), {}
-        warm = [None if temperature is None else float(t) for t in np.broadcast_to(temperature, len(sensors))]
-        for row, *one in zip(
-            rows, sensors, warm, np.broadcast_to(liquid, len(sensors)).tolist(), strict=True
-        ):
-            if tuple(one) not in states:
-                single = Acquisition(sensor=one[0], film_rest=rest, heat=heat, design=design)
-                single.reset(row, rest, temperature=one[1], liquid=one[2])
-                states[tuple(one)] = row
-            row[:] = states[tuple(one)]
+        self._film_rest, self._heat, self._design, n = rest, heat, design, len(sensors)
+        warm = [None if temperature is None else float(t) for t in np.broadcast_to(temperature, n)]
+        rest_state = functools.cache(self.rest_state)  # equal sensors are many
+        rows = [*map(rest_state, sensors, warm, np.broadcast_to(liquid, n).tolist())]
         seeds = [int(seed) + w for w in range(nworld)] if np.ndim(seed) == 0 else [int(s) for s in seed]
         if len(seeds) != nworld:
             raise ValueError(
@@ -371,7 +366,7 @@ class BatchAcquisition:
         with wp.ScopedDevice(self.device):
             self.seed = wp.array(np.array(seeds, np.uint64), dtype=wp.uint64)
             self._noise = _noise(noise, self.seed)
-            self.rest_states = wp.array(rows, dtype=real)
+            self.rest_states = wp.array(np.array(rows), dtype=real)
             self.drawn, self.row = (wp.zeros(nworld, dtype=int) for _ in range(2))
             self.state = wp.zeros((nworld, self.place.nstate), dtype=real)
             self.time, self.temperature, self.liquid = (wp.zeros(nworld, dtype=real) for _ in range(3))
@@ -379,6 +374,13 @@ class BatchAcquisition:
             self._still = wp.zeros((nworld, 0), dtype=real)
             self.reset(wp.full(nworld, True, dtype=bool))
             self.drawn.zero_()  # the owner's first reset is the beginning and draws nothing
+
+    def rest_state(self, sensor: Sensor, temperature: float | None = None, liquid: float = 0.0) -> np.ndarray:
+        """(nstate,) initial state of a sensor; temperature, liquid: see the class."""
+        row, rest = np.zeros(self.place.nstate), self._film_rest
+        single = Acquisition(sensor=sensor, film_rest=rest, heat=self._heat, design=self._design)
+        single.reset(row, rest, temperature=temperature, liquid=liquid)
+        return row
 
     def reset(self, mask: wp.array) -> None:
         """Resets the worlds of mask, (nworld,) wp.array of bool, to rest at time zero."""

@@ -16,7 +16,7 @@ from ..geometry import load_skin
 from ..sensor.colors import electrode_colors
 from ..skin.settings import read_dict
 from ..tasks.batched import TASKS
-from ..tasks.batched.playing import HELD_OUT, acting, agree, env_of, play
+from ..tasks.batched.playing import HELD_OUT, acting, agree, env_of, interval, play
 from ..tasks.batched.task import BatchTask
 from .maps import Maps
 from .offscreen import Offscreen, find_gl
@@ -84,10 +84,11 @@ def _said(score):
     text += f"{score['high']:.2f}) of {score['episodes']} episodes"
     if score["agrees"] is None:
         return text
-    card = score["card"]
+    card, n = score["card"], score["episodes"]
+    alike = [k / n for k in range(n + 1) if agree(interval(k, n), card)]
     meets = "agrees with" if score["agrees"] else "does NOT agree with"
     text += f"; that {meets} its card: {card['success']:.2f} ({card['low']:.2f} to {card['high']:.2f})"
-    return f"{text} of {card['episodes']}"
+    return f"{text} of {card['episodes']}, as {min(alike):.2f} to {max(alike):.2f} would in {n} episodes"
 
 
 class Mirror:

@@ -101,9 +101,9 @@ def save_forward_model(folder: pathlib.Path | str, out: pathlib.Path | str) -> N
     if not source.is_file():
         raise FileNotFoundError(f"no {source}: train seed 0 of the split trajectory")
     report, found = report_of(folder / "trajectory-0.json"), predictions_of(folder / "trajectory-0.npz")
-    arrays = load_arrays(report["set"], limit=report["settings"].get("limit"))
+    arrays = load_arrays(report["set"])
     pod = load_forward(source, arrays.geometry).pod
-    check = division_of(report["set"], "trajectory", 0, len(arrays.objects)).validation
+    check = division_of(report["set"], "trajectory", 0).validation
     rows = arrays.rows(check, labelled=True)
     strange = np.concatenate([_beyond(pod, arrays.field[r].float()) for r in rows.split(256)])
     usual = float(np.quantile(strange, 0.95))

@@ -92,7 +92,7 @@ class Reader:
         for name in self.targets:
             out = self._code(x) if name == "electrodes" else self._regress(name, x)
             value[name] = counts_from_log_impedance(out + rest) if name == "electrodes" else out
-            half[name] = self.tensors[f"{name}.half"] * _scale(strange)[:, None]
+            half[name] = self.tensors[f"{name}.half"] * (1 + strange)[:, None]  # hardly more where usual
         novelty = strange
         if self.meta["tared"]:  # an unusual baseline makes every row unusual
             level = self._novelty_detector["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
@@ -187,11 +187,6 @@ def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type])
 def _stored(name, one):
     """Tensors of a dataclass of arrays."""
     return {f"{name}.{field.name}": getattr(one, field.name) for field in dataclasses.fields(one)}
-
-
-def _scale(strange):
-    """Factor on intervals: it grows with novelty and hardly varies among ordinary rows."""
-    return 1 + strange
 
 
 def _least_aside(level):

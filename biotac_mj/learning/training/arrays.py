@@ -134,20 +134,17 @@ def check_columns(data: "TactileSet") -> None:
             )
 
 
-def load_arrays(
-    path: pathlib.Path | str, device: torch.device | str = "cpu", limit: int | None = None
-) -> Arrays:
+def load_arrays(path: pathlib.Path | str, device: torch.device | str = "cpu") -> Arrays:
     """Reads a set (docs/howto/file_formats.md).
 
     Args:
-      path: folder or shard. device: of torch. limit: interactions to read, the first ones; None reads all.
+      path: folder or shard. device: of torch.
 
     Raises:
       FileNotFoundError: no such set.
       ValueError: no displacements or measured counts in it, channels in another order, NaN, or interactions
         without a row before touch.
     """
-
     from ...data import TactileSet
 
     with TactileSet(path) as data:
@@ -160,13 +157,12 @@ def load_arrays(
                     f"{file.filename} has its channels in the order {' '.join(channels)}: "
                     f"{' '.join(names)} is needed"
                 )
-        stop = len(data) if limit is None else min(limit, len(data))
-        nstep = int(data.stop[stop - 1])
+        nstep = int(data.stop[-1])
         good = data["converged"][:nstep].astype(bool) if "converged" in data.columns else np.ones(nstep, bool)
-        good[data.start[:stop]] = True
+        good[data.start] = True
         keep = np.flatnonzero(good)
-        owner = np.repeat(np.arange(stop), data.stop[:stop] - data.start[:stop])[keep]
-        first = np.searchsorted(keep, data.start[:stop])[owner]
+        owner = np.repeat(np.arange(len(data)), data.stop - data.start)[keep]
+        first = np.searchsorted(keep, data.start)[owner]
         field = np.empty((len(keep), data.geometry.nvert, 3), np.float16)
         for a in range(0, len(keep), 2048):
             field[a : a + 2048] = 1e3 * data["displacement"][keep[a : a + 2048]]
@@ -179,7 +175,7 @@ def load_arrays(
         counts = data["counts"][keep][:, :n]
         check_counts(counts, f"simulated counts of {path}")
         check_counts(np.where(np.isnan(measured), counts, measured), f"measured counts of {path}")
-        labelled = np.asarray(data.labelled[:stop])
+        labelled = np.asarray(data.labelled)
         force = np.zeros((len(keep), data["contact_force"].shape[1]), np.float16)
         for a in range(0, len(keep), 2048):
             force[a : a + 2048] = np.linalg.norm(data["contact_force"][keep[a : a + 2048]], axis=2)
@@ -191,7 +187,7 @@ def load_arrays(
             owner=tensor(owner, torch.int64),
             first=tensor(first, torch.int64),
             time=tensor(time - time[first], torch.float32),
-            objects=np.asarray(data.object[:stop]),
+            objects=np.asarray(data.object),
             labelled=labelled,
             counts=tensor(measured, torch.float32),
             tare=tensor(measured[first], torch.float32),
@@ -200,5 +196,5 @@ def load_arrays(
             outer=np.unique(data.geometry.outer_face),
             geometry=data.geometry,
             path=str(path),
-            sensor="real" if (data.kind[:stop][labelled] == "resimulated").all() else "synthetic",
+            sensor="real" if (data.kind[labelled] == "resimulated").all() else "synthetic",
         )

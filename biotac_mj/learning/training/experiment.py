@@ -41,7 +41,6 @@ def train_all(
     config: LearningConfig | None = None,
     device: torch.device | str = "cpu",
     paper: bool = True,
-    limit: int | None = None,
     progress: bool = True,
     ray: str | None = None,
 ) -> None:
@@ -56,7 +55,6 @@ def train_all(
         object (or objects, with +) that is held out for the test.
       config: LearningConfig. device: of torch. paper: False skips what is slow without a GPU: latent
         projection and PointNet++.
-      limit: number of interactions to read.
       progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for each split and
         seed, with one core, and one GPU if the device is one. All nodes read the set at its path.
     """
@@ -66,10 +64,11 @@ def train_all(
         "set": str(pathlib.Path(path).resolve()),
         "config": dataclasses.asdict(config),
         "paper": paper,
-        "limit": limit,
     }
     _refuse_others(out, json.loads(json.dumps(settings)))
-    size = _steps_of(config, paper)
+    # steps of the heads, the inverse, and the paper's networks
+    size = (2 * config.members + 3) * config.steps
+    size += (config.mesh_steps + 4 * config.paper_steps) if paper else 0
     tasks = [
         Task((split, seed), size, f"{split}-{seed}.json")
         for split in splits
@@ -80,20 +79,13 @@ def train_all(
         return
     with TactileSet(path) as data:
         check_columns(data)
-        count = min(len(data), limit or len(data))
     for split in splits:
-        division_of(path, split, 0, count)  # raises if it cannot be split
+        division_of(path, split, 0)  # raises if it cannot be split
     work = _Train(settings, str(device))
     for _ in run_tasks(
         work, tasks, out, "train", "step", ray, gpus=int(str(device) != "cpu"), progress=progress
     ):
         pass
-
-
-def _steps_of(config, paper):
-    """Steps of all networks of a split and seed: heads, the inverse, the paper's."""
-    papers = config.mesh_steps + 4 * config.paper_steps
-    return (2 * config.members + 3) * config.steps + (papers if paper else 0)
 
 
 @dataclasses.dataclass
@@ -123,7 +115,7 @@ class _Train:
         begun = time.time()
         given = self.settings
         config = LearningConfig(**given["config"])
-        arrays = load_arrays(given["set"], self.device, given["limit"])
+        arrays = load_arrays(given["set"], self.device)
         features = Features(arrays, config)
         text = f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps"
         report(f"{text} read in {time.time() - begun:.0f} s")
@@ -169,7 +161,7 @@ def train_split(
     seed 0, and last SPLIT-SEED.json with the settings of the whole training. checkpoints: of all networks."""
     arrays, config = features.arrays, features.config
     path, checkpoints = settings["set"], checkpoints or Checkpoints()
-    division = division_of(path, split, seed, len(arrays.objects))
+    division = division_of(path, split, seed)
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
     fit = arrays.rows(train, labelled=True)
@@ -263,15 +255,12 @@ def train_split(
     _write(out, f"{split}-{seed}", arrays, check, both, truth, predictions, report)
 
 
-def division_of(path: pathlib.Path | str, split: str, seed: int, count: int) -> Split:
-    """Split of a set in a training, see `train_all`; count: interactions that were read."""
+def division_of(path: pathlib.Path | str, split: str, seed: int) -> Split:
+    """Split of a set in a training, see `train_all`."""
     with TactileSet(path) as data:
-        whole = (
-            split_by_interaction(data, seed)
-            if split == "trajectory"
-            else split_by_object(data, split.split("+"), seed)
-        )
-    return Split(*(subset[subset < count] for subset in (whole.train, whole.validation, whole.test))).check()
+        if split == "trajectory":
+            return split_by_interaction(data, seed)
+        return split_by_object(data, split.split("+"), seed)
 
 
 def _linear(arrays, now, fit, check, both):

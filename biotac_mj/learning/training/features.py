@@ -87,10 +87,10 @@ class FilmFeatures(nn.Module):
         super().__init__()
         node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
         place = geometry.vert[node]
-        gap, foot, triangle = CoreSurface(geometry.core_vert, geometry.core_face).closest(place)
+        core = CoreSurface(geometry.core_vert, geometry.core_face)
+        gap, foot, triangle = core.closest(place)
         away = place - foot
         length = np.linalg.norm(away, axis=1, keepdims=True)
-        core = CoreSurface(geometry.core_vert, geometry.core_face)
         away = np.where(length > 1e-5, away / np.maximum(length, 1e-12), core.normal[triangle])
         gap = np.maximum(gap, _FILM)
         self.nvert = geometry.nvert
@@ -159,15 +159,11 @@ class FilmFeatures(nn.Module):
         film = torch.clamp(self.gap + (inner * self.away).sum(2), min=1e3 * _FILM)
         thinner = torch.log(film / self.gap)
         inverse = self.gap / film - 1
-        local = torch.cat([thinner, torch.log1p(inverse.clamp(min=-0.9))], 0)
-        local = (local @ self.patch.T).view(2, n, len(_RADII), -1).permute(1, 3, 0, 2).flatten(2)
-        mean_inverse = (
-            torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), -1).transpose(1, 2)
-        )
         # ln of the mean of 1/h is for resistances in series; ln h alone is averaged as is
-        local[..., len(_RADII) :] = mean_inverse
+        means = thinner @ self.patch.T, torch.log1p((inverse @ self.patch.T).clamp(min=-0.9))
+        local = [mean.view(n, len(_RADII), -1).transpose(1, 2) for mean in means]
         whole = (thinner @ self.whole.T)[:, self.order]
-        return torch.cat([local, linear, whole], 2)
+        return torch.cat([*local, linear, whole], 2)
 
 
 def mirror_matrix(geometry: SkinGeometry) -> csr_matrix:

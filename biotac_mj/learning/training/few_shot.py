@@ -151,5 +151,5 @@ def evaluate_new_sensor(
     if sensor is not None:
         rest = arrays.counts[arrays.first[rows].unique()].mean(0).tolist()
         own = {"rest": rest, "mixing": fit_mixing(film, truth, owner).tolist()}
-        write_sensor_file(sensor, SensorFile({"sensor": own}, [], {}))
+        write_sensor_file(sensor, SensorFile({"sensor": own, "signal": "physics"}, [], {}))
     return result

@@ -142,7 +142,8 @@ def train(
         optimizer.load_state_dict(kept["optimizer"])
         schedule.load_state_dict(kept["schedule"])
         generator.set_state(kept["generator"])
-        _set_random(kept["random"])
+        for one, put in zip(kept["random"], (torch.set_rng_state, torch.cuda.set_rng_state)):
+            put(one.cpu())
 
     def one():
         value = loss(chosen)
@@ -187,23 +188,13 @@ def train(
                 optimizer=optimizer.state_dict(),
                 schedule=schedule.state_dict(),
                 generator=generator.get_state(),
-                random=_random(cuda),
+                # dropout and new networks draw from these
+                random=[torch.get_rng_state(), *([torch.cuda.get_rng_state()] if cuda else [])],
             )
     if state is not None:
         module.load_state_dict(state)
     module.eval()
     return best
-
-
-def _random(cuda):
-    """State of the generators that dropout and new networks draw from."""
-    return [torch.get_rng_state(), *([torch.cuda.get_rng_state()] if cuda else [])]
-
-
-def _set_random(states):
-    torch.set_rng_state(states[0].cpu())
-    for state in states[1:]:
-        torch.cuda.set_rng_state(state.cpu())
 
 
 def _schedule(optimizer, rate, steps, decay):

@@ -152,7 +152,7 @@ class BatchTask(abc.ABC):
         self._moved = torch.zeros(n, self.num_actions, device=self.device)
         # decisions since the last frame in which nothing was touched
         self._age = torch.zeros(n, dtype=torch.long, device=self.device)
-        self._bank = self._past = self._blur = None
+        self._bank = self._past = self._errors = self._blur = None
         with wp.ScopedDevice(where):
             self._read(mjm, prefixes)
             self._begin(self._everyone)
@@ -266,7 +266,7 @@ class BatchTask(abc.ABC):
           observations (of worlds that ended: of their new episode), reward (num_envs,), terminated
           (num_envs,) (what is held is lost, or a finger felt more than `gentle`), truncated (num_envs,),
           extras: "time_outs", "success" (num_envs,) (the episode ends where it should), "error" (num_envs,),
-          and "log": means over the episodes that ended.
+          "log": means over the episodes that ended, and if some did "final": observations before the reset.
 
         Raises:
           ValueError: actions of another shape.
@@ -292,8 +292,11 @@ class BatchTask(abc.ABC):
             "/error": error[truncated].mean() if truncated.any() else torch.zeros(()),
         }
         extras = {"time_outs": truncated, "success": success, "error": error, "log": log}
-        self._begin(done)
-        self._sense(done)
+        self._sense()
+        if done.any():
+            extras["final"] = self.observe()
+            self._begin(done)
+            self._sense(done)
         return self.observe(), reward, terminated, truncated, extras
 
     def stagger(self) -> None:
@@ -413,21 +416,23 @@ class BatchTask(abc.ABC):
         # nothing is touched yet
         self._touch.tare[:] = torch.where(waits, self._touch.channels, self._touch.tare)
 
-    def _sense(self, begun):
-        """Adds the latest readings to the history; worlds (num_envs,) of bool that were reset have no earlier
-        ones."""
+    def _sense(self, begun=None):
+        """Adds the latest readings to the history; begun: instead, those of worlds (num_envs,) of bool that
+        were reset become all of theirs."""
         touched = (self._age > 0)[:, None, None]
         changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
         body = torch.cat(self._sense_body(0.0, 0.0), dim=1)
-        errors = self._touch.draw_errors((self.num_envs,), self.model_error, self._draw)
-        self._errors = errors if self._past is None else errors.where(begun[:, None, None], self._errors)
         now = [body, self._noise(body), changes]
+        if begun is None:
+            pairs = zip(now, self._past, strict=True)
+            self._past = [torch.cat([one[:, None], past[:, :-1]], dim=1) for one, past in pairs]
+            return
+        errors = self._touch.draw_errors((self.num_envs,), self.model_error, self._draw)
         first = [one[:, None].expand(-1, self.history, *one.shape[1:]) for one in now]
-        if self._past is None:
-            self._past = first
-        for i, (past, one) in enumerate(zip(self._past, first, strict=True)):
-            later = torch.cat([one[:, :1], past[:, :-1]], dim=1)
-            self._past[i] = one.where(begun.view(-1, *[1] * (one.ndim - 1)), later)
+        self._errors, *self._past = (
+            new if self._past is None else new.where(begun.view(-1, *[1] * (new.ndim - 1)), old)
+            for new, old in zip((errors, *first), (self._errors, *(self._past or now)), strict=True)
+        )
 
     def _substep(self):
         import mujoco_warp as mjw

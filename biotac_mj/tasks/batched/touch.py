@@ -8,8 +8,9 @@ import torch
 import warp as wp
 
 from ...batch import Batch
-from ...fields import as_numbers
+from ...fields import as_numbers, check_choice
 from ...geometry import load_skin
+from ...sensor.film import BatchFilm
 from ...sensor.weighted import WeightedElectrodes
 from ...short_repr import short_repr
 
@@ -53,6 +54,7 @@ class Touch:
         self._pos = tensor(geometry.electrode_pos, dtype=torch.float32)
         # the formula is linear in how far counts fall
         self._force = tensor(WeightedElectrodes(geometry).force(-each), dtype=torch.float32)
+        self._film = any(isinstance(batch.senses.film, BatchFilm) for batch in batches.values())
         acquired = [batch.senses.acquisition for batch in batches.values()]
         self._seeds = [_as_int64(a.seed) for a in acquired]
         self._drawn = [wp.to_torch(a.drawn) for a in acquired]
@@ -106,7 +108,13 @@ class Touch:
         For each finger: "none" nothing; "binary" whether PDC is 50 deviations of its noise above its
         baseline; "force" the force [N] and the mean place of contact [cm] by `WeightedElectrodes`, on the
         core; "electrodes" and "learned" the changes of electrodes and PDC, in hundreds of counts;
-        "electrodes+pac" also those of PAC's 22 samples of a frame."""
+        "electrodes+pac" also those of PAC's 22 samples of a frame.
+
+        Raises:
+          ValueError: another choice, or "learned" where electrodes are the film's.
+        """
+        more = "; learned needs make(..., observe='learned')" if self._film else ""
+        check_choice("observe is", choice, OBSERVE[:-1] if self._film else OBSERVE, more)
         electrodes, pdc, pac = changes.split(self._split, dim=3)
         if choice == "none":
             parts = [pdc[..., :0]]
