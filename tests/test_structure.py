@@ -35,7 +35,7 @@ LAYERS = {
     "learning.serve",
     "plugin": "coupling",
     "batch": "kernels short_repr coupling skin sensor effects geometry fields learning.serve",
-    "mjx": "batch coupling",
+    "mjx": "batch coupling fields",
     "neighbours": "lazy batch coupling geometry recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading short_repr triangles units "
     "versions view.offscreen",
