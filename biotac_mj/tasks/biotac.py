@@ -14,11 +14,13 @@ from ..coupling.config import TO_COME
 from ..coupling.handle import SENSORS
 from ..effects.sensors import take_sensor
 from ..fields import refuse_unknown
+from ..geometry import load_skin
 from ..geometry.design import DESIGNS
 from ..sensor.channels import FULL_SCALE
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
+from ..sensor.weighted import WeightedElectrodes
 from ..short_repr import short_repr
 
 TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # readings of the real sensor
@@ -146,7 +148,7 @@ class BioTac(composer.Entity):
                 element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
         self._name_geoms(root, chosen)
         self._mjcf_root, self._noise, self._sensor = root, noise, self.handle.numbers
-        self._outer, self._weighted = _outer_nodes(self.handle.config.skin), None
+        self._outer, self._weighted = np.unique(load_skin(self.handle.config.skin).outer_face), None
 
     def _name_geoms(self, root, chosen):
         """Resolves settings of the arena's geoms."""
@@ -171,10 +173,6 @@ class BioTac(composer.Entity):
     def core(self) -> mjcf.Element:
         """The body whose frame is the BioTac frame."""
         return self._mjcf_root.find("body", "core")
-
-    @property
-    def noise(self) -> bool:
-        return self._noise
 
     @property
     def outer(self) -> np.ndarray:
@@ -218,9 +216,6 @@ class BioTac(composer.Entity):
         Raises:
           ValueError: a design with other electrodes, without a known scale of force.
         """
-        from ..geometry import load_skin
-        from ..sensor.weighted import WeightedElectrodes
-
         if self._weighted is None:
             self._weighted = WeightedElectrodes(load_skin(self.handle.config.skin))
         change = counts - self.rest()
@@ -283,7 +278,7 @@ class BioTacObservables(composer.Observables):
 
         return Reading(
             lambda physics: entity.read(physics, name),
-            noise=corrupt if noise and entity.noise else None,
+            noise=corrupt if noise and entity._noise else None,
             find=find,
         )
 
@@ -343,9 +338,3 @@ def _pac_noise(sensor, counts, random_state):
     for i in range(1, len(out)):
         out[i] += sensor.pac_colour * out[i - 1]
     return out
-
-
-def _outer_nodes(skin):
-    from ..geometry import load_skin
-
-    return np.unique(load_skin(skin).outer_face)
