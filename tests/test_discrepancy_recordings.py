@@ -576,7 +576,7 @@ def test_the_report_leads_with_the_largest_gap(tmp_path):
     files = write_report(d, tmp_path)
     assert all(f.exists() for f in files) and not list(tmp_path.glob(".*"))
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64") == 3 and 'src="curves' not in page  # one file, to be sent
+    assert page.count("data:image/png;base64") == 2 and 'src="curves' not in page  # one file, to be sent
     verdict = json.loads((tmp_path / "verdict.json").read_text())
     assert verdict == json.loads(json.dumps(d.to_dict()))
     check_verdict(verdict)

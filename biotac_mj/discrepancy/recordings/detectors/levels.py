@@ -9,22 +9,18 @@ import numpy as np
 
 from ....effects.logged import SHARED
 from ....effects.sensing import Thermal
-from ....geometry.design import Design, electrode_positions
 from ....quality.evidence import sign_flip
-from ....recordings.recording import designed
 from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ..candidates import Candidate
 from ..model import Model
 from ..session import Session
 from .process import process
-from .together import ahead
 from .trends import BLOCKS, SHARP, Trend, compare, sharp, trends
 
 _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 # of a shared drift's shares about their mean: 8-15 % seen in a real unloaded sensor
 _SCATTER = 0.12
-# off their median at most: the weakest of a real unloaded sensor has 65 % of it
-_OFF_MEDIAN = 0.7
+_OFF = 0.7  # at most: the weakest of a real unloaded sensor has 65 % of the others' share
 _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _WARMER = 0.05  # [K] by which the thermistor has to change
 _ALIKE = 0.9  # correlation of a trend with the thermistor's
@@ -59,9 +55,6 @@ def levels(session: Session, rejected: set) -> Candidate | None:
     tried = [o for o in tried if (o[1],) not in rejected]
     # of single electrodes the levels wander with a load as well
     for energy, k, trend, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
-        if k is None and trend.kind == "step" and sharp(level, time, trend.onset) <= SHARP:
-            # where the load's level changes all drift a little: a step that does not stand out is none
-            trend = trends(level, time, ("smooth",))[0]
         trend = trend.continued(level, time)
         if trend.p > 0.02 or trend.nats < 6 or energy < 30:
             continue
@@ -71,19 +64,25 @@ def levels(session: Session, rejected: set) -> Candidate | None:
         if k is not None and _part_of_common(session, trend, trend.size):
             continue
         finding = _shared(session, trend) if k is None else _single(session, trend, k)
-        finding.features["lead"] = _lead(size, k, designed(session.counts))
+        finding.features["lead"] = _lead(size, k)
         return finding
     return None
 
 
-def _lead(size, k, design):
+def _lead(size, k):
     """Logarithm of the energy of electrode k, None of all alike, over the next one's, by logarithms of all:
     number -> size."""
     others = {j: s for j, s in size.items() if j is not None}
     if k is None:
         return size[None] - max(others.values())
-    lead = ahead(np.array([*others.values()]), np.array([*others]), k, design)
+    lead = _ahead(np.array([*others.values()]), [*others].index(k))
     return float(np.clip(lead, -1, _PLAINLY))
+
+
+def _ahead(size, i):
+    """Logarithm of the i-th size over the second of the others, by logarithms (c,): a connector may have
+    two."""
+    return float(size[i] - np.sort(np.delete(size, i))[-min(2, len(size) - 1)])
 
 
 def _under_load(session, rejected, common):
@@ -158,17 +157,17 @@ def _single(session, trend, k):
         nats=trend.nats,
         p=trend.p,
         detector="one",
-        features=_features(session, trend) | {"wandering": _wandering(m, k, designed(session.counts))},
+        features=_features(session, trend) | {"wandering": _wandering(m, i)},
         correct=correct,
         trend=trend,
     )
 
 
-def _wandering(m, k, design):
-    """Logarithm of how much more the levels of electrode k wander about their mean, in counts, than those of
-    the others that have no trend of their own."""
+def _wandering(m, i):
+    """Logarithm of how much more the levels of used electrode i wander about their mean, in counts, than
+    those of the others."""
     level, _ = m.levels(m.residual())
-    return ahead(np.log(level.std(0) * m.slope + 0.3), m.used, k, design)
+    return _ahead(np.log(level.std(0) * m.slope + 0.3), i)
 
 
 def settle(session: Session) -> None:
@@ -215,7 +214,7 @@ def _shared(session, trend):
     m, time = session.model(), session.recording.time
     fraction = np.ones(session.counts.shape[1])
     own = {f.channels[0] for f in session.findings if len(f.channels) == 1 and f.correct is not None}
-    fraction[m.used] = _fractions(m, trend, np.isin(m.used, list(own)), designed(session.counts))
+    fraction[m.used] = _fractions(m, trend, np.isin(m.used, list(own)))
     before = trend(time[:1])[0]
 
     def correct(counts, at):
@@ -258,41 +257,20 @@ def _uneven(m, trend):
     return float(np.log(np.clip(spread / max(abs(np.median(each)), 1e-12), 0.05, 5)))
 
 
-def _fractions(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarray:
+def _fractions(m: Model, trend: Trend, own: np.ndarray) -> np.ndarray:
     """Relative drift of each electrode (c,), about one: generalised least squares on the cells' levels,
-    shrunk towards their mean. An electrode with a change of its own, in `own` (c,), gets the mean of its
-    three neighbours."""
-    number = len(m.used)
+    shrunk towards one. An electrode with a change of its own, in `own` (c,), and where nothing moves one so
+    far off has one."""
     level, time = m.levels(m.value)
-    g = trend(time)
-    g = g - g.mean()
-    marginal = m.given.marginal()
-    residual = m.levels(m.residual())[0]
-    residual = residual - residual.mean(0)
-    residual = residual - np.outer(g, g @ residual / max(g @ g, 1e-12))
-    # the cells' levels wander by more than the changes within them, and remember where they have been
-    memory = np.clip((residual[1:] * residual[:-1]).sum(0) / np.maximum((residual**2).sum(0), 1e-12), 0, 0.95)
-    scatter = (residual**2).mean(0) * (1 + memory) / (1 - memory)
-    worse = max(float(np.median(scatter / m.given.noise**2)), 1e-9)
-    fraction = np.ones(number)
-    for _ in range(3):
-        # shares far off are a change of one electrode: they are drawn to the mean all the more
-        off = (fraction - np.median(fraction)) / _SCATTER
-        pull = (1 / (1 + (off / 4) ** 2)) / _SCATTER**2
-        pull = (
-            np.maximum(pull, 1 / _SCATTER**2 * 0.05)
-            if m.dimensions == 0
-            else np.full(number, 1 / _SCATTER**2)
-        )
-        A = g @ g / worse * marginal + np.diag(pull)
-        fraction = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(fraction))
-    if not m.dimensions:  # unloaded: a fraction that far off is a change of that electrode alone
-        own = own | (np.abs(fraction - np.median(fraction)) > _OFF_MEDIAN)
-    place = electrode_positions(design)[m.used]
-    for i in np.flatnonzero(own):
-        near = np.argsort(np.linalg.norm(place - place[i], axis=1) + 1e3 * own)[:3]
-        fraction[i] = fraction[near].mean()
-    return fraction
+    g = trend(time) - trend(time).mean()
+    marginal, residual = m.given.marginal(), m.levels(m.residual())[0]
+    # the cells' levels wander by more than the changes within them
+    residual = residual - residual.mean(0) - np.outer(g, g @ residual / max(g @ g, 1e-12))
+    worse = max(float(np.median((residual**2).mean(0) / m.given.noise**2)), 1e-9)
+    precision = g @ g / worse * marginal + np.eye(len(m.used)) / _SCATTER**2
+    fraction = np.linalg.solve(precision, marginal @ (level.T @ g) / worse + 1 / _SCATTER**2)
+    far = (not m.dimensions) & (np.abs(fraction - 1) > _OFF)
+    return np.where(own | far, 1.0, fraction)
 
 
 def _name_shared(session, finding, trend, change):
