@@ -227,7 +227,6 @@ class Worker:
             "confidence": [e.confidence for e in report.effects],
             "closed": report.closed,
             "nats": report.tried[0]["evidence_nats"] / len(report.selection) if report.tried else 0.0,
-            "trace": report.trace,
             "where": len(report.where),
             "before": report.proof.before,
             "after": report.proof.after,

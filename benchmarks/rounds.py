@@ -75,8 +75,12 @@ def _record(report, seconds):
         "decided": beliefs.decided,
         "explanations": [[one.ids, one.weight] for one in beliefs.explanations],
         "tried": [
-            [{key: one[key] for key in ("id", "gain", "overlap", "p", "rejections", "ties")} for one in step]
-            for step in report.trace["rounds"]
+            [
+                {"id": one.effect.id, "overlap": one.fit.overlap}
+                | {key: getattr(one, key) for key in ("gain", "p", "rejections", "ties")}
+                for one in step
+            ]
+            for step in report.search.rounds
         ],
         "contacts": len(report.selection) + len(report.locked),
         "seconds": seconds,

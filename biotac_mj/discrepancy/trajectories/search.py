@@ -42,19 +42,6 @@ class Candidate:
     rejections: list[str]
     ties: list[str] = dataclasses.field(default_factory=list)
 
-    def record(self) -> dict:
-        """The part of it that a file can hold."""
-        theta = next(th for e, th in self.fit.effects if e.id == self.effect.id)
-        return {
-            "id": self.effect.id,
-            "gain": self.gain,
-            "overlap": self.fit.overlap,
-            "p": self.p,
-            "rejections": self.rejections,
-            "ties": self.ties,
-            "theta": theta,
-        }
-
 
 @dataclasses.dataclass
 class Search:

@@ -21,7 +21,7 @@ from .fitting import Fit, fit_effects
 from .model.simulator import Simulator
 from .proof import Proof, borne_out, proved
 from .remarks import few_off, next_experiment, of_base, of_data, of_search, strays
-from .search import found
+from .search import Search, found
 from .settings import SETTINGS
 from .trajectory import FEWEST, measurement_noise
 from .where import left_over, overall, residual_cells, where
@@ -45,7 +45,7 @@ class TrajectoryDiagnosis(Verdict):
         without effects.
       proof: on held-out trajectories, the skin solved again. comparison, selection, locked: what it was
         made of. beliefs: how likely which explanation is.
-      trace: numbers that thresholds are set on, as a file can hold them.
+      search: what was tried.
     """
 
     given: Simulator
@@ -56,7 +56,7 @@ class TrajectoryDiagnosis(Verdict):
     selection: np.ndarray
     locked: np.ndarray
     beliefs: Beliefs
-    trace: dict
+    search: Search
 
     def panels(self) -> list[list[Panel]]:
         """The two channels with the largest error, in some of the held-out trajectories."""
@@ -322,13 +322,6 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     further = next_experiment(effects, suspected, names, more, comparison.sim.tier)
     notes = [*notes, *of_base(comparison, current, chosen), *of_search(search)]
     before, after = (dict(zip(("level", "peak"), _off(comparison, fit))) for fit in (null, current))
-    trace = {
-        "before": before,
-        "after": after,
-        "rounds": [[c.record() for c in step] for step in search.rounds],
-        "closed": proof.closed,
-        "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
-    }
     cells = where(comparison, null, chosen)
     added = [effect.name for effect, _ in proof.fit.effects] + ([modulus.name] if modulus else [])
     return TrajectoryDiagnosis(
@@ -361,10 +354,6 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         next_command="" if beliefs.decided else "biotac next REPORT --budget 20 --out plan.csv",
         amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
-            "mean_square": {
-                "before": proof.before["mean_square"],
-                "after": proof.after["mean_square"],
-            },
             "trajectories": {
                 "fitted": len(chosen),
                 "kept_aside": [comparison.trajectories[i].id for i in aside],
@@ -382,7 +371,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         selection=chosen,
         locked=aside,
         beliefs=beliefs,
-        trace=trace,
+        search=search,
     )
 
 
