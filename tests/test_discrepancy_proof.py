@@ -121,7 +121,7 @@ def test_what_the_amended_sensor_leaves_out_has_no_name(monkeypatch):
     data = measured([LATE], n=12)
     report = diagnose(Springs(), data, effects=[LATE[0], by_id("lowpass")], progress=False)
     assert not report.effects and not report.apply(Springs()).effects
-    assert report.verdict.startswith("unknown (") and report.significant
+    assert report.verdict.startswith("unknown: ") and report.significant
     assert {(e.id, e.confirmed, e.confidence) for e in report.not_named} == {("latency", False, None)}
     assert not report.beliefs.distinguished and [e.ids for e in report.beliefs.explanations] == [[]]
 
@@ -149,7 +149,7 @@ def test_what_is_less_likely_than_not_is_suspected(monkeypatch):
     monkeypatch.setattr(beliefs, "_CONTACTS", 1e-3)
     report = diagnose(Springs(), measured([LATE], n=8), effects=[LATE[0], by_id("lowpass")], progress=False)
     assert not report.effects and not report.apply(Springs()).effects and not report.beliefs.decided
-    assert report.verdict.startswith("unknown (suspected, and less likely than not: ") and report.significant
+    assert report.verdict.startswith("unknown: suspected, and less likely than not: ") and report.significant
     (one,) = report.not_named
     assert one.id == "latency" and one.confirmed and one.confidence < 0.5
     assert one.name in report.next_experiment

@@ -40,7 +40,6 @@ VERDICT = Verdict(
     kind="plain recording",
     name="a.txt",
     data="100 rows",
-    verdict="found: warm-up",
     significant=True,
     effects=[WARM],
     gap={
@@ -70,7 +69,7 @@ def everywhere(text):
         confusable={"x": text},
         gap=Gap(text, 2.0, 1.0, 0.1, text),
     )
-    lines = ("name", "data", "verdict", "aside", "where_note", "remainder", "tried_note", "next_experiment")
+    lines = ("name", "data", "aside", "where_note", "remainder", "tried_note", "next_experiment")
     return dataclasses.replace(
         VERDICT,
         **dict.fromkeys(lines, text),

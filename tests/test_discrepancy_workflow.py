@@ -379,7 +379,7 @@ def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more, effects):
     if more is None:
         assert report.verdict == "no significant disagreement"
         return
-    assert report.verdict.startswith("unknown (") and "too few of them were fitted" in report.remainder
+    assert report.verdict.startswith("unknown: ") and "too few of them were fitted" in report.remainder
     assert all(data[i].id in report.verdict for i in off) and "none needed" not in report.next_experiment
 
 
@@ -393,7 +393,7 @@ def test_what_trajectories_kept_aside_contradict_has_no_name():
         Springs(), [plain[i] if i in aside else t for i, t in enumerate(data)], effects=FEW, progress=False
     )
     assert not report.effects and not report.apply(Springs()).effects
-    assert report.verdict.startswith("unknown (") and not report.beliefs.decided
+    assert report.verdict.startswith("unknown: ") and not report.beliefs.decided
     assert [e.id for e in report.not_named] == ["relax"] and report.not_named[0].confirmed is False
 
 

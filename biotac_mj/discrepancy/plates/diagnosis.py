@@ -153,7 +153,6 @@ class PlateDiagnosis(Verdict):
         return dataclasses.replace(
             self,
             **{name: getattr(first, name) for name in ("kind", "name", "data", "aside")},
-            verdict=f"{first.verdict}; {self.verdict}",
             significant=first.significant or self.significant,
             gap=first.gap | self.gap,
             lead=max(self.gap, key=lambda name: self.gap[name].loudness) if self.significant else "",
@@ -261,7 +260,6 @@ def _concluded(sensors, tried, named):
         kind="flat presses, simulated",
         name=", ".join(s.name for s in sensors),
         data=f"{', '.join(str(len(s.rows[0])) for s in sensors)} loaded rows, each with a fitted pose",
-        verdict=_in_words(sensors, named) if off else "no significant disagreement",
         significant=bool(off),
         effects=[_finding(f, named, tried, sensors) for f in named],
         gap={
@@ -295,17 +293,6 @@ def _concluded(sensors, tried, named):
         for s, given in zip(sensors, f.attached or ())
     ]
     return dataclasses.replace(out, amended=lines)
-
-
-def _in_words(sensors, named):
-    where = "; ".join(f"{s.name} at {', '.join(electrode_names(sorted(s.worst)))}" for s in sensors)
-    if len(named) == 1:
-        what = f"{named[0].effect.name} (of the {named[0].whose})"
-    elif named:
-        what = "a tie of " + ", ".join(f.effect.name for f in named)
-    else:
-        what = "unknown: no mechanism tried takes it away" + (" from every sensor" * (len(sensors) > 1))
-    return f"the simulation errs most in {where}: {what}"
 
 
 def _finding(f, named, tried, sensors):

@@ -99,7 +99,6 @@ def concluded(
         name=r.name,
         data=f"{data}; last {locked:.0%} held out",
         warnings=list(r.warnings),
-        verdict=_in_words(found, left),
         significant=bool(found) or left.significant,
         effects=[_finding(f) for f in found],
         not_named=[_finding(f) for f in session.weak],
@@ -143,16 +142,6 @@ def _tried(session, found):
         rows.pop(f.id, None)
         rows = {f.id: {"id": f.id, "name": f.kind.name, "confidence": f.confidence}} | rows
     return list(rows.values())
-
-
-def _in_words(found, left):
-    if not (found or left.significant):
-        return "no significant disagreement"
-    names = dict.fromkeys(f.kind.name + f.where for f in found)
-    parts = ["found: " + "; ".join(names)] if names else []
-    if left.significant:
-        parts.append(("remainder " if parts else "") + "unknown: " + left.text)
-    return "; ".join(parts)
 
 
 def _finding(f: Candidate) -> Finding:

@@ -23,7 +23,7 @@ SCHEMA, VERSION = "biotac_mj.verdict", 3
 _NOISELESS = 2e-6  # counts or newtons: a simulated force has no noise, which is taken for half of that
 _ABOVE = 1.05  # times noise and resolution, from which on something is above them
 _NEXT = 3  # experiments
-_EVERYWHERE = 12  # electrodes, beyond which they are not listed
+_EVERYWHERE, _FEW = 12, 4  # electrodes, beyond which they are not listed, and in one line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,6 +172,12 @@ class Finding:
         return ", ".join(electrode_names(self.channels)) or "not of single electrodes"
 
     @property
+    def at(self) -> str:
+        """The same behind a name, of few electrodes."""
+        few = "" if len(self.channels) > _EVERYWHERE else ", ".join(electrode_names(self.channels[:_FEW]))
+        return few and f" {few}"
+
+    @property
     def when(self) -> str:
         return "" if self.start is None else f"{self.start:.1f} s to {self.end:.1f} s"
 
@@ -227,7 +233,7 @@ class Verdict:
 
     Attributes:
       kind: of the data; name: of this one; data: what it consists of, a line. warnings: lines.
-      verdict: one line. significant: whether simulation and measurement disagree.
+      significant: whether simulation and measurement disagree.
       effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
       gap: what is compared -> Gap, on held-out data. lead: which of them the headline is about; empty: the
         one that is most above noise. aside: what these data are, in words.
@@ -244,7 +250,6 @@ class Verdict:
     kind: str
     name: str
     data: str
-    verdict: str
     significant: bool
     effects: list[Finding]
     gap: dict[str, Gap]
@@ -286,6 +291,17 @@ class Verdict:
     def sensor(self) -> "SensorFile | None":
         """The sensor with what was found, None where there is none to write."""
         return None
+
+    @property
+    def verdict(self) -> str:
+        """What was found and what is left, in one line."""
+        if not self.significant:
+            return "no significant disagreement"
+        names = dict.fromkeys(f.title + f.at for f in self.effects)
+        parts = [f"found: {'; '.join(names)}"] if names else []
+        if self.unknown:
+            parts.append(f"{'remainder ' * bool(names)}unknown: {self.remainder}")
+        return "; ".join(parts)
 
     @property
     def leading(self) -> Gap:

@@ -208,20 +208,6 @@ def _tie_aliases(current, found, names):
         item.ties = [*item.ties, *(i for i in item.effect.alias(theta) if i in names and i not in known)]
 
 
-def _in_words(comparison, current, effects, named, chosen, refuted):
-    """Verdict, and a line on the remainder where something disagrees; refuted: line on effects that have no
-    name."""
-    parts = [
-        e.name + (f" (or {' or '.join(e.ties.values())}: not told apart)" if e.ties else "") for e in effects
-    ]
-    if effects and named:
-        return ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts), ""
-    remainder = refuted or left_over(comparison, current, chosen)
-    if not effects:
-        return f"unknown ({remainder})", remainder
-    return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder
-
-
 def _with(comparison, null, some, search, chosen):
     """Fit of these Candidates' effects together."""
     pairs = [one.fit.effects[-1] for one in some]
@@ -307,19 +293,15 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
     effects = [_described(item, current, sure[item.effect.id], names) for item in found]
     effects = [_proved(one, proof, gaps) for one in effects]
     effects += [dataclasses.replace(modulus, confidence=_SURE)] if modulus else []
-    stray = ""
-    if seen:
-        verdict, remainder = _in_words(comparison, current, effects, named, chosen, without_name)
-        few = few_off(null.mean_square(comparison)[chosen])
-        stray = "" if effects or not few else strays(comparison, null, chosen, aside, search.rounds[0])
-        verdict, remainder = (f"unknown ({stray})", stray) if stray else (verdict, remainder)
-    else:
-        stray = strays(comparison, null, chosen, aside, search.rounds[0])
-        stray = stray or without_name
-        remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
-        verdict = f"unknown ({stray})" if stray else "no significant disagreement"
-    more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
-    further = next_experiment(effects, suspected, names, more, comparison.sim.tier)
+    rest = ""
+    if not effects and (not seen or few_off(null.mean_square(comparison)[chosen])):
+        rest = strays(comparison, null, chosen, aside, search.rounds[0])
+    if not (rest or effects and named):
+        rest = without_name or (left_over(comparison, current, chosen) if seen else "")
+    explained = (
+        "" if seen else "noise, the model's resolution and the set-up's repeatability explain the data"
+    )
+    further = next_experiment(effects, suspected, names, bool(rest), comparison.sim.tier)
     notes = [*notes, *of_base(comparison, current, chosen), *of_search(search)]
     before, after = (dict(zip(("level", "peak"), _off(comparison, fit))) for fit in (null, current))
     cells = where(comparison, null, chosen)
@@ -328,8 +310,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         kind="trajectories",
         name="trajectories",
         data=f"{len(chosen)} fitted, {len(aside)} held out",
-        verdict=verdict,
-        significant=bool(seen or stray),
+        significant=bool(seen or rest),
         effects=effects,
         not_named=[_described(item, item.fit, None, names, False) for item in refuted] + suspected,
         gap=gaps,
@@ -342,8 +323,8 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
             f"{before['peak']:.2g} in the worst channel, by {after['level']:.2g} and {after['peak']:.2g} "
             f"with the causes added; beyond {SETTINGS.beyond:g} or {SETTINGS.beyond**2:g} something is missed"
         ),
-        remainder=remainder,
-        unknown=bool(seen or stray) and bool(remainder),
+        remainder=rest or explained,
+        unknown=bool(rest),
         tried=[
             {"id": c.effect.id, "name": c.effect.name, "evidence_nats": c.gain, "p": c.p}
             for c in search.rounds[0]

@@ -55,6 +55,9 @@ def levels(session: Session, rejected: set) -> Candidate | None:
     tried = [o for o in tried if (o[1],) not in rejected]
     # of single electrodes the levels wander with a load as well
     for energy, k, trend, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
+        if k is None and trend.kind == "step" and sharp(level, time, trend.onset) <= SHARP:
+            # where the load's level changes all drift a little: a step that does not stand out is none
+            trend = trends(level, time, ("smooth",))[0]
         trend = trend.continued(level, time)
         if trend.p > 0.02 or trend.nats < 6 or energy < 30:
             continue
@@ -259,18 +262,23 @@ def _uneven(m, trend):
 
 def _fractions(m: Model, trend: Trend, own: np.ndarray) -> np.ndarray:
     """Relative drift of each electrode (c,), about one: generalised least squares on the cells' levels,
-    shrunk towards one. An electrode with a change of its own, in `own` (c,), and where nothing moves one so
-    far off has one."""
+    shrunk towards their median, which an electrode with a change of its own has, one in `own` (c,) or,
+    where nothing moves, one so far off."""
     level, time = m.levels(m.value)
     g = trend(time) - trend(time).mean()
     marginal, residual = m.given.marginal(), m.levels(m.residual())[0]
-    # the cells' levels wander by more than the changes within them
     residual = residual - residual.mean(0) - np.outer(g, g @ residual / max(g @ g, 1e-12))
-    worse = max(float(np.median((residual**2).mean(0) / m.given.noise**2)), 1e-9)
+    # the cells' levels wander by more than the changes within them, and remember where they have been
+    memory = np.clip((residual[1:] * residual[:-1]).sum(0) / np.maximum((residual**2).sum(0), 1e-12), 0, 0.95)
+    scatter = (residual**2).mean(0) * (1 + memory) / (1 - memory)
+    worse = max(float(np.median(scatter / m.given.noise**2)), 1e-9)
     precision = g @ g / worse * marginal + np.eye(len(m.used)) / _SCATTER**2
-    fraction = np.linalg.solve(precision, marginal @ (level.T @ g) / worse + 1 / _SCATTER**2)
-    far = (not m.dimensions) & (np.abs(fraction - 1) > _OFF)
-    return np.where(own | far, 1.0, fraction)
+    middle = 1.0
+    for _ in range(3):
+        fraction = np.linalg.solve(precision, marginal @ (level.T @ g) / worse + middle / _SCATTER**2)
+        middle = np.median(fraction)
+    far = (not m.dimensions) & (np.abs(fraction - middle) > _OFF)
+    return np.where(own | far, middle, fraction)
 
 
 def _name_shared(session, finding, trend, change):
