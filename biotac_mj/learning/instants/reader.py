@@ -97,19 +97,16 @@ class Reader:
         if self.meta["tared"]:  # an unusual baseline makes every row unusual
             level = self._novelty_detector["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
             novelty = np.where(level > 1, np.maximum(level, strange), strange)
-        stuck = self._stuck_detector(x)
+        stuck = self._restored(StuckDetector, "moving")(x)
         novelty = np.where(stuck > 1, np.maximum(novelty, stuck), novelty)
         return Prediction(value, half, novelty)
 
     def _regress(self, name, x):
         out = 0.0
-        for k, terms in enumerate(self._kinds):
-            out = out + terms(x) @ self.tensors[f"{name}.{k}.weight"] + self.tensors[f"{name}.{k}.offset"]
+        for k in range(len(KINDS)):
+            terms = self._restored(Terms, f"terms.{k}")(x)
+            out = out + terms @ self.tensors[f"{name}.{k}.weight"] + self.tensors[f"{name}.{k}.offset"]
         return out / len(KINDS)
-
-    @property
-    def _kinds(self):
-        return [self._restored(Terms, f"terms.{k}") for k in range(len(KINDS))]
 
     def _restored(self, kind, name):
         """A dataclass of arrays from the tensors of `_stored`."""
@@ -118,10 +115,6 @@ class Reader:
     def _code(self, x):
         t = self.tensors
         return (x - t["mean"]) @ t["axes"][:, :_CODE] @ t["axes"][:, :_CODE].T + t["mean"]
-
-    @property
-    def _stuck_detector(self):
-        return self._restored(StuckDetector, "moving")
 
     @functools.cached_property
     def _novelty_detector(self):
