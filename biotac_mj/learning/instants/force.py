@@ -55,7 +55,8 @@ def fit_force(
     rise = 1 - np.exp(-np.arange(len(log_z)) / (_WARM_UP * ntrain))
     prediction, total, trials = 0.0, 0.0, {}
     for kind in KINDS:
-        columns = _columns(Terms.fit(log_z[:ntrain], **kind), log_z)
+        now = Terms.fit(log_z[:ntrain], **kind)(log_z)
+        columns = np.hstack([now, causal_average(now[:, : log_z.shape[1]], _WINDOW)])  # of the electrodes
         for warm_up, x in (("", columns), (" and warm-up", np.column_stack([columns, rise]))):
             error = held_out_errors(x[:ntrain], force, block, _RIDGE, _FOLDS)
             weight, offset = of_strengths(x[:ntrain], force, _RIDGE, error.argmin(0))
@@ -66,9 +67,3 @@ def fit_force(
             if progress:
                 progress()
     return ForceModel(prediction / total, trials)
-
-
-def _columns(terms: Terms, log_z: np.ndarray) -> np.ndarray:
-    """(n, k) terms of ln Z (n, nelectrode) and causal averages of the electrodes."""
-    now = terms(log_z)
-    return np.hstack([now, causal_average(now[:, : log_z.shape[1]], _WINDOW)])

@@ -64,7 +64,7 @@ class LocalHead(nn.Module):
         x = local / self.scale
         own = (x * self.own).sum(-1)
         return (
-            self._curved(_plain, x, pod * self.damp)
+            self._curved(nn.Module.__call__, x, pod * self.damp)
             + own
             - self._curved(steady, torch.zeros_like(x[:1]), torch.zeros_like(pod[:1]))
         )
@@ -72,10 +72,6 @@ class LocalHead(nn.Module):
     def _curved(self, apply, x, pod):
         embedding = self.embedding.expand(len(x), -1, -1)
         return apply(self.shared, torch.cat([x, embedding], -1))[..., 0] + apply(self.residual, pod)
-
-
-def _plain(net, x):
-    return net(x)
 
 
 def steady(net: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
