@@ -76,7 +76,8 @@ class Instance:
       begun: frame in which a coupled step began.
       state: (nstate,) view of the plugin state, which stays where it is; parts: its parts, see `Setup.parts`;
         state_address: where it is.
-      slots: of a two-way one, see `assign_slots`. keep_held: `StepArrays.held` of it, set by its group.
+      slots: of a two-way one, see `assign_slots`. keep_held: what of tangents rows represent; set by its
+        group.
       sensed: whether the readings of this step are written.
       stays: whether the last solve left the skin as it was.
       put: the skin's state after bodies were placed before this step; None: none was.

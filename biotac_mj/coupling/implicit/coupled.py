@@ -7,7 +7,6 @@ from ..instance import Instance, Outcome
 from ..setup import LINEAR
 from ..structs import DataView
 from .rules import FORETOLD, STILL, TOLERANCE
-from .step_arrays import StepArrays
 
 # of what the solves of a step may cost together: what is left is not worth another one
 _MOST = 0.9
@@ -17,7 +16,7 @@ class Coupled:
     """One of the skins of a `SkinGroup`. Its model is wrench0 - tangent (pose - pose0).
 
     Args:
-      number: of the skin. bodies: where they are in the arrays of the group.
+      arrays: of the group. number: of the skin. bodies: where they are in the arrays.
 
     Attributes:
       off: [m] how far the bodies go from where the skin was last solved.
@@ -25,7 +24,7 @@ class Coupled:
       settled: whether the skin was solved where the bodies go.
     """
 
-    def __init__(self, instance: Instance, data: DataView, arrays: StepArrays, number: int, bodies: slice):
+    def __init__(self, instance: Instance, data: DataView, arrays: object, number: int, bodies: slice):
         self.instance, self.number, self.bodies = instance, number, bodies
         self._data, self._arrays = data, arrays
         self.begin()

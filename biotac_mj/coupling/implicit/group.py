@@ -1,33 +1,49 @@
 """All two-way skins of an mjData in a step: their linear models, where their bodies go under these, and the
-energy that the skins can give. The bodies of one skin follow those of another in each array."""
+energy that the skins can give. The arrays and kernels of `rounds` and `energy`, seen from numpy; the bodies
+of one skin follow those of another."""
 
+import math
+import types
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+import warp as wp
 
 from ...geometry.rigid_warp import LEVER
+from ...kernels import set_fields
+from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
+from ...skin.types import mat66, real, vec6
 from ..instance import Instance
 from ..setup import LINEAR, MODEL, STARTED
 from ..solid_contacts import contacts_of
 from ..structs import DataView, ModelView
+from . import energy, rounds
+from .compliance import Response, add_stiffness
 from .coupled import Coupled
-from .kinematics import Kinematics
+from .kinematics import Kinematics, row, rows_of
 from .metric import Metric
+from .rounds import MarkedWorlds, Model, Rounds, Solid
+from .rows import keep_held
+from .rules import LOSS_FREQUENCY
 from .springs import Springs
-from .step_arrays import StepArrays
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # the first type of a contact's row
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
+_FLAGS = "awake", "began", "inside", "reason", "greedy", "marked"  # [skin]
 
 
 class SkinGroup:
-    """The two-way skins of an mjData.
+    """The two-way skins of an mjData. A stage of all skins is one call: a launch takes 1 us, several numpy
+    calls on so few numbers.
 
     Attributes:
       skins: `Coupled` that take part in this step: not those that rest with nothing in reach.
-      arrays: `StepArrays`, where the step stands. springs: `Springs`. metric: `Metric`.
-      jacobian: (n, 6, nv) of the bodies relative to their BioTacs.
+      arrays: views (n, ...) of what kernels work on, by the names of `Rounds` and `Model`; last: of the last
+        step's `Model`.
+      find_energy, restrain, gains: functions that do the energy balance. They return whether a skin is
+        greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
+      springs: `Springs`. metric: `Metric`. jacobian: (n, 6, nv) of the bodies relative to their BioTacs.
       correction: (n, 6) of what the integrator's accelerations differ in from the constraint solver's.
       amiss: (n, 6) what that still lacks: it acts on the bodies too.
       excess: (n, 6) what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts
@@ -36,18 +52,124 @@ class SkinGroup:
     """
 
     def __init__(self, model: ModelView, data: DataView, instances: Sequence[Instance]):
-        self._model, self._data, self._instances = model, data, instances
+        self._model, self._data, self._instances, self._made = model, data, instances, None
         meets = ((t.touching.core, body) for t in instances for body in t.touching.body)
         self._meets = np.array(list(meets), int).reshape(-1, 2)
         touchings, slots = [t.touching for t in instances], [t.slots for t in instances]
-        self._kinematics = Kinematics(model, data, touchings)
-        self.springs = Springs(model, data, list(map(len, slots)))
-        self.arrays = arrays = StepArrays(self._kinematics, [t.setup for t in instances], self.springs)
-        self.metric = Metric(model, touchings, slots, arrays.stiffness)
-        both = zip(instances, self._kinematics.parts)
-        self._all = [Coupled(t, data, arrays, k, bodies) for k, (t, bodies) in enumerate(both)]
-        for k, t in enumerate(instances):
-            t.keep_held = lambda tangent, k=k: arrays.held(k, tangent)
+        self._kinematics = at = Kinematics(model, data, touchings)
+        self.springs, self.arrays = Springs(model, data, list(map(len, slots))), types.SimpleNamespace()
+        both = zip(instances, at.parts)
+        self._all = [Coupled(t, data, self.arrays, k, bodies) for k, (t, bodies) in enumerate(both)]
+        with wp.ScopedDevice("cpu"):
+            self._make_arrays(at, at.jacobian.shape[:2])
+        self._respond(at.jacobian)
+        square, tangent = self._whole.square, self._models.tangent0
+        self.metric = Metric(model, touchings, slots, (square, at.jacobian, tangent))
+
+    def _make_arrays(self, at, shape):
+        """Makes the arrays of all skins, each skin's structs cut out of them, and the views."""
+        self._whole = whole = rounds.make_rounds(*shape)
+        self._models, last = (rounds.make_model(*shape) for _ in range(2))
+        wrench, tangent = wp.zeros(shape, dtype=vec6), wp.zeros(shape, dtype=mat66)
+        left, self._qacc = wp.zeros(shape, dtype=real), wp.zeros_like(at.d.qvel)
+        off, self._any = wp.zeros((len(self._all), 2), dtype=real), wp.zeros(1, dtype=int)
+        flags = {name: wp.zeros(len(self._all), dtype=int) for name in _FLAGS}
+        for k, (skin, part) in enumerate(zip(self._all, at.parts)):
+            setup = skin.instance.setup
+            skin.moving, skin.jacobian = at.bodies[k], rows_of(at.jacobian, part)
+            skin.flags = {name: array[k : k + 1] for name, array in flags.items()}
+            skin.wrench, skin.left, skin.off_out = rows_of(wrench, part), rows_of(left, part), off[k]
+            skin.rounds = set_fields(
+                _of_skin(Rounds, whole, part),
+                began=skin.flags["began"],
+                inside=skin.flags["inside"],
+                surface=np.array([setup.skin.stepper.surface_energy]),
+            )
+            skin.model, skin.last = (_of_skin(Model, one, part) for one in (self._models, last))
+            skin.marks = set_fields(MarkedWorlds(), world=skin.flags["marked"], any=self._any)
+            skin.compliance = wp.zeros((setup.ngroup, setup.ngroup, 1), dtype=wp.spatial_matrixd)
+            skin.by_mocap = wp.array(setup.touching.by_mocap, dtype=bool)
+            of_skin = {"thickness": setup.skin.thickness, "inertial": setup.skin.stepper.inertial}
+            skin.solid = set_fields(Solid(), area=1.0, **of_skin)
+            skin.instance.keep_held = _keeping(rows_of(tangent, part))
+        views = {"wrench": _seen(wrench), "left_out": _seen(left), "qacc": self._qacc.numpy()[0]}
+        views |= {name: array.numpy() for name, array in {"off": off, **flags}.items()}
+        views["compliance"] = [skin.compliance.numpy()[:, :, 0] for skin in self._all]
+        views["last"] = {name: _seen(getattr(last, name)) for name in Model.vars}
+        for struct in (whole, self._models):
+            of_bodies = (name for name in struct._cls.vars if _is_of_bodies(getattr(struct, name)))
+            views |= {name: _seen(getattr(struct, name)) for name in of_bodies}
+        vars(self.arrays).update(views)
+
+    def _respond(self, jacobian):
+        """Makes the launches that find how the bodies respond to wrenches, with the factors of `springs`."""
+        L, stiffness, frequencies = self.springs.L, self.springs.stiffness, []
+        for skin in self._all:
+            response, r, awake = Response(skin.jacobian, skin.model), skin.rounds, skin.flags["awake"]
+            skin.find_compliance = row(*response.compliance(awake, L, r.square, skin.compliance))
+            frequencies += response.frequencies(awake, stiffness, L, r.frequency)
+        known = [jacobian, self._models, stiffness]
+        self._find_frequencies = row((add_stiffness, stiffness.shape[:2], known), *frequencies)
+
+    def _record(self, step, ahead):
+        """Makes the launches for a time step [s]; ahead: see `rounds.choose_gamma`."""
+        if self._made == (step, ahead):
+            return
+        self._made, m, d = (step, ahead), self._kinematics.m, self._kinematics.d
+
+        def drift(skin):
+            return skin.moving.drift(m, d, step, skin.jacobian, skin.rounds)
+
+        def begin(skin):
+            r, awake = skin.rounds, skin.flags["awake"]
+            delay = skin.instance.setup.config.loss / (2 * math.pi * LOSS_FREQUENCY * step)
+            return (
+                skin.moving.here(d, r.here_pos, r.here_mat),
+                *drift(skin),
+                (rounds.begin_rounds, 1, [awake, skin.by_mocap, r, skin.last, skin.model]),
+                (rounds.choose_gamma, r.pos.shape, [step, ahead, delay, skin.solid, skin.last, r]),
+                *drift(skin),
+            )
+
+        def forces(skin):
+            return [(rounds.wrenches, skin.wrench.shape, [skin.model, skin.rounds, skin.wrench])]
+
+        def evaluate(skin):
+            moved = skin.moving.accelerate(step, skin.jacobian, self._qacc, skin.rounds)
+            return moved, (rounds.find_off, 1, [skin.model, skin.rounds, skin.off_out]), *forces(skin)
+
+        def use_euler(skin):
+            return (rounds.use_euler, 1, [step, skin.flags["greedy"], skin.rounds]), *drift(skin)
+
+        def conclude(skin):
+            flags = skin.flags["awake"], skin.flags["reason"]
+            return [(energy.conclude, 1, [*flags, skin.rounds, skin.left])]
+
+        stages = begin, use_euler, forces, evaluate, conclude
+        self._begin, self._use_euler, self._find_wrenches, self._evaluate, self._conclude = (
+            self._row(stage) for stage in stages
+        )
+        self.find_energy = self._marking(
+            energy.find_energy, lambda s: (s.last, s.solid, s.rounds, s.flags["greedy"])
+        )
+        self.restrain = self._marking(energy.restrain, lambda s: (s.model, s.compliance, s.rounds))
+        self.gains = self._marking(energy.find_gain, lambda s: (0.0, s.solid, s.rounds))
+
+    def _row(self, launches):
+        """One call for the launches of all skins."""
+        return row(*(launch for skin in self._all for launch in launches(skin)))
+
+    def _marking(self, kernel, known):
+        """A function that runs a kernel and returns whether it has marked a skin."""
+        run = self._row(lambda s: [(kernel, 1, [s.flags["awake"], *known(s), s.marks])])
+        marked = self._any.numpy()
+
+        def find():
+            marked[0] = 0
+            run()
+            return bool(marked[0])
+
+        return find
 
     def begin(self) -> None:
         """Begins a step: the linear models in force are those of the last one. Skins that rest with nothing
@@ -71,7 +193,7 @@ class SkinGroup:
         self._rows = self.jacobian.reshape(6 * len(models), self._model.nv)
         self.correction, self.amiss, self.excess = np.zeros((3, len(models), 6))
         self.forced, self.withdrawn, self.written = None, False, False
-        arrays.record(step, 0.5 * first.by_stages)
+        self._record(step, 0.5 * first.by_stages)
         for name in MODEL.names:
             getattr(arrays, name)[:] = models[name]
         for name in LINEAR:
@@ -80,7 +202,7 @@ class SkinGroup:
             if skin not in self.skins:
                 skin.part("wrench0")[:] = 0.0
         arrays.began[:] = [head[STARTED] != 0.0 for head in heads]
-        arrays.begin()
+        self._begin()
         self._kinematics.check(arrays.start_pos, arrays.start_mat)
         if arrays.placed.any():
             for skin in self.skins:
@@ -107,7 +229,7 @@ class SkinGroup:
         they are from the poses for which the skins were solved."""
         self.arrays.qacc[:] = acceleration
         np.add(self.amiss, self.excess, out=self.arrays.amiss)
-        self.arrays.evaluate()
+        self._evaluate()
         self.arrays.lifted[:] = self._find_lift()
         if self.withdrawn:
             self.arrays.acting[:] = 0.0
@@ -141,7 +263,7 @@ class SkinGroup:
         self.springs.take(inertia)
         for skin in skins:
             self.springs.factor(skin.number)
-            self.arrays.find_compliance[skin.number]()
+            skin.find_compliance()
 
     def find_frequencies(self) -> None:
         """Finds the frequencies at which the bodies bounce on all skins, as inertia and MuJoCo's other
@@ -149,7 +271,7 @@ class SkinGroup:
         self.springs.take(None)
         self.springs.factor(None)
         self.springs.held[:] = 0.0
-        self.arrays.find_frequencies()
+        self._find_frequencies()
 
     def apply(self) -> np.ndarray:
         """Puts the models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
@@ -159,12 +281,12 @@ class SkinGroup:
         if not self.written:
             self.metric.write(self.touching)
             self.written = True
-        self.arrays.find_wrenches()
+        self._find_wrenches()
         return (self.correction + self.arrays.wrench).ravel() @ self._rows
 
     def use_euler(self) -> None:
         """Makes the step of the bodies of greedy skins that of backward Euler."""
-        self.arrays.use_euler()
+        self._use_euler()
         self.written = False
 
     def withdraw(self) -> None:
@@ -202,9 +324,10 @@ class SkinGroup:
         travel = self.jacobian @ moved
         error = np.abs((travel - self.arrays.travel) * _SCALE)
         self.arrays.travel[:] = travel
-        converged = np.zeros(len(self._all), bool)
-        converged[[skin.number for skin in self.skins]] = [skin.result.converged for skin in self.skins]
-        self.arrays.conclude(converged)
+        self.arrays.reason[:] = NOT_CONVERGED
+        for skin in self.skins:
+            self.arrays.reason[skin.number] = CONVERGED if skin.result.converged else NOT_CONVERGED
+        self._conclude()
         for skin in self.skins:
             outcome = skin.instance.outcome
             outcome.energy = skin.part("left_out").copy()
@@ -216,3 +339,34 @@ class SkinGroup:
         pos, mat = self._kinematics.predict(0.0)
         for skin in self._all:
             skin.instance.ends = pos[skin.bodies], mat[skin.bodies]
+
+
+def _keeping(tangent):
+    """A function that gives the part of tangents (ngroup, 6, 6) that rows represent, see
+    `rows.hold_by_rows`."""
+    held, keep = _seen(tangent), row((keep_held, tangent.shape, [tangent]))
+
+    def find(given):
+        held[:] = given
+        keep()
+        return held.copy()
+
+    return find
+
+
+def _of_skin(kind, whole, part):
+    """A struct with rows `part` of the arrays [body, world] of another, and its other fields."""
+    one = kind()
+    for name in kind.vars:
+        value = getattr(whole, name)
+        setattr(one, name, rows_of(value, part) if _is_of_bodies(value) else value)
+    return one
+
+
+def _is_of_bodies(value):
+    return isinstance(value, wp.array) and value.ndim == 2
+
+
+def _seen(array):
+    """A view of the only world of an array [item, world]."""
+    return array.numpy()[:, 0]

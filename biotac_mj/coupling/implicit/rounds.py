@@ -362,6 +362,19 @@ def distance_off(model: Model, r: Rounds, w: int, free: real):
 
 
 @wp.kernel
+def find_off(
+    # In:
+    model: Model,
+    r: Rounds,
+    # Out:
+    off_out: wp.array(dtype=real),
+):
+    """Largest distance from where the skin was solved [m], of the bodies that may touch it and of all."""
+    for k in range(2):
+        off_out[k] = distance_off(model, r, 0, real(1 - k))
+
+
+@wp.kernel
 def look(
     # In:
     awake: wp.array(dtype=int),

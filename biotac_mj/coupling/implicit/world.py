@@ -370,12 +370,12 @@ class World:
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
         how many rounds that took."""
         group = self._group
-        if not group.arrays.find_energy():
+        if not group.find_energy():
             return 0
         group.use_euler()
         group.find_compliance(group.skins, self._inertia)
         rounds = self._find_balance(outside)
-        group.arrays.find_energy()
+        group.find_energy()
         return rounds
 
     def _restrain(self, outside):
@@ -384,9 +384,9 @@ class World:
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself.
         """
-        while self._group.arrays.restrain():
+        while self._group.restrain():
             self._predict(outside)
-        if self._group.arrays.gains():
+        if self._group.gains():
             self._group.withdraw()
             self._predict(outside)
 
