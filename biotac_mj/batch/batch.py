@@ -259,20 +259,11 @@ class Batch(Skins):
         out = [self._greedy, damped.struct]
         self._settle(energy.find_energy, taking_part, [self._last, self._solid], out)
 
-    def restrain(self, worlds: Marks, going: Marks) -> None:
+    def restrain(self, d: "mjw.Data", worlds: Marks, going: Marks) -> None:
         """Takes the push on bodies that have not the energy for it, after `find_energy` and `evaluate`, and
         marks their worlds."""
-        known = [self.model, self.skin.bodies.compliance]
-        self._settle(energy.restrain, worlds, known, [going.struct])
-
-    def find_gain(self, taking_part: Marks, gains: Marks) -> None:
-        """Marks worlds where withholding all does not help, after `evaluate`."""
-        self._settle(energy.find_gain, taking_part, [_ROUNDING, self._solid], [gains.struct])
-
-    def withdraw(self, d: "mjw.Data", gains: wp.array) -> None:
-        """Lets the skins of those worlds not act in this step."""
-        changed = [self.model, self._of_step, self._correction_force, d.qacc_warmstart]
-        self._launch(energy.withdraw, self.nworld, [gains], changed)
+        known = [_ROUNDING, self._solid, self.skin.bodies.compliance, self.model]
+        self._settle(energy.restrain, worlds, known, [d.qacc_warmstart, going.struct])
 
     def add_stiffness(self, stiffness: wp.array) -> None:
         """Adds the skin's to that of all (nworld, nv, nv)."""

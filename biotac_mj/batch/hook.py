@@ -201,7 +201,7 @@ class Hook:
         self._go_on(m, d, moving)
         self._choose(moving, lambda batch, found: batch.find_energy(taking_part, found))
         wp.capture_if(going.any, lambda: self._damp(m, d, moving))
-        self._choose(moving, lambda batch, found: batch.restrain(taking_part, found))
+        self._choose(moving, lambda batch, found: batch.restrain(d, taking_part, found))
         wp.capture_if(going.any, lambda: self._restrain(m, d, moving))
         self._stiffness.zero_()
         for batch in moving:
@@ -248,16 +248,9 @@ class Hook:
 
         def withhold():
             self._accelerate(m, d, moving)
-            self._choose(moving, lambda batch, found: batch.restrain(self._going, found))
-
-        def withdraw():
-            for batch in moving:
-                batch.withdraw(d, self._going.world)
-            self._accelerate(m, d, moving)
+            self._choose(moving, lambda batch, found: batch.restrain(d, self._going, found))
 
         wp.capture_while(self._going.any, withhold)
-        self._choose(moving, lambda batch, found: batch.find_gain(self._taking_part, found))
-        wp.capture_if(self._going.any, withdraw)
 
     def _find_compliance(self, m, d, moving):
         known = m, d, self._going.world, self._integrator.inertia

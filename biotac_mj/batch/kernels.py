@@ -84,6 +84,8 @@ def accept_models(
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
     slack: wp.array2d(dtype=real),
+    fraction: wp.array(dtype=real),
+    path: wp.array(dtype=real),
     at_rest: wp.array(dtype=bool),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
@@ -94,7 +96,7 @@ def accept_models(
 ):
     """Linear models of skins after a solve for poses pos, mat: about the poses that were reached. Where none
     was reached: the last step's model, or in a first step one about the target poses. No force where poses
-    are not finite."""
+    are not finite. fraction, path: see `BatchSkin`."""
     g, w = wp.tid()
     if st.wanted[w] == 0:
         return
@@ -118,7 +120,7 @@ def accept_models(
             p = turn * (p - geoms.pos[k, w]) + geoms.pos_last[k, w]
             R = turn * R
         model.wrench0[g, w] = wrench[g, w]
-        model.tangent0[g, w] = hold_by_rows(tangent[g, w])
+        model.tangent0[g, w] = hold_by_rows(fraction[g] * path[g] * tangent[g, w])
     model.pos0[g, w] = p
     model.mat0[g, w] = R
     model.slack[g, w] = real(0.0)
@@ -370,16 +372,6 @@ def begin_near(
 
 
 @wp.kernel
-def scale_tangents(
-    fraction: wp.array(dtype=real), path: wp.array(dtype=real), tangent: wp.array2d(dtype=wp.spatial_matrixd)
-):
-    """Takes of tangents what this skin answers for, and how far what it meets goes with a group."""
-    g, w = wp.tid()
-    if path[g] != real(1.0):
-        tangent[g, w] = fraction[g] * path[g] * tangent[g, w]
-
-
-@wp.kernel
 def begin_at_rest(
     # In:
     fresh: wp.array(dtype=int),
@@ -396,22 +388,6 @@ def begin_at_rest(
     i, w = wp.tid()
     if fresh[w] == 1:
         velocity_out[i, w] = ((mat_end[w] - mat[w]) * x[i, w] + pos_end[w] - pos[w]) / dt[w]
-
-
-@wp.kernel
-def begin_frames(
-    # In:
-    pos: wp.array(dtype=vec3),
-    mat: wp.array(dtype=mat33),
-    # Out:
-    fresh_out: wp.array(dtype=int),
-    pos_out: wp.array(dtype=vec3),
-    mat_out: wp.array(dtype=mat33),
-):
-    w = wp.tid()
-    fresh_out[w] = 0
-    pos_out[w] = pos[w]
-    mat_out[w] = mat[w]
 
 
 @wp.kernel

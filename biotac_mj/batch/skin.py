@@ -13,7 +13,6 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel
 from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.outside import leave_skin
-from ..skin.contact.touch import SKINS
 from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_worlds
 from ..skin.program import Fork, Launcher
@@ -53,10 +52,12 @@ class BatchSkin:
       rest: `rest.Rest`, which skins sleep, and which come to rest instead of being solved.
       x: (nvert, nworld) nodes [m].
       motion: (ngeom, nworld) of the geoms in the last step [m].
-      fraction: (ngroup,) of what it does to each group that this skin answers for, see `Touching`.
+      fraction, path: (ngroup,) of what it does to each group that this skin answers for, and how far what it
+        meets goes with one, see `Touching`.
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
-      tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
+      tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector) without fraction
+        and path.
       pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
         energy norm, estimated.
       bodies: `skin.bodies.Bodies`, of skins with tangents: how what touches gives way, for the caller to
@@ -114,7 +115,7 @@ class BatchSkin:
             self.tier = (self._condensed or self.data.worlds).tier
             self.slack = self._condensed.slack if self._condensed else wp.zeros((0, nworld), dtype=wp.float64)
             allocate("batch", self, {"group": self.ngroup, "world": nworld})
-            self.fraction, self._path = (
+            self.fraction, self.path = (
                 wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)
             )
             self.by_mocap = wp.array(touching.by_mocap, dtype=bool)
@@ -152,12 +153,9 @@ class BatchSkin:
         if self.inertial:
             frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]
             self._launch(kernels.begin_at_rest, d.x.shape, [self.fresh, *frames, d.dt, d.x], [d.velocity])
-            self._launch(
-                kernels.begin_frames,
-                self.nworld,
-                [self.core_pos, self.core_mat],
-                [self.fresh, d.frame_pos_last, d.frame_mat_last],
-            )
+            wp.copy(d.frame_pos_last, self.core_pos)
+            wp.copy(d.frame_mat_last, self.core_mat)
+            self.fresh.zero_()
         self._come_from_outside(d.worlds.wanted)
         if self._condensed:
             self._condensed.begin()
@@ -206,9 +204,6 @@ class BatchSkin:
         if wanted:
             if not self._condensed:
                 d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
-            if self.geoms.shapes == SKINS:
-                known = [self.fraction, self._path]
-                self._launch(kernels.scale_tangents, self.tangent.shape, known, [self.tangent])
         self.rest.end_solve()
 
     def prepare_keep(self) -> None:

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ...coupling.implicit.compliance import substitute
+from ...coupling.implicit.compliance import holds, substitute
 from ...coupling.implicit.rounds import Model, make_model
 from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
@@ -112,7 +112,8 @@ def find_amiss(
     again_out: wp.array(dtype=int),
 ):
     """After mujoco_warp's answer a, a' [world, dof]: what the correction lacks, and which worlds need another
-    one; sets again[0] where one does. Skins that do not act lack nothing. One block per world."""
+    one; sets again[0] where one does. Skins that do not act, or hold no body, lack nothing. One block per
+    world."""
     w, t = wp.tid()
     if c.going[w] == 0:
         return
@@ -121,7 +122,7 @@ def find_amiss(
     largest = real(0.0)
     for k in range(t, c.jacobian.shape[0], wp.block_dim()):
         excess = vec6()
-        if c.acts[k] == 1:
+        if c.acts[k] == 1 and holds(c.model, k, w):
             motion = vec6()
             for i in range(c.jacobian.shape[2]):
                 motion += c.square[k, w] * real(found[w, i] - moved[w, i]) * c.jacobian[k, w, i]

@@ -57,10 +57,10 @@ def draws(r: Rounds, w: int):
 
 
 @wp.func
-def overdraws(r: Rounds, w: int, slack: real):
-    """Whether what acts gives bodies more energy than they have and a slack [J], or is no number."""
+def overdraws(r: Rounds, w: int):
+    """Whether what acts gives bodies more energy than they have, or is no number."""
     both = draws(r, w)
-    return not both[0] <= both[1] + slack
+    return not both[0] <= both[1]
 
 
 @wp.kernel
@@ -99,7 +99,7 @@ def find_energy(
     for g in range(r.pos.shape[0]):
         if r.gamma[g, w] < real(EULER):
             undamped += 1
-    if solid.inertial == 0 and undamped > 0 and overdraws(r, w, real(0.0)):
+    if solid.inertial == 0 and undamped > 0 and overdraws(r, w):
         greedy_out[w] = 1
         mark(damped, w)
 
@@ -108,21 +108,36 @@ def find_energy(
 def restrain(
     # In:
     worlds: wp.array(dtype=int),
-    model: Model,
+    rounding: real,
+    solid: Solid,
     compliance: wp.array3d(dtype=mat66),
     # In and out:
+    model: Model,
     r: Rounds,
+    warmstart: wp.array2d(dtype=float),
     going: MarkedWorlds,
 ):
     """Withholds so much of the push on bodies that would get more energy than they have that they get what
-    they have, all where that was not enough, and marks their worlds. compliance: of `Bodies`."""
+    they have, all where that was not enough. Where others turn even that into a gain the skin does not act on
+    the body in this step, and mujoco_warp's solver begins anew, since what it found may be no number. Marks
+    their worlds.
+
+    Args:
+      rounding: of the most that a skin holds which pushes with what acts, may be the engine's. A solve that
+        lost its way may leave a model so stiff and far off that what acts of it is rounding alone.
+      compliance: of `Bodies`. warmstart: (nworld, nv) of mujoco_warp, empty without.
+    """
     w = wp.tid()
-    if worlds[w] == 0 or not overdraws(r, w, real(0.0)):
+    if worlds[w] == 0 or not overdraws(r, w):
         return
     for g in range(r.pos.shape[0]):
         gets = given(r, g, w)
-        if r.push[g, w] > real(0.0) and not _lacking(r.store[g, w], gets) == real(0.0):
-            acts = r.acting[g, w]
+        lacks = _lacking(r.store[g, w], gets)
+        acts = r.acting[g, w]
+        slack = real(0.0)
+        if rounding > real(0.0):
+            slack = rounding * most_energy(r, force_of(acts), solid, w)
+        if r.push[g, w] > real(0.0) and not lacks == real(0.0):
             moves = compliance[g, g, w] * acts
             own = real(0.5) / _beta_of(r.gamma[g, w]) * wp.dot(acts, moves)
             fraction = real(0.0)
@@ -133,56 +148,15 @@ def restrain(
             r.withheld[g, w] = r.withheld[g, w] + change
             r.push[g, w] = fraction * r.push[g, w]
             mark(going, w)
-
-
-@wp.kernel
-def find_gain(
-    # In:
-    taking_part: wp.array(dtype=int),
-    rounding: real,
-    solid: Solid,
-    r: Rounds,
-    # Out:
-    gains: MarkedWorlds,
-):
-    """Marks worlds where a skin gives more than it has whatever is withheld, or what acts is no number.
-    rounding: of the most that a skin holds which pushes with what acts, may be the engine's. A solve that
-    lost its way may leave a model so stiff and far off that what acts of it is rounding alone."""
-    w = wp.tid()
-    if taking_part[w] == 0:
-        return
-    slack = real(0.0)
-    if rounding > real(0.0):
-        for g in range(r.acting.shape[0]):
-            slack += rounding * most_energy(r, force_of(r.acting[g, w]), solid, w)
-    if overdraws(r, w, slack):
-        mark(gains, w)
-
-
-@wp.kernel
-def withdraw(
-    # In:
-    gains: wp.array(dtype=int),
-    # In and out:
-    model: Model,
-    r: Rounds,
-    correction: wp.array2d(dtype=vec6),
-    warmstart: wp.array2d(dtype=float),
-):
-    """No skin of such a world acts in this step; mujoco_warp's solver begins anew, since what it found may be
-    no number."""
-    w = wp.tid()
-    if gains[w] == 0:
-        return
-    for i in range(warmstart.shape[1]):
-        warmstart[w, i] = 0.0
-    r.settled[w] = 0
-    for g in range(correction.shape[0]):
-        r.push[g, w] = real(0.0)
-        r.withheld[g, w] = vec6()
-        model.wrench0[g, w] = vec6()
-        model.tangent0[g, w] = mat66()
-        correction[g, w] = vec6()
+        elif not (lacks <= slack or (model.wrench0[g, w] == vec6() and model.tangent0[g, w] == mat66())):
+            r.push[g, w] = real(0.0)
+            r.withheld[g, w] = vec6()
+            r.settled[w] = 0
+            model.wrench0[g, w] = vec6()
+            model.tangent0[g, w] = mat66()
+            for i in range(warmstart.shape[1]):
+                warmstart[w, i] = 0.0
+            mark(going, w)
 
 
 @wp.kernel

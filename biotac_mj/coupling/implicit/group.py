@@ -41,14 +41,14 @@ class SkinGroup:
       skins: `Coupled` that take part in this step: not those that rest with nothing in reach.
       arrays: views (n, ...) of what kernels work on, by the names of `Rounds` and `Model`; last: of the last
         step's `Model`.
-      find_energy, restrain, gains: functions that do the energy balance. They return whether a skin is
-        greedy; whether push on a body had to be withheld; whether bodies get more energy than they have.
+      find_energy, restrain: functions that do the energy balance. They return whether a skin is greedy, and
+        whether push on a body had to be withheld.
       springs: `Springs`. metric: `Metric`. jacobian: (n, 6, nv) of the bodies relative to their BioTacs.
       correction: (n, 6) of what the integrator's accelerations differ in from the constraint solver's.
       amiss: (n, 6) what that still lacks: it acts on the bodies too.
       excess: (n, 6) what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts
         too.
-      forced: wrenches (n, 6) that act in place of models and rows, or None. withdrawn: nothing acts.
+      forced: wrenches (n, 6) that act in place of models and rows, or None.
     """
 
     def __init__(self, model: ModelView, data: DataView, instances: Sequence[Instance]):
@@ -152,8 +152,10 @@ class SkinGroup:
         self.find_energy = self._marking(
             energy.find_energy, lambda s: (s.last, s.solid, s.rounds, s.flags["greedy"])
         )
-        self.restrain = self._marking(energy.restrain, lambda s: (s.model, s.compliance, s.rounds))
-        self.gains = self._marking(energy.find_gain, lambda s: (0.0, s.solid, s.rounds))
+        none = wp.zeros((1, 0), dtype=float, device="cpu")
+        self.restrain = self._marking(
+            energy.restrain, lambda s: (0.0, s.solid, s.compliance, s.model, s.rounds, none)
+        )
 
     def _row(self, launches):
         """One call for the launches of all skins."""
@@ -192,7 +194,7 @@ class SkinGroup:
         self.jacobian = self._kinematics.jacobians()
         self._rows = self.jacobian.reshape(6 * len(models), self._model.nv)
         self.correction, self.amiss, self.excess = np.zeros((3, len(models), 6))
-        self.forced, self.withdrawn, self.written = None, False, False
+        self.forced, self.written = None, False
         self._record(step, 0.5 * first.by_stages)
         for name in MODEL.names:
             getattr(arrays, name)[:] = models[name]
@@ -214,7 +216,7 @@ class SkinGroup:
     @property
     def touching(self) -> np.ndarray:
         """Numbers of the bodies that a skin holds: it has a stiffness against them."""
-        return np.flatnonzero(self.arrays.tangent0.any(axis=(1, 2)) & (not self.withdrawn))
+        return np.flatnonzero(self.arrays.tangent0.any(axis=(1, 2)))
 
     def held(self, touching: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Jacobian (6 k, nv) of some bodies that skins hold, and what these push against accelerations (nv,)
@@ -231,8 +233,6 @@ class SkinGroup:
         np.add(self.amiss, self.excess, out=self.arrays.amiss)
         self._evaluate()
         self.arrays.lifted[:] = self._find_lift()
-        if self.withdrawn:
-            self.arrays.acting[:] = 0.0
         for skin in self.skins:
             skin.find_off()
 
@@ -288,12 +288,6 @@ class SkinGroup:
         """Makes the step of the bodies of greedy skins that of backward Euler."""
         self._use_euler()
         self.written = False
-
-    def withdraw(self) -> None:
-        """Lets nothing act in this step; the models stay as the next one's first."""
-        self.forced, self.withdrawn, self.arrays.push[:] = np.zeros_like(self.correction), True, 0.0
-        for skin in self.skins:
-            skin.settled = False
 
     def hold(self, acceleration: np.ndarray) -> None:
         """Lets what acts with accelerations (nv,) of MuJoCo's constraint solver act in place of the rows."""

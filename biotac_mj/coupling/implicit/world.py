@@ -384,11 +384,12 @@ class World:
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself.
         """
-        while self._group.restrain():
+        group = self._group
+        while group.restrain():
+            group.use_models()
             self._predict(outside)
-        if self._group.gains():
-            self._group.withdraw()
-            self._predict(outside)
+        for skin in group.skins:  # unless it does not act on a body
+            skin.settled &= bool(skin.part("push")[~skin.part("wrench0").any(axis=1)].all())
 
     def _corrected(self, outside):
         """Accelerations a and a'."""
